@@ -4,13 +4,13 @@ from . import live
 from .errors import InputError, SimulationError
 from .fem.body import Body
 from .fem.constants import Constant
-from .fem.field import Field
 from .fem.materials import Material, Prony
 from .fem.mesh import TetMesh
 from .fem.node_force import NodeForce
 from .fem.regions import Region
 from .fem.rest_shape import UnderGravity
 from .fem.selection import Ball, Box, Face, Indices, Named
+from .fem.spatial_field import Field
 from .fem.structured import box_mesh, cylinder_mesh
 from .methods.comparison.casadi_nlp import Sleqp, SqpMethod
 from .methods.comparison.penalty import AugmentedLagrangian, Penalty
@@ -51,8 +51,8 @@ from .recording import (
     depth_image,
     place_markers,
 )
-from .runs.refine import refine
-from .statistics.assumptions import Assumptions
+from .runs.numerical_error import refine
+from .statistics.systematic_effects import Assumptions
 
 __all__ = [
     "Assumptions",

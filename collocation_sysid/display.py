@@ -24,7 +24,7 @@ from rich.text import Text
 from .console import PlainConsole
 from .errors import printable
 from .files import is_own
-from .tree import optional
+from .serialisation import optional
 
 COLOURS = {"good": "green", "check": "yellow", "doubtful": "red", "strong": "bold", "quiet": "dim"}
 # Markup of Markdown: anywhere in a text, at its beginning, and as the number of a list item.

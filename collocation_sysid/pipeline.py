@@ -16,32 +16,32 @@ import numpy as np
 from .display import plain_text
 from .errors import InputError, SimulationError
 from .fem.two_phase import TwoPhaseModes
+from .methods.experiment_executors import connect_executor
+from .methods.initial_trajectories import simulate_trajectories
 from .methods.solution import Method, Solution, Status, Watch
-from .methods.start import simulate_trajectories
-from .methods.workers import connect_executor
 from .model.schemes import as_scheme
 from .problem import Problem
-from .runs.answer import SolvedProblem
 from .runs.check.cost import require_memory
 from .runs.forward_simulation import simulate_experiments, step_error
-from .runs.refine import refine
-from .runs.result import Elapsed, Result
+from .runs.numerical_error import refine
+from .runs.result_builder import build_result
+from .runs.result_content import Elapsed, Result
+from .runs.solved_problem import SolvedProblem
 from .runs.solving import solve, solve_with_renewed_correspondences, with_workers
-from .runs.told import build_result
 from .runs.warm_start import WarmStart
-from .statistics.budget import VarianceSources
-from .statistics.causes import find_misspecifications
-from .statistics.considered import ResidualChanges, changes_of_assumptions
-from .statistics.diagnostics import diagnose_markers
+from .statistics.assessment import rotation_step_concerns
+from .statistics.consider_analysis import ResidualChanges, changes_of_assumptions
+from .statistics.deep_probes import deep_probes, routine_probes_with_steps
+from .statistics.discretisation_error import MOST_SUBSTEPS
+from .statistics.fit_misspecifications import find_misspecifications
 from .statistics.linearised import LinearisedFit, linearise_fit
-from .statistics.numerical import MOST_SUBSTEPS
 from .statistics.pose_noise import with_pose_noise
-from .statistics.probes import deep_probes, routine_probes_with_steps
-from .statistics.profile import Profile, profile_of_solution
-from .statistics.relaxation import Probe, SolvedFit, probed_changes
+from .statistics.profile_likelihood import Profile, profile_of_solution
+from .statistics.relaxed_assumptions import Probe, SolvedFit, probed_changes
+from .statistics.residual_diagnostics import diagnose_markers
 from .statistics.routine_probes import probed_deviations
-from .statistics.trust import rotation_step_concerns
 from .statistics.uncertainty import Uncertainty, uncertainty_from_fit
+from .statistics.uncertainty_budget import VarianceSources
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes a while to import
@@ -101,7 +101,7 @@ class Run(SolvedProblem):
         """
         from .result.animation import chosen  # how it looks is no part of a run
         from .result.pictures.shapes import portrait
-        from .result.record import replays
+        from .result.run_record import replays
 
         replay = chosen(replays(self), experiment)
         bodies = {each.name: each.body for each in self.problem.experiments}
@@ -125,7 +125,7 @@ class Run(SolvedProblem):
         InputError
             If the folder contains anything other than an earlier run.
         """
-        from .result.record import write_run  # what files hold is no part of a run
+        from .result.run_record import write_run  # what files hold is no part of a run
 
         return write_run(self, folder, frames=frames, pictures=pictures)
 

@@ -9,7 +9,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from sphinx_gallery.scrapers import figure_rst
 
-from collocation_sysid.result.style import RESOLUTION_DPI
+from collocation_sysid.result.figure_style import RESOLUTION_DPI
 
 
 def last_figure(_block: object, variables: Mapping[str, Any], gallery: Mapping[str, Any]) -> str:

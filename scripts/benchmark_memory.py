@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from collocation_sysid import Body, Collocation, Experiment, Parameters, Problem, Unknown
-from collocation_sysid.program.marching import simulate_scheme
+from collocation_sysid.program.scheme_simulation import simulate_scheme
 from collocation_sysid.program.sweep import Sweep
 
 FILE = Path(__file__).parents[1] / "problems/table1/problem.toml"

@@ -41,9 +41,9 @@ from collocation_sysid import (
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.methods import METHODS
+from collocation_sysid.methods.experiment_executors import DaskExecutor
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.methods.workers import DaskExecutor
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem

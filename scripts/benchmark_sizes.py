@@ -24,8 +24,8 @@ from benchmark_methods import PARAMETERS, TRUTH, cylinder, swung
 
 from collocation_sysid import Body, Collocation
 from collocation_sysid.program.factorisation import Choice
-from collocation_sysid.program.marching import continue_simulation
-from collocation_sysid.program.newton import NewtonOptions
+from collocation_sysid.program.newton_solver import NewtonOptions
+from collocation_sysid.program.scheme_simulation import continue_simulation
 from collocation_sysid.program.stopwatch import Stopwatch
 from collocation_sysid.program.sweep import Sweep
 

@@ -53,12 +53,12 @@ import problem_files
 from studies import markdown
 
 from collocation_sysid import cli
-from collocation_sysid.cli import problems, runs, streams  # noqa: F401
+from collocation_sysid.cli import problem_commands, run_commands, stream_commands  # noqa: F401
 from collocation_sysid.fem.kernels import jit
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.recording import read_markers, read_poses
 from collocation_sysid.recording.formats import topics  # noqa: F401
-from collocation_sysid.result import record
+from collocation_sysid.result import run_record
 from collocation_sysid.result.export import TARGETS
 from collocation_sysid.result.pictures import album  # noqa: F401
 from collocation_sysid.runs import check  # noqa: F401
@@ -997,7 +997,7 @@ def table(
             words = ("solve", "problem.toml", *REDUCED, "-q", "--out", "run")
             if (ended := run(words, solved, 10 * limit_s)).code not in (0, 1):
                 raise RuntimeError(f"the small problem is not solved: {ended.err}")
-        record._write_pictures = lambda *_: None
+        run_record._write_pictures = lambda *_: None
         cases = Cases(folder, problem, solved, count, seed, limit_s, kept)
         for name in only:
             began = time.monotonic()

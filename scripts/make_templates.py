@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from collocation_sysid.arrays import Array
+from collocation_sysid.array_types import Array
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import cylinder_of_edge
 from collocation_sysid.files import write_whole
 from collocation_sysid.problem import Problem
-from collocation_sysid.problem.beginning import TEMPLATES
+from collocation_sysid.problem.new_problem import TEMPLATES
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import (
     Experiment,

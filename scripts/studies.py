@@ -16,7 +16,7 @@ from collocation_sysid.plan import (
     plan_comparison,
     run_all,
 )
-from collocation_sysid.plan.table import Row, SuccessCriterion, run_row
+from collocation_sysid.plan.study_rows import Row, SuccessCriterion, run_row
 from collocation_sysid.problem import Problem
 
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}

@@ -24,7 +24,7 @@ from scipy.stats import t as student
 import collocation_sysid as cs
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.contact import contact_terms
-from collocation_sysid.recording.solids import Solid
+from collocation_sysid.recording.obstacle_solids import Solid
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 YOUNG_PA, POISSON = 1e4, 0.3

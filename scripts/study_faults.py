@@ -34,11 +34,11 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Nuisance, PoseSequence
-from collocation_sysid.statistics.assumptions import ASSUMPTIONS, Assumption
-from collocation_sysid.statistics.budget import BudgetLine, VarianceSources, budget
-from collocation_sysid.statistics.considered import changed_residuals
+from collocation_sysid.statistics.consider_analysis import changed_residuals
 from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.systematic_effects import ASSUMPTIONS, Assumption
 from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_at
+from collocation_sysid.statistics.uncertainty_budget import BudgetLine, VarianceSources, budget
 
 Array = NDArray[np.float64]
 Generator = np.random.Generator

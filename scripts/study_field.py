@@ -24,9 +24,9 @@ from synthetic import swing
 
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.field import Prior
+from collocation_sysid.fem.spatial_field import Prior
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.statistics.fields import FieldEstimate, field_estimates
+from collocation_sysid.statistics.field_estimates import FieldEstimate, field_estimates
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 Array = NDArray[np.float64]

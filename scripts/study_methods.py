@@ -21,7 +21,7 @@ from studies import TRUTH, Variant, markdown, number, run_variants, save, worst_
 from synthetic import swing
 
 from collocation_sysid.fem.structured import cylinder_mesh
-from collocation_sysid.plan.table import Row, wilson_interval
+from collocation_sysid.plan.study_rows import Row, wilson_interval
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import write_poses_csv
 from collocation_sysid.result.synthesis import Recipe, write_data

@@ -22,7 +22,7 @@ from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
 from collocation_sysid.runs.check import misspecification_hypotheses
-from collocation_sysid.statistics.hypothesis import rank
+from collocation_sysid.statistics.misspecification_hypothesis import rank
 from collocation_sysid.statistics.wrench_causes import wrench_mistakes
 
 PROBLEMS = Path(__file__).parents[1] / "problems"

@@ -23,7 +23,7 @@ from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance
-from collocation_sysid.runs.refine import finer_mesh, solve_refined
+from collocation_sysid.runs.numerical_error import finer_mesh, solve_refined
 from collocation_sysid.runs.warm_start import WarmStart
 from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
 

@@ -21,7 +21,7 @@ import numpy as np
 from collocation_sysid import Problem, run
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.constants import symbol_of
-from collocation_sysid.runs.result import ReportedEstimate
+from collocation_sysid.runs.result_content import ReportedEstimate
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
 SILICONES = ("EF10", "EF30", "EF50")

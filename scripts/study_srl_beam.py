@@ -24,10 +24,10 @@ from collocation_sysid import Problem, Solution, solve
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import ExperimentIterate
-from collocation_sysid.statistics.diagnostics import diagnose_markers
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.identifiability import identifiability_sentences
 from collocation_sysid.statistics.linearised import LinearisedFit, linearise_fit
+from collocation_sysid.statistics.residual_diagnostics import diagnose_markers
 from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_from_fit
 
 TRIALS = ("gravity", "load52", "load101")

@@ -18,7 +18,7 @@ from study_refinement import BODIES, NAMES, STEP_S, still
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
-from collocation_sysid.runs.result import ReportedEstimate
+from collocation_sysid.runs.result_content import ReportedEstimate
 
 NOISES_M = (5e-5, 2e-4, 1e-3)
 

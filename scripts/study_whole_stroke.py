@@ -21,7 +21,7 @@ from make_phantom_mesh import SECTIONS_MM, turned
 from collocation_sysid import Problem, run
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.methods.solution import pooled_wrench_rms
-from collocation_sysid.runs.result import ReportedEstimate
+from collocation_sysid.runs.result_content import ReportedEstimate
 
 FILE = Path(__file__).parents[1] / "problems" / "phantom_compression" / "whole_stroke.toml"
 PLATEN = "experiment.A1.obstacle.platen"

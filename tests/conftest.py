@@ -13,7 +13,7 @@ from problems_small import uneven_box
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.recording import environment
-from collocation_sysid.result import progress, record
+from collocation_sysid.result import run_record, solve_progress
 
 BodyFactory = Callable[..., Body]
 
@@ -22,7 +22,7 @@ BodyFactory = Callable[..., Body]
 def _runs_without_pictures() -> Iterator[None]:
     """Pictures take most of the time of a small run; `problem_files.pictures_drawn` has them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(record, "_write_pictures", lambda *_: None)
+        patch.setattr(run_record, "_write_pictures", lambda *_: None)
         yield
 
 
@@ -30,7 +30,7 @@ def _runs_without_pictures() -> Iterator[None]:
 def _no_lines_of_slow_machines() -> Iterator[None]:
     """What runs leave on stderr does not depend on how busy the machine is."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(progress, "FIRST_S", 1e6)
+        patch.setattr(solve_progress, "FIRST_S", 1e6)
         yield
 
 

@@ -18,7 +18,7 @@ from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import write_poses_csv
-from collocation_sysid.result import record
+from collocation_sysid.result import run_record
 from collocation_sysid.result.synthesis import Recipe, write_data
 
 SIZE_M, DIVISIONS = (0.06, 0.06, 0.09), (2, 2, 3)
@@ -58,7 +58,7 @@ reference_m = {REFERENCES}
 """
 
 Edit = Callable[[Path], object]
-write_pictures = record._write_pictures  # before the session's fixture leaves them out
+write_pictures = run_record._write_pictures  # before the session's fixture leaves them out
 
 
 # Writing ------------------------------------------------------------------------------------------
@@ -177,7 +177,7 @@ def run_command(*arguments: object) -> Outcome:
 def pictures_drawn() -> Iterator[None]:
     """Runs that are written in this block have their pictures."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(record, "_write_pictures", write_pictures)
+        patch.setattr(run_record, "_write_pictures", write_pictures)
         yield
 
 

@@ -14,7 +14,7 @@ from collocation_sysid.fem.rest_shape import UnderGravity
 from collocation_sysid.fem.selection import Indices
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.problem.problem import Problem
-from collocation_sysid.program.rest import equilibrium
+from collocation_sysid.program.initial_equilibrium import equilibrium
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from collocation_sysid.files import SCHEMA
 from collocation_sysid.methods.solution import Timing
-from collocation_sysid.runs.result import (
+from collocation_sysid.runs.result_content import (
     DynamicsResult,
     Elapsed,
     FitResult,
@@ -21,7 +21,7 @@ from collocation_sysid.runs.result import (
     Result,
     UncertaintyResult,
 )
-from collocation_sysid.statistics.trust import Assessment
+from collocation_sysid.statistics.assessment import Assessment
 
 FIT = FitResult(1e-3, 1e-3, {})
 ROLLOUT = ForwardResult(0.8e-3, 2e-3, {})

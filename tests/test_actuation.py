@@ -14,8 +14,8 @@ from collocation_sysid.fem.selection import Box, Named
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.force_term import States
 from collocation_sysid.model.forces import Forces
-from collocation_sysid.program.newton import NewtonSolver
-from collocation_sysid.program.rest import equilibrium
+from collocation_sysid.program.initial_equilibrium import equilibrium
+from collocation_sysid.program.newton_solver import NewtonSolver
 from collocation_sysid.recording import (
     Experiment,
     Grasp,

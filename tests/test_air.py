@@ -35,11 +35,11 @@ from collocation_sysid.model.forces import Forces
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment
-from collocation_sysid.statistics.assumptions import ASSUMPTIONS
-from collocation_sysid.statistics.budget import BudgetLine, VarianceSources, budget
-from collocation_sysid.statistics.considered import changed_residuals
+from collocation_sysid.statistics.consider_analysis import changed_residuals
 from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.systematic_effects import ASSUMPTIONS
 from collocation_sysid.statistics.uncertainty import uncertainty_at
+from collocation_sysid.statistics.uncertainty_budget import BudgetLine, VarianceSources, budget
 
 VOLUME_M3, DENSITY_KG_M3 = EDGE_M**3, 30.0
 STIFF = {"lambda_pa": 1e5, "mu_pa": 1e5, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.0}

@@ -30,12 +30,12 @@ from collocation_sysid.result.animation import (
     animate,
     film_samples,
 )
-from collocation_sysid.result.page import Colouring, surface_strain, write_page
+from collocation_sysid.result.figure_style import GREEN
+from collocation_sysid.result.interactive_view import frame_files, view
 from collocation_sysid.result.replay import headline, read_run
-from collocation_sysid.result.style import GREEN
-from collocation_sysid.result.view import frame_files, view
-from collocation_sysid.statistics.concern import Concern
-from collocation_sysid.statistics.trust import Assessment
+from collocation_sysid.result.web_page import Colouring, surface_strain, write_page
+from collocation_sysid.statistics.assessment import Assessment
+from collocation_sysid.statistics.concerns import Concern
 
 NODES = 36
 
@@ -290,7 +290,7 @@ def test_the_page_has_no_syntax_error(run, tmp_path):
 
 
 def test_without_pyvista_the_remedy_is_named(run, monkeypatch):
-    monkeypatch.setattr("collocation_sysid.result.view.find_spec", lambda name: None)
+    monkeypatch.setattr("collocation_sysid.result.interactive_view.find_spec", lambda name: None)
     outcome = run_command("view", run)
     assert outcome.code == 2
     assert "pip install 'collocation-sysid[view]'" in outcome.err

@@ -16,8 +16,9 @@ import collocation_sysid
 PACKAGE = Path(collocation_sysid.__file__).parent
 # As in CONTRIBUTING.md.
 LAYERS = (
-    {"arrays", "errors", "cluster", "checked", "files", "folders", "starting", "apart", "console"}
-    | {"tree", "display", "section", "stated", "machine", "array_files", "written_files", "pages"},
+    {"array_files", "array_types", "cluster", "console", "declarations", "display", "errors"}
+    | {"files", "isolated_process", "machine", "pages", "schema_tables", "serialisation"}
+    | {"signal_handling", "validated_types", "written_files"},
     {"fem"},
     {"recording"},
     {"model"},

@@ -28,11 +28,11 @@ from collocation_sysid.fem.air import AIR_KG_M3
 from collocation_sysid.fem.constants import GAMMA_R
 from collocation_sysid.fem.materials import DAMPINGS, DampingLaw
 from collocation_sysid.model.parameters import Parameters
-from collocation_sysid.statistics.assumptions import (
+from collocation_sysid.statistics.consider_analysis import changed_residuals
+from collocation_sysid.statistics.systematic_effects import (
     ASSUMPTIONS,
     ExperimentAtAnswer,
 )
-from collocation_sysid.statistics.considered import changed_residuals
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 

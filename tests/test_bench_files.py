@@ -18,14 +18,14 @@ from collocation_sysid.fem.mesh import ElementNodes
 from collocation_sysid.fem.selection import Face
 from collocation_sysid.fem.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.problem import Problem
-from collocation_sysid.problem.beginning import TEMPLATES
+from collocation_sysid.problem.new_problem import TEMPLATES
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import displaced_axes, read_displacement, read_wrench
 from collocation_sysid.recording.formats.units import si_factor
-from collocation_sysid.recording.tables import read_pressure
+from collocation_sysid.recording.time_tables import read_pressure
 from collocation_sysid.result.run_sections import run_report, summary
 from collocation_sysid.result.synthesis import write_data
-from collocation_sysid.statistics.modal import find_misspecifications_by_modes
+from collocation_sysid.statistics.modal_misspecifications import find_misspecifications_by_modes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 

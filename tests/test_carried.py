@@ -12,10 +12,10 @@ from checks import assert_derivative, relative_error
 from problems_small import GUESS, hung_cube
 
 from collocation_sysid.model.recursion import Recursion, RecursionTrajectory
-from collocation_sysid.program.carried import LiftedOffsets, LiftedVariables
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.part import ExperimentIterate
-from collocation_sysid.program.pattern_rows import ExpressionPattern, PatternIndices
+from collocation_sysid.program.experiment_iterate import ExperimentIterate
+from collocation_sysid.program.expression_patterns import ExpressionPattern, PatternIndices
+from collocation_sysid.program.lifted_variables import LiftedOffsets, LiftedVariables
 
 CORNERS = np.array([[0, 3], [1, 5], [2, 4]])
 MODULUS_PA = 1e3

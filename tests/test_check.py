@@ -26,11 +26,16 @@ from collocation_sysid.model.schemes import SCHEMES, as_scheme
 from collocation_sysid.problem import Problem
 from collocation_sysid.result.check_sections import closer_table, glance_table
 from collocation_sysid.runs.check import CheckResult, check_problem, quick_check
-from collocation_sysid.runs.check.body import element_concerns, slenderness, worst_elements
+from collocation_sysid.runs.check.body_check import element_concerns, slenderness, worst_elements
 from collocation_sysid.runs.check.cost import MethodCost, cost_concerns, cost_notes
 from collocation_sysid.runs.check.derivatives import shortened_problem
-from collocation_sysid.runs.check.motion import ModeCheck, ModesCheck, check_modes, mode_concerns
-from collocation_sysid.statistics.concern import Concern
+from collocation_sysid.runs.check.modes_check import (
+    ModeCheck,
+    ModesCheck,
+    check_modes,
+    mode_concerns,
+)
+from collocation_sysid.statistics.concerns import Concern
 
 # The tiny problem's bar, stiff enough for 7.7 Hz and little damped, as silicone is.
 SILICONE = (
@@ -349,7 +354,7 @@ def test_a_glance_needs_no_simulation_and_no_guess(tiny: Path, monkeypatch):
 def test_the_command_shows_it_before_anything_is_simulated(tiny: Path, monkeypatch):
     monkeypatch.setattr("collocation_sysid.runs.check.initial_variables", no_simulation)
     shown = []
-    show = "collocation_sysid.cli.problems.show"
+    show = "collocation_sysid.cli.problem_commands.show"
     monkeypatch.setattr(show, lambda content: shown.append(plain_text(content)))
     with pytest.raises(AssertionError, match="simulated"):
         run_command("check", "problem.toml")

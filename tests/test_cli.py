@@ -35,15 +35,15 @@ from rich.console import Console
 
 import collocation_sysid as cs
 from collocation_sysid import cli, pipeline
-from collocation_sysid.cli import common, options
+from collocation_sysid.cli import command_options, common
 from collocation_sysid.console import PlainConsole
 from collocation_sysid.methods.solution import Iteration
-from collocation_sysid.problem.reading import read_problem_file
+from collocation_sysid.problem.problem_reading import read_problem_file
 from collocation_sysid.problem.schema import ProblemFile
 from collocation_sysid.recording import read_markers, read_poses
-from collocation_sysid.result import progress as progress_shown
-from collocation_sysid.result import record
-from collocation_sysid.result.progress import Heartbeat
+from collocation_sysid.result import run_record
+from collocation_sysid.result import solve_progress as progress_shown
+from collocation_sysid.result.solve_progress import Heartbeat
 from collocation_sysid.runs import forward_simulation, solving
 
 RESULT_KEYS = {
@@ -279,7 +279,7 @@ def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(tiny, monkeypatc
         shown.append((sys.stdout.getvalue(), result_in(tiny / "run")))
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(record, "_write_pictures", interrupt)
+    monkeypatch.setattr(run_record, "_write_pictures", interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     ((out, result),) = shown
     assert "Verdict: check" in out
@@ -292,8 +292,10 @@ def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(tiny, monkeypatc
 
 
 def test_an_interrupt_while_the_folder_is_written_loses_nothing(tiny, monkeypatch):
-    monkeypatch.setattr(record, "_write_all_frames", lambda *_: signal.raise_signal(signal.SIGTERM))
-    monkeypatch.setattr(record, "_write_pictures", lambda *_: time.sleep(60))
+    monkeypatch.setattr(
+        run_record, "_write_all_frames", lambda *_: signal.raise_signal(signal.SIGTERM)
+    )
+    monkeypatch.setattr(run_record, "_write_pictures", lambda *_: time.sleep(60))
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
     assert "Verdict: check" in outcome.out
@@ -303,7 +305,7 @@ def test_an_interrupt_while_the_folder_is_written_loses_nothing(tiny, monkeypatc
 
 def test_another_result_in_the_folder_is_left_alone_when_the_pictures_are_drawn(tiny, monkeypatch):
     file = tiny / "run" / "result.json"
-    monkeypatch.setattr(record, "_write_pictures", lambda *_: file.write_text('{"another": 1}'))
+    monkeypatch.setattr(run_record, "_write_pictures", lambda *_: file.write_text('{"another": 1}'))
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 2
     assert "result.json was changed while the pictures were drawn" in outcome.err
@@ -414,7 +416,7 @@ def test_a_terminal_shows_iterations_as_they_come(tiny):
 
 
 def test_elsewhere_long_work_leaves_a_line_now_and_then(monkeypatch):
-    monkeypatch.setattr("collocation_sysid.result.progress.FIRST_S", 0.01)
+    monkeypatch.setattr("collocation_sysid.result.solve_progress.FIRST_S", 0.01)
     told, lines = threading.Event(), []
 
     class Log(io.StringIO):
@@ -722,11 +724,11 @@ def test_a_run_from_python_is_written_like_any_other(tiny):
 def test_a_terminal_is_told_what_is_waited_for_before_anything_heavy(monkeypatch, tiny):
     screen = io.StringIO()
     terminal = PlainConsole(file=screen, force_terminal=True, width=100)
-    for module in (cli, options):
+    for module in (cli, command_options):
         monkeypatch.setattr(module, "errors", terminal)
     assert cli.Commands().get_command(None, "check") is not None
     assert "starting" in screen.getvalue()
-    options.OfProblem(problem=Path("problem.toml")).read()
+    command_options.OfProblem(problem=Path("problem.toml")).read()
     assert "reading" in screen.getvalue()
 
 
@@ -743,5 +745,5 @@ def test_a_terminal_gets_lines_that_break_between_words(monkeypatch):
 
 
 def test_what_reads_runs_needs_no_solver_to_show_its_help():
-    code = "import sys, collocation_sysid.cli.runs; sys.exit('casadi' in sys.modules)"
+    code = "import sys, collocation_sysid.cli.run_commands; sys.exit('casadi' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -29,11 +29,11 @@ from problems_small import (
 import collocation_sysid as cs
 from collocation_sysid import cluster
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods import workers
+from collocation_sysid.methods import experiment_executors
+from collocation_sysid.methods.experiment_executors import DaskExecutor, connect_executor
+from collocation_sysid.methods.initial_trajectories import simulate_trajectories
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Status
-from collocation_sysid.methods.start import simulate_trajectories
-from collocation_sysid.methods.workers import DaskExecutor, connect_executor
 from collocation_sysid.program.collocation import Collocation
 
 distributed = pytest.importorskip("distributed")
@@ -147,7 +147,7 @@ def assert_best_is_kept(solution: cs.Solution, why: str) -> None:
 
 
 def test_without_workers_left_the_best_is_kept(there, monkeypatch):
-    monkeypatch.setattr(workers, "LOOK_EVERY_S", 0.2)
+    monkeypatch.setattr(experiment_executors, "LOOK_EVERY_S", 0.2)
 
     def watch(line: Iteration) -> None:
         if line.number == 3:
@@ -251,7 +251,7 @@ def apart(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen]]]:
     ids=["a worker", "all workers", "the scheduler"],
 )
 def test_killed_processes_cost_no_answer(apart, monkeypatch, ended, status, said):
-    monkeypatch.setattr(workers, "LOOK_EVERY_S", 0.5)
+    monkeypatch.setattr(experiment_executors, "LOOK_EVERY_S", 0.5)
     monkeypatch.setattr(cluster, "CONNECT_WITHIN_S", 2.0)
     address, processes = apart
 
@@ -271,7 +271,7 @@ def test_killed_processes_cost_no_answer(apart, monkeypatch, ended, status, said
 
 
 def test_workers_of_another_version_are_refused():
-    answers = {"tcp://a:1": workers.version("collocation-sysid"), "tcp://b:1": "0.0.1"}
+    answers = {"tcp://a:1": experiment_executors.version("collocation-sysid"), "tcp://b:1": "0.0.1"}
     client = SimpleNamespace(run=lambda *_, **__: answers)
     with pytest.raises(InputError, match=r"found '0\.0\.1' on the worker tcp://b:1; expected"):
         DaskExecutor(client)
@@ -294,8 +294,8 @@ def test_a_scheduler_lost_while_versions_are_asked_for_is_reported(monkeypatch, 
 
 def test_costly_experiments_are_shared_out_first():
     threads = {"a": 1, "b": 1}
-    assert workers._assign_workers([1, 5, 2, 3], threads) == ["a", "a", "b", "b"]
-    assert workers._assign_workers([1, 1, 1], {"a": 2, "b": 1}) == ["a", "b", "a"]
+    assert experiment_executors._assign_workers([1, 5, 2, 3], threads) == ["a", "a", "b", "b"]
+    assert experiment_executors._assign_workers([1, 1, 1], {"a": 2, "b": 1}) == ["a", "b", "a"]
 
 
 # The command line

@@ -15,11 +15,11 @@ from problem_files import TRUTH, Outcome, run_command, state_vacuum, write_probl
 from results_small import a_result
 from rich.console import Console
 
-from collocation_sysid.cli import studies
+from collocation_sysid.cli import study_commands
 from collocation_sysid.methods.solution import Iteration
-from collocation_sysid.plan import process
-from collocation_sysid.plan import progress as display
-from collocation_sysid.tree import as_json
+from collocation_sysid.plan import run_execution
+from collocation_sysid.plan import study_progress as display
+from collocation_sysid.serialisation import as_json
 
 KNOWN = [word for name, value in TRUTH.items() for word in ("--truth", f"{name}={value}")]
 METHODS = ("interior-point", "reduced-space")
@@ -57,7 +57,7 @@ def stand_in(tmp_path, monkeypatch):
     script = tmp_path / "stand_in.py"
     script.write_text(STAND_IN)
     found = as_json(a_result(history=HISTORY))
-    monkeypatch.setattr(process, "COMMAND", (sys.executable, str(script), found))
+    monkeypatch.setattr(run_execution, "COMMAND", (sys.executable, str(script), found))
 
 
 def table(file: Path) -> list[dict[str, str]]:
@@ -190,7 +190,9 @@ def test_an_interrupted_study_says_how_to_resume(tiny, stand_in, monkeypatch):
 
 def test_progress_is_one_line_on_a_terminal(tiny, stand_in, monkeypatch):
     shown = io.StringIO()
-    monkeypatch.setattr(studies, "errors", Console(force_terminal=True, width=80, file=shown))
+    monkeypatch.setattr(
+        study_commands, "errors", Console(force_terminal=True, width=80, file=shown)
+    )
     monkeypatch.setenv("TERM", "xterm")
     assert compare().code == 0
     assert "0/1 runs" in shown.getvalue()

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from test_static import HANGING, block
 from wrenches_small import sensing, wristed_cube
 
-from collocation_sysid.methods.condensed import CondensedCollocation, condense
+from collocation_sysid.methods.condensed_program import CondensedCollocation, condense
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.parameters import Parameters

@@ -19,9 +19,9 @@ from collocation_sysid.model.contact import contact_terms
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.force_term import States
 from collocation_sysid.model.forces import Forces
-from collocation_sysid.program.near_contact import StepContact
+from collocation_sysid.program.contact_summary import friction_summaries
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.program.touches import friction_summaries
+from collocation_sysid.program.step_contact import StepContact
 from collocation_sysid.recording import (
     Capsule,
     Cuboid,

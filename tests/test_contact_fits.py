@@ -11,12 +11,12 @@ from problems_small import GUESS, measured, pressed_cube
 
 import collocation_sysid as cs
 from collocation_sysid.display import plain_text
-from collocation_sysid.program.touches import ContactSummary, contact_summaries
+from collocation_sysid.program.contact_summary import ContactSummary, contact_summaries
 from collocation_sysid.recording import Experiment
 from collocation_sysid.result.run_sections import summary
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.runs.result import Result
-from collocation_sysid.statistics.trust import contact_concerns
+from collocation_sysid.runs.result_content import Result
+from collocation_sysid.statistics.assessment import contact_concerns
 
 TRUTH = {"young_pa": 2e4, "poisson": 0.3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 DEPTHS_M = np.linspace(-0.0005, 0.006, 14)

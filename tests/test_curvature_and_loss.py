@@ -9,13 +9,13 @@ from memories_small import guesses, recorded, truth
 from problems_small import GUESS, TRUTH, bar_let_go, cube_with_nuisance, hung_cube, noisy
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods.curvature import exact_curvature
 from collocation_sysid.methods.horizon import Horizon, Iterate
 from collocation_sysid.methods.interior_point import InteriorPoint
+from collocation_sysid.methods.loss_curvature import exact_curvature
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marching import simulate_scheme
-from collocation_sysid.program.reading import huber_as_least_squares
+from collocation_sysid.program.measurement_residual import huber_as_least_squares
+from collocation_sysid.program.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment
 

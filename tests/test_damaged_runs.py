@@ -15,7 +15,7 @@ import pytest
 from problem_files import run_command, settings, write_problem
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.result.view import frame_files
+from collocation_sysid.result.interactive_view import frame_files
 from collocation_sysid.runs.warm_start import WarmStart
 
 Damage = Callable[[Path], object]

@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.model.nuisance import NuisanceMap
-from collocation_sysid.program.sighting import SurfaceCorrespondences
-from collocation_sysid.program.skin import VisibleSurface
-from collocation_sysid.program.view import DepthCameraModel
-from collocation_sysid.recording.depth import points_from_image
+from collocation_sysid.model.nuisance_map import NuisanceMap
+from collocation_sysid.program.depth_camera_model import DepthCameraModel
+from collocation_sysid.program.surface_correspondences import SurfaceCorrespondences
+from collocation_sysid.program.visible_surface import VisibleSurface
+from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 

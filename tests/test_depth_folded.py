@@ -8,10 +8,10 @@ import numpy as np
 from test_depth import MATRIX, NOISE_M, SHAPE, looking
 
 import collocation_sysid as cs
-from collocation_sysid.model.nuisance import NuisanceMap
-from collocation_sysid.program.sighting import SurfaceCorrespondences
-from collocation_sysid.program.skin import VisibleSurface
-from collocation_sysid.program.view import DepthCameraModel
+from collocation_sysid.model.nuisance_map import NuisanceMap
+from collocation_sysid.program.depth_camera_model import DepthCameraModel
+from collocation_sysid.program.surface_correspondences import SurfaceCorrespondences
+from collocation_sysid.program.visible_surface import VisibleSurface
 
 # A strip folded to a U that lies on its side: arms so far apart, the one behind longer.
 ARM_M, BEHIND_M, APART_M, THICK_M = 0.08, 0.12, 0.02, 0.008

@@ -11,9 +11,9 @@ from test_depth import MATRIX, NOISE_M, POSE, SHAPE, TRUTH, bar
 
 import collocation_sysid as cs
 from collocation_sysid.methods.continuation import first_samples
-from collocation_sysid.plan.choice import hold_out
-from collocation_sysid.program.skin import VisibleSurface
-from collocation_sysid.result.record import replays
+from collocation_sysid.plan.model_choice import hold_out
+from collocation_sysid.program.visible_surface import VisibleSurface
+from collocation_sysid.result.run_record import replays
 from collocation_sysid.runs.check import check_problem
 
 MADE = {**TRUTH, "young_pa": 3e5, "gamma_r_s": 5e-3}

@@ -16,16 +16,16 @@ from test_depth import MATRIX, NOISE_M, POSE, PROBLEM, SHAPE, TRUTH, bar, hangin
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods.scan import _other_starts
-from collocation_sysid.model.nuisance import NuisanceMap
+from collocation_sysid.methods.stiffness_scan import _other_starts
+from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.outline import no_depth_is_empty
-from collocation_sysid.program.sighting import SurfaceCorrespondences
-from collocation_sysid.program.skin import VisibleSurface
-from collocation_sysid.program.view import DepthCameraModel
-from collocation_sysid.recording.depth import MOST_OUTLINE_IMAGES, samples_with_outlines
+from collocation_sysid.program.depth_camera_model import DepthCameraModel
+from collocation_sysid.program.depth_outline import no_depth_is_empty
+from collocation_sysid.program.surface_correspondences import SurfaceCorrespondences
+from collocation_sysid.program.visible_surface import VisibleSurface
+from collocation_sysid.recording.depth_camera import MOST_OUTLINE_IMAGES, samples_with_outlines
 from collocation_sysid.runs.several_starts import SAME_LOSS, robust_loss
-from collocation_sysid.statistics.trust import camera_pose_concerns, outline_concerns
+from collocation_sysid.statistics.assessment import camera_pose_concerns, outline_concerns
 
 UNKNOWN = cs.Nuisance.none(depth_turn_rad=0.09, depth_shift_m=0.02, depth_edge_px=1.0)
 CAMERA = cs.DepthCamera(MATRIX, pose=POSE)

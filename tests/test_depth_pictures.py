@@ -28,14 +28,14 @@ import collocation_sysid as cs
 from collocation_sysid.pipeline import run
 from collocation_sysid.program.depth_comparison import SurfaceComparison
 from collocation_sysid.program.simulation import with_markers
-from collocation_sysid.program.skin import VisibleSurface
-from collocation_sysid.recording.depth import points_from_image
+from collocation_sysid.program.visible_surface import VisibleSurface
+from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.result.animation import Film
+from collocation_sysid.result.depth_overlays import compared_rows, save_overlays, seen_before
 from collocation_sysid.result.pictures.album import album
-from collocation_sysid.result.pictures.depth import depth_picture
+from collocation_sysid.result.pictures.depth_comparison_picture import depth_picture
 from collocation_sysid.result.replay import Replay
-from collocation_sysid.result.seen import compared_rows, save_overlays, seen_before
-from collocation_sysid.statistics.cameras import camera_hypotheses
+from collocation_sysid.statistics.camera_misspecifications import camera_hypotheses
 
 UPWARD, INVERTED = np.diag([1.0, -1, -1, 1]), np.linalg.inv(POSE)
 AWAY = np.eye(4) + 5 * np.outer(np.eye(4)[2], np.eye(4)[3])  # 5 m above, and looks up

@@ -20,11 +20,13 @@ from collocation_sysid.plan.design import (
     DesignOptions,
     HandMotion,
     Limits,
-    designing,
+    motion_design,
 )
-from collocation_sysid.plan.design.designing import MotionObjective, design_motion
-from collocation_sysid.plan.design.folder import PROBLEM_FILE, write_design
-from collocation_sysid.plan.design.information import (
+from collocation_sysid.plan.design.design_folder import PROBLEM_FILE, write_design
+from collocation_sysid.plan.design.evolution_search import minimise
+from collocation_sysid.plan.design.hand_motion import angular_motion
+from collocation_sysid.plan.design.motion_design import MotionObjective, design_motion
+from collocation_sysid.plan.design.predicted_information import (
     FutureRecording,
     LinearRecording,
     PredictedErrors,
@@ -32,12 +34,10 @@ from collocation_sysid.plan.design.information import (
     shared_information,
     symmetric_draws,
 )
-from collocation_sysid.plan.design.motion import angular_motion
-from collocation_sysid.plan.design.search import minimise
-from collocation_sysid.plan.progress import DesignProgress
+from collocation_sysid.plan.study_progress import DesignProgress
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marching import simulate_scheme
+from collocation_sysid.program.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Grasp, PoseSequence
 from collocation_sysid.statistics.linearised import linearise_fit
@@ -423,7 +423,7 @@ def test_a_wrench_counts_and_the_search_then_begins_at_random():
 def test_answers_that_need_too_much_memory_are_not_sought(monkeypatch):
     recording = FutureRecording(problem(), hung_cube(8), 0.08)
     judge = MotionObjective(recording, LIMITS, DesignCriterion(), [AT.guess_q], np.zeros((4, 4)))
-    monkeypatch.setattr(designing, "MOST_GIGABYTES", 0.5 * LinearRecording.gigabytes(recording))
+    monkeypatch.setattr(motion_design, "MOST_GIGABYTES", 0.5 * LinearRecording.gigabytes(recording))
     assert judge.first_guess(FEW, print).coefficients is None
 
 
@@ -493,7 +493,7 @@ def test_motions_that_break_a_rule_come_after_all_others():
         )
         for limits in (LIMITS, near, far)
     ]
-    assert values[0] < 100 < designing.FORBIDDEN < values[1] < values[2]
+    assert values[0] < 100 < motion_design.FORBIDDEN < values[1] < values[2]
 
 
 def test_the_search_finds_a_minimum_in_a_few_hundred_evaluations():

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from collocation_sysid.statistics.diagnostics import MarkerDiagnosis, diagnose_markers
 from collocation_sysid.statistics.linearised import LinearisedFit, ResidualBlock
+from collocation_sysid.statistics.residual_diagnostics import MarkerDiagnosis, diagnose_markers
 
 T_S = 0.01 * np.arange(160)
 SIGMA_M = 2e-4

@@ -15,7 +15,7 @@ import pytest
 from problem_files import Outcome, contents, run_command, settings, write_problem
 
 from collocation_sysid.files import whole_file, write_whole
-from collocation_sysid.result.writers import run_folder
+from collocation_sysid.result.run_writers import run_folder
 
 resource = pytest.importorskip("resource", reason="limits of POSIX")
 

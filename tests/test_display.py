@@ -28,7 +28,7 @@ from collocation_sysid.display import (
     plain_text,
 )
 from collocation_sysid.errors import printable
-from collocation_sysid.tree import as_json, content, read
+from collocation_sysid.serialisation import as_json, content, read
 
 NUMBERS = Table(
     "Estimates", ("", "value", ""), (("E Pa", "1500", "a|b"), ("ν", "0.3", "")), texts=1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from collocation_sysid.program.entries import SparseAssembly
+from collocation_sysid.program.sparse_assembly import SparseAssembly
 
 SHAPE = (5, 7)
 

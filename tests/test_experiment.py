@@ -20,7 +20,7 @@ from collocation_sysid.recording import (
     PoseSequence,
     align,
 )
-from collocation_sysid.recording.clock import unrounded_s
+from collocation_sysid.recording.sample_times import unrounded_s
 
 NODES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0.0]]) * 0.1
 TIMES = 0.01 * np.arange(6.0)

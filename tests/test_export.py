@@ -40,9 +40,9 @@ from collocation_sysid.recording import (
     Wrench,
 )
 from collocation_sysid.result.export import TARGETS, Identified, export_run, verify_export
+from collocation_sysid.result.export.export_target import at_rest
 from collocation_sysid.result.export.identified import alone
-from collocation_sysid.result.export.solids import Facets, walls
-from collocation_sysid.result.export.target import at_rest
+from collocation_sysid.result.export.obstacle_shapes import Facets, walls
 
 needs_ccx = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
 needs_mujoco = pytest.mark.skipif(

@@ -16,16 +16,16 @@ from problems_small import IDEAL, point_markers, smooth_poses, times
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.constants import MU
-from collocation_sysid.fem.field import FieldModes, Laplacian
 from collocation_sysid.fem.refinement import refine_body
-from collocation_sysid.result.pictures.field import field_picture
+from collocation_sysid.fem.spatial_field import FieldModes, Laplacian
+from collocation_sysid.result.pictures.field_intervals import field_picture
 from collocation_sysid.result.replay import GROUPS, LAYOUT, WRENCH, read_run
-from collocation_sysid.runs.check.body import check_body
+from collocation_sysid.runs.check.body_check import check_body
 from collocation_sysid.runs.forward_simulation import simulate_experiment
-from collocation_sysid.statistics.considered import changes_of_assumptions
-from collocation_sysid.statistics.fields import FieldEstimate, field_estimates
+from collocation_sysid.statistics.consider_analysis import changes_of_assumptions
+from collocation_sysid.statistics.discretisation_error import estimate_changes
+from collocation_sysid.statistics.field_estimates import FieldEstimate, field_estimates
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.numerical import estimate_changes
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 SIZE_M, SIGMA_M, YOUNG_PA = (0.04, 0.04, 0.12), 1e-4, 4e3

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.result.fields import NAMES, ElementFields
+from collocation_sysid.result.element_fields import NAMES, ElementFields
 
 LAMBDA_PA, MU_PA = 200.0, 300.0
 BOTH = pytest.mark.parametrize("element", ["tet4", "tet10"])

@@ -20,7 +20,7 @@ from collocation_sysid.model.forces import Forces
 from collocation_sysid.model.parameters import Parameters, Unknown
 from collocation_sysid.program.block_band import full_matrix
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.segment import Transcription
+from collocation_sysid.program.transcription import Transcription
 from collocation_sysid.recording import Experiment, Force, Markers, Nuisance, PointMass
 
 # Of a tendon whose tension grows and a pressure that stays.

@@ -10,7 +10,7 @@ from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
-from collocation_sysid.runs.check.body import (
+from collocation_sysid.runs.check.body_check import (
     GraspCheck,
     check_grasps,
     grasp_concerns,

@@ -19,7 +19,6 @@ import pytest
 from problem_files import replace_cell, replace_text, run_command, settings
 
 from collocation_sysid import machine
-from collocation_sysid.apart import Failed, ProcessLimits, computed_apart
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import (
@@ -28,12 +27,13 @@ from collocation_sysid.fem.structured import (
     count_cylinder_elements,
     cylinder_of_edge,
 )
-from collocation_sysid.problem import Problem, loading, size
+from collocation_sysid.isolated_process import Failed, ProcessLimits, computed_apart
+from collocation_sysid.problem import Problem, loading, problem_size
 from collocation_sysid.recording import read_markers, read_poses, write_markers_csv
 from collocation_sysid.recording.formats.depth_files import read_depth
-from collocation_sysid.result import writers
+from collocation_sysid.result import run_writers
 from collocation_sysid.runs.check import cost as memory
-from collocation_sysid.starting import INTERRUPTS, heed_interrupts
+from collocation_sysid.signal_handling import INTERRUPTS, heed_interrupts
 
 COMMAND_LINE = "from collocation_sysid import cli; cli.main()"
 
@@ -274,7 +274,7 @@ def test_a_solve_that_memory_cannot_hold_is_refused(tiny: Path, monkeypatch: pyt
 def test_a_problem_that_memory_cannot_hold_is_refused_when_it_is_read(
     tiny: Path, monkeypatch: pytest.MonkeyPatch, setting: str, found: str
 ):
-    monkeypatch.setattr(size, "machine_memory_mb", lambda: 1e3)
+    monkeypatch.setattr(problem_size, "machine_memory_mb", lambda: 1e3)
     began = time.process_time()
     for command in (("check",), ("solve", "--out", "run")):
         assert found in refused(command[0], "problem.toml", *command[1:], *settings(setting))
@@ -285,7 +285,7 @@ def test_a_problem_that_memory_cannot_hold_is_refused_when_it_is_read(
 def test_a_generated_mesh_that_memory_cannot_hold_is_refused_before_it_is_made(
     tiny: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(size, "machine_memory_mb", lambda: 2e3)
+    monkeypatch.setattr(problem_size, "machine_memory_mb", lambda: 2e3)
     monkeypatch.setattr(loading, "box_of_edge", lambda *_: pytest.fail("the mesh was made"))
     box = "box_m = [0.06, 0.06, 0.09]\nedge_length_m = 0.0015"
     replace_text('mesh = "body.vtu"', box)(tiny)
@@ -311,13 +311,13 @@ def test_long_work_is_announced_before_it_begins(tiny: Path, monkeypatch: pytest
     assert len(announced) == 1
     assert "9 samples of 1,000 substeps" in announced[0]
     assert "a solve takes about" in announced[0]
-    monkeypatch.setattr(size, "TEXT_MB_PER_S", 1e-6)
+    monkeypatch.setattr(problem_size, "TEXT_MB_PER_S", 1e-6)
     Problem.read("problem.toml", say=announced.append)
     assert "MB of recordings, most of them in swing_markers.csv" in announced[1]
 
 
 def test_so_it_is_on_the_command_line(tiny: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(size, "ANNOUNCED_SOLVE_S", 0.0)
+    monkeypatch.setattr(problem_size, "ANNOUNCED_SOLVE_S", 0.0)
     assert "a solve takes about" in run_command("check", "problem.toml").err
     assert "takes about" not in run_command("check", "problem.toml", "--quiet").err
 
@@ -486,7 +486,7 @@ def test_a_deferred_signal_interrupts_what_follows():
 def test_an_interrupt_and_sigterm_leave_the_best_result(
     tiny: Path, monkeypatch: pytest.MonkeyPatch, method: str, number: int
 ):
-    from collocation_sysid.methods.recorder import Recorder
+    from collocation_sysid.methods.solve_recorder import Recorder
 
     add = Recorder.add
 
@@ -517,7 +517,7 @@ def test_an_interrupt_and_sigterm_leave_the_best_result(
 def test_what_a_killed_run_left_is_removed_by_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, host: str
 ):
-    monkeypatch.setattr(writers.platform, "node", lambda: host)
+    monkeypatch.setattr(run_writers.platform, "node", lambda: host)
     child = subprocess.run(
         [sys.executable, "-c", "import os; print(os.getpid())"],
         capture_output=True, text=True, check=True,
@@ -527,7 +527,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next(
     going_on = tmp_path / f".run.{host}-{os.getpid()}-0a1b2c3d.partial"
     for folder in (stale, others, going_on):
         folder.mkdir()
-    with writers.run_folder(tmp_path / "run") as place:
+    with run_writers.run_folder(tmp_path / "run") as place:
         (place / "result.json").write_text("{}")
     assert not stale.exists()
     assert others.exists()

@@ -30,12 +30,16 @@ from wrenches_small import sensed, wristed_cube
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.moduli import engineering_constants
-from collocation_sysid.methods.condensed import condense
+from collocation_sysid.methods.condensed_program import condense
 from collocation_sysid.methods.initial_point import NEAR, adjoint_multipliers
+from collocation_sysid.methods.initial_trajectories import (
+    associated_at_guess,
+    initial_variables,
+    rigid_trajectory,
+)
 from collocation_sysid.methods.interior_point import IPOPT_STATUS, InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
-from collocation_sysid.methods.start import associated_at_guess, initial_variables, rigid_trajectory
 from collocation_sysid.model.parameters import Parameter, Parameters, Unknown
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem

@@ -14,7 +14,7 @@ from problems_small import GUESS, IDEAL, TRUTH, bar_loaded, box, hung_cube, node
 from collocation_sysid.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.model.nuisance import NuisanceMap
+from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem, RolloutOptions, UncertaintyOptions
@@ -23,8 +23,8 @@ from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Force, Nuisance, PointMass
 from collocation_sysid.recording.loads import smooth_ramp
 from collocation_sysid.result.run_sections import summary
-from collocation_sysid.statistics.assumptions import Assumptions
 from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.systematic_effects import Assumptions
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 TIP = nodes_where(box(), 2, 0.0)

@@ -10,11 +10,11 @@ from test_static import PRESSED_M, block
 
 from collocation_sysid import Experiment, Problem, Unknown, Wrench, run, simulate
 from collocation_sysid.errors import InputError
-from collocation_sysid.problem.options import UncertaintyOptions
+from collocation_sysid.problem.problem_options import UncertaintyOptions
 from collocation_sysid.program.simulation import with_wrenches
-from collocation_sysid.statistics.assumptions import Assumptions
-from collocation_sysid.statistics.combined import combine
+from collocation_sysid.statistics.combined_intervals import combine
 from collocation_sysid.statistics.estimates import Estimate
+from collocation_sysid.statistics.systematic_effects import Assumptions
 
 STATED = {"poisson": 0.3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 YOUNG_PA = 8e3

@@ -28,18 +28,18 @@ from collocation_sysid.live import (
     LiveOptions,
     LiveUpdate,
     estimator,
-    model,
-    sweep,
+    live_model,
+    streaming_sweep,
 )
-from collocation_sysid.live.budget import TimeBudget
-from collocation_sysid.live.intake import FrameBuffer
+from collocation_sysid.live.frame_buffer import FrameBuffer
 from collocation_sysid.live.sources import (
     frames_of_recording,
     paced_frames,
     receive_datagrams,
     update_as_json,
 )
-from collocation_sysid.live.track import WindowPass
+from collocation_sysid.live.time_budget import TimeBudget
+from collocation_sysid.live.window_pass import WindowPass
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.least_squares import SquareRootInformation
@@ -117,12 +117,12 @@ OF_THE_USER = Nuisance.none(
     ids=["ideal", "in dense air", "as in a laboratory", "a user's own"],
 )
 def test_frames_one_by_one_say_what_the_batch_says(nuisance, air_density_kg_m3, monkeypatch):
-    monkeypatch.setattr(sweep, "LARGEST_CORRECTION", 1e-12)
+    monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem, count = swing(nuisance=nuisance, air_density_kg_m3=air_density_kg_m3), 30
     live = streamed(problem, count)
     collocation = problem.collocation()
     horizon, p = (
-        Horizon(collocation, [count], prior=model.WEAK_PRIOR_DEVIATION),
+        Horizon(collocation, [count], prior=live_model.WEAK_PRIOR_DEVIATION),
         collocation.guess_p,
     )
     reached, failure = horizon.simulate(p)
@@ -204,11 +204,11 @@ def test_without_all_it_settles_within_some_passes(hidden, monkeypatch):
     live.p = live.p + 0.5
     monkeypatch.setattr(estimator, "FINAL_PASSES", 1)
     monkeypatch.setattr(estimator, "REPEAT_DISTANCE", 0.0)
-    assert 0 < live.finish().relinearised <= len(live.log) + sweep.ROWS_PER_CHUNK
+    assert 0 < live.finish().relinearised <= len(live.log) + streaming_sweep.ROWS_PER_CHUNK
 
 
 def test_a_pass_that_turns_goes_on_to_first_order_and_says_so(monkeypatch):
-    monkeypatch.setattr(sweep, "LARGEST_CORRECTION", 1e-12)
+    monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem = swing(nuisance=Nuisance())
     live = streamed(problem)
     half, errors = len(live.log) // 2, []
@@ -278,7 +278,7 @@ def test_a_stream_looks_through_nothing_old_for_garbage(tiny, monkeypatch):
 
 
 def test_what_leaves_the_window_stays_known_as_a_prior(monkeypatch):
-    monkeypatch.setattr(sweep, "LARGEST_CORRECTION", 1e-12)
+    monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem = swing(nuisance=Nuisance())
     live = streamed(problem)
     track, log, whole = live.first_pass, list(live.log), live.first_pass.information
@@ -295,7 +295,7 @@ def test_what_leaves_the_window_stays_known_as_a_prior(monkeypatch):
 
 
 def test_a_pass_from_within_the_window_moves_its_first_state_along_its_slopes(monkeypatch):
-    monkeypatch.setattr(sweep, "LARGEST_CORRECTION", 1e-12)
+    monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem = swing(nuisance=Nuisance())
     live = streamed(problem)
     way = np.full(len(live.p), 1.0)
@@ -304,7 +304,7 @@ def test_a_pass_from_within_the_window_moves_its_first_state_along_its_slopes(mo
         p = live.first_pass.linearisation_point + size * way
         whole = WindowPass(live.model, p, live.prior, live._block_rows)
         state = live.first_pass.blocks[1]
-        part = sweep.StreamingSweep(
+        part = streaming_sweep.StreamingSweep(
             live.model, p, live.prior, state.start, state.linearisation_point
         )
         for number, row in enumerate(live.log):
@@ -332,7 +332,7 @@ def test_residuals_follow_damping_by_mass_that_is_wrong_by_three():
 
 
 def test_rows_solved_together_miss_by_the_square_of_the_step_and_say_so(monkeypatch):
-    monkeypatch.setattr(sweep, "LARGEST_CORRECTION", 1e-12)
+    monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem = swing(nuisance=Nuisance())
     live = streamed(problem)
     way, errors = np.full(len(live.p), 1.0), []
@@ -344,7 +344,7 @@ def test_rows_solved_together_miss_by_the_square_of_the_step_and_say_so(monkeypa
         for row in live.log:
             whole.repeat_rows([row])
         assert not whole.sweep.needs_another_pass
-        monkeypatch.setattr(sweep, "CHUNK_CORRECTION_FACTOR", 1e12)
+        monkeypatch.setattr(streaming_sweep, "CHUNK_CORRECTION_FACTOR", 1e12)
         calls = 0
         while together.rows < len(live.log):
             together.repeat_rows(live.log[together.rows :])
@@ -616,7 +616,7 @@ def felt(bias_m_s2: float = 0.3) -> cs.Problem:
 
 
 def test_readings_of_ones_own_say_what_they_say_to_the_batch(monkeypatch):
-    monkeypatch.setattr(sweep, "LARGEST_CORRECTION", 1e-12)
+    monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem = felt()
     live = streamed(problem)
     (seen,), count = problem.experiments, len(live.log)
@@ -628,7 +628,7 @@ def test_readings_of_ones_own_say_what_they_say_to_the_batch(monkeypatch):
     whole = cs.Problem([cs.with_readings(seen, taken)], GUESS)
     collocation = whole.collocation()
     horizon, p = (
-        Horizon(collocation, [count], prior=model.WEAK_PRIOR_DEVIATION),
+        Horizon(collocation, [count], prior=live_model.WEAK_PRIOR_DEVIATION),
         collocation.guess_p,
     )
     reached, _ = horizon.simulate(p)

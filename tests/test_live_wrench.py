@@ -22,9 +22,9 @@ from wrenches_small import POINT_M, SIGMA_N, SIGMA_NM, sensing
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.live import Frame, FrameReader, LiveEstimator, model, sweep
+from collocation_sysid.live import Frame, FrameReader, LiveEstimator, live_model, streaming_sweep
 from collocation_sysid.live.sources import frames_of_recording
-from collocation_sysid.live.track import WindowPass
+from collocation_sysid.live.window_pass import WindowPass
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.recording import Nuisance, Wrench
 
@@ -70,7 +70,7 @@ def without(experiment: cs.Experiment, waiting: list[tuple[int, float]]) -> cs.E
     ],
 )
 def test_load_cells_say_what_they_say_to_the_batch(scheme, frame, unknown, monkeypatch):
-    monkeypatch.setattr(sweep, "LARGEST_CORRECTION", 1e-12)
+    monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem = weighed(scheme, frame, **unknown)
     live = streamed(problem)
     waiting = [each[:2] for each in live.intake._waiting]
@@ -78,7 +78,7 @@ def test_load_cells_say_what_they_say_to_the_batch(scheme, frame, unknown, monke
     seen = without(problem.experiments[0], waiting)
     collocation = replace(problem, experiments=[seen]).collocation()
     horizon, p = (
-        Horizon(collocation, [len(live.log)], prior=model.WEAK_PRIOR_DEVIATION),
+        Horizon(collocation, [len(live.log)], prior=live_model.WEAK_PRIOR_DEVIATION),
         collocation.guess_p,
     )
     point = horizon.evaluate(p, horizon.simulate(p)[0])
@@ -91,7 +91,7 @@ def test_load_cells_say_what_they_say_to_the_batch(scheme, frame, unknown, monke
 
 
 def test_a_pass_that_turns_moves_what_a_load_cell_looks_at_along_its_slopes(monkeypatch):
-    monkeypatch.setattr(sweep, "LARGEST_CORRECTION", 1e-12)
+    monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     live = streamed(weighed(tare=0.1, tool_kg=0.01))
     half, far = len(live.log) // 2, []
     for size in (1e-2, 5e-3):

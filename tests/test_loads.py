@@ -23,10 +23,10 @@ from problems_small import (
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.schemes import SCHEMES
-from collocation_sysid.program.rest import equilibrium
+from collocation_sysid.program.initial_equilibrium import equilibrium
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Force, Grasp, PointMass, PoseSequence
-from collocation_sysid.recording.tables import read_forces
+from collocation_sysid.recording.time_tables import read_forces
 
 INTEGRATORS = ["newmark", *SCHEMES]
 UNDAMPED = {**TRUTH, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}

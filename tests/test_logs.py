@@ -29,7 +29,7 @@ from collocation_sysid.recording import read_markers, read_poses, read_wrench
 from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.recording.formats.logs import stored_files
 from collocation_sysid.recording.formats.topics import list_topics
-from collocation_sysid.recording.tables import read_custom_sensor, read_pressure
+from collocation_sysid.recording.time_tables import read_custom_sensor, read_pressure
 
 T_S = np.arange(40) / 50.0
 STILL = (0.0, 0.0, 0.0, 1.0)

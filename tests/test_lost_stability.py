@@ -10,7 +10,7 @@ import pytest
 
 import collocation_sysid as cs
 from collocation_sysid.errors import SimulationError
-from collocation_sysid.program.lost_stability import BIOT_RATIO, LostStability, _on_surface
+from collocation_sysid.program.loss_of_stability import BIOT_RATIO, LostStability, _on_surface
 
 LAW = {"young_pa": 2e4, "poisson": 0.45, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 SIZE_M = (0.08, 0.01, 0.06)

@@ -24,7 +24,7 @@ from collocation_sysid.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.recording.formats import c3d
-from collocation_sysid.recording.readers import read_markers
+from collocation_sysid.recording.marker_files import read_markers
 
 MARKERS, POSES = "swing_markers.csv", "swing_motion.csv"
 RED = "\x1b[31m"

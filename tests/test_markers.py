@@ -10,7 +10,7 @@ import pytest
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.program.channel import interpolation_matrix
+from collocation_sysid.program.observables import interpolation_matrix
 from collocation_sysid.recording import Markers, Placement, place_markers
 
 

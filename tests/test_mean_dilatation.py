@@ -27,7 +27,7 @@ from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp
-from collocation_sysid.result.fields import ElementFields
+from collocation_sysid.result.element_fields import ElementFields
 
 P0 = "tet10-p0"
 LENGTH_M = 0.03  # a large change of a position

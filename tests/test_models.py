@@ -24,7 +24,8 @@ from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.plan import PlannedRun, plan_models
-from collocation_sysid.plan.choice import (
+from collocation_sysid.plan.law_disagreements import law_table
+from collocation_sysid.plan.model_choice import (
     advice,
     evidence_from_fit,
     fit_record,
@@ -32,8 +33,7 @@ from collocation_sysid.plan.choice import (
     law_disagreements,
     model_rows,
 )
-from collocation_sysid.plan.laws import law_table
-from collocation_sysid.plan.variants import (
+from collocation_sysid.plan.model_variants import (
     as_inline_toml,
     file_variants,
     models,
@@ -44,7 +44,7 @@ from collocation_sysid.plan.variants import (
 )
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marching import simulate_scheme
+from collocation_sysid.program.scheme_simulation import simulate_scheme
 from collocation_sysid.recording import (
     Experiment,
     Markers,

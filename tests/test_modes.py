@@ -15,8 +15,8 @@ from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.forces import Forces
-from collocation_sysid.program.any_stiffness import _oscillator_responses
-from collocation_sysid.program.modes import Modes, natural_modes
+from collocation_sysid.program.modal_prediction import _oscillator_responses
+from collocation_sysid.program.natural_modes import Modes, natural_modes
 
 ELASTIC = np.array([200.0, 300.0, 0.0, 0.0])
 DENSITY = 30.0

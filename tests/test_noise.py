@@ -14,7 +14,7 @@ from fits_small import PARAMETERS, Problem, problem
 from scipy.stats import binom, kstest
 
 from collocation_sysid.statistics.linearised import factorise_information
-from collocation_sysid.statistics.noise import estimate_noise_level
+from collocation_sysid.statistics.noise_level import estimate_noise_level
 from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))

@@ -24,11 +24,11 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.model.nuisance import NuisanceMap
+from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.program.charts import MarkerAssociation
 from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.marker_association import MarkerAssociation
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
 from collocation_sysid.statistics.uncertainty import uncertainty_at

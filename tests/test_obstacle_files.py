@@ -17,11 +17,11 @@ import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.contact import contact_terms
 from collocation_sysid.model.force_term import States
-from collocation_sysid.program.touches import surface_gaps_and_pressures
+from collocation_sysid.program.contact_summary import surface_gaps_and_pressures
 from collocation_sysid.recording import write_markers_csv, write_poses_csv, write_wrench_csv
-from collocation_sysid.result.page import write_page
 from collocation_sysid.result.pictures.shapes import contact_shapes
 from collocation_sysid.result.replay import Replay
+from collocation_sysid.result.web_page import write_page
 
 PROBLEM = """
 [object]

@@ -8,14 +8,14 @@ import pytest
 from problems_small import GUESS, hung_cube, measured
 from pydantic import TypeAdapter
 
+from collocation_sysid.declarations import documented
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.comparison.penalty import Penalty
 from collocation_sysid.methods.continuation import Continuation
-from collocation_sysid.methods.options import method_from_options
+from collocation_sysid.methods.method_options import method_from_options
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.stated import documented
 
 each_method = pytest.mark.parametrize("name", METHODS)
 

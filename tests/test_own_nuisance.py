@@ -18,7 +18,7 @@ import collocation_sysid as cs
 from collocation_sysid.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.model.nuisance import NuisanceMap
+from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.result.run_sections import summary

@@ -15,7 +15,7 @@ from collocation_sysid.console import PlainConsole
 from collocation_sysid.display import plain_text
 from collocation_sysid.pages import page_files, page_text, page_url
 from collocation_sysid.result.run_sections import _cures, how_to
-from collocation_sysid.statistics.concern import TOPICS, Concern
+from collocation_sysid.statistics.concerns import TOPICS, Concern
 
 ROOT = Path(__file__).parents[1]
 CONCERNS = (Concern("residuals/persist"), Concern("scheme/step"), Concern("solve/no-start"))

@@ -14,8 +14,8 @@ from problem_files import AT_TRUTH, REFERENCES, replace_text, run_command, setti
 
 import collocation_sysid as cs
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.methods.start import initial_variables
-from collocation_sysid.result.pictures.mesh import mesh_picture
+from collocation_sysid.methods.initial_trajectories import initial_variables
+from collocation_sysid.result.pictures.mesh_pictures import mesh_picture
 from collocation_sysid.result.replay import read_run
 from collocation_sysid.runs.warm_start import WarmStart
 from collocation_sysid.statistics.uncertainty import MarkerPlace, marker_places, uncertainty_at

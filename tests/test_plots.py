@@ -29,8 +29,9 @@ from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.solution import Iteration, Solution, Status, Timing
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marching import simulate_scheme
+from collocation_sysid.program.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import simulate
+from collocation_sysid.result.figure_style import COLUMN_MM, CYCLE, RESOLUTION_DPI, SMALL_PT
 from collocation_sysid.result.pictures import (
     Confidence,
     album,
@@ -46,16 +47,15 @@ from collocation_sysid.result.pictures import (
     spectrum,
     tracks,
 )
-from collocation_sysid.result.pictures.camera import Camera
 from collocation_sysid.result.pictures.confidence import GREY, budget_picture, ellipse
 from collocation_sysid.result.pictures.jacobian import RASTER, SHOWN_STEPS
-from collocation_sysid.result.pictures.mesh import apart
+from collocation_sysid.result.pictures.mesh_pictures import apart
+from collocation_sysid.result.pictures.projection import Camera
 from collocation_sysid.result.pictures.scene import Drawn, View, sheet
 from collocation_sysid.result.pictures.shapes import COLOURS, Coloured
 from collocation_sysid.result.pictures.spectrum import spectral_density
 from collocation_sysid.result.replay import Replay
-from collocation_sysid.result.style import COLUMN_MM, CYCLE, RESOLUTION_DPI, SMALL_PT
-from collocation_sysid.runs.result import Result
+from collocation_sysid.runs.result_content import Result
 
 THETA = np.array([*TRUTH.values()])
 TIMES = 0.01 * np.arange(20.0)

@@ -28,9 +28,9 @@ from collocation_sysid import (
 from collocation_sysid.display import plain_text
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.result.run_sections import summary
-from collocation_sysid.runs.result import Result
-from collocation_sysid.statistics.assumptions import Assumptions
-from collocation_sysid.statistics.probes import WINDOWS, Probe
+from collocation_sysid.runs.result_content import Result
+from collocation_sysid.statistics.deep_probes import WINDOWS, Probe
+from collocation_sysid.statistics.systematic_effects import Assumptions
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 

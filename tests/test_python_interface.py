@@ -17,10 +17,10 @@ from matplotlib.collections import PolyCollection
 from problems_small import EDGE_M, TRUTH, box, hung_cube, measured, noisy, smooth_poses, times
 
 import collocation_sysid as cs
-from collocation_sysid.checked import Options
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.result.fields import ElementFields
+from collocation_sysid.result.element_fields import ElementFields
 from collocation_sysid.runs.check import check_problem
+from collocation_sysid.validated_types import Options
 
 UNKNOWN = {
     "lambda_pa": 200.0,

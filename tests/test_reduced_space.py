@@ -26,12 +26,12 @@ from problems_small import (
 
 from collocation_sysid.errors import SimulationError
 from collocation_sysid.fem.moduli import engineering_constants
-from collocation_sysid.methods.curvature import secant_update, with_curvature
 from collocation_sysid.methods.horizon import Horizon, Iterate
+from collocation_sysid.methods.initial_trajectories import initial_variables, rigid_trajectory
 from collocation_sysid.methods.interior_point import InteriorPoint
+from collocation_sysid.methods.loss_curvature import secant_update, with_curvature
 from collocation_sysid.methods.reduced_space import ReducedSpace, memory_mb
 from collocation_sysid.methods.solution import Iteration, Solution, Status
-from collocation_sysid.methods.start import initial_variables, rigid_trajectory
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.least_squares import SquareRootInformation

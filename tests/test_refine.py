@@ -16,11 +16,11 @@ from collocation_sysid.methods.solution import Status
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.pipeline import Run, run
 from collocation_sysid.problem import Problem, RolloutOptions, UncertaintyOptions
-from collocation_sysid.runs.refine import refine
-from collocation_sysid.statistics.assumptions import Assumptions
+from collocation_sysid.runs.numerical_error import refine
+from collocation_sysid.statistics.assessment import numerical_concerns
+from collocation_sysid.statistics.discretisation_error import Refinement, discretisation_error
 from collocation_sysid.statistics.estimates import Estimate
-from collocation_sysid.statistics.numerical import Refinement, discretisation_error
-from collocation_sysid.statistics.trust import numerical_concerns
+from collocation_sysid.statistics.systematic_effects import Assumptions
 
 FREE = ("mu_pa", "gamma_r_s")
 # Lower bounds of `write_problem`.
@@ -206,7 +206,7 @@ def test_what_is_interrupted_keeps_the_levels_that_it_finished(tmp_path, monkeyp
     problem = write_problem(tmp_path, {"swing": 8})
     folder = tmp_path / "run"
     assert run_command("solve", problem, "--out", folder, "--method", "reduced-space").code == 0
-    from collocation_sysid.runs import refine as refining
+    from collocation_sysid.runs import numerical_error as refining
 
     solved, whole = [], refining.solve
 

@@ -13,7 +13,9 @@ from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import box_mesh, cylinder_mesh
 from collocation_sysid.recording import Grasp
-from collocation_sysid.recording.refinement import refined_experiment as refined_experiment
+from collocation_sysid.recording.experiment_refinement import (
+    refined_experiment as refined_experiment,
+)
 
 TOP = Box((-1.0, -1.0, 0.6 * EDGE_M), (1.0, 1.0, 1.0))
 

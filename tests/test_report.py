@@ -16,10 +16,10 @@ from results_small import ROLLOUT, a_result
 
 from collocation_sysid.display import plain_text
 from collocation_sysid.result.run_sections import summary
-from collocation_sysid.runs.result import Result, SimulatedExperiment
-from collocation_sysid.statistics.concern import TOPICS, Concern
-from collocation_sysid.statistics.trust import Assessment
-from collocation_sysid.tree import as_json
+from collocation_sysid.runs.result_content import Result, SimulatedExperiment
+from collocation_sysid.serialisation import as_json
+from collocation_sysid.statistics.assessment import Assessment
+from collocation_sysid.statistics.concerns import TOPICS, Concern
 
 pytestmark = pytest.mark.long
 

@@ -28,14 +28,14 @@ from collocation_sysid.fem.selection import Indices
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.model.parameters import Unknown
-from collocation_sysid.problem.options import UncertaintyOptions
+from collocation_sysid.problem.problem_options import UncertaintyOptions
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.rest import equilibrium
+from collocation_sysid.program.initial_equilibrium import equilibrium
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.result.fields import ElementFields
-from collocation_sysid.statistics.assumptions import Assumptions
-from collocation_sysid.statistics.considered import changes_of_assumptions
+from collocation_sysid.result.element_fields import ElementFields
+from collocation_sysid.statistics.consider_analysis import changes_of_assumptions
 from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.systematic_effects import Assumptions
 
 SOFT = TRUTH | {"young_pa": 6e4}
 ELEMENTS = ["tet4", pytest.param("tet10", marks=pytest.mark.long), "tet10-p0"]

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.recording import MarkerTable, align_to_template, fit_poses
-from collocation_sysid.recording.rigid import least_rigid_marker
+from collocation_sysid.recording.rigid_fit import least_rigid_marker
 
 CLUSTER_M = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.08, 0.0], [0.03, 0.03, 0.06]])
 

@@ -32,14 +32,14 @@ from collocation_sysid import (
     run,
 )
 from collocation_sysid.display import plain_text
-from collocation_sysid.methods.start import initial_variables
+from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.result.probe_sections import DEEPER, is_deeper_check_worthwhile
 from collocation_sysid.result.run_sections import summary
-from collocation_sysid.statistics.assumptions import Assumptions
+from collocation_sysid.statistics.assessment import Assessment, probe_concerns
 from collocation_sysid.statistics.linearised import gauss_newton_step, linearise_fit
-from collocation_sysid.statistics.relaxation import (
+from collocation_sysid.statistics.relaxed_assumptions import (
     EstimateChange,
     Probe,
     SolvedFit,
@@ -53,7 +53,7 @@ from collocation_sysid.statistics.routine_probes import (
     probed_deviations,
     routine_probes,
 )
-from collocation_sysid.statistics.trust import Assessment, probe_concerns
+from collocation_sysid.statistics.systematic_effects import Assumptions
 from collocation_sysid.statistics.uncertainty import AUTO
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))

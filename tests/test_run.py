@@ -14,10 +14,10 @@ from collocation_sysid import Problem, run
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.recording import read_markers, write_markers_csv
 from collocation_sysid.runs.forward_simulation import ForwardSimulation
-from collocation_sysid.runs.result import Result
+from collocation_sysid.runs.result_content import Result
+from collocation_sysid.serialisation import as_json, content, read
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.profile import profile_of_solution
-from collocation_sysid.tree import as_json, content, read
+from collocation_sysid.statistics.profile_likelihood import profile_of_solution
 
 NUISANCE = """
 [experiment.nuisance]

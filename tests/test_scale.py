@@ -15,7 +15,7 @@ from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import Experiment, Force, PointMass
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.statistics.scale import (
+from collocation_sysid.statistics.scale_identifiability import (
     parameters_of_open_scale,
     relative_moduli,
     relative_scale_note,

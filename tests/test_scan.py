@@ -26,7 +26,7 @@ from collocation_sysid import (
 )
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.methods.scan import (
+from collocation_sysid.methods.stiffness_scan import (
     _ScanState,
     _TrialSimulation,
     scan_stiffness,
@@ -292,7 +292,9 @@ def test_a_guess_that_cannot_be_simulated_is_rescued_with_a_note():
 
 
 def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
-    monkeypatch.setattr("collocation_sysid.methods.scan._TrialSimulation.rigid_misfit", 1e-3)
+    monkeypatch.setattr(
+        "collocation_sysid.methods.stiffness_scan._TrialSimulation.rigid_misfit", 1e-3
+    )
     collocation, found = start_problem(cube(guessed(mu_pa=1e4)).collocation())
     assert found is not None
     assert found.sentence.startswith("at the guess the measurements are missed by more than")
@@ -302,7 +304,9 @@ def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
 
 
 def test_a_better_guess_than_the_scans_best_stays(monkeypatch):
-    monkeypatch.setattr("collocation_sysid.methods.scan._TrialSimulation.rigid_misfit", 0.0)
+    monkeypatch.setattr(
+        "collocation_sysid.methods.stiffness_scan._TrialSimulation.rigid_misfit", 0.0
+    )
     collocation = cube(guessed(**{**TRUTH, "mu_pa": 301.0})).collocation()
     assert start_problem(collocation)[0] is collocation
 
@@ -328,7 +332,7 @@ def test_with_a_guess_it_is_left_to_the_method():
 def test_a_method_that_simulates_everything_gets_a_start_that_can_be(monkeypatch):
     best = scanned().young_pa[scanned().best]
     monkeypatch.setattr(
-        "collocation_sysid.methods.scan._TrialSimulation.is_simulable",
+        "collocation_sysid.methods.stiffness_scan._TrialSimulation.is_simulable",
         lambda _, young: young > 1.5 * best,
     )
     found = scan_stiffness(cube().collocation(), is_complete=True)

@@ -7,9 +7,9 @@ import pytest
 from fits_small import PARAMETERS, problem
 from scipy.stats import binom, chi2, t
 
+from collocation_sysid.statistics.assessment import fit_concerns
 from collocation_sysid.statistics.linearised import LinearisedFit
-from collocation_sysid.statistics.scatter import RecordingComparison, single_fits
-from collocation_sysid.statistics.trust import fit_concerns
+from collocation_sysid.statistics.recording_scatter import RecordingComparison, single_fits
 from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 MADE = problem((80, 80, 80, 80), 3, offsets=False)

@@ -17,8 +17,8 @@ from collocation_sysid import (
     box_mesh,
 )
 from collocation_sysid.program.factorisation import Factoriser
-from collocation_sysid.program.newton import NewtonOptions, NewtonSolver
-from collocation_sysid.program.rest import equilibrium
+from collocation_sysid.program.initial_equilibrium import equilibrium
+from collocation_sysid.program.newton_solver import NewtonOptions, NewtonSolver
 from collocation_sysid.program.retraction import Retraction
 
 SIZE_M = (0.18, 0.02, 0.02)

@@ -9,12 +9,12 @@ from dataclasses import fields
 import pytest
 from problem_files import EXPERIMENT, PROBLEM, run_command
 
+from collocation_sysid.declarations import documented
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
-from collocation_sysid.problem.reading import read_problem_file
+from collocation_sysid.problem.problem_reading import read_problem_file
 from collocation_sysid.problem.schema import ProblemFile
 from collocation_sysid.problem.solver_schema import SolverSection
-from collocation_sysid.stated import documented
 
 each_method = pytest.mark.parametrize("method", METHODS)
 

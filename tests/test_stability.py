@@ -20,7 +20,7 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.program.stability import find_instabilities, growth_rate_1_s
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
-from collocation_sysid.statistics.trust import stability_concerns
+from collocation_sysid.statistics.assessment import stability_concerns
 
 SIZE_M, STRETCH = (0.03, 0.03, 0.09), 1.6
 YOUNG_PA, POISSON = 1e5, 0.45

@@ -28,15 +28,15 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.comparison.shooting import Shooting
+from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.methods.start import initial_variables
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.pipeline import run
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.newton import NewtonSolver
-from collocation_sysid.program.rest import equilibrium
+from collocation_sysid.program.initial_equilibrium import equilibrium
+from collocation_sysid.program.newton_solver import NewtonSolver
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import (
     Experiment,
@@ -51,7 +51,7 @@ from collocation_sysid.result.run_sections import summary
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.check.derivatives import derivative_errors
 from collocation_sysid.runs.forward_simulation import ForwardSimulation
-from collocation_sysid.statistics.scale import static_concerns
+from collocation_sysid.statistics.scale_identifiability import static_concerns
 
 # Uneven, as test benches' are.
 TIMES = np.array([0.0, 1.0, 1.5, 4.0])

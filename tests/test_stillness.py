@@ -21,7 +21,7 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.statistics.scale import is_motionless
+from collocation_sysid.statistics.scale_identifiability import is_motionless
 
 
 def hanging(noise_m: float = 5e-4) -> Experiment:

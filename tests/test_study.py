@@ -24,16 +24,21 @@ from collocation_sysid.plan import (
     Starts,
     plan_comparison,
     plan_sweep,
-    process,
     run_all,
-    worker,
+    run_execution,
+    run_worker,
 )
-from collocation_sysid.plan.arguments import parse_methods, parse_swept_keys, read_truth
-from collocation_sysid.plan.progress import remaining_time_s
-from collocation_sysid.plan.study import shortened_keys
-from collocation_sysid.plan.table import SuccessCriterion, method_rows, run_row, wilson_interval
+from collocation_sysid.plan.study_arguments import parse_methods, parse_swept_keys, read_truth
+from collocation_sysid.plan.study_planning import shortened_keys
+from collocation_sysid.plan.study_progress import remaining_time_s
+from collocation_sysid.plan.study_rows import (
+    SuccessCriterion,
+    method_rows,
+    run_row,
+    wilson_interval,
+)
 from collocation_sysid.problem import Problem
-from collocation_sysid.tree import as_json, content
+from collocation_sysid.serialisation import as_json, content
 
 NAMES = tuple(TRUTH)
 # Stands in for a run's process: it reads the run, and ends as its first argument says.
@@ -65,7 +70,7 @@ def stand_in(tmp_path, monkeypatch):
 
     def behave(behaviour: str):
         command = (sys.executable, str(script), behaviour, str(place))
-        monkeypatch.setattr(process, "COMMAND", command)
+        monkeypatch.setattr(run_execution, "COMMAND", command)
         return lambda key: len((place / key).read_text())
 
     return behave
@@ -284,7 +289,7 @@ def test_starts_that_cannot_be_are_refused(options, where):
 
 def test_a_run_has_one_thread(stand_in):
     stand_in("answers")
-    record = process.execute(planned_runs(1)[0].as_dict())
+    record = run_execution.execute(planned_runs(1)[0].as_dict())
     assert record["outcome"] == "finished"
     assert record["threads"] == ["1", "1"]
     assert record["attempts"] == 1
@@ -292,20 +297,20 @@ def test_a_run_has_one_thread(stand_in):
 
 def test_a_process_that_dies_once_is_tried_again(stand_in):
     tries = stand_in("dies once")
-    record = process.execute(planned_runs(1)[0].as_dict())
+    record = run_execution.execute(planned_runs(1)[0].as_dict())
     assert (record["outcome"], record["attempts"], tries("key0")) == ("finished", 2, 2)
 
 
 def test_a_process_that_always_dies_is_a_record(stand_in):
     tries = stand_in("dies")
-    record = process.execute(planned_runs(1)[0].as_dict(), retries=2)
+    record = run_execution.execute(planned_runs(1)[0].as_dict(), retries=2)
     assert (record["outcome"], tries("key0")) == ("crashed", 3)
     assert record["message"] == "its process ended with code 3: Bus error"
 
 
 def test_a_late_run_is_killed(stand_in):
     tries = stand_in("hangs")
-    record = process.execute(planned_runs(1)[0].as_dict(), time_limit_s=0.5)
+    record = run_execution.execute(planned_runs(1)[0].as_dict(), time_limit_s=0.5)
     assert (record["outcome"], tries("key0")) == ("timeout", 1)
     assert record["message"] == "ended after the time limit of 0.5 s"
 
@@ -326,10 +331,12 @@ signal.pause()
 def test_a_late_run_keeps_the_answer_that_it_had(tmp_path, monkeypatch):
     ready = tmp_path / "ready"
     found = as_json(a_result(status="interrupted", converged=False))
-    monkeypatch.setattr(process, "COMMAND", (sys.executable, "-c", OBEDIENT, found, str(ready)))
-    monkeypatch.setattr(process.time, "monotonic", lambda: 100.0 if ready.exists() else 0.0)
+    monkeypatch.setattr(
+        run_execution, "COMMAND", (sys.executable, "-c", OBEDIENT, found, str(ready))
+    )
+    monkeypatch.setattr(run_execution.time, "monotonic", lambda: 100.0 if ready.exists() else 0.0)
     planned = planned_runs(1)[0]
-    record = process.execute(planned.as_dict(), time_limit_s=10.0)
+    record = run_execution.execute(planned.as_dict(), time_limit_s=10.0)
     assert record["outcome"] == "timeout"
     assert record["result"] == json.loads(found)
     assert run_row(planned, record, SuccessCriterion())["status"] == "timeout"
@@ -337,7 +344,7 @@ def test_a_late_run_keeps_the_answer_that_it_had(tmp_path, monkeypatch):
 
 def test_a_stopped_study_ends_its_runs(stand_in):
     stand_in("hangs")
-    record = process.execute(planned_runs(1)[0].as_dict(), is_stopped=lambda: True)
+    record = run_execution.execute(planned_runs(1)[0].as_dict(), is_stopped=lambda: True)
     assert record["outcome"] == "stopped"
 
 
@@ -348,11 +355,11 @@ def test_what_goes_wrong_in_a_run_becomes_its_record(tiny, monkeypatch):
 
     monkeypatch.setitem(METHODS, "reduced-space", Broken)
     planned = plan_comparison(Problem.read("problem.toml"), ["reduced-space"])[0].as_dict()
-    record = worker.record_of_run(planned)
+    record = run_worker.record_of_run(planned)
     assert record["outcome"] == "error"
     assert record["message"] == "ZeroDivisionError: nothing to divide by"
     assert "in __call__" in record["traceback"]
-    refused = worker.record_of_run({**planned, "overrides": ["parameters.mu_pa.guess=1e9"]})
+    refused = run_worker.record_of_run({**planned, "overrides": ["parameters.mu_pa.guess=1e9"]})
     assert refused["outcome"] == "error"
     assert "mu_pa: guess = 1e+09" in refused["message"]
 

@@ -10,13 +10,17 @@ import pytest
 from problems_small import TRUTH, hung_cube
 
 import collocation_sysid as cs
-from collocation_sysid.live.model import LiveModel
+from collocation_sysid.live.live_model import LiveModel
 from collocation_sysid.methods.solution import Method
 from collocation_sysid.pipeline import Run, run
 from collocation_sysid.problem import Problem
-from collocation_sysid.runs.refine import refine
+from collocation_sysid.runs.numerical_error import refine
+from collocation_sysid.statistics.discretisation_error import (
+    MOST_SUBSTEPS,
+    Refinement,
+    discretisation_error,
+)
 from collocation_sysid.statistics.estimates import Estimate
-from collocation_sysid.statistics.numerical import MOST_SUBSTEPS, Refinement, discretisation_error
 
 SOFT = {"mu_pa": cs.Unknown(400.0), "gamma_r_s": cs.Unknown(0.005)}
 

@@ -19,11 +19,11 @@ from problems_small import (
 
 from collocation_sysid.errors import SimulationError
 from collocation_sysid.methods.solution import constraint_multipliers
+from collocation_sysid.model.equations_at_parameters import EquationsAtParameters
 from collocation_sysid.model.schemes import SCHEMES
-from collocation_sysid.model.setting import EquationsAtParameters
 from collocation_sysid.program import sweep
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marching import simulate_scheme
+from collocation_sysid.program.scheme_simulation import simulate_scheme
 from collocation_sysid.program.stopwatch import Stopwatch
 from collocation_sysid.program.sweep import Sweep, Tangent
 

@@ -23,8 +23,8 @@ from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import place_markers
+from collocation_sysid.result.run_writers import write_frames
 from collocation_sysid.result.synthesis import Recipe, write_data
-from collocation_sysid.result.writers import write_frames
 
 TET10 = element_named("tet10")
 LENGTH_M = 0.03  # a large change of a position

@@ -19,10 +19,8 @@ from collocation_sysid.display import plain_text
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.problem import Problem
 from collocation_sysid.result.run_sections import summary
-from collocation_sysid.statistics.assumptions import Assumptions
-from collocation_sysid.statistics.concern import TOPICS, Concern
-from collocation_sysid.statistics.hypothesis import Hypothesis
-from collocation_sysid.statistics.trust import (
+from collocation_sysid.serialisation import as_json, content, read
+from collocation_sysid.statistics.assessment import (
     GROSS_MISFIT,
     MISFIT,
     Assessment,
@@ -33,8 +31,10 @@ from collocation_sysid.statistics.trust import (
     rms_expected_from_noise_m,
     scheme_concerns,
 )
+from collocation_sysid.statistics.concerns import TOPICS, Concern
+from collocation_sysid.statistics.misspecification_hypothesis import Hypothesis
+from collocation_sysid.statistics.systematic_effects import Assumptions
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
-from collocation_sysid.tree import as_json, content, read
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 

@@ -17,8 +17,12 @@ from collocation_sysid.fem.refinement import refine_body
 from collocation_sysid.fem.two_phase import ElementLogarithms, PhaseSummary, TwoPhaseModes
 from collocation_sysid.live.estimator import LiveEstimator
 from collocation_sysid.runs.two_phases import solve_two_phases
-from collocation_sysid.statistics.fields import FieldEstimate, field_estimates, phase_concerns
-from collocation_sysid.statistics.phases import (
+from collocation_sysid.statistics.field_estimates import (
+    FieldEstimate,
+    field_estimates,
+    phase_concerns,
+)
+from collocation_sysid.statistics.phase_sampling import (
     ElementInformation,
     InternalFaces,
     SamplerSettings,

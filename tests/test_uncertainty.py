@@ -21,9 +21,9 @@ from collocation_sysid.fem.moduli import engineering_constants
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marching import simulate_scheme
-from collocation_sysid.program.segment import Transcription
+from collocation_sysid.program.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import with_markers
+from collocation_sysid.program.transcription import Transcription
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.statistics.linearised import marker_sensitivities, sensitivities
 from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at

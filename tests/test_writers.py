@@ -14,8 +14,8 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import element_named
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.files import write_whole
-from collocation_sysid.result.fields import ElementFields
-from collocation_sysid.result.writers import run_folder, write_frames, write_pvd, write_vtu
+from collocation_sysid.result.element_fields import ElementFields
+from collocation_sysid.result.run_writers import run_folder, write_frames, write_pvd, write_vtu
 from collocation_sysid.written_files import LIST_FILE, list_files
 
 MESH = box_mesh((0.1, 0.2, 0.3), (1, 2, 1))

@@ -23,14 +23,14 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp
 from collocation_sysid.runs.check import misspecification_hypotheses
-from collocation_sysid.runs.check.body import check_grasps, grasp_concerns
-from collocation_sysid.statistics.causes import find_misspecifications
-from collocation_sysid.statistics.plausible import (
+from collocation_sysid.runs.check.body_check import check_grasps, grasp_concerns
+from collocation_sysid.statistics.assessment import cause_concerns
+from collocation_sysid.statistics.fit_misspecifications import find_misspecifications
+from collocation_sysid.statistics.plausibility import (
     material_hypothesis,
     size_and_density_hypotheses,
     step_hypotheses,
 )
-from collocation_sysid.statistics.trust import cause_concerns
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from twins import BODIES, SOFT, STIFF, twin
@@ -201,7 +201,7 @@ def test_a_short_exchange_is_left_to_hubers_loss():
 
 def test_of_markers_that_are_exchanged_nothing_is_fitted_again(monkeypatch):
     solution = solve(exchanged(soft("bar"), slice(20, None)))
-    monkeypatch.setattr("collocation_sysid.statistics.causes.ReducedSpace", None)
+    monkeypatch.setattr("collocation_sysid.statistics.fit_misspecifications.ReducedSpace", None)
     assert [cause.cause for cause in find_misspecifications(solution)] == ["markers-exchanged"]
 
 
@@ -214,8 +214,8 @@ def test_the_search_for_causes_is_bounded_by_what_the_fit_took(monkeypatch, rng)
             sweeps.append(found.iterations)
             return found
 
-    monkeypatch.setattr("collocation_sysid.statistics.causes.ReducedSpace", Counted)
-    by_modes = "collocation_sysid.statistics.causes.find_misspecifications_by_modes"
+    monkeypatch.setattr("collocation_sysid.statistics.fit_misspecifications.ReducedSpace", Counted)
+    by_modes = "collocation_sysid.statistics.fit_misspecifications.find_misspecifications_by_modes"
     monkeypatch.setattr(by_modes, lambda *_: ())
     assert find_misspecifications(solution)[0].cause == "marker-slip"
     assert len(sweeps) > 1

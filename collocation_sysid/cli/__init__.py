@@ -1,13 +1,10 @@
 """Command line of the package: results on stdout, progress and messages on stderr.
 
-Each command is a function in one of the modules `FAMILIES`: `problems` (solve, simulate, check),
-`runs`
-(refine, export, plot, report, animate, view), `studies` (compare, sweep), `designs` (design),
-`streams`
-(live, replay) and `texts` (methods, schema, explain, topics, new). `options` makes command-line
-options
-from dataclasses, `common` has exit codes and output, and `markdown` shows documentation on a
-terminal.
+Each command is a function in one of the modules `FAMILIES`: `problem_commands` (solve, simulate,
+check), `run_commands` (refine, export, plot, report, animate, view), `study_commands` (compare,
+sweep), `design_commands` (design), `stream_commands` (live, replay) and `texts` (methods, schema,
+explain, topics, new). `command_options` makes command-line options from dataclasses, `common` has
+exit codes and output, and `markdown` shows documentation on a terminal.
 
 Exit codes: 0 converged, 1 not converged or, with ``solve --strict``, doubtful, 2 bad input,
 130 interrupted.
@@ -30,10 +27,17 @@ from typer.core import TyperGroup
 from typer.main import get_command, get_command_from_info
 
 from ..errors import InputError, SimulationError, hint_at
-from ..starting import heed_interrupts, leave
+from ..signal_handling import heed_interrupts, leave
 from .common import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, errors
 
-FAMILIES = ("problems", "studies", "designs", "runs", "streams", "texts")
+FAMILIES = (
+    "problem_commands",
+    "study_commands",
+    "design_commands",
+    "run_commands",
+    "stream_commands",
+    "texts",
+)
 
 
 @cache

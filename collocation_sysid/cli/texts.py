@@ -16,9 +16,9 @@ from ..console import PlainConsole
 from ..display import Shown, Table
 from ..errors import located, require_among
 from ..pages import page_files, page_text, page_title
-from ..tree import as_json
+from ..serialisation import as_json
+from .command_options import AsJson, command
 from .common import errors, show
-from .options import AsJson, command
 
 commands = typer.Typer()
 
@@ -174,7 +174,7 @@ class New:
 )
 def new(options: New) -> None:
     """Write a commented problem file to start from."""
-    from ..problem.beginning import create_problem
+    from ..problem.new_problem import create_problem
 
     folder = Path(options.name)
     kind = options.kind

@@ -27,12 +27,11 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import InputError
 from .air import placed_unit_drag
 from .constants import DENSITY, Constant
 from .discretisation import Discretisation
-from .field import Field, FieldModes
 from .materials import DampingLaw, Energy, Material, Prony
 from .memory import MemoryInput
 from .mesh import TetMesh
@@ -41,6 +40,7 @@ from .pattern import JointPattern, SymmetricPattern
 from .regions import BodyPart, ConstantsModel, Region, Theta, parts_from_regions
 from .rest_shape import InverseEquilibrium, RestShapeError, UnderGravity, require_supported
 from .selection import Selection
+from .spatial_field import Field, FieldModes
 from .stress import StressEvaluator
 from .two_phase import PhaseSamples, TwoPhaseModes
 

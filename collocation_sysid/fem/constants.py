@@ -97,7 +97,7 @@ MASS = Constant("mass_kg", "m", "mass of the whole body", (1e-6, 1e3))
 FRICTION = Constant(
     "friction", "friction", "coefficient of friction", (0.0, 2.0), "linear", 0.1, 0.3, at_least=0.0
 )
-# Coefficient of a shape of a field, see `field`; names are field_1, field_2, ….
+# Coefficient of a shape of a field, see `spatial_field`; names are field_1, field_2, ….
 MODE = Constant("field", "", "share of a shape", (-1e3, 1e3), "linear", 1.0, 0.0)
 # Contrast of a field with prior "two-phase", see `two_phase`; 1 in a body of one material.
 CONTRAST = Constant("contrast", "contrast", "inclusion over surroundings", (0.02, 50.0), usual=1.0)

@@ -15,11 +15,10 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..errors import InputError
 from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS, PointLaw, energy_kernel
-from .field import FieldAssembly
 from .kernels import COMPILING, Evaluator, EvaluatorChoice, KernelBatch, available_threads
 from .memory import MemoryInput, MemoryLayout
 from .mesh import ElementNodes, TetMesh
@@ -28,6 +27,7 @@ from .pattern import SymmetricPattern, dofs_of, element_destinations, with_ascen
 from .regions import BodyPart, ConstantsModel, Theta
 from .rest_shape import InverseEquilibrium
 from .selection import Selection
+from .spatial_field import FieldAssembly
 
 # Outputs with columns for θ; a field adds derivatives by the logarithm of each cell.
 BY_FIELD = {

@@ -9,7 +9,7 @@ w        3·nodes       weights on the node forces (Lagrange multipliers)
 geometry 3·nodes + 1   shape gradients ∂N_a/∂X_j at 3a + j, then the volume [m³]
 theta    k             constants of the material, then of the damping law, then s
 carried  6             H; for second derivatives 12, H and the weights σ of S; then, if there
-                       is a field, its logarithm; for a stress-free shape see `rest_point`
+                       is a field, its logarithm; for a stress-free shape see `rest_point_layout`
 ======== ============= ==============================================================
 
 Its outputs are summed over points and elements. Matrices are given by the lower triangles of their
@@ -36,7 +36,7 @@ from .elements import Element
 from .kernel import Derivative, ElementKernel, Outputs, Pieces, QuadraturePoint
 from .materials import DampingLaw, Material
 from .mean_dilatation import averaging_kernel
-from .rest_point import RestPointLayout
+from .rest_point_layout import RestPointLayout
 
 # Number of kernels of each kind kept in memory, shared by bodies of the same law and element.
 CACHED_KERNELS = 64

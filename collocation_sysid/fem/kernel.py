@@ -20,7 +20,7 @@ from typing import Any, Literal
 import casadi as ca
 
 from .elements import Element
-from .rest_point import RestPointLayout
+from .rest_point_layout import RestPointLayout
 
 # Product of a piece with the shape gradients. "none": no product; "nodes": from (9, k), conjugate
 # to F, to (3·nodes, k); "pairs": from a symmetric (9, 9) to the lower triangle of
@@ -290,7 +290,7 @@ class QuadraturePoint:
     point_data : SX
         Internal variables of the point, see `memory`; with a field, its logarithm comes last.
     scaled_indices : tuple of int
-        Indices in θ of the constants that a field multiplies, see `field`.
+        Indices in θ of the constants that a field multiplies, see `spatial_field`.
     rest : RestPointLayout, optional
         Layout of a stress-free shape that is not the mesh, see `rest_shape`: its data are the last
         ones of `point_data`, and the changes of its inputs the last entries of θ.

@@ -28,7 +28,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..array_types import Array
 from .regions import BodyPart
 
 

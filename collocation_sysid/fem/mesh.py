@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..errors import InputError
 from .elements import Element
 from .mesh_checks import (

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..apart import Failed, ProcessLimits, computed_apart
 from ..errors import InputError
+from ..isolated_process import Failed, ProcessLimits, computed_apart
 
 # Largest file that is read in this process [bytes]. Zlib compresses at most 1032-fold, so that the
 # content takes up to 200 MB.

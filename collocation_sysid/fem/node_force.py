@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..errors import InputError, hint_at
 from ..files import reason
 from .constants import Constant, constant_named

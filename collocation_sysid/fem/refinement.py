@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Index
+from ..array_types import Index
 from .elements import ELEMENTS
 from .mesh import ElementNodes, TetMesh
 from .mesh_checks import orient_elements

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..errors import InputError, hint_at
 from .constants import CONTRAST, DENSITY, GAMMA_M, MASS, Constant, is_field_coefficient
-from .field import TWO_PHASE, Field, FieldModes
 from .materials import DampingLaw, Energy, Material, Prony, as_branches, as_damping, as_material
 from .mesh import TetMesh
 from .moduli import ConstantSource, elastic_names, find_source
 from .node_force import NodeForce
 from .selection import Selection
+from .spatial_field import TWO_PHASE, Field, FieldModes
 from .two_phase import TwoPhaseModes
 
 

@@ -30,12 +30,12 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 from scipy.sparse.linalg import splu
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..errors import InputError, SimulationError
 from .materials import Material
 from .mesh import ElementNodes
 from .regions import BodyPart
-from .rest_point import RestPointLayout
+from .rest_point_layout import RestPointLayout
 from .selection import Selection
 
 # Number of cached stress-free shapes: of an iterate, of its neighbours for difference quotients,

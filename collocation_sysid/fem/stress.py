@@ -17,7 +17,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from .discretisation import Discretisation
 from .elements import Element
 from .expressions import (

@@ -12,9 +12,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from ..apart import Failed, computed_apart
 from ..errors import InputError
 from ..files import whole_file
+from ..isolated_process import Failed, computed_apart
 from .mesh_checks import clean_mesh
 from .mesh_files import read_tetrahedra, write_tetrahedra
 

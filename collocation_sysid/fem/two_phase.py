@@ -3,7 +3,7 @@
 If the field of a part has `prior = "two-phase"`, a constant c has one value in the surroundings and
 another in inclusions, ln c_e = ln c_0 + ln r · h_e, with the contrast r = c_1/c_0, which is a
 parameter, and the phase h_e ∈ {0, 1} of element e. Phases are not parameters: solvers keep them
-fixed, and `statistics.phases` determines them with derivatives by `ElementLogarithms`.
+fixed, and `statistics.phase_sampling` determines them with derivatives by `ElementLogarithms`.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..errors import InputError
 from .constants import CONTRAST, DENSITY, Constant, field_coefficient
-from .field import SMOOTH, Field, FieldModes
 from .mesh import TetMesh
+from .spatial_field import SMOOTH, Field, FieldModes
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,13 +5,13 @@ Use `LiveEstimator`: `LiveEstimator.update` takes one frame and returns estimate
 
 - `estimator`: the estimator, its options and its output.
 - `frames`: frames as Python values, JSON lines or rows of a table; `sources`: streams of frames.
-- `intake`: buffer that turns frames into time steps with interpolated poses.
-- `model`: the problem, prepared for streaming; `sweep`: time marching with sensitivities;
-  `track`: the window of recent time steps, with its information and prior.
-- `felt`: reaction forces of grasps with a sensor.
-- `budget`: computing time per frame; `minimise`: initial values without a guess.
-- `trust`: verdict of a live estimate; `full_matrix`: batch solution at the end; `view`: terminal
-  and
+- `frame_buffer`: buffer that turns frames into time steps with interpolated poses.
+- `live_model`: the problem, prepared for streaming; `streaming_sweep`: time marching with
+  sensitivities; `window_pass`: the window of recent time steps, with its information and prior.
+- `grasp_reactions`: reaction forces of grasps with a sensor.
+- `time_budget`: computing time per frame; `stiffness_search`: initial values without a guess.
+- `live_trust`: verdict of a live estimate; `batch_solution`: batch solution at the end;
+  `live_display`: terminal and
 film.
 """
 

@@ -22,19 +22,20 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Array
-from ..checked import AtLeastOne, Options, Positive
+from ..array_types import Array
 from ..errors import InputError, SimulationError
 from ..fem.constants import is_field_coefficient
 from ..pipeline import Run
 from ..problem import Problem
 from ..program.lapack import one_blas_thread
 from ..program.least_squares import SquareRootInformation
-from ..statistics.concern import concern_if
+from ..statistics.assessment import GROSS_MISFIT, Assessment
+from ..statistics.concerns import concern_if
 from ..statistics.estimates import Estimate, user_estimates
 from ..statistics.linearised import AT_BOUND
-from ..statistics.trust import GROSS_MISFIT, Assessment
-from .budget import TimeBudget
+from ..validated_types import AtLeastOne, Options, Positive
+from .batch_solution import recording_from_log, solve_recording
+from .frame_buffer import LARGEST_GAP, FrameBuffer
 from .frames import (
     Frame,
     Pose,
@@ -44,19 +45,18 @@ from .frames import (
     parse_time,
     parse_wrenches,
 )
-from .intake import LARGEST_GAP, FrameBuffer
-from .model import ROWS_PER_CHUNK, LiveModel, Poses
-from .search import TRIAL_SAMPLES, StiffnessSearch
-from .sweep import LoggedRow, Sample
-from .track import CombinedPasses, WindowPass
-from .trust import (
+from .live_model import ROWS_PER_CHUNK, LiveModel, Poses
+from .live_trust import (
     LARGEST_SETTLED_DISTANCE,
     ResidualScatter,
     data_concerns,
     estimate_concerns,
     variance_factor,
 )
-from .whole import recording_from_log, solve_recording
+from .stiffness_search import TRIAL_SAMPLES, StiffnessSearch
+from .streaming_sweep import LoggedRow, Sample
+from .time_budget import TimeBudget
+from .window_pass import CombinedPasses, WindowPass
 
 # Standard deviation, in steps of the trust region, of a prior that keeps the next linearisation
 # point near the last one until many samples are available.

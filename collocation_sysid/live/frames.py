@@ -18,14 +18,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..errors import InputError
+from ..recording.custom_sensor import Gauge
 from ..recording.formats.text import number_from_text
 from ..recording.formats.topics import POSE
-from ..recording.gauge import Gauge
+from ..recording.measured_wrench import Wrench
 from ..recording.poses import first_matrix_fault, first_pose_fault
-from ..recording.tables import WRENCH_COLUMNS
-from ..recording.wrench import Wrench
+from ..recording.time_tables import WRENCH_COLUMNS
 
 Pose = Any
 

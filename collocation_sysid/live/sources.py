@@ -14,12 +14,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..problem import Problem
-from ..recording.clock import TIME_TOLERANCE_S
 from ..recording.experiment import Experiment
-from ..runs.result import Result
+from ..recording.sample_times import TIME_TOLERANCE_S
+from ..runs.result_content import Result
 from .estimator import LiveUpdate
 from .frames import Frame
-from .model import LiveModel
+from .live_model import LiveModel
 
 # Largest accepted datagram [bytes].
 DATAGRAM_BYTES = 65536

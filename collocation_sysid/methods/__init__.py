@@ -4,19 +4,20 @@
 
 Solvers
     `reduced_space` eliminates the motion by the equations of motion and searches only for the
-    parameters; `minimise` is its trust region, `curvature` its second derivatives, `horizon` and
-    `trajectory` its linearised problem, and `workers` runs it in threads or on a Dask cluster.
-    `interior_point` solves for motion and parameters simultaneously with IPOPT; `condense` removes
-    variables that follow from others, `initial_point` computes its start, and `complementarity`
-    adds hard contact. `continuation` runs any method on growing parts of the recordings.
-    `comparison` contains methods of the literature, to compare with.
+    parameters; `reduced_search` is its trust region, `loss_curvature` its second derivatives,
+    `horizon` and `trajectory_sweeps` its linearised problem, and `experiment_executors` runs it in
+    threads or on a Dask cluster. `interior_point` solves for motion and parameters simultaneously
+    with IPOPT; `condensed_program` removes variables that follow from others, `initial_point`
+    computes its start, and `complementarity` adds hard contact. `continuation` runs any method on
+    growing parts of the recordings. `comparison` contains methods of the literature, to compare
+    with.
 Start
-    `scan_stiffness` finds a stiffness to start from, `start` simulates trajectories at given
-    parameters.
+    `stiffness_scan` finds a stiffness to start from, `initial_trajectories` simulates trajectories
+    at given parameters.
 Common
-    `solution` defines the protocol of methods and the result, `recorder` the history, `options` the
-    construction of methods from options by name, `nlpsol` and `callbacks` the interface to CasADi's
-    solvers.
+    `solution` defines the protocol of methods and the result, `solve_recorder` the history,
+    `method_options` the construction of methods from options by name, `nlpsol` and `callbacks` the
+    interface to CasADi's solvers.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from ..declarations import documented
 from ..errors import InputError, require_among
-from ..stated import documented
 from .comparison.casadi_nlp import refusal_reason
 from .continuation import STAGES, Continuation
 

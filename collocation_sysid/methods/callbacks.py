@@ -15,10 +15,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..array_types import Array
 from ..fem.rest_shape import RestShapeError
 from ..program.collocation import Collocation, convert_variables
-from .recorder import Recorder
+from .solve_recorder import Recorder
 
 HessianValues = Callable[[Array, float, Array, Array], None]
 

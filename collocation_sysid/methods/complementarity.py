@@ -14,12 +14,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import InputError
 from ..fem.selection import Indices
 from ..model.contact import contact_terms
 from ..program.collocation import Collocation
-from ..program.touches import smallest_gaps
+from ..program.contact_summary import smallest_gaps
 from ..recording.experiment import Experiment
 from ..recording.obstacle import Obstacle
 from .solution import Solution

@@ -13,22 +13,22 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
-from ..arrays import Array
-from ..checked import Options
+from ..array_types import Array
 from ..errors import InputError, hint_at
 from ..program.collocation import Collocation
-from ..recording.depth import until_all_cameras_see
+from ..recording.depth_camera import until_all_cameras_see
 from ..recording.experiment import Experiment
-from ..recording.tables import FEWEST_SHARED_SAMPLES
+from ..recording.time_tables import FEWEST_SHARED_SAMPLES
+from ..validated_types import Options
 from .comparison.casadi_nlp import Sleqp, SqpMethod
 from .comparison.penalty import AugmentedLagrangian, Penalty
 from .comparison.shooting import Shooting
+from .initial_trajectories import complete_variables, simulate_trajectories
 from .interior_point import InteriorPoint
-from .options import SHARES, Shares, method_from_options, samples_in_share
-from .recorder import Recorder
+from .method_options import SHARES, Shares, method_from_options, samples_in_share
 from .reduced_space import ReducedSpace
 from .solution import Iteration, Method, Solution, Status, Watch
-from .start import complete_variables, simulate_trajectories
+from .solve_recorder import Recorder
 
 _ONE_HORIZON = (
     InteriorPoint,

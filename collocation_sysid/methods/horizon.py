@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import SimulationError
 from ..program.collocation import Collocation
 from ..program.factorisation import Choice
@@ -22,7 +22,8 @@ from ..program.lapack import one_blas_thread
 from ..program.least_squares import SquareRootInformation
 from ..program.stopwatch import Stopwatch
 from ..program.sweep import Sweep
-from .trajectory import (
+from .experiment_executors import ExperimentExecutor, LocalExecutor
+from .trajectory_sweeps import (
     FitSummary,
     SimulationResult,
     SweepReport,
@@ -35,7 +36,6 @@ from .trajectory import (
     sweep_after_step,
     trajectory_positions,
 )
-from .workers import ExperimentExecutor, LocalExecutor
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse.linalg as spla
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import SimulationError
 from ..program.collocation import Collocation, convert_variables
-from .condensed import CondensedCollocation
-from .recorder import Recorder, SearchEnded
+from .condensed_program import CondensedCollocation
 from .reduced_space import ReducedSpace
 from .solution import Iteration, Solution, Status, constraint_multipliers
+from .solve_recorder import Recorder, SearchEnded
 
 # Longest last step of a parameter's logarithm: Newton's method converges quadratically from there.
 NEAR = 1e-3

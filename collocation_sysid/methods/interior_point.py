@@ -14,18 +14,18 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import BeforeValidator
 
-from ..arrays import Array
-from ..checked import Count, Finite, NotNegative, Options, Positive, Text, Whole
+from ..array_types import Array
 from ..errors import located
 from ..program.collocation import Collocation
 from ..recording.experiment import Experiment
+from ..validated_types import Count, Finite, NotNegative, Options, Positive, Text, Whole
 from . import nlpsol
 from .callbacks import NlpFunctions
 from .complementarity import require_frictionless, solve_complementarity
-from .condensed import condense
+from .condensed_program import condense
 from .initial_point import InitialPoint, adjoint_multipliers, compute_initial_point
-from .recorder import Recorder
 from .solution import Solution, Status, Watch
+from .solve_recorder import Recorder
 
 
 def _require_ipopt_value(value: Any) -> Any:

@@ -14,15 +14,15 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import InputError
 from ..program.collocation import Collocation, convert_variables
-from ..starting import LEFT, raises_interrupt
+from ..signal_handling import LEFT, raises_interrupt
 from .callbacks import HessianValues, IterationMonitor, NlpFunctions
-from .condensed import complete_multipliers
+from .condensed_program import complete_multipliers
 from .initial_point import InitialMultipliers
-from .recorder import Recorder
 from .solution import Solution, Status
+from .solve_recorder import Recorder
 
 # Of solvers that are written otherwise.
 NAMES = {"ipopt": "IPOPT"}

@@ -29,19 +29,19 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import InputError
 from ..fem.kernels import concurrent_count
 from ..program.collocation import Collocation
 from ..program.lapack import one_blas_thread
 from ..program.sweep import Sweep
-from .curvature import require_second_derivatives
-from .recorder import Recorder, SearchEnded
-from .search import ReducedSearch, SearchOptions
+from .experiment_executors import ExperimentExecutor, LocalExecutor
+from .initial_trajectories import complete_variables, simulate_trajectories
+from .loss_curvature import require_second_derivatives
+from .reduced_search import ReducedSearch, SearchOptions
 from .solution import Solution, Status, Watch
-from .start import complete_variables, simulate_trajectories
-from .trajectory import trajectory_positions
-from .workers import ExperimentExecutor, LocalExecutor
+from .solve_recorder import Recorder, SearchEnded
+from .trajectory_sweeps import trajectory_positions
 
 # Misfits above this many standard deviations of the markers are worth a note.
 MISFIT = 3.0

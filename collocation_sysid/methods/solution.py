@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..arrays import Array, root_mean
+from ..array_types import Array, root_mean
 from ..errors import InputError, SimulationError, hint_at
 from ..fem.kernels import map_experiments
 from ..program.collocation import Collocation, ExperimentIterate, Violation
@@ -23,7 +23,7 @@ from ..program.stopwatch import Stopwatch
 from ..program.sweep import Sweep
 from ..recording.experiment import Experiment
 from ..recording.nuisance import GAUGE
-from .scan import Scan
+from .stiffness_scan import Scan
 
 
 class Status(Enum):

@@ -3,7 +3,7 @@
 From parameters to inputs of the equations:
 
 - `parameters`: shared parameters of a problem, with bounds, priors and the solver's coordinates q.
-- `nuisance`: nuisance parameters φ of one recording.
+- `nuisance_map`: nuisance parameters φ of one recording.
 - `inputs`: the vector u(q, φ; t) by which both enter the equations of motion.
 
 Forces:
@@ -12,21 +12,21 @@ Forces:
 - `force_term`: interface of a force, and forces that have an energy.
 - `weight`: gravity, masses and loads.
 - `contact`: pressure and friction of rigid obstacles.
-- `custom_force_terms`: custom forces and air drag.
-- `law_function`: small expressions with generated derivatives.
+- `point_forces`: custom forces and air drag.
+- `generated_functions`: small expressions with generated derivatives.
 
 Internal (history) variables:
 
 - `viscoelasticity`: memory of the material.
-- `force_history`: internal variables of forces.
-- `histories_along`: both of them along one motion.
+- `force_internal_variables`: internal variables of forces.
+- `internal_variables`: both of them along one motion.
 - `recursion`: recursions h_k = R(h_{k−1}, …) of sensors and memories.
 
 Equations in discrete time:
 
 - `schemes`: tables of the time-stepping schemes.
 - `dynamics`: discrete equations of motion of an experiment.
-- `setting`: these equations at given parameters, with the chain rule.
+- `equations_at_parameters`: these equations at given parameters, with the chain rule.
 - `grasp_constraint`: prescribed displacements of grasped nodes, as a function of φ.
 - `numerical_damping`: damping and period error of a scheme.
 """

@@ -42,15 +42,15 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..fem.body import Body
+from ..fem.contact_surface import VECTORS_PER_POINT, ContactSurface
 from ..fem.force_points import ForcePoints
 from ..fem.moduli import engineering_constants
-from ..fem.touching import VECTORS_PER_POINT, ContactSurface
 from ..recording.experiment import Experiment
 from ..recording.obstacle import Obstacle
 from .force_term import AssemblyIndices, States
-from .generated import GeneratedFunction
+from .generated_functions import GeneratedFunction
 from .point_forces import Pointwise, PreviousState
 
 # Stiffness κ in multiples of E / (mean edge length of the face); sets the penetration.

@@ -23,13 +23,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..array_types import Array
 from ..fem.body import Body, Linearisation
 from ..fem.pattern import SymmetricPattern
 from ..recording.experiment import Experiment
-from .force_history import ForceHistory
+from .force_internal_variables import ForceHistory
 from .forces import Forces
-from .histories import AnyHistory, histories_along, insert_histories
+from .internal_variables import AnyHistory, histories_along, insert_histories
 from .schemes import QUASI_STATIC, SLIDING, Scheme, as_scheme
 from .weight import DofMasses
 

@@ -18,7 +18,7 @@ from itertools import accumulate
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..fem.body import Body, Linearisation, SecondDerivatives
 from ..fem.memory import MemoryInput
 from ..fem.pattern import JointPattern, SymmetricPattern

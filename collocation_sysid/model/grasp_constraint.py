@@ -1,7 +1,7 @@
 """Prescribed displacements of grasped nodes, as a function of the nuisance parameters φ.
 
 A grasped node is at U_t H(φ) X, along the held axes, with the pose U_t of the gripper and the
-motion H of the body in its grasp (see `nuisance`). A node of an obstacle's frame is at U_t X,
+motion H of the body in its grasp (see `nuisance_map`). A node of an obstacle's frame is at U_t X,
 displaced to first order by the nuisance parameters of the obstacle.
 """
 
@@ -14,12 +14,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..recording.experiment import Experiment
 from ..recording.grasp import prescribed_dofs
 from ..recording.nuisance import OBSTACLE_TILT, OBSTACLE_TIME, NuisanceRow
 from ..recording.obstacle import Obstacle
-from .nuisance import NuisanceMap
+from .nuisance_map import NuisanceMap
 
 
 @dataclass(frozen=True, eq=False)

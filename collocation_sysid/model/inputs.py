@@ -17,14 +17,14 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from ..arrays import Array
+from ..array_types import Array
 from ..recording.actuator import Actuator
 from ..recording.experiment import Experiment
 from ..recording.loads import smooth_ramp
 from ..recording.nuisance import JOINING
 from .dynamics import Dynamics
-from .generated import GeneratedFunction
-from .nuisance import NuisanceMap, TimedLoad
+from .generated_functions import GeneratedFunction
+from .nuisance_map import NuisanceMap, TimedLoad
 from .parameters import Parameters, ThetaMap
 
 Expression = Callable[[ca.SX, ca.SX], ca.SX]

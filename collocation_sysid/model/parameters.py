@@ -18,8 +18,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from ..arrays import Array
-from ..checked import Finite, Positive
+from ..array_types import Array
 from ..errors import InputError, hint_at
 from ..fem.body import Body
 from ..fem.constants import (
@@ -33,7 +32,8 @@ from ..fem.constants import (
     without_region,
 )
 from ..fem.moduli import ENGINEERING, engineering_constants
-from .generated import GeneratedFunction
+from ..validated_types import Finite, Positive
+from .generated_functions import GeneratedFunction
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..fem.air import unit_drag
 from ..fem.body import Body, Linearisation, SecondDerivatives
 from ..fem.force_points import ForcePoints
@@ -27,7 +27,7 @@ from ..fem.node_force import CONTEXT_SIZE, LocatedForce, NodeForce
 from ..fem.pattern import SymmetricPattern
 from ..recording.experiment import Experiment
 from .force_term import AssemblyIndices, ForceTerm, States
-from .generated import GeneratedFunction
+from .generated_functions import GeneratedFunction
 
 
 class PreviousState(NamedTuple):

@@ -18,8 +18,8 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from ..arrays import Array
-from .generated import GeneratedFunction
+from ..array_types import Array
+from .generated_functions import GeneratedFunction
 
 Expression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]
 

@@ -31,11 +31,11 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..fem.body import Body, SecondDerivatives
 from ..fem.memory import MemoryInput, MemoryLayout, fading_coefficients
 from .forces import Forces
-from .generated import GeneratedFunction
+from .generated_functions import GeneratedFunction
 from .recursion import Recursion
 
 # Number of evaluations whose stress derivatives are kept at a time; limits memory.

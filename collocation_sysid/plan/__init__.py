@@ -1,19 +1,19 @@
 """Studies of many runs, model comparison, and design of the next recording.
 
-Studies: `arguments` parses command-line arguments, `study` plans the runs, `process` executes them
-(each in its own process, see `worker`) and stores their records, `topic_as_csv` converts records to
-rows
-of numbers, and `study_page` and `plots` present them. `progress` shows progress in the terminal.
+Studies: `study_arguments` parses command-line arguments, `study_planning` plans the runs,
+`run_execution` executes them (each in its own process, see `run_worker`) and stores their records,
+`study_rows` converts records to rows of numbers, and `study_page` and `study_plots` present them.
+`study_progress` shows progress in the terminal.
 
-Model comparison: `variants` derives models from a problem file, `choice` compares their
-predictions, and `laws` evaluates how much an estimate depends on the model.
+Model comparison: `model_variants` derives models from a problem file, `model_choice` compares their
+predictions, and `law_disagreements` evaluates how much an estimate depends on the model.
 
-Experiment design: the package `design_motion` computes motions of a gripper that reduce the
+Experiment design: the package `design` computes motions of a gripper that reduce the
 uncertainty.
 """
 
-from .process import RunOptions, RunStore, run_all
-from .study import PlannedRun, Starts, plan_comparison, plan_models, plan_sweep
+from .run_execution import RunOptions, RunStore, run_all
+from .study_planning import PlannedRun, Starts, plan_comparison, plan_models, plan_sweep
 
 __all__ = [
     "PlannedRun",

@@ -13,13 +13,21 @@ from typing import Any
 from ..display import Items, Line, Section, Shown, Table, as_markdown
 from ..fem.constants import symbol_of, symbol_with_unit, unit_of
 from ..files import SCHEMA, whole_file, write_whole
-from ..tree import as_json
-from .choice import advice, display_unit, law_disagreements, model_notes, model_rows
-from .laws import law_table
-from .plots import comparison_plots, sweep_plots
-from .process import Record, RunStore
-from .study import PlannedRun, shortened_keys
-from .table import COLUMNS, NumberColumn, Row, SuccessCriterion, method_rows, parameters_in, run_row
+from ..serialisation import as_json
+from .law_disagreements import law_table
+from .model_choice import advice, display_unit, law_disagreements, model_notes, model_rows
+from .run_execution import Record, RunStore
+from .study_planning import PlannedRun, shortened_keys
+from .study_plots import comparison_plots, sweep_plots
+from .study_rows import (
+    COLUMNS,
+    NumberColumn,
+    Row,
+    SuccessCriterion,
+    method_rows,
+    parameters_in,
+    run_row,
+)
 
 RESOLUTION_DPI = 150
 SHOWN_FAILURES = 8

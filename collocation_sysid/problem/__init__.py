@@ -1,16 +1,17 @@
 """Estimation problems, and the problem file (TOML).
 
-`problem` defines `Problem`, and `options` its options for checks and uncertainties. The other
-modules read a problem file: `reading` parses and validates it, `loading` converts it to a problem,
-`recording` reads the files of one experiment (`tracking` its markers, `code` Python files,
-`bench_files` tables of a test bench, `densities` the mass), and `size` estimates memory and time.
-`schema`, `recording_schema`, `nuisance_schema` and `solver_schema` define the keys, and
-`explaining` words validation errors. `beginning` writes the file of a new problem.
+`problem` defines `Problem`, and `problem_options` its options for checks and uncertainties. The
+other modules read a problem file: `problem_reading` parses and validates it, `loading` converts it
+to a problem, `recording_reader` reads the files of one experiment (`marker_tracking` its markers,
+`code_loader` Python files, `bench_files` tables of a test bench, `density_guesses` the mass), and
+`problem_size` estimates memory and time. `schema`, `recording_schema`, `nuisance_schema` and
+`solver_schema` define the keys, and `validation_messages` words validation errors. `new_problem`
+writes the file of a new problem.
 
 Use `Problem` in Python and `Problem.read` for a file.
 """
 
-from .options import Origin, RolloutOptions, UncertaintyOptions
 from .problem import Problem
+from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 
 __all__ = ["Origin", "Problem", "RolloutOptions", "UncertaintyOptions"]

@@ -12,7 +12,7 @@ from pathlib import PurePath
 
 import numpy as np
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import InputError
 from ..fem.body import Body
 from ..recording import Experiment, Grasp

@@ -8,13 +8,14 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from ..declarations import keys_of, tables_of
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.constants import FRICTION, Constant, constant_named
-from ..fem.field import Field
 from ..fem.mesh import TetMesh
 from ..fem.regions import Region
 from ..fem.rest_shape import UnderGravity
+from ..fem.spatial_field import Field
 from ..fem.structured import (
     box_of_edge,
     count_box_elements,
@@ -23,17 +24,16 @@ from ..fem.structured import (
 )
 from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Experiment
-from ..recording.selected import selection_from_section
-from ..section import Section, stated_in
-from ..stated import keys_of, tables_of
-from ..statistics.plausible import SIZES_M, size_and_density_hypotheses
-from .code import CodeLoader, existing_file
-from .densities import with_guessed_densities, with_stated_densities
-from .options import Origin, RolloutOptions, UncertaintyOptions
-from .reading import read_problem_file
-from .recording import RecordingReader
+from ..recording.node_selection import selection_from_section
+from ..schema_tables import Section, stated_in
+from ..statistics.plausibility import SIZES_M, size_and_density_hypotheses
+from .code_loader import CodeLoader, existing_file
+from .density_guesses import with_guessed_densities, with_stated_densities
+from .problem_options import Origin, RolloutOptions, UncertaintyOptions
+from .problem_reading import read_problem_file
+from .problem_size import Say, Size, announce_reading, require_feasible
+from .recording_reader import RecordingReader
 from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
-from .size import Say, Size, announce_reading, require_feasible
 
 # The key of `Experiment` that stands in a table of its own, of all experiments.
 AIR_KEY = "air_density_kg_m3"

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Optional
 
 from pydantic import AfterValidator, Field, create_model, model_validator
 
-from ..checked import Positive, Text
 from ..recording import Nuisance
 from ..recording.nuisance import KINDS, SCOPE, SCOPE_TEXT, NuisanceRow
-from ..section import ByForm, Section, given_keys
+from ..schema_tables import ByForm, Section, given_keys
+from ..validated_types import Positive, Text
 
 KEYS = {key: list(rows) for key, rows in groupby(KINDS, key=lambda row: row.key)}
 

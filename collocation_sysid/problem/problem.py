@@ -9,10 +9,11 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import Array
+from ..array_types import Array
+from ..declarations import key, stated
 from ..errors import InputError, located
 from ..fem.body import Body
-from ..fem.field import FieldModes
+from ..fem.spatial_field import FieldModes
 from ..fem.two_phase import TwoPhaseModes
 from ..methods import METHODS, require_method
 from ..methods.interior_point import InteriorPoint
@@ -20,13 +21,12 @@ from ..methods.solution import Method
 from ..model.parameters import Parameters, Tied, Unknown
 from ..model.schemes import Scheme, as_scheme
 from ..program.collocation import Collocation
-from ..program.sharing import nuisance_indices
+from ..program.shared_nuisances import nuisance_indices
 from ..program.simulation import require_steps
 from ..recording import Experiment
-from ..stated import key, stated
-from ..statistics.plausible import size_and_density_hypotheses
-from ..statistics.scale import scale_concerns, static_concerns
-from .options import Origin, RolloutOptions, UncertaintyOptions
+from ..statistics.plausibility import size_and_density_hypotheses
+from ..statistics.scale_identifiability import scale_concerns, static_concerns
+from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 
 
 def _as_parameters(parameters: Parameters | Mapping[str, Unknown | Tied | float]) -> Parameters:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from ..checked import AtLeastOne, Boundless, Finite, NotNegative, Positive, Text
 from ..recording import Depth, DepthCamera, Experiment, Gauge, Grasp, Markers, Obstacle, Wrench
-from ..section import ByForm, Section, Unit, Vector, given_keys, section_of
+from ..schema_tables import ByForm, Section, Unit, Vector, given_keys, section_of
+from ..validated_types import AtLeastOne, Boundless, Finite, NotNegative, Positive, Text
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
 
 

@@ -6,15 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from ..checked import Count, Finite, Flag, NotNegative, Positive, Text
 from ..fem.elements import ELEMENTS
-from ..fem.field import Field as MaterialField
 from ..fem.materials import DAMPINGS, MATERIALS
+from ..fem.spatial_field import Field as MaterialField
 from ..model.parameters import Unknown
 from ..model.schemes import MOST_STEPS, SCHEMES
 from ..recording.environment import usual_air_density
-from ..recording.selected import Nodes
-from ..section import (
+from ..recording.node_selection import Nodes
+from ..schema_tables import (
     Among,
     ByForm,
     Section,
@@ -24,7 +23,8 @@ from ..section import (
     require_one,
     section_of,
 )
-from .options import RolloutOptions, UncertaintyOptions
+from ..validated_types import Count, Finite, Flag, NotNegative, Positive, Text
+from .problem_options import RolloutOptions, UncertaintyOptions
 from .recording_schema import ExperimentSection
 from .solver_schema import SolverSection
 

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import BeforeValidator, Field, create_model, model_validator
 from pydantic_core.core_schema import no_info_plain_validator_function
 
-from ..checked import Positive
 from ..errors import InputError
 from ..methods import METHODS, method_options_schema
 from ..methods.comparison.casadi_nlp import refusal_reason
-from ..methods.options import method_from_options
+from ..methods.method_options import method_from_options
 from ..methods.solution import Method
-from ..section import Among, Section
+from ..schema_tables import Among, Section
+from ..validated_types import Positive
 
 OPTIONS = {method: [field.name for field in fields(kind)] for method, kind in METHODS.items()}
 DEFAULT = "reduced-space"

@@ -3,34 +3,35 @@ solved.
 
 Transcription
     `collocation` is the whole program (objective, constraints, derivatives) of several experiments.
-    `segment` is one experiment of it, `part` one experiment at given variables, `sharing` the
-    nuisance parameters that experiments have in common. `motion_rows`, `block_band` and `entries`
-    lay out the sparse Jacobian and Hessian, `local_loss` the Hessian of the loss.
+    `transcription` is one experiment of it, `experiment_iterate` one experiment at given variables,
+    `shared_nuisances` the nuisance parameters that experiments have in common. `motion_jacobian`,
+    `block_band` and `sparse_assembly` lay out the sparse Jacobian and Hessian, `local_loss` the
+    Hessian of the loss.
 Lifted variables
-    `carried` is the base class of variables that are eliminated by default and can be added with
-    equations of their own; `explicit` adds them. `viscoelastic_rows` (material memory),
-    `force_rows` (force histories), `pressure_rows` (complementarity), `reaction_rows` and
-    `wrench_rows` (measured forces) are the kinds; `pattern_rows` assembles repeated small
-    expressions.
+    `lifted_variables` is the base class of variables that are eliminated by default and can be
+    added with equations of their own; `lifting` adds them. `lifted_memory` (material memory),
+    `lifted_force_histories` (force histories), `lifted_contact_pressures` (complementarity),
+    `lifted_reactions` and `lifted_wrenches` (measured forces) are the kinds; `expression_patterns`
+    assembles repeated small expressions.
 Measurements
-    `channel` and `wrench_channel` are the observables, `sensing` evaluates them along a motion, and
-    `reading` compares them with data. `markers`, `wrench`, `gauge` (custom sensors), `depth` and
-    `outline_reading` are the kinds of measurement. `charts` associates markers with elements.
-    `view`, `skin`, `sighting`, `outline`, `camera_alignment` and `depth_comparison` model depth
-    cameras.
+    `observables` and `wrench_observable` are the observables, `observation` evaluates them along a
+    motion, and `measurement_residual` compares them with data. `marker_residual`,
+    `wrench_residual`, `custom_sensor_residual` (custom sensors), `depth_residual` and
+    `outline_residual` are the kinds of measurement. `marker_association` associates markers with
+    elements. `depth_camera_model`, `visible_surface`, `surface_correspondences`, `depth_outline`,
+    `camera_alignment` and `depth_comparison` model depth cameras.
 Linear algebra
     `sweep` solves the linearised equations of motion forward and backward in time, `factorisation`
-    factorises one time step (with `lapack` and `supernodal`), `least_squares_of_fit` accumulates
-    normal
+    factorises one time step (with `lapack` and `supernodal`), `least_squares` accumulates normal
     equations in square-root form, `stopwatch` measures time.
 Simulation
-    `simulation` simulates an experiment by `marching` (collocation schemes) or `simulate_newmark`,
-    with
-    Newton's method of `newton`, `retraction` and `near_contact`, from the equilibrium of `rest`.
+    `simulation` simulates an experiment by `scheme_simulation` (collocation schemes) or `newmark`,
+    with Newton's method of `newton_solver`, `retraction` and `step_contact`, from the equilibrium
+    of `initial_equilibrium`.
 Analyses of a motion
-    `reaction` (reaction forces), `modes` (natural modes), `stability` and `find_lost_stability`,
-    `contact_summaries` (contact), `any_stiffness` (rough predictions while the stiffness is
-    unknown).
+    `reaction_forces` (reaction forces), `natural_modes` (natural modes), `stability` and
+    `loss_of_stability`, `contact_summary` (contact), `modal_prediction` (rough predictions
+    while the stiffness is unknown).
 
 Methods use `Collocation`; statistics use `Transcription`, `ExperimentIterate` and `Sweep`;
 predictions use `simulate`.

@@ -21,7 +21,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..fem.kernels import make_combiner, run_in_slices
 from ..fem.pattern import SymmetricPattern
 

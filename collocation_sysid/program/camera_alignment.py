@@ -12,10 +12,10 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from ..arrays import Array
+from ..array_types import Array
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
-from .skin import GRAZING, VisibleSurface
-from .view import DepthCameraModel
+from .depth_camera_model import DepthCameraModel
+from .visible_surface import GRAZING, VisibleSurface
 
 # Points of the surface that are associated with the cloud.
 SAMPLES = 250

@@ -9,9 +9,9 @@ Variables z, in this order:
 q                  estimated parameters, in the order of `Parameters.free`
 x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axis, the last
                    index fastest; ℓ_e is the mean edge length
-φ_e                nuisance parameters of experiment e, see `model.nuisance`, experiment by
+φ_e                nuisance parameters of experiment e, see `model.nuisance_map`, experiment by
                    experiment; shared ones are those of the first experiment that has them,
-                   see `program.sharing`
+                   see `program.shared_nuisances`
 =================  =========================================================================
 
 Lifted variables (history variables, reaction forces, wrenches, contact pressures) are eliminated by
@@ -41,18 +41,18 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..errors import InputError
 from ..model.parameters import Parameters
 from ..model.schemes import Scheme
 from ..recording.experiment import Experiment
-from .carried import LiftedOffsets, LiftedVariables
-from .charts import MarkerAssociation
-from .entries import SparseAssembly
-from .explicit import lift_variables
-from .part import ExperimentIterate
-from .segment import RowWeights, SegmentOffsets, Transcription
-from .sharing import nuisance_indices, shared_charts
+from .experiment_iterate import ExperimentIterate
+from .lifted_variables import LiftedOffsets, LiftedVariables
+from .lifting import lift_variables
+from .marker_association import MarkerAssociation
+from .shared_nuisances import nuisance_indices, shared_charts
+from .sparse_assembly import SparseAssembly
+from .transcription import RowWeights, SegmentOffsets, Transcription
 
 
 def convert_variables(z: Array, source: Collocation, target: Collocation) -> Array:

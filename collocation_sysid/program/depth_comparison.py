@@ -1,7 +1,8 @@
 """Distances between the points of a depth camera and the surface of a given motion.
 
 For motions that are simulated forward or predicted; a fit has its own association of points with
-the surface, see `sighting`. Which points are compared is defined by `SurfaceComparison`.
+the surface, see `surface_correspondences`. Which points are compared is defined by
+`SurfaceComparison`.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from ..arrays import Array, root_mean
-from .depth import HUBER, DepthResidual
-from .sighting import SurfaceCorrespondences, initial_gate_m
+from ..array_types import Array, root_mean
+from .depth_residual import HUBER, DepthResidual
+from .surface_correspondences import SurfaceCorrespondences, initial_gate_m
 
 # Fewest samples of a motion between which a cubic spline is drawn; lines between fewer.
 FEWEST_FOR_SPLINE = 4

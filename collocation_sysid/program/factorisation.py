@@ -23,7 +23,7 @@ from scipy.linalg import get_lapack_funcs
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import SuperLU, splu
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..fem.kernels import make_skyline, run_in_slices
 from ..fem.pattern import SymmetricPattern
 from .lapack import cholesky_in_place

@@ -1,7 +1,7 @@
 """Second derivatives of the loss by positions and nuisance parameters, for local observables.
 
 An observable is local if it depends on few positions at each time, such as the place of a marker.
-Wrenches are not; programs that need their second derivatives lift them, see `wrench_rows`.
+Wrenches are not; programs that need their second derivatives lift them, see `lifted_wrenches`.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from functools import cached_property
 
 import numpy as np
 
-from ..arrays import Array, Index
-from .channel import PointPositions, SparseEntries
-from .reading import MeasurementResidual
+from ..array_types import Array, Index
+from .measurement_residual import MeasurementResidual
+from .observables import PointPositions, SparseEntries
 
 
 @dataclass(frozen=True, eq=False)

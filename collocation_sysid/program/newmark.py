@@ -17,18 +17,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..model.contact import Contact
 from ..model.force_term import States
 from ..model.forces import Forces
-from ..model.histories import PreviousState, advance_states, insert_previous_states, start_states
+from ..model.internal_variables import (
+    PreviousState,
+    advance_states,
+    insert_previous_states,
+    start_states,
+)
 from ..model.weight import Weight
 from ..recording.experiment import Experiment
-from .channel import ReactionForces
+from .initial_equilibrium import initial_state
 from .lapack import one_blas_thread
-from .near_contact import StepContact
-from .newton import NewtonFailure, NewtonOptions, NewtonSolver, NewtonSolvers, simulation_error
-from .rest import initial_state
+from .newton_solver import (
+    NewtonFailure,
+    NewtonOptions,
+    NewtonSolver,
+    NewtonSolvers,
+    simulation_error,
+)
+from .observables import ReactionForces
+from .step_contact import StepContact
 
 Progress = Callable[[float], None]
 

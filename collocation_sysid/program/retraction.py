@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial.transform import Rotation
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..fem.body import Body
 
 # Weight of the distance to x + δ beside that of the gradients, relative to the square of the body's

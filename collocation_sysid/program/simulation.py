@@ -16,23 +16,23 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import InputError, SimulationError
 from ..model.dynamics import Dynamics
-from ..model.nuisance import NuisanceMap
+from ..model.nuisance_map import NuisanceMap
 from ..model.parameters import Parameters, resolve_theta
 from ..model.schemes import MOST_STEPS, Scheme, as_scheme
 from ..recording.experiment import Experiment
 from ..recording.nuisance import Nuisance
-from .channel import ObservedMotion, ReactionForces
-from .gauge import custom_sensor_residuals
-from .lost_stability import explain_failure
-from .marching import Progress, simulate_scheme
+from .custom_sensor_residual import custom_sensor_residuals
+from .loss_of_stability import explain_failure
 from .newmark import simulate_newmark
-from .newton import NewtonOptions
-from .reaction import forces_on_dofs, reaction_forces
-from .wrench import wrench_residuals
-from .wrench_channel import ReactionGrid, sensed_dofs
+from .newton_solver import NewtonOptions
+from .observables import ObservedMotion, ReactionForces
+from .reaction_forces import forces_on_dofs, reaction_forces
+from .scheme_simulation import Progress, simulate_scheme
+from .wrench_observable import ReactionGrid, sensed_dofs
+from .wrench_residual import wrench_residuals
 
 # Name of the integrator that is no collocation scheme, and its order of accuracy.
 NEWMARK = "newmark"

@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs, eigsh, splu
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..fem.pattern import SymmetricPattern
 from ..model.forces import Forces
 from .collocation import Collocation, ExperimentIterate

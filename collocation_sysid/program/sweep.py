@@ -29,20 +29,20 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..errors import SimulationError
 from ..fem.body import Linearisation
 from ..model.dynamics import Dynamics, StencilRow, weighted_sum_of_past
-from ..model.force_history import ForceForwardColumns
-from ..model.histories import AnyHistory
-from ..model.setting import EquationsAtParameters
+from ..model.equations_at_parameters import EquationsAtParameters
+from ..model.force_internal_variables import ForceForwardColumns
+from ..model.internal_variables import AnyHistory
 from ..model.viscoelasticity import MemoryForwardColumns
 from .block_band import Submatrix
 from .factorisation import Choice, Factor, Factoriser
 from .lapack import one_blas_thread
-from .reaction import GraspForces
-from .segment import Transcription
+from .reaction_forces import GraspForces
 from .stopwatch import Stopwatch
+from .transcription import Transcription
 
 if TYPE_CHECKING:
     from ..fem.kernels.skyline import FactorMemory

@@ -2,62 +2,63 @@
 
 Begin with `experiment` (one recording with all its parts). Its parts are in:
 
-- `grasp`, `poses`, `wrench`: prescribed displacements, the rigid motions that prescribe them, and
+- `grasp`, `poses`, `measured_wrench`: prescribed displacements, the rigid motions that prescribe
+  them, and
 measured reaction forces.
-- `obstacle`, `solids`: rigid obstacles for contact, and their shapes.
+- `obstacle`, `obstacle_solids`: rigid obstacles for contact, and their shapes.
 - `loads`, `tendon`, `pressure`, `actuator`: point masses, forces, tendons and pressures.
 - `markers`, `placement`: tracked markers and where they sit on the body.
-- `depth`: depth cameras and scanners.
-- `gauge`: custom sensors.
+- `depth_camera`: depth cameras and scanners.
+- `custom_sensor`: custom sensors.
 - `nuisance`: unknowns of a single recording, with their priors.
 - `environment`: the density of the air.
 
-Files are read by `readers` (markers), `pose_files` (poses), `tables` (forces, displacements,
-pressures, custom sensors) and the subpackage `formats`; `writers` writes them. `align_camera`,
-`clock_hypothesis`
-and `rigid` prepare data: one time grid, sample times, rigid fits. `refinement` moves an experiment
-to a finer mesh, `turning` finds the fastest rotation of its grasps, and `arrays` and `selected`
-check arrays and node selections.
+Files are read by `marker_files` (markers), `pose_files` (poses), `time_tables` (forces,
+displacements, pressures, custom sensors) and the subpackage `formats`; `recording_writers` writes
+them. `alignment`, `sample_times` and `rigid_fit` prepare data: one time grid, sample times,
+rigid fits. `experiment_refinement` moves an experiment to a finer mesh, `grasp_rotation` finds the
+fastest rotation of its grasps, and `checked_arrays` and `node_selection` check arrays and node
+selections.
 """
 
 from .alignment import align as align
-from .clock import sample_interval_s as sample_interval_s
-from .depth import Depth as Depth
-from .depth import DepthCamera as DepthCamera
-from .depth import depth_image as depth_image
+from .custom_sensor import Gauge as Gauge
+from .custom_sensor import Look as Look
+from .depth_camera import Depth as Depth
+from .depth_camera import DepthCamera as DepthCamera
+from .depth_camera import depth_image as depth_image
 from .experiment import Experiment as Experiment
-from .gauge import Gauge as Gauge
-from .gauge import Look as Look
 from .grasp import Grasp as Grasp
 from .grasp import prescribed_dofs as prescribed_dofs
 from .grasp import prescribed_nodes as prescribed_nodes
 from .loads import Force as Force
 from .loads import PointMass as PointMass
+from .marker_files import MarkerTable as MarkerTable
+from .marker_files import read_markers as read_markers
 from .markers import Markers as Markers
 from .markers import Placement as Placement
 from .markers import place_markers as place_markers
+from .measured_wrench import Wrench as Wrench
 from .nuisance import Nuisance as Nuisance
 from .nuisance import NuisanceRow as NuisanceRow
 from .obstacle import Obstacle as Obstacle
+from .obstacle_solids import Capsule as Capsule
+from .obstacle_solids import Cuboid as Cuboid
+from .obstacle_solids import Cylinder as Cylinder
+from .obstacle_solids import Plane as Plane
+from .obstacle_solids import Solid as Solid
+from .obstacle_solids import Sphere as Sphere
 from .pose_files import read_poses as read_poses
 from .poses import PoseSequence as PoseSequence
 from .pressure import Pressure as Pressure
-from .readers import MarkerTable as MarkerTable
-from .readers import read_markers as read_markers
-from .rigid import align_to_template as align_to_template
-from .rigid import fit_poses as fit_poses
-from .solids import Capsule as Capsule
-from .solids import Cuboid as Cuboid
-from .solids import Cylinder as Cylinder
-from .solids import Plane as Plane
-from .solids import Solid as Solid
-from .solids import Sphere as Sphere
-from .tables import displaced_axes as displaced_axes
-from .tables import read_displacement as read_displacement
-from .tables import read_wrench as read_wrench
+from .recording_writers import write_gauge_csv as write_gauge_csv
+from .recording_writers import write_markers_csv as write_markers_csv
+from .recording_writers import write_poses_csv as write_poses_csv
+from .recording_writers import write_wrench_csv as write_wrench_csv
+from .rigid_fit import align_to_template as align_to_template
+from .rigid_fit import fit_poses as fit_poses
+from .sample_times import sample_interval_s as sample_interval_s
 from .tendon import Tendon as Tendon
-from .wrench import Wrench as Wrench
-from .writers import write_gauge_csv as write_gauge_csv
-from .writers import write_markers_csv as write_markers_csv
-from .writers import write_poses_csv as write_poses_csv
-from .writers import write_wrench_csv as write_wrench_csv
+from .time_tables import displaced_axes as displaced_axes
+from .time_tables import read_displacement as read_displacement
+from .time_tables import read_wrench as read_wrench

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import InputError
 from ..fem.shape import EnclosedVolume, PolylineLength
 from .loads import TimeSeries

@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import InputError
-from .clock import (
+from .marker_files import MarkerTable
+from .poses import PoseSequence
+from .sample_times import (
     STEP_TOLERANCE,
     evenly_spaced_s,
     printed_rounding_s,
     sample_interval_s,
     unrounded_s,
 )
-from .poses import PoseSequence
-from .readers import MarkerTable
 
 # Distance of samples, in median steps, above which samples were lost between them.
 _GAP_STEPS = 1.5

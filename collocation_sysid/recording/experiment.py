@@ -10,26 +10,26 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Array, Index
-from ..checked import Flag, NotNegative
+from ..array_types import Array, Index
+from ..declarations import as_given, key, stated
 from ..errors import InputError
-from ..section import Vector, tables
-from ..stated import as_given, key, stated
+from ..schema_tables import Vector, tables
+from ..validated_types import Flag, NotNegative
 from .actuator import Actuator
-from .arrays import float_converter, read_only_floats
-from .clock import STEP_TOLERANCE, TIME_TOLERANCE_S, first_unordered_time, sample_interval_s
-from .depth import Depth
+from .checked_arrays import float_converter, read_only_floats
+from .custom_sensor import Gauge
+from .depth_camera import Depth
 from .environment import air_density, usual_air_density
-from .gauge import Gauge
 from .grasp import Grasp, free_rigid_motions, prescribed_dofs
 from .loads import Force, LoadTime, PointMass, smooth_ramp
 from .markers import Markers
+from .measured_wrench import Wrench
 from .nuisance import Nuisance
 from .obstacle import Obstacle, with_obstacle_frames
 from .pressure import Pressure
-from .tables import is_within_experiment
+from .sample_times import STEP_TOLERANCE, TIME_TOLERANCE_S, first_unordered_time, sample_interval_s
 from .tendon import Tendon
-from .wrench import Wrench
+from .time_tables import is_within_experiment
 
 if TYPE_CHECKING:
     from ..fem.body import Body

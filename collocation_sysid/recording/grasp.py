@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Literal, Self, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Array, Index
-from ..checked import Finite, NotNegative
+from ..array_types import Array, Index
+from ..declarations import as_given, key, stated
 from ..errors import InputError
 from ..fem.selection import Selection
-from ..stated import as_given, key, stated
-from .clock import TIME_TOLERANCE_S
+from ..validated_types import Finite, NotNegative
+from .measured_wrench import Wrench
+from .node_selection import Nodes, node_converter, select_on_body, selection_from_section
 from .poses import PoseSequence
-from .selected import Nodes, node_converter, select_on_body, selection_from_section
-from .wrench import Wrench
+from .sample_times import TIME_TOLERANCE_S
 
 if TYPE_CHECKING:
     from ..fem.body import Body

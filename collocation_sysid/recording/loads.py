@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Array, Index
-from ..checked import Finite, Positive, Text
+from ..array_types import Array, Index
+from ..declarations import Key, key, stated
 from ..errors import InputError
 from ..fem.selection import Selection
-from ..section import Vector
-from ..stated import Key, key, stated
-from .arrays import read_only_floats
-from .clock import TIME_TOLERANCE_S, first_unordered_time
-from .selected import Nodes, node_converter, select_on_body, selection_from_section
-from .tables import read_forces
+from ..schema_tables import Vector
+from ..validated_types import Finite, Positive, Text
+from .checked_arrays import read_only_floats
+from .node_selection import Nodes, node_converter, select_on_body, selection_from_section
+from .sample_times import TIME_TOLERANCE_S, first_unordered_time
+from .time_tables import read_forces
 
 if TYPE_CHECKING:
     from ..fem.body import Body

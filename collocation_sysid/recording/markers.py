@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Array, Index
-from ..checked import Positive
+from ..array_types import Array, Index
+from ..declarations import Key, as_given, key, stated
 from ..errors import InputError
-from ..stated import Key, as_given, key, stated
-from .arrays import float_converter, read_only_floats, read_only_tracks
+from ..validated_types import Positive
+from .checked_arrays import float_converter, read_only_floats, read_only_tracks
 from .placement import AttachmentRule, LocatedBody, Placement, place_markers
 
 if TYPE_CHECKING:

@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..arrays import Array, Index
-from ..checked import NotNegative, Positive, Text
+from ..array_types import Array, Index
+from ..declarations import key, stated
 from ..errors import InputError
 from ..fem.constants import FRICTION, Constant, constant_named
+from ..fem.contact_surface import ContactSurface
 from ..fem.selection import Selection
-from ..fem.touching import ContactSurface
-from ..stated import key, stated
+from ..validated_types import NotNegative, Positive, Text
 from .grasp import Grasp
+from .node_selection import Nodes, selection_from_section
+from .obstacle_solids import KINDS, Solid, SolidSection, orthogonal_axes, solid_from_section
 from .poses import PoseSequence
-from .selected import Nodes, selection_from_section
-from .solids import KINDS, Solid, SolidSection, orthogonal_axes, solid_from_section
 
 if TYPE_CHECKING:
     from ..fem.body import Body

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..errors import InputError
-from .arrays import point_text, read_only_floats, read_only_nodes
+from .checked_arrays import point_text, read_only_floats, read_only_nodes
 
 if TYPE_CHECKING:
     from ..fem.body import Body

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..array_files import load_arrays
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import InputError
 from ..files import DAMAGE
 from .formats.columns import TIME, find_column, name_and_unit

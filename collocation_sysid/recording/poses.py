@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline, PPoly
 from scipy.spatial.transform import Rotation
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
+from ..declarations import key, stated
 from ..errors import InputError
-from ..stated import key, stated
-from .arrays import float_converter, read_only_floats
-from .clock import TIME_TOLERANCE_S, first_unordered_time
+from .checked_arrays import float_converter, read_only_floats
+from .sample_times import TIME_TOLERANCE_S, first_unordered_time
 
 Interpolation = Literal["smooth", "linear", "hold"]
 

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Array, Index
-from ..checked import Finite, Text
+from ..array_types import Array, Index
+from ..declarations import Key, key, stated
 from ..errors import InputError
 from ..fem.refinement import split_faces_in_four
 from ..fem.selection import Indices, Selection, rows_of_faces
 from ..fem.shape import EnclosedVolume
-from ..stated import Key, key, stated
+from ..validated_types import Finite, Text
 from .actuator import Actuator, BodyMeasure
 from .loads import TimeSeries
-from .selected import Nodes, selection_from_section
-from .tables import read_pressure
+from .node_selection import Nodes, selection_from_section
+from .time_tables import read_pressure
 
 if TYPE_CHECKING:
     from ..fem.body import Body

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from ..arrays import Array
-from ..checked import NotNegative, Text
+from ..array_types import Array
+from ..declarations import Key, key, stated
 from ..errors import InputError
 from ..fem.shape import PolylineLength
-from ..section import Vector
-from ..stated import Key, key, stated
+from ..schema_tables import Vector
+from ..validated_types import NotNegative, Text
 from .actuator import Actuator, BodyMeasure
-from .arrays import float_converter, point_text
+from .checked_arrays import float_converter, point_text
 from .loads import TimeSeries
 from .placement import LocatedBody
-from .tables import read_tension
+from .time_tables import read_tension
 
 if TYPE_CHECKING:
     from ..fem.body import Body

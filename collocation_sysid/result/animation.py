@@ -20,11 +20,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import InputError, require_among
 from ..files import safe_name, whole_file
-from .pictures.camera import Camera
+from .figure_style import BLACK, BLUE, GREEN, LINE_PT, TEXT_PT, dress, legend_above
 from .pictures.over_time import rms_over_markers
+from .pictures.projection import Camera
 from .pictures.scene import (
     Drawn,
     View,
@@ -37,7 +38,6 @@ from .pictures.scene import (
     with_outlines,
 )
 from .replay import Replay, headline, read_run, reading_run
-from .style import BLACK, BLUE, GREEN, LINE_PT, TEXT_PT, dress, legend_above
 
 WIDTH_MM = 160.0
 TALLEST_MM = 110.0

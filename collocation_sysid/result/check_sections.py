@@ -12,7 +12,7 @@ import numpy as np
 from ..display import Line, Shown, Table, duration, labelled
 from ..fem.constants import symbol_of, unit_of
 from ..runs.check import BodyCheck, CheckResult, GraspCheck, QuickCheck, RecordingCheck
-from ..runs.check.body import grasp_sentence
+from ..runs.check.body_check import grasp_sentence
 from .run_sections import how_to
 
 # Natural modes in the table, lowest first.

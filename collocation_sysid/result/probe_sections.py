@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from ..display import Section, Table, short
 from ..errors import listed
 from ..fem.constants import symbol_of
-from ..runs.result import Result
-from ..statistics.budget import source_label
-from ..statistics.relaxation import EstimateChange, Probe
+from ..runs.result_content import Result
+from ..statistics.relaxed_assumptions import EstimateChange, Probe
+from ..statistics.uncertainty_budget import source_label
 
 # Measures of stiffness, the most important first.
 FOREMOST = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")

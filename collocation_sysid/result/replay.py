@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import InputError
 from ..fem.constants import symbol_of, without_region
 from ..fem.elements import EDGES
 from ..files import RESULT_FILE, damage_refused, require_own
-from ..recording.clock import TIME_TOLERANCE_S
 from ..recording.experiment import Experiment
-from ..runs.result import Result
+from ..recording.sample_times import TIME_TOLERANCE_S
+from ..runs.result_content import Result
 
 ARRAYS_FILE = "trajectory.npz"
 # Prefix of a wrench array, before its number from 1.

@@ -24,7 +24,7 @@ from ..display import (
     own_pictures,
 )
 from ..files import damage_refused, read_json
-from ..tree import read
+from ..serialisation import read
 
 SUMMARY_FILE = "summary.json"
 CAPTIONS = {

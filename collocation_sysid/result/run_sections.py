@@ -34,11 +34,11 @@ from ..pages import explain_command, page_url
 from ..program.depth_comparison import DepthError
 from ..recording.nuisance import in_readable_unit
 from ..runs.prediction import PredictionErrors
-from ..runs.result import Elapsed, Result, SimulatedExperiment
-from ..statistics.budget import main_sources, source_label
-from ..statistics.concern import Concern, topics_of
-from ..statistics.trust import Assessment
-from ..tree import content
+from ..runs.result_content import Elapsed, Result, SimulatedExperiment
+from ..serialisation import content
+from ..statistics.assessment import Assessment
+from ..statistics.concerns import Concern, topics_of
+from ..statistics.uncertainty_budget import main_sources, source_label
 from .probe_sections import DEEPER, FOREMOST, is_deeper_check_worthwhile, probe_lines, probe_section
 from .replay import LARGEST, read_arrays, reading_run
 

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..checked import Count, NotNegative, Options, Positive
 from ..errors import InputError, require_among
 from ..files import whole_file
 from ..model.schemes import SCHEMES
@@ -24,7 +23,7 @@ from ..problem.bench_files import (
     has_displacement_table,
     table_name,
 )
-from ..problem.reading import parse_toml
+from ..problem.problem_reading import parse_toml
 from ..problem.recording_schema import ExperimentSection, WrenchSection
 from ..problem.schema import ProblemFile
 from ..program.simulation import NEWMARK, Trajectory, simulate
@@ -34,9 +33,10 @@ from ..recording import (
     write_markers_csv,
     write_poses_csv,
 )
-from ..recording.writers import write_columns_csv
+from ..recording.recording_writers import write_columns_csv
+from ..validated_types import Count, NotNegative, Options, Positive
 from ..written_files import LIST_FILE, hashes_of, is_written_here, list_as_text, listed_hashes
-from .writers import (
+from .run_writers import (
     FRAMES_FILE,
     require_no_link,
     require_only_written,

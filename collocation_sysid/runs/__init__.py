@@ -6,7 +6,8 @@ and `warm_start` for a start from an earlier run.
 - `forward_simulation`, `prediction`: simulate recordings with the estimates, and compare with the
 measurements.
 - `verdict`: concerns about a solution.
-- `refine`: solve at finer discretisations, for the numerical error.
-- `answer`: the solved problem with all of this; `report` converts it to `result`, the content of
+- `numerical_error`: solve at finer discretisations, for the numerical error.
+- `solved_problem`: the solved problem with all of this; `result_builder` converts it to
+  `result_content`, the content of
 ``result.json``.
 """

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import InputError, SimulationError
 from ..fem.kernels import map_experiments
 from ..methods.complementarity import with_contact_energy
@@ -15,17 +15,21 @@ from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
 from ..model.schemes import MOST_STEPS, as_scheme
 from ..problem import Problem
-from ..program.channel import ObservedMotion, ReactionForces
 from ..program.collocation import ExperimentIterate
+from ..program.custom_sensor_residual import custom_sensor_residuals
 from ..program.depth_comparison import DepthError, SurfaceComparison
-from ..program.gauge import custom_sensor_residuals
-from ..program.segment import Transcription
+from ..program.observables import ObservedMotion, ReactionForces
 from ..program.simulation import Trajectory, simulate
-from ..program.wrench_channel import ReactionGrid
+from ..program.transcription import Transcription
+from ..program.wrench_observable import ReactionGrid
 from ..recording import Experiment
+from ..statistics.discretisation_error import (
+    Refinement,
+    change_towards_observations,
+    discretisation_errors,
+)
 from ..statistics.estimates import Estimate
 from ..statistics.linearised import LinearisedFit, parameter_values
-from ..statistics.numerical import Refinement, change_towards_observations, discretisation_errors
 from .prediction import (
     CopyError,
     InstrumentMisfit,

@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..arrays import Array, root_mean
+from ..array_types import Array, root_mean
 from ..methods.solution import Solution, custom_sensor_rms, wrench_rms
 from ..program.depth_comparison import DepthError
-from ..program.segment import Transcription
+from ..program.transcription import Transcription
 from ..recording import Experiment
-from ..recording.clock import TIME_TOLERANCE_S
+from ..recording.sample_times import TIME_TOLERANCE_S
 
 
 @dataclass(frozen=True)

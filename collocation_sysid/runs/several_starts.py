@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from ..methods.initial_trajectories import associated_at_guess
 from ..methods.reduced_space import ReducedSpace
-from ..methods.scan import Scan
 from ..methods.solution import Method, Solution, Status, Watch
-from ..methods.start import associated_at_guess
+from ..methods.stiffness_scan import Scan
 from ..program.collocation import Collocation
 
 # Difference of losses below which two solutions are the same minimum with other correspondences:

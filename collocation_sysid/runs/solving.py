@@ -9,19 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import InputError
 from ..fem.constants import usual_value, without_region
+from ..methods.experiment_executors import ExperimentExecutor, connect_executor
+from ..methods.initial_trajectories import associated_at_guess
 from ..methods.reduced_space import ReducedSpace
-from ..methods.scan import Scan, rescue, start_problem
 from ..methods.solution import Method, Solution, Status, Watch
-from ..methods.start import associated_at_guess
-from ..methods.workers import ExperimentExecutor, connect_executor
+from ..methods.stiffness_scan import Scan, rescue, start_problem
 from ..model.parameters import Parameters
 from ..problem import Problem
 from ..program.collocation import Collocation
-from ..statistics.cameras import require_depth_units
-from ..statistics.fields import field_estimates_at
+from ..statistics.camera_misspecifications import require_depth_units
+from ..statistics.field_estimates import field_estimates_at
 from ..statistics.linearised import parameter_values
 from .check.cost import require_memory
 from .several_starts import follow_starts
@@ -98,9 +98,9 @@ def _solve_with_likeliest_lengths(
 ) -> Solution:
     """Solve a problem with the most likely of the correlation lengths that its fields allow.
 
-    The likelihood of each length follows to first order from a solution, see `statistics.fields`.
-    The problem is solved again, from there, with the most likely lengths, until these no longer
-    change or were tried before.
+    The likelihood of each length follows to first order from a solution, see
+    `statistics.field_estimates`. The problem is solved again, from there, with the most likely
+    lengths, until these no longer change or were tried before.
     """
     if any(not modes.has_phases for modes in problem.two_phase_fields.values()):
         return solve_two_phases(problem, start, solve_once)

@@ -3,7 +3,7 @@ turn.
 
 1. The problem with a smooth field in place of the two phases is solved.
 2. At that solution the measurements are linearised in the logarithm of every element, and phases
-are sampled from their posterior, see `statistics.phases`.
+are sampled from their posterior, see `statistics.phase_sampling`.
 3. With the more likely phase of every element the problem is solved for the contrast and all other
 parameters by the chosen method. Steps 2 and 3 repeat until only a small share of the volume changes
 its phase.
@@ -17,19 +17,19 @@ from pathlib import Path
 
 import numpy as np
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.constants import CONTRAST, field_coefficient
 from ..fem.two_phase import ElementLogarithms, PhaseSamples, TwoPhaseModes, is_inclusion
 from ..methods.solution import Solution
 from ..problem import Problem
-from ..program.charts import MarkerAssociation
 from ..program.collocation import Collocation
+from ..program.marker_association import MarkerAssociation
 from ..recording.experiment import Experiment
-from ..statistics.fields import mean_logarithm
+from ..statistics.field_estimates import mean_logarithm
 from ..statistics.linearised import LinearisedFit, factorise_information, linearise_fit
-from ..statistics.phases import (
+from ..statistics.phase_sampling import (
     USUAL,
     ElementInformation,
     InternalFaces,
@@ -94,7 +94,7 @@ class _SmoothFitQuality:
     determined: float
 
     def lack_of_fit(self, chi_squared: float) -> float:
-        """Return T of `statistics.phases`, at least one, of an answer with this χ²."""
+        """Return T of `statistics.phase_sampling`, at least one, of an answer with this χ²."""
         return max(1.0, (chi_squared - self.chi_squared) / max(1.0, self.determined))
 
 

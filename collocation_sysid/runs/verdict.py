@@ -1,4 +1,4 @@
-"""Concerns about a finished run, from which its verdict follows, see `statistics.trust`."""
+"""Concerns about a finished run, from which its verdict follows, see `statistics.assessment`."""
 
 from __future__ import annotations
 
@@ -6,24 +6,18 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ..arrays import root_mean
+from ..array_types import root_mean
 from ..errors import SimulationError
 from ..methods.solution import Solution, Status, pooled_wrench_rms
 from ..model.parameters import Parameters
 from ..model.schemes import as_scheme
 from ..problem import Problem
+from ..program.contact_summary import contact_summaries_of_parts
 from ..program.depth_comparison import DepthError, SurfaceComparison
 from ..program.stability import find_instabilities
-from ..program.touches import contact_summaries_of_parts
+from ..recording.grasp_rotation import DOUBTFUL_ANGLE_RAD
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN, TIME
-from ..recording.turning import DOUBTFUL_ANGLE_RAD
-from ..statistics.budget import source_label
-from ..statistics.concern import Concern
-from ..statistics.diagnostics import MarkerDiagnosis
-from ..statistics.plausible import material_hypothesis, size_and_density_hypotheses
-from ..statistics.remedies import remedy_for
-from ..statistics.scale import scale_concerns
-from ..statistics.trust import (
+from ..statistics.assessment import (
     camera_pose_concerns,
     clock_concerns,
     contact_concerns,
@@ -39,10 +33,16 @@ from ..statistics.trust import (
     scheme_concerns,
     stability_concerns,
 )
+from ..statistics.concerns import Concern
+from ..statistics.plausibility import material_hypothesis, size_and_density_hypotheses
+from ..statistics.remedies import remedy_for
+from ..statistics.residual_diagnostics import MarkerDiagnosis
+from ..statistics.scale_identifiability import scale_concerns
 from ..statistics.uncertainty import Uncertainty
-from .check.motion import ModesCheck, check_modes
+from ..statistics.uncertainty_budget import source_label
+from .check.modes_check import ModesCheck, check_modes
 from .forward_simulation import ForwardSimulation
-from .result import ReportedEstimate
+from .result_content import ReportedEstimate
 
 # Largest noise of cameras, relative to the size of the body.
 LARGEST_CAMERA_NOISE = 0.01

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import InputError
 from ..files import RESULT_FILE, damage_refused
+from ..methods.initial_trajectories import simulate_trajectories
 from ..methods.solution import Solution
-from ..methods.start import simulate_trajectories
 from ..problem import Problem
 from ..program.collocation import Collocation
-from ..program.segment import Transcription
+from ..program.transcription import Transcription
 from ..statistics.linearised import parameter_values
-from .result import Result
+from .result_content import Result
 
 
 @dataclass(frozen=True)

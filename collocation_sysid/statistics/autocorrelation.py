@@ -33,11 +33,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import matmul_toeplitz
 
-from ..arrays import Array
+from ..array_types import Array
 from .distributions import chi2_sf, normal_isf
 from .linearised import Information, LinearisedFit, ResidualBlock
-from .noise import ROUNDING
-from .spatial import estimate_spatial_correlation
+from .noise_level import ROUNDING
+from .spatial_correlation import estimate_spatial_correlation
 
 Mask = NDArray[np.bool_]
 

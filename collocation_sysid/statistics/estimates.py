@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..array_types import Array
 from ..fem.constants import (
     MODE,
     SHARE,
@@ -28,8 +28,8 @@ from ..fem.constants import (
 from ..model.parameters import Parameter, Parameters
 from .autocorrelation import Dependence
 from .linearised import DerivedModuli, LinearisedFit
-from .noise import Noise, NoiseLevel
-from .scatter import RecordingComparison
+from .noise_level import Noise, NoiseLevel
+from .recording_scatter import RecordingComparison
 
 Mask = NDArray[np.bool_]
 

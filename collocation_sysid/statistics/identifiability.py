@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import listed
 from ..fem.constants import is_field_coefficient, without_region
 from ..fem.moduli import ELASTIC

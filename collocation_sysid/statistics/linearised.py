@@ -22,15 +22,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..array_types import Array
 from ..fem.kernels import map_experiments
 from ..model.parameters import ThetaMap
 from ..program.collocation import Collocation, ExperimentIterate
 from ..program.lapack import one_blas_thread
 from ..program.least_squares import SquareRootInformation
-from ..program.reaction import GraspForces
-from ..program.reading import huber_as_weights
-from ..program.sensing import ObservableResponse
+from ..program.measurement_residual import huber_as_weights
+from ..program.observation import ObservableResponse
+from ..program.reaction_forces import GraspForces
 from ..program.sweep import Sweep
 
 

@@ -11,11 +11,11 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ..arrays import Array
+from ..array_types import Array
 from ..recording.experiment import Experiment
 from ..recording.obstacle import Obstacle
-from ..recording.solids import Plane
-from .hypothesis import Hypothesis
+from ..recording.obstacle_solids import Plane
+from .misspecification_hypothesis import Hypothesis
 
 # Depth in a solid from which on a node is inside, over the body's diagonal.
 DEEP = 0.01

@@ -1,10 +1,10 @@
 """Tests of two assumptions in every solve: constant stiffness, and clocks of equal rate.
 
 A drift of the stiffness and a rate of the cameras' clock join the linearised fit as one more column
-each, see `relaxation`. The uncertainty budget needs these columns anyway, so that a probe costs one
-least-squares problem and no simulation. `deep_probes` (``solve --probe``) relaxes all other
-assumptions,
-refits parts of the data, and follows effects that are too large for one linear step.
+each, see `relaxed_assumptions`. The uncertainty budget needs these columns anyway, so that a probe
+costs one least-squares problem and no simulation. `deep_probes` (``solve --probe``) relaxes all
+other assumptions, refits parts of the data, and follows effects that are too large for one linear
+step.
 
 A probe is *significant* if its amplitude is farther from zero than noise explains, and *relevant*
 if relaxing the assumption changes what is reported. Only what is both gives concern, see
@@ -18,10 +18,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ..recording.nuisance import CLOCK_RATE
-from .assumptions import ASSUMPTIONS
-from .considered import ResidualChanges
+from .consider_analysis import ResidualChanges
 from .distributions import normal_isf
-from .relaxation import DRIFT, Probe, SolvedFit, relaxed_probe, with_relaxed_assumption
+from .relaxed_assumptions import DRIFT, Probe, SolvedFit, relaxed_probe, with_relaxed_assumption
+from .systematic_effects import ASSUMPTIONS
 
 # Assumptions that are probed in every solve: both can be wrong while the residuals look white, bias
 # the estimates, and are determined by a single recording.

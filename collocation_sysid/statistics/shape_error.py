@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
 
-from ..arrays import Array, Index
+from ..array_types import Array, Index
 from ..fem.body import Body
 from ..fem.mesh import ElementNodes
 from ..fem.node_force import surface_shares

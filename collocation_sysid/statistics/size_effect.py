@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Array
+from ..array_types import Array
 from ..model.contact import Contact
-from ..program.part import ExperimentIterate
+from ..program.experiment_iterate import ExperimentIterate
 from ..recording.obstacle import Obstacle
 
 # Rows whose gaps are evaluated together.

@@ -8,10 +8,9 @@ the priors, the error of the estimate is A⁻¹ Sᵀe, A = SᵀS + PᵀP, with t
 The block of the shared parameters q is reported; nuisance parameters of single experiments widen it
 by what they could have explained. For independent errors of the stated σ, C is A⁻¹. If the
 residuals are larger or smaller than σ, Cov(e) = s² I with their variance s², and where markers
-differ each has its own variance (see `noise`); intervals are then Student's. If a test finds the
-residuals correlated, in time or among markers, Cov(e) is that of `process_autocorrelation`. The
-output
-states which was used.
+differ each has its own variance (see `noise_level`); intervals are then Student's. If a test finds
+the residuals correlated, in time or among markers, Cov(e) is that of `process_autocorrelation`. The
+output states which was used.
 
 Use `uncertainty_at` at a solution, or `uncertainty_from_fit` where the linearised fit is known.
 Estimated
@@ -27,15 +26,14 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array
-from ..checked import Options
+from ..array_types import Array
 from ..errors import InputError
 from ..fem.constants import constant_named, is_damping
 from ..model.parameters import Parameters
 from ..program.collocation import Collocation, ExperimentIterate
 from ..program.lapack import one_blas_thread
+from ..validated_types import Options
 from .autocorrelation import Dependence, analyse_dependence, error_processes, score_covariance
-from .diagnostics import Outlier, remove_outliers
 from .distributions import student_ppf
 from .estimates import (
     UNDETERMINED,
@@ -57,9 +55,21 @@ from .linearised import (
     least_squares_of_fit,
     linearise_fit,
 )
-from .noise import Noise, NoiseLevel, disturbance_samples, estimate_noise_level, project_errors
+from .noise_level import (
+    Noise,
+    NoiseLevel,
+    disturbance_samples,
+    estimate_noise_level,
+    project_errors,
+)
 from .pose_noise import with_pose_noise
-from .scatter import RecordingComparison, blocks_by_recording, compare_recordings, single_fits
+from .recording_scatter import (
+    RecordingComparison,
+    blocks_by_recording,
+    compare_recordings,
+    single_fits,
+)
+from .residual_diagnostics import Outlier, remove_outliers
 
 Errors = Literal["independent", "autocorrelated"]
 

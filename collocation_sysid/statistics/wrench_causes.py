@@ -13,18 +13,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Array
+from ..array_types import Array
 from ..errors import InputError, SimulationError
 from ..methods.continuation import first_samples
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
-from ..program.channel import ReactionForces
 from ..program.collocation import Collocation, ExperimentIterate
-from ..program.segment import Transcription
-from ..program.wrench import WrenchResidual, without_grasp_sensors
-from ..recording.wrench import Frame, Wrench
+from ..program.observables import ReactionForces
+from ..program.transcription import Transcription
+from ..program.wrench_residual import WrenchResidual, without_grasp_sensors
+from ..recording.measured_wrench import Frame, Wrench
 from .axes import OTHER_AXES
-from .hypothesis import Hypothesis, HypothesisTest
+from .misspecification_hypothesis import Hypothesis, HypothesisTest
 
 # RMS residual in standard deviations that needs an explanation; a correct description must leave
 # less.

@@ -54,7 +54,7 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.recording import prescribed_nodes
 from collocation_sysid.recording.nuisance import Nuisance
-from collocation_sysid.result.style import (
+from collocation_sysid.result.figure_style import (
     BLACK,
     BLUE,
     GREEN,
@@ -66,9 +66,9 @@ from collocation_sysid.result.style import (
     new_figure,
 )
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.statistics.diagnostics import diagnose_markers
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.profile import profile_of_solution
+from collocation_sysid.statistics.profile_likelihood import profile_of_solution
+from collocation_sysid.statistics.residual_diagnostics import diagnose_markers
 from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_from_fit
 
 mpl.rcParams["figure.dpi"] = 110

@@ -41,7 +41,7 @@ from .threads import (
 )
 
 if TYPE_CHECKING:
-    from ...arrays import Index
+    from ...array_types import Index
     from .skyline import SkylineFactorisation
 
 __all__ = [

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Array, Index
+from ...array_types import Array, Index
 
 
 class CombinationPlan(Protocol):

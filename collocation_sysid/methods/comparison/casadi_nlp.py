@@ -26,13 +26,13 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from ...arrays import Array
-from ...checked import Count, Options, Positive
+from ...array_types import Array
 from ...program.collocation import Collocation
+from ...validated_types import Count, Options, Positive
 from .. import nlpsol
 from ..callbacks import HessianValues, NlpFunctions
-from ..recorder import Recorder
 from ..solution import Solution, Status, Watch
+from ..solve_recorder import Recorder
 
 Hessian = Literal["gauss-newton", "exact"]
 

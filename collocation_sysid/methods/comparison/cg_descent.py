@@ -19,7 +19,7 @@ from typing import Literal
 
 import numpy as np
 
-from ...arrays import Array
+from ...array_types import Array
 
 ValueAndGradient = Callable[[Array], tuple[float, Array]]
 

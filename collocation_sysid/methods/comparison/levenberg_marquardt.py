@@ -20,7 +20,7 @@ import scipy.sparse as sp
 from scipy.linalg import cholesky, get_lapack_funcs, solve_triangular
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from ...arrays import Array, Index
+from ...array_types import Array, Index
 from ...errors import InputError
 from ...program.lapack import cholesky_in_place, one_blas_thread
 from ...program.least_squares import SquareRootInformation

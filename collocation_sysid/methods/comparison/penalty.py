@@ -24,12 +24,12 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from ...arrays import Array
-from ...checked import AboveOne, AtLeastOne, Count, Options, Positive
+from ...array_types import Array
 from ...errors import InputError
 from ...program.collocation import Collocation
-from ..recorder import Recorder, SearchEnded
+from ...validated_types import AboveOne, AtLeastOne, Count, Options, Positive
 from ..solution import Solution, Status, Watch
+from ..solve_recorder import Recorder, SearchEnded
 from .inner import FIRST_ORDER, Inner, minimise_merit
 from .merit import MeritFunction, PenaltyProblem
 

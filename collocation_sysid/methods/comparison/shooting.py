@@ -23,15 +23,15 @@ from typing import ClassVar, Literal
 import numpy as np
 from scipy.optimize import least_squares, minimize
 
-from ...arrays import Array
-from ...checked import Count, Options, Positive
+from ...array_types import Array
 from ...errors import SimulationError
 from ...program.collocation import Collocation
 from ...program.stopwatch import Stopwatch
+from ...validated_types import Count, Options, Positive
 from ..horizon import Horizon
-from ..recorder import Recorder, SearchEnded
+from ..initial_trajectories import complete_variables, simulate_trajectories
 from ..solution import Solution, Status, Watch, constraint_multipliers
-from ..start import complete_variables, simulate_trajectories
+from ..solve_recorder import Recorder, SearchEnded
 
 # Relative decrease of the loss, or of one of a standard deviation, that is rounding.
 ROUNDING = 1e-14

@@ -1,8 +1,9 @@
-"""File formats of recordings; they are used through `recording.readers`, `pose_files` and `tables`.
+"""File formats of recordings; they are used through `recording.marker_files`, `pose_files` and
+`time_tables`.
 
 - `text`, `columns`, `units`: CSV tables, columns recognised by name, units.
-- `tracks_of_table`: marker tracks as they are in a file; `c3d`, `trc`, `qualisys`, `motive` and
-  `plain` read
+- `raw_tracks`: marker tracks as they are in a file; `c3d`, `trc`, `qualisys`, `motive` and
+  `plain_csv` read
 the formats.
 - `logs`, `topics`: logs of robots (ROS bags, MCAP, LeRobot), and the tables in their topics.
 - `depth_files`, `depth_messages`, `ply`: depth images and clouds of points, from files and logs.

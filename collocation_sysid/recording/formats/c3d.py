@@ -9,9 +9,9 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from ...apart import Failed, ProcessLimits, computed_apart
 from ...errors import InputError
-from .tracks import LabelChooser, RawTracks
+from ...isolated_process import Failed, ProcessLimits, computed_apart
+from .raw_tracks import LabelChooser, RawTracks
 from .units import length_unit_of_text
 
 # Second byte of every C3D file.

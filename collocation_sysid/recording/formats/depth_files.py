@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ...array_files import load_array, load_arrays
-from ...arrays import Array
+from ...array_types import Array
 from ...errors import InputError, located
 from ...files import reason, require_regular
 from . import ply

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import Array
+from ...array_types import Array
 from ...errors import InputError
 from ...files import reason
 

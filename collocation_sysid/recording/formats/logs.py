@@ -19,7 +19,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ...arrays import Array
+from ...array_types import Array
 from ...errors import InputError, hint_at
 from ...files import reason, require_regular
 

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ...errors import InputError
+from .raw_tracks import Header, LabelChooser, RawTracks, tracks_of_table
 from .text import Row, separated_rows, table_of_rows
-from .tracks import Header, LabelChooser, RawTracks, tracks_of_table
 from .units import length_unit_of_text
 
 BEGINNING = "Format Version"

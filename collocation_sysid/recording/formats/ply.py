@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...array_types import Array
 from ...errors import InputError
 from ...fem.meshio_reader import read_content
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 
 from ...errors import InputError
+from .raw_tracks import Header, LabelChooser, RawTracks, tracks_of_frames
 from .text import Row, tab_rows
-from .tracks import Header, LabelChooser, RawTracks, tracks_of_frames
 
 BEGINNING = "NO_OF_"
 _KEY = re.compile(r"(?!NAN$)[A-Z][A-Z0-9_]*")

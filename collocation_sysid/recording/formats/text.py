@@ -18,10 +18,10 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
-from ...arrays import Array
+from ...array_types import Array
 from ...errors import InputError, excerpt, located
 from ...files import require_regular
-from ..clock import first_unordered_time
+from ..sample_times import first_unordered_time
 from .logs import TopicAddress
 from .topics import topic_as_csv
 from .units import UNITS, si_factor

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import Array
+from ...array_types import Array
 from ...errors import InputError, hint_at
 from ...files import require_regular
 from .depth_messages import depth_kind, is_camera_model

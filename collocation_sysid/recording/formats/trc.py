@@ -7,8 +7,8 @@ Units …); line 4 Frame#, Time and the marker names, line 5 X1, Y1, Z1 …; the
 from __future__ import annotations
 
 from ...errors import InputError
+from .raw_tracks import Header, LabelChooser, RawTracks, tracks_of_frames
 from .text import tab_rows
-from .tracks import Header, LabelChooser, RawTracks, tracks_of_frames
 from .units import length_unit_of_text
 
 BEGINNING = "PathFileType"

@@ -2,9 +2,8 @@
 
 `export_run` writes the files of a target in `TARGETS`, `verify_export` runs the target and compares
 its prediction with that of this package. One module per simulator: `mujoco`, `newton`, `usd`,
-`sofa`,
-`febio` and `calculix`. For all of them, `identified` reads the body from a run folder, `target`
-describes what a simulator can express, and `solids` converts obstacles.
+`sofa`, `febio` and `calculix`. For all of them, `identified` reads the body from a run folder,
+`export_target` describes what a simulator can express, and `obstacle_shapes` converts obstacles.
 """
 
 from __future__ import annotations
@@ -17,11 +16,11 @@ from pathlib import Path
 from ...display import Table
 from ...errors import InputError, hint_at
 from ...recording import write_poses_csv
-from ...tree import as_json
-from ..writers import run_folder
+from ...serialisation import as_json
+from ..run_writers import run_folder
 from . import calculix, febio, mujoco, newton, sofa, usd
+from .export_target import Comparison, Exported, Target
 from .identified import Identified
-from .target import Comparison, Exported, Target
 
 NUMBERS = "identified.json"
 

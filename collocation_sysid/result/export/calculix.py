@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ...arrays import Array
+from ...array_types import Array
 from ...errors import InputError
+from .export_target import Comparison, Exported, Holds, at_rest, heading, longest
 from .identified import Identified, IdentifiedRegion
-from .solids import Wall, walls
-from .target import Comparison, Exported, Holds, at_rest, heading, longest
+from .obstacle_shapes import Wall, walls
 
 DECK = "body.inp"
 # Time after which a run of CalculiX is stopped.

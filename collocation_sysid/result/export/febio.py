@@ -8,10 +8,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...arrays import Index
+from ...array_types import Index
+from .export_target import Exported, Holds, heading, numbers
 from .identified import Identified, IdentifiedRegion
-from .solids import Wall, walls
-from .target import Exported, Holds, heading, numbers
+from .obstacle_shapes import Wall, walls
 
 MODEL = "body.feb"
 # Number of the volumetric energy ½ κ (J − 1)² among those of an uncoupled material.

@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Array, Index
+from ...array_types import Array, Index
 from ...errors import InputError, listed, located
 from ...fem.body import Body
 from ...fem.moduli import engineering_constants
 from ...problem import Problem
 from ...recording import Experiment, Markers, Obstacle
-from ...recording.solids import solid_key
-from ...runs.result import ReportedEstimate, Result
+from ...recording.obstacle_solids import solid_key
+from ...runs.result_content import ReportedEstimate, Result
 from ...runs.warm_start import WarmStart
 from ..replay import Replay, read_arrays, reading_run
 

@@ -13,14 +13,14 @@ from scipy.linalg import eigh
 from scipy.sparse.linalg import eigsh
 from scipy.spatial.transform import Rotation
 
-from ...arrays import Array
+from ...array_types import Array
 from ...errors import InputError
 from ...model.forces import Forces
-from ...program.modes import natural_modes
+from ...program.natural_modes import natural_modes
 from ...recording import Grasp, Solid
+from .export_target import Comparison, Exported, Holds, attribute, heading, linear_cells, numbers
 from .identified import Identified
-from .solids import Primitive, grown
-from .target import Comparison, Exported, Holds, attribute, heading, linear_cells, numbers
+from .obstacle_shapes import Primitive, grown
 
 MODEL = "body.xml"
 # Oldest major version: with 3.3 to 3.8 and 3.17 the first natural frequency is 10 % too high, with

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from ...recording import Obstacle
-from ...tree import content
+from ...serialisation import content
+from .export_target import Exported, Holds, heading, linear_cells
 from .identified import Identified
-from .solids import OneContact, Primitive, walls
-from .target import Exported, Holds, heading, linear_cells
+from .obstacle_shapes import OneContact, Primitive, walls
 
 MODULE = "body.py"
 NUMBERS = "body.json"

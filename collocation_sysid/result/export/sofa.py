@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ...errors import InputError
+from .export_target import Exported, Holds, heading, numbers
 from .identified import Identified, IdentifiedRegion
-from .solids import Primitive, grown, walls
-from .target import Exported, Holds, heading, numbers
+from .obstacle_shapes import Primitive, grown, walls
 
 SCENE = "body.scn"
 PLUGINS = (

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...arrays import Array, Index
+from ...array_types import Array, Index
 from ...errors import InputError, printable
 from ...recording import Grasp, Obstacle
+from .export_target import Comparison, Exported, Holds, at_rest, heading, linear_cells, longest
 from .identified import Identified, IdentifiedRegion
-from .solids import OneContact, Primitive, walls
-from .target import Comparison, Exported, Holds, at_rest, heading, linear_cells, longest
+from .obstacle_shapes import OneContact, Primitive, walls
 
 STAGE = "body.usda"
 OWN = "collocationSysid"

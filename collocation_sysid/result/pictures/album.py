@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from ...arrays import Array
+from ...array_types import Array
 from ...files import safe_name, whole_file
-from ...recording.wrench import COMPONENTS, UNITS
-from ...runs.result import Result
+from ...recording.measured_wrench import COMPONENTS, UNITS
+from ...runs.result_content import Result
+from ..figure_style import RESOLUTION_DPI
 from ..replay import Replay, read_run, reading_run
-from ..style import RESOLUTION_DPI
 from .confidence import Confidence, budget_picture, confidence_ellipses, correlation_matrix
-from .depth import depth_picture
-from .field import field_picture
-from .mesh import elements_picture, mesh_picture
+from .depth_comparison_picture import depth_picture
+from .field_intervals import field_picture
+from .mesh_pictures import elements_picture, mesh_picture
 from .over_time import error_over_time, readings_picture, tracks
-from .search import convergence, scan_picture
+from .search_pictures import convergence, scan_picture
 from .shapes import contact_shapes, shapes
 from .spectrum import spectrum
 

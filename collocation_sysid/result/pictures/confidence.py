@@ -11,11 +11,11 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from scipy.stats import chi2, norm
 
-from ...arrays import Array
-from ...runs.result import Result
-from ...statistics.budget import main_sources, source_label
+from ...array_types import Array
+from ...runs.result_content import Result
 from ...statistics.estimates import correlation_from_covariance
-from ..style import (
+from ...statistics.uncertainty_budget import main_sources, source_label
+from ..figure_style import (
     BLACK,
     BLUE,
     COLUMN_MM,

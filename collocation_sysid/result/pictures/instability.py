@@ -7,9 +7,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from ...program.lost_stability import LostStability
-from ..style import PAGE_MM, SMALL_PT
-from .camera import Camera
+from ...program.loss_of_stability import LostStability
+from ..figure_style import PAGE_MM, SMALL_PT
+from .projection import Camera
 from .scene import Drawn, View, draw_directions, draw_scale, sheet, width_over_height
 from .shapes import COLOURS
 

@@ -12,10 +12,10 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from ...arrays import Array
+from ...array_types import Array
 from ...program.collocation import Collocation
 from ...runs.check.derivatives import shortened_experiment
-from ..style import PAGE_MM, SMALL_PT, dress, framed_figure, mathematical
+from ..figure_style import PAGE_MM, SMALL_PT, dress, framed_figure, mathematical
 
 # Timesteps shown: enough to see the band, few enough to see its blocks.
 SHOWN_STEPS = 6

@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ...arrays import Array
-from ..style import (
+from ...array_types import Array
+from ..figure_style import (
     BLACK,
     BLUE,
     COLUMN_MM,

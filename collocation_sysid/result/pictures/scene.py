@@ -15,9 +15,9 @@ from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
-from ...arrays import Array
-from ..style import BLACK, BLUE, SMALL_PT, VERMILION, Picture
-from .camera import Camera, Triangles
+from ...array_types import Array
+from ..figure_style import BLACK, BLUE, SMALL_PT, VERMILION, Picture
+from .projection import Camera, Triangles
 
 EDGE = "#5A6B7B"
 # Colours of the parts of a body, repeated for further parts.

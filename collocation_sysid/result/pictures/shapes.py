@@ -15,13 +15,13 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ...arrays import Array, Index
+from ...array_types import Array, Index
 from ...errors import InputError, hint_at
 from ...fem.body import Body
-from ..fields import ElementFields
+from ..element_fields import ElementFields
+from ..figure_style import PAGE_MM, SMALL_PT
 from ..replay import Replay
-from ..style import PAGE_MM, SMALL_PT
-from .camera import ELEVATION_DEG, Camera
+from .projection import ELEVATION_DEG, Camera
 from .scene import Drawn, View, draw_directions, draw_key, draw_scale, key, sheet, with_outlines
 
 SHOWN = 6

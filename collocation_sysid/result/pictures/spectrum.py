@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import periodogram
 
-from ...arrays import Array
-from ..style import (
+from ...array_types import Array
+from ..figure_style import (
     BLACK,
     BLUE,
     COLUMN_MM,

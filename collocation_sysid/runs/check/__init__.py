@@ -1,8 +1,8 @@
 """Check of a problem before it is solved: contents, cost, and likely mistakes.
 
 `check_problem` does everything, `quick_check` what takes no simulation. The modules contribute
-`body`
-(meshes and grasps), `measurements`, `motion` (natural modes and the time grid), `cost` and
+`body_check`
+(meshes and grasps), `measurements`, `modes_check` (natural modes and the time grid), `cost` and
 `derivatives`. Every warning is one sentence that ends with the remedy.
 """
 
@@ -13,31 +13,38 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-from ...arrays import Array
+from ...array_types import Array
+from ...methods.initial_trajectories import initial_variables
 from ...methods.reduced_space import ReducedSpace
-from ...methods.scan import SOFT_PA, start_problem, typical_constants, typical_parameters
-from ...methods.start import initial_variables
+from ...methods.stiffness_scan import SOFT_PA, start_problem, typical_constants, typical_parameters
 from ...model.schemes import as_scheme
 from ...problem import Problem
 from ...program.collocation import Collocation
+from ...program.contact_summary import contact_summaries_of_parts
 from ...program.stability import Instability, find_instabilities
-from ...program.touches import contact_summaries_of_parts
-from ...statistics.cameras import camera_hypotheses
-from ...statistics.concern import Concern
-from ...statistics.hypothesis import Hypothesis, rank
-from ...statistics.modal import find_misspecifications_by_modes
-from ...statistics.numerical import MOST_SUBSTEPS
+from ...serialisation import content
+from ...statistics.assessment import contact_concerns, rotation_step_concerns, stability_concerns
+from ...statistics.camera_misspecifications import camera_hypotheses
+from ...statistics.concerns import Concern
+from ...statistics.discretisation_error import MOST_SUBSTEPS
+from ...statistics.misspecification_hypothesis import Hypothesis, rank
+from ...statistics.modal_misspecifications import find_misspecifications_by_modes
 from ...statistics.placement_causes import placement_mistakes
-from ...statistics.plausible import size_and_density_hypotheses
-from ...statistics.scale import scale_concerns, static_concerns
-from ...statistics.trust import contact_concerns, rotation_step_concerns, stability_concerns
+from ...statistics.plausibility import size_and_density_hypotheses
+from ...statistics.scale_identifiability import scale_concerns, static_concerns
 from ...statistics.wrench_causes import CHECKED_SAMPLES, wrench_mistakes
-from ...tree import content
-from .body import BodyCheck, ElementShape, GraspCheck, check_body, check_grasps, grasp_concerns
+from .body_check import (
+    BodyCheck,
+    ElementShape,
+    GraspCheck,
+    check_body,
+    check_grasps,
+    grasp_concerns,
+)
 from .cost import MethodCost, cost_concerns, cost_notes, method_costs, nonzeros
 from .derivatives import derivative_errors, shortened_problem
 from .measurements import MarkerCheck, RecordingCheck, check_recording, recording_concerns
-from .motion import ModeCheck, ModesCheck, check_modes, mode_concerns, mode_notes
+from .modes_check import ModeCheck, ModesCheck, check_modes, mode_concerns, mode_notes
 
 __all__ = [
     "BodyCheck",

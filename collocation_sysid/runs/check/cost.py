@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...array_types import Array
 from ...errors import InputError, SimulationError
 from ...machine import machine_memory_mb
 from ...methods.interior_point import InteriorPoint
@@ -18,7 +18,7 @@ from ...problem import Problem
 from ...program.collocation import Collocation
 from ...program.factorisation import Choice
 from ...program.sweep import Sweep
-from ...statistics.concern import Concern
+from ...statistics.concerns import Concern
 from .derivatives import first_sample_count, shortened_experiment, shortened_problem
 
 # Memory per nonzero [bytes]: IPOPT with MUMPS, midpoint, 60 to 170 nodes and 80 to 100 steps.

@@ -9,14 +9,14 @@ from functools import partial
 
 import numpy as np
 
-from ...arrays import Array
+from ...array_types import Array
 from ...model.contact import contact_terms
 from ...problem import Problem
 from ...program.collocation import Collocation, convert_variables
-from ...recording.depth import until_all_cameras_see
+from ...recording.depth_camera import until_all_cameras_see
 from ...recording.experiment import Experiment
-from ...recording.tables import FEWEST_SHARED_SAMPLES
-from ...recording.wrench import Wrench
+from ...recording.measured_wrench import Wrench
+from ...recording.time_tables import FEWEST_SHARED_SAMPLES
 
 # First samples of a motion that contain all kinds of equations; more would not change derivatives.
 SAMPLES = 12

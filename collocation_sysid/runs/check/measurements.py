@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import Array
+from ...array_types import Array
 from ...recording.experiment import Experiment
-from ...statistics.concern import Concern, concern_if
-from .body import BodyCheck
+from ...statistics.concerns import Concern, concern_if
+from .body_check import BodyCheck
 
 # Distance of a marker from the body, in mean edges, above which its place is mostly extrapolated.
 LARGEST_DISTANCE_EDGES = 0.5

@@ -1,0 +1,245 @@
+"""Commands made from dataclasses of options; an option is declared once, as a field.
+
+The help text of an option is in the section "Attributes" of its class, as for the options of a
+method. There, in place of the type, names of the option other than the field's can be given, such
+as
+-v, and the placeholder that help shows for the value, such as FILE. Options that several commands
+share are annotated with both instead. Help lists the options of a class before those of its bases.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from copy import copy
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import cache, reduce
+from operator import or_
+from pathlib import Path
+from types import UnionType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+import typer
+from rich.text import Text
+from typer.models import OptionInfo, ParameterInfo
+
+from ..declarations import attributes
+from ..display import Shown
+from ..errors import InputError
+from ..serialisation import as_json
+from ..validated_types import Options
+from .common import errors, show
+
+if TYPE_CHECKING:
+    from ..problem import Problem  # which takes a second to import
+
+T = TypeVar("T")
+
+ProblemPath = Annotated[Path, typer.Argument(metavar="PROBLEM.toml", help="The problem file.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Override a key, such as parameters.mu_pa.guess=200."
+    ),
+]
+AllowCode = Annotated[
+    bool, typer.Option("--allow-code", help="Run Python files that the problem names.")
+]
+OneExperiment = Annotated[
+    str | None,
+    typer.Option("--experiment", metavar="NAME", help="Experiment; by default the first."),
+]
+Out = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Where to write.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+
+
+def command(group: typer.Typer, *shown: str) -> Callable[[Callable[[Any], None]], Any]:
+    """Return a decorator that registers a function of a dataclass of options as a command.
+
+    Parameters
+    ----------
+    group : Typer
+        Group of commands, to which the command is added.
+    *shown : str
+        Examples of arguments, shown below the help.
+    """
+
+    def registered(function: Callable[[Any], None]) -> Callable[[Any], None]:
+        """Register the function in `group`, and return it unchanged."""
+        (kind,) = (each for name, each in get_type_hints(function).items() if name != "return")
+        parameters = [*_parameters(kind)]
+
+        def called(**values: Any) -> None:
+            function(_built(kind, values))
+
+        called.__name__ = function.__name__
+        called.__doc__ = function.__doc__
+        called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        called.__annotations__ = {each.name: each.annotation for each in parameters}
+        lines = "".join(f"\n  collocation-sysid {each}" for each in shown)
+        group.command(epilog=f"\b\nExamples:{lines}")(called)  # kept as they are
+        return function
+
+    return registered
+
+
+def _parameters(kind: type) -> Iterator[inspect.Parameter]:
+    """Yield the parameters of a command, from which typer makes its options.
+
+    A field that is itself a dataclass of options yields one parameter for each of its fields.
+    """
+    documented = attributes(kind)
+    for name, default, hint, marks in _typed_fields(kind):
+        if is_dataclass(hint):
+            yield from _parameters(hint)  # type: ignore[arg-type]
+            continue
+        infos = (copy(mark) for mark in marks if isinstance(mark, ParameterInfo))
+        info = next(infos, None) or typer.Option()
+        if info.help is None:
+            written, info.help = documented[name]
+            info.metavar = next(
+                (w for w in written.split() if w[0].isupper() or w[0].isdigit()), None
+            )
+            if isinstance(info, OptionInfo):
+                info.param_decls = _names(name, default, written)
+        yield inspect.Parameter(
+            name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=inspect.Parameter.empty if default is MISSING else default,
+            annotation=Annotated[hint, info],
+        )
+
+
+def _names(field: str, default: Any, written: str) -> list[str]:
+    """Return the names of an option on the command line.
+
+    Parameters
+    ----------
+    field : str
+        Name of the field.
+    default : object
+        Default value; an option that is on by default gets a name to switch it off.
+    written : str
+        Type of the field in the docstring, which may contain names that begin with "-".
+    """
+    option = field.strip("_").replace("_", "-")
+    names = [word for word in written.split() if word.startswith("-")]
+    if not any(word.startswith("--") for word in names):
+        names.insert(0, f"--{option}" + (default is True) * f"/--no-{option}")
+    return names
+
+
+def _built(kind: type[T], values: Mapping[str, Any]) -> T:
+    """Return the options of a command from their values by name.
+
+    Parameters
+    ----------
+    kind : type
+        Dataclass of options; fields that are dataclasses of options are made from the same values.
+    values : mapping of name to value
+
+    Raises
+    ------
+    InputError
+        Naming the option as it is written on the command line.
+    """
+    content = {
+        name: _built(hint, values) if is_dataclass(hint) else values[name]  # type: ignore[arg-type]
+        for name, _, hint, _ in _typed_fields(kind)
+    }
+    try:
+        return kind(**content)
+    except InputError as error:
+        fields_ = {name: default for name, default, _, _ in _typed_fields(kind)}
+        if error.where not in fields_:
+            raise
+        written = attributes(kind).get(error.where, ("", ""))[0]
+        names = _names(error.where, fields_[error.where], written)
+        raise InputError(error.message, None, names[0]) from error
+
+
+@cache
+def _typed_fields(kind: type) -> list[tuple[str, Any, Any, tuple[Any, ...]]]:
+    """Return name, default, type and annotations of each field, those of a class before its bases'.
+
+    A type that allows None is replaced by the type without None.
+    """
+    hints = get_type_hints(kind, include_extras=True)
+    defaults = {field.name: field.default for field in fields(kind)}  # type: ignore[arg-type]
+    order = (name for base in kind.__mro__ for name in inspect.get_annotations(base))
+    listed = []
+    for name in dict.fromkeys(name for name in order if name in defaults):
+        annotated = get_origin(hints[name]) is Annotated
+        hint, *marks = get_args(hints[name]) if annotated else (hints[name],)
+        if get_origin(hint) in (Union, UnionType):  # of what may be None
+            kinds = (
+                get_args(one)[0] if get_origin(one) is Annotated else one for one in get_args(hint)
+            )
+            hint = reduce(or_, kinds)
+        listed.append((name, defaults[name], hint, tuple(marks)))
+    return listed
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfProblem:
+    """Options that name a problem file and change its keys."""
+
+    problem: ProblemPath
+    set_: Overrides = None
+    allow_code: AllowCode = False
+
+    def read(self, simulation: bool = False) -> Problem:
+        """Read the problem file with the changes of the command line.
+
+        Notes are printed on stderr unless the command is quiet. With `simulation`, measurements may
+        be
+        missing.
+        """
+        with errors.status(f"reading {self.problem}"):
+            from ..problem import Problem
+
+            def say(sentence: str) -> None:
+                if not getattr(self, "quiet", False):
+                    errors.print(Text(sentence, style="dim"), soft_wrap=True)
+
+            return Problem.read(
+                self.problem, self.set_ or (), self.allow_code, simulation=simulation, say=say
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfRun:
+    """Options that name a run folder.
+
+    Attributes
+    ----------
+    run_folder : RUN
+        A run folder.
+    """
+
+    run_folder: Annotated[Path, typer.Argument()]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Told(Options):
+    """Options for the form of the result and of the progress."""
+
+    as_json: AsJson = False
+    quiet: Quiet = False
+
+    def tell(self, answer: Any, shown: Shown | Iterable[Shown]) -> None:
+        """Print the result as JSON if requested, or else its tables and lines `shown`."""
+        if self.as_json:
+            typer.echo(as_json(answer))
+        else:
+            show(shown)

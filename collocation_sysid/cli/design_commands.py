@@ -1,0 +1,100 @@
+"""The command `design_motion`, which finds the motion that makes the error bars smallest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import typer
+
+from ..errors import InputError
+from ..files import require_possible, run_name
+from ..plan.design import DesignCriterion, DesignOptions, Limits
+from ..plan.design import design_motion as designed
+from ..plan.design.predicted_information import Kind, Over
+from ..result.run_writers import require_replaceable
+from .command_options import OfProblem, OneExperiment, Out, Told, command
+from .common import EXIT_INTERRUPTED, errors
+
+commands = typer.Typer()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Design(OfProblem, Told):
+    """Options of `design_motion`.
+
+    Attributes
+    ----------
+    duration : SECONDS
+        How long the motion takes.
+    limits : FILE
+        A file (TOML) with what the robot may do and what cameras see.
+    criterion : str
+        What to minimise: worst, the largest error bar; A, their mean square; D, the volume of
+        their ellipsoid.
+    for_ : A,B,…
+        Parameters and moduli that count; all by default.
+    over : str
+        Over draws from the prior: their mean, or the worst.
+    add : bool
+        Complement the problem's recordings; they are fitted first.
+    film : bool
+        Film the motion.
+    """
+
+    duration: float
+    limits: Path
+    criterion: str = "worst"
+    for_: str | None = None
+    over: str = "mean"
+    search: DesignOptions
+    add: bool = False
+    experiment: OneExperiment = None
+    out: Out = None
+    film: bool = True
+
+
+@command(
+    commands,
+    "design problem.toml --duration 2 --limits limits.toml",
+    "design problem.toml --duration 2 --limits limits.toml --for poisson",
+    "design problem.toml --duration 2 --limits limits.toml --add",
+)
+def design(options: Design) -> None:
+    """Find the motion of the grasp that makes the error bars smallest.
+
+    It begins and ends at rest in the first pose, keeps to the limits, and is judged over a prior
+    of the parameters. The folder gets poses.csv, error bars before and after, pictures, a film and
+    a problem that simulates it. Ctrl-C keeps the best motion so far.
+    """
+    from ..plan.design.design_folder import DESIGN_FILE, design_json, write_design
+    from ..plan.design.design_page import design_summary
+    from ..plan.study_progress import DesignProgress
+
+    folder = options.out or Path("runs") / f"{run_name(options.problem)}-design"
+    names = () if options.for_ is None else tuple(n.strip() for n in options.for_.split(","))
+    criterion = DesignCriterion(cast("Kind", options.criterion), names, cast("Over", options.over))
+    limits = Limits.read(options.limits)
+    problem = options.read(simulation=not options.add)
+    require_possible(folder)
+    require_replaceable(folder, mark=DESIGN_FILE, what="design")
+    with DesignProgress(errors, options.search.evaluations, options.quiet) as progress:
+        try:
+            answer = designed(
+                problem,
+                limits,
+                options.duration,
+                criterion,
+                options.search,
+                experiment=options.experiment,
+                add=options.add,
+                watch=progress.show_best,
+                say=progress.show_activity,
+            )
+        except InputError as error:
+            key = error.where in Limits.model_fields and error.source is None
+            raise (error.located(options.limits) if key else error) from error
+        write_design(answer, folder, options.film, progress.show_activity)
+    options.tell(design_json(answer), design_summary(answer, folder))
+    raise typer.Exit(EXIT_INTERRUPTED if answer.best.is_interrupted else 0)

@@ -1,0 +1,261 @@
+"""Commands that take a problem: solve, simulate and check."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+from rich.text import Text
+
+from ..errors import SimulationError
+from ..files import require_possible, run_name, whole_file
+from ..methods import require_method
+from ..methods.solution import Status
+from ..pipeline import Run, run
+from ..result.run_record import draw_run
+from ..result.run_writers import require_replaceable
+from ..result.synthesis import Recipe, write_data
+from ..runs.check import check_problem, quick_check
+from ..runs.result_content import Result
+from ..serialisation import as_json
+from ..signal_handling import INTERRUPTS
+from .command_options import OfProblem, Out, Told, command
+from .common import EXIT_DOUBTFUL, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, errors, show
+
+if TYPE_CHECKING:
+    from ..problem import Problem
+
+commands = typer.Typer()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solve(OfProblem, Told):
+    """Options of `solve`.
+
+    Attributes
+    ----------
+    method : str
+        The method, instead of the problem's.
+    start : RUN
+        Start from the answer in this run folder.
+    scheduler : ADDRESS
+        A dask.distributed scheduler to run on.
+    verbose : -v
+        A line per iteration.
+    strict : bool
+        Exit code 1 if the verdict is doubtful.
+    budget : bool
+        Show the contributions to the variance of each estimate.
+    probe : bool
+        Deeper check: refit subsets of the data, and relax each assumption.
+    pictures : bool
+        Draw pictures into the run folder; the command plot draws them later.
+    """
+
+    method: str | None = None
+    out: Out = None
+    start: Path | None = None
+    scheduler: str | None = None
+    verbose: bool = False
+    strict: bool = False
+    budget: bool = False
+    probe: bool = False
+    pictures: bool = True
+
+
+@command(
+    commands,
+    "solve problem.toml",
+    "solve problem.toml --method interior-point --out runs/ip",
+    "solve problem.toml --set parameters.mu_pa.guess=200",
+    "solve finer.toml --start runs/coarse",
+)
+def solve(options: Solve) -> None:
+    """Identify the parameters and write a run folder.
+
+    Parameters need no guess: a scan of the stiffness finds where to start. --start takes an earlier
+    answer instead, also of another mesh or timestep.
+
+    --scheduler shares the experiments among the workers of a cluster.
+
+    Set a method's options in its table of the file, [solver.reduced-space] and so on, or with
+    --set, as in --set solver.reduced-space.tolerance=1e-6; the command methods lists them.
+    """
+    from ..result.run_sections import summary
+    from ..result.solve_progress import Progress
+
+    if options.method is not None:
+        require_method(options.method, "--method")
+    folder = options.out or Path("runs") / run_name(options.problem)
+    problem = options.read()
+    require_possible(folder)
+    require_replaceable(folder)
+    with ExitStack() as until_shown:
+        with Progress(errors, problem, options.verbose, options.quiet) as progress:
+            finished = run(
+                problem,
+                options.method,
+                progress.iteration,
+                progress.say,
+                options.start,
+                scheduler=options.scheduler,
+                probe=options.probe,
+            )
+            until_shown.enter_context(INTERRUPTS.deferred())
+            progress.say("writing the run folder")
+            finished.save(folder, pictures=False)
+        if not options.as_json:
+            show(summary(finished.result, folder, options.budget))
+    result = _drawn(finished, folder, options) if options.pictures else finished.result
+    if options.as_json:
+        typer.echo(as_json(result))
+    elif result.elapsed_s.pictures is not None:
+        show(f"pictures drawn in {result.elapsed_s.pictures:.1f} s")
+    status = finished.solution.status
+    if options.pictures and result.elapsed_s.pictures is None:
+        raise typer.Exit(EXIT_INTERRUPTED)
+    if status is Status.INTERRUPTED or finished.omitted_checks:
+        raise typer.Exit(EXIT_INTERRUPTED)
+    if options.strict and finished.trust.verdict == "doubtful":
+        raise typer.Exit(EXIT_DOUBTFUL)
+    raise typer.Exit(0 if status.converged else EXIT_NOT_CONVERGED)
+
+
+def _drawn(finished: Run, folder: Path, options: Solve) -> Result:
+    """Draw the pictures of a run, and return its result with the time that they took.
+
+    After an interrupt the result without that time is returned, and a message says how to go on.
+    """
+    from ..result.solve_progress import Progress
+
+    try:
+        with Progress(errors, verbose=options.verbose, quiet=options.quiet) as progress:
+            return draw_run(finished, folder, progress.say)
+    except KeyboardInterrupt:
+        again = shlex.join(["collocation-sysid", "plot", str(folder)])
+        kept = f"interrupted: the answer is kept in {folder}, without all pictures"
+        errors.print(Text(f"{kept}; draw them with: {again}"), soft_wrap=True)
+        return finished.result
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate(OfProblem, Told):
+    """Options of `simulate`.
+
+    Attributes
+    ----------
+    out : DIR
+        Where to write.
+    """
+
+    out: Path
+    recipe: Recipe
+
+
+@command(
+    commands,
+    "simulate problem.toml --out data --noise-m 0.001 --seed 1",
+    "simulate problem.toml --out data --set parameters.mu_pa.guess=300",
+)
+def simulate(options: Simulate) -> None:
+    """Simulate at the guesses and write markers and poses as CSV.
+
+    The markers' places are their reference_m, or follow from their file. The parameters are the
+    guesses or fixed values: set others with --set.
+    """
+    from ..result.solve_progress import Progress
+
+    problem = options.read(simulation=True)
+    require_possible(options.out)
+    with Progress(errors, problem, quiet=options.quiet) as progress:
+        try:
+            written = write_data(problem, options.out, options.recipe, progress.share)
+        except SimulationError as error:
+            if error.lost_stability is not None:
+                _draw_instability(error, options.out)
+            raise
+    if options.as_json:
+        typer.echo(json.dumps([str(file) for file in written]))
+    else:
+        for file in written:
+            typer.echo(file)
+
+
+def _draw_instability(error: SimulationError, folder: Path) -> None:
+    """Write a picture of the mode in which the body loses its stability into the folder.
+
+    `error` has such a mode.
+    """
+    from ..result.figure_style import RESOLUTION_DPI
+    from ..result.pictures.instability import instability_picture
+
+    file = folder / "instability.png"
+    folder.mkdir(parents=True, exist_ok=True)
+    with whole_file(file) as draft:
+        instability_picture(error.lost_stability).savefig(draft, dpi=RESOLUTION_DPI)
+    errors.print(f"the mode is drawn in {file}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check(OfProblem, Told):
+    """Options of `check`.
+
+    Attributes
+    ----------
+    full : bool
+        Simulate whole recordings, however long that takes.
+    out : DIR
+        Where pictures of what depth cameras see are written; runs/<problem>_check by default.
+    """
+
+    full: bool = False
+    out: Path | None = None
+
+
+@command(
+    commands,
+    "check problem.toml",
+    "check problem.toml --full",
+    "check problem.toml --out pictures",
+    "check problem.toml --set transcription.scheme=backward-euler",
+)
+def check(options: Check) -> None:
+    """Check a problem before solving it, and say what will go wrong.
+
+    Bodies, recordings and grasps are shown at once. Derivatives, costs and the simulation at the
+    guess follow, of the first samples only where whole recordings take more than ten seconds.
+
+    Of each depth camera a picture shows the first image and the undeformed body over it.
+    """
+    from ..result.check_sections import closer_table, glance_table
+    from ..result.solve_progress import Progress
+
+    problem = options.read()
+    if not options.as_json:
+        show(glance_table(quick_check(problem)))
+        _overlay(problem, options.out or Path("runs") / f"{run_name(options.problem)}_check")
+    with Progress(errors, quiet=options.quiet) as progress:
+        findings = check_problem(problem, progress.say, options.full)
+    options.tell(findings.as_dict(), closer_table(findings))
+    good = findings.derivatives_agree and not findings.causes
+    raise typer.Exit(0 if good else EXIT_NOT_CONVERGED)
+
+
+def _overlay(problem: Problem, folder: Path) -> None:
+    """Write a picture of each depth camera's first image with the undeformed body into the folder.
+
+    Nothing is written without depth cameras.
+    """
+    if not any(experiment.depths for experiment in problem.experiments):
+        return
+    from ..result.depth_overlays import save_overlays
+
+    require_possible(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for file in save_overlays(problem.experiments, folder):
+        typer.echo(f"depth over the undeformed body: {file}")

@@ -1,0 +1,250 @@
+"""Commands that take a run folder: refine, export, plot, report, animate and view."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.text import Text
+
+from ..files import require_possible, write_whole
+from ..serialisation import as_json, content
+from .command_options import AllowCode, AsJson, OfRun, OneExperiment, Out, Quiet, Told, command
+from .common import errors, interrupted, show
+
+commands = typer.Typer()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refine(OfRun, Told):
+    """Options of `refine`.
+
+    Attributes
+    ----------
+    levels : int
+        2, or 3 to observe the orders of convergence, which takes much longer.
+    """
+
+    levels: int = 2
+    allow_code: AllowCode = False
+
+
+@command(commands, "refine runs/swing", "refine runs/swing --levels 3")
+def refine(options: Refine) -> None:
+    """Solve again with half the step and a finer mesh, to measure the discretisation error.
+
+    Each solve starts from the run's answer. The folder gets refinement.json, and result.json gets
+    the
+    discretisation error of each parameter, with corrected values and combined intervals. After an
+    interruption the same command continues where it stopped.
+    """
+    from ..result.run_refinement import refine_run
+    from ..result.run_sections import refinement_table, verdict_of
+
+    def say(what: str) -> None:
+        """Print what is being done on stderr unless the command is quiet."""
+        if not options.quiet:
+            errors.print(Text(what, style="dim"), soft_wrap=True)
+
+    try:
+        refinement, result = refine_run(options.run_folder, options.levels, options.allow_code, say)
+    except KeyboardInterrupt:
+        raise interrupted(f"what was solved is kept in {options.run_folder}") from None
+    report = {**content(refinement), "trust": result.trust}
+    options.tell(report, [refinement_table(result), verdict_of(result.trust)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(OfRun):
+    """Options of `export`.
+
+    Attributes
+    ----------
+    to : TARGET
+        mujoco, usd, newton, sofa, febio, calculix or json.
+    verify : bool
+        Simulate the exported body in the target, and compare.
+    """
+
+    to: str
+    out: Out = None
+    experiment: OneExperiment = None
+    verify: bool = False
+    allow_code: AllowCode = False
+    as_json: AsJson = False
+
+
+@command(
+    commands, "export runs/swing --to mujoco", "export runs/swing --to calculix --out deck --verify"
+)
+def export(options: Export) -> None:
+    """Write the identified body for another simulator: mesh, material, damping, grasp.
+
+    What the target cannot express is printed. The files go to export-TARGET in the run folder.
+    """
+    from ..result.export import (
+        Identified,
+        comparison_table,
+        export_run,
+        target_named,
+        verify_export,
+    )
+
+    target = target_named(options.to)
+    folder = options.out or options.run_folder / f"export-{options.to}"
+    require_possible(folder)
+    body = Identified.read(options.run_folder, options.experiment, options.allow_code)
+    exported = export_run(body, options.to, folder)
+    compared = verify_export(body, options.to, folder) if options.verify else []
+    if options.as_json:
+        report = {
+            "folder": str(folder),
+            "warnings": body.warnings,
+            "not_expressed": exported.limits,
+            "verified": [{**asdict(each), "relative": each.relative} for each in compared],
+        }
+        typer.echo(as_json(report))
+        return
+    show(f"warning: {each}" for each in body.warnings)
+    show(f"not expressed: {each}" for each in exported.limits)
+    if options.verify:
+        show(comparison_table(target.name, compared))
+    typer.echo(folder)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plot(OfRun):
+    """Options of `plot`, all of which are shared."""
+
+    out: Out = None
+    quiet: Quiet = False
+
+
+@command(commands, "plot runs/swing")
+def plot(options: Plot) -> None:
+    """Draw the pictures of a run again, from its files."""
+    from ..result.pictures.album import redraw
+    from ..result.solve_progress import Progress
+
+    folder = options.out or options.run_folder
+    require_possible(folder)
+    with Progress(errors, quiet=options.quiet) as progress:
+        files = redraw(options.run_folder, folder, progress.say)
+    for file in files:
+        typer.echo(file)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Options of `report`.
+
+    Attributes
+    ----------
+    folder : FOLDER
+        A run folder, or one of compare or sweep.
+    to : FILE
+        An .html or .md; report.html in the folder by default.
+    """
+
+    folder: Annotated[Path, typer.Argument()]
+    to: Path | None = None
+
+
+@command(commands, "report runs/swing", "report runs/compare --to comparison.html")
+def report(options: Report) -> None:
+    """Write one HTML page about a run or a study, or a Markdown file.
+
+    It has all results and the pictures; Markdown links to them.
+    """
+    from ..result.report import as_file, comparison_report
+    from ..result.run_sections import run_report
+
+    folder = options.folder
+    file = options.to or options.folder / "report.html"
+    study = (folder / "summary.json").is_file()
+    page = comparison_report(folder) if study else run_report(folder)
+    require_possible(file.parent)
+    write_whole(file, as_file(page, file))
+    typer.echo(file)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Animate(OfRun):
+    """Options of `animate`.
+
+    Attributes
+    ----------
+    to : FILE
+        A .gif, or an .mp4, which needs ffmpeg.
+    fps : float
+        Frames per second.
+    slow : float
+        How many times slower than in reality.
+    """
+
+    to: Path | None = None
+    fps: float = 25.0
+    slow: float = 1.0
+    experiment: OneExperiment = None
+    quiet: Quiet = False
+
+
+@command(commands, "animate runs/swing --to swing.mp4", "animate runs/swing --slow 4")
+def animate(options: Animate) -> None:
+    """Film a run: the body as fitted beside its forward simulation."""
+    from rich.progress import Progress
+
+    from ..result.animation import animate as film
+
+    require_possible(options.run_folder if options.to is None else options.to.parent)
+    bar = Progress(console=errors, transient=True)
+    task = bar.add_task("filming", total=1.0)
+    with bar if errors.is_terminal and not options.quiet else nullcontext():
+        file = film(
+            options.run_folder,
+            options.to,
+            fps=options.fps,
+            slow=options.slow,
+            experiment=options.experiment,
+            progress=lambda share: bar.update(task, completed=share),
+        )
+    typer.echo(file)
+
+
+@dataclass(frozen=True, kw_only=True)
+class View(OfRun):
+    """Options of `view`.
+
+    Attributes
+    ----------
+    field : str
+        The field of the frames that colours the body; von_mises_pa, or on a page strain.
+    html : FILE
+        Write a web page; no window opens.
+    """
+
+    field: str | None = None
+    html: Path | None = None
+    experiment: OneExperiment = None
+
+
+@command(commands, "view runs/swing", "view runs/swing --html swing.html")
+def view(options: View) -> None:
+    """Show a run in 3-D.
+
+    It opens a window, which needs pyvista, or writes a web page, which needs nothing.
+    """
+    from ..result.interactive_view import FIELD, export_page
+    from ..result.interactive_view import view as opened
+
+    run = options.run_folder
+    html = options.html
+    field = options.field
+    if html is None:
+        opened(run, field or FIELD, options.experiment)
+        return
+    require_possible(html.parent)
+    typer.echo(export_page(run, html, options.experiment, field))

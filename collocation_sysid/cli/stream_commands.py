@@ -1,0 +1,182 @@
+"""Commands that estimate while frames arrive: live and replay."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.text import Text
+
+from ..errors import InputError
+from ..files import require_possible
+from ..live import LiveEstimator, LiveOptions
+from ..live.sources import read_problem
+from ..validated_types import NotNegative, Options, Positive
+from .command_options import AllowCode, Overrides, ProblemPath, Told, command
+from .common import EXIT_BAD_INPUT, errors, show
+
+commands = typer.Typer()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimating(Options):
+    """Options of commands that estimate from frames as they come.
+
+    Attributes
+    ----------
+    budget_ms : float
+        Time that a frame may take; by default 80 % of the time between samples.
+    window_s : float
+        How far back earlier frames are revisited.
+    """
+
+    budget_ms: Positive | None = None
+    window_s: Positive = 3.0
+    set_: Overrides = None
+    allow_code: AllowCode = False
+
+    def estimator(self, recording: Path) -> LiveEstimator:
+        """Return the estimator for a problem file or a run folder, with these options."""
+        budget_s = None if self.budget_ms is None else 1e-3 * self.budget_ms
+        problem = read_problem(recording, self.set_ or (), self.allow_code)
+        return LiveEstimator(problem, LiveOptions(budget_s, self.window_s))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Live(Estimating):
+    """Options of `live`.
+
+    Attributes
+    ----------
+    udp : PORT
+        Read a UDP port of this machine instead.
+    """
+
+    problem: ProblemPath
+    udp: Annotated[int | None, typer.Option(min=0, max=65535)] = None
+
+
+@command(
+    commands, "live problem.toml < frames.jsonl", "live problem.toml --udp 9870 > estimates.jsonl"
+)
+def live(options: Live) -> None:
+    """Identify while the recording is made: frames in, a line of JSON for each out, one at the end.
+
+    A frame is a line: {"t_s": 0.01, "pose": {"position_m": [x, y, z], "quaternion_xyzw": [x, y, z,
+    w]}, "markers": {"tip": [x, y, z]}}, or a row of a table whose first line is t_s, x_m, y_m,
+    z_m, qx, qy, qz, qw, tip_x, tip_y, tip_z and so on. A line that is no frame is reported
+    and left out, and the exit code is then 2. An empty datagram ends it.
+    """
+    from ..live.frames import FrameReader
+    from ..live.sources import (
+        decode_lines,
+        receive_datagrams,
+        update_as_json,
+        without_garbage_of_startup,
+    )
+
+    if options.udp is None and sys.stdin is None:  # closed by whoever started the process
+        raise InputError(
+            "is closed; expected frames, as in live problem.toml < frames.jsonl, or --udp PORT",
+            "standard input",
+        )
+    estimator = options.estimator(options.problem)
+
+    def opened(port: int) -> None:
+        """Print on stderr that the port is open."""
+        errors.print(f"listening on UDP port {port} of this machine")
+
+    if options.udp is None:
+        lines = decode_lines(sys.stdin.buffer)
+        source = "standard input"
+    else:
+        lines = receive_datagrams(options.udp, opened)
+        source = f"UDP port {options.udp}"
+    reader = FrameReader(
+        estimator.model.moving_grasps + 1,
+        estimator.names,
+        source,
+        estimator.model.experiment.readings,
+        estimator.model.wrenches,
+    )
+    bad = 0
+    with without_garbage_of_startup():
+        for line in lines:
+            try:
+                frame = reader.read(line)
+            except InputError as error:
+                bad += 1
+                errors.print(Text(f"error: {error}"), soft_wrap=True)
+                continue
+            if frame is not None:
+                typer.echo(update_as_json(estimator.process_frame(frame)))
+    if (settled := estimator.finish()) is not None:
+        typer.echo(update_as_json(settled))
+    if bad:
+        raise typer.Exit(EXIT_BAD_INPUT)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay(Estimating, Told):
+    """Options of `replay`.
+
+    Attributes
+    ----------
+    recording : RUN_OR_PROBLEM
+        A problem file, or a run's folder.
+    rate : HZ
+        Frames a second: by default as recorded, with 0 without a pause.
+    film : FILE
+        Write the estimates as a .gif.
+    """
+
+    recording: Annotated[Path, typer.Argument()]
+    rate: NotNegative | None = None
+    film: Path | None = None
+
+
+@command(
+    commands,
+    "replay problem.toml --rate 100",
+    "replay runs/swing --film swing.gif",
+    "replay problem.toml --json --rate 0",
+)
+def replay(options: Replay) -> None:
+    """Stream a recording as if it were made now, and estimate from it live."""
+    from rich.live import Live
+
+    from ..display import on_terminal
+    from ..live import live_display
+    from ..live.sources import frames_of_recording, paced_frames, without_garbage_of_startup
+    from ..live.sources import update_as_json as json_line
+
+    rate = options.rate
+    film = options.film
+    if film is not None:
+        require_possible(film.parent)
+        live_display.require_gif(film)
+    estimator = options.estimator(options.recording)
+    experiment = estimator.model.experiment
+    frames = frames_of_recording(experiment, estimator.model)
+    pace = 1.0 / experiment.timestep_s if rate is None else rate
+    updates = []
+    watched = errors.is_terminal and not options.quiet and not options.as_json
+    shown = Live(console=errors, refresh_per_second=10)
+    with without_garbage_of_startup(), shown if watched else nullcontext():
+        for frame in paced_frames(frames, pace) if pace else frames:
+            updates.append(estimator.process_frame(frame))
+            if options.as_json:
+                typer.echo(json_line(updates[-1]))
+            elif watched:
+                shown.update(on_terminal(live_display.display_of(updates)))
+    settled = estimator.finish() or updates[-1]
+    if options.as_json:
+        typer.echo(json_line(settled))
+    else:
+        show(live_display.final_display(updates, settled))
+    if film is not None:
+        typer.echo(live_display.write_film(updates, film))

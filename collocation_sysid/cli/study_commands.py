@@ -1,0 +1,249 @@
+"""Commands that run many problems: compare and sweep."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import typer
+
+from ..errors import InputError
+from ..files import require_possible, run_name
+from ..plan import (
+    PlannedRun,
+    RunOptions,
+    RunStore,
+    Starts,
+    plan_comparison,
+    plan_models,
+    plan_sweep,
+    run_all,
+)
+from ..plan.model_variants import models, parse_branches, parse_dampings, parse_materials
+from ..plan.study_arguments import parse_methods, parse_swept_keys, read_truth
+from ..plan.study_rows import SuccessCriterion
+from ..problem import Problem
+from ..validated_types import Positive
+from .command_options import OfProblem, Out, Told, command
+from .common import errors, interrupted, show
+
+commands = typer.Typer()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Many(OfProblem, Told):
+    """Options of commands with many runs.
+
+    Attributes
+    ----------
+    dry_run : bool
+        Only list the runs.
+    """
+
+    limits: RunOptions
+    out: Out = None
+    dry_run: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare(Many):
+    """Options of `compare`.
+
+    Attributes
+    ----------
+    methods : A,B,…
+        Methods to compare, each with its options in the file.
+    materials : A,B,…
+        Materials to compare, in place of the object's.
+    damping : A,B,…
+        Laws of damping to compare, in place of the object's.
+    prony : 0,1,…
+        Numbers of viscoelastic branches to compare.
+    region : NAME
+        The region that has these materials, laws of damping and branches; by default the whole
+        body.
+    with_ : FILE
+        Another problem file of the same recordings, as a model.
+    truth : FILE|NAME=VALUE
+        True parameters: a TOML file, or values.
+    within : float
+        Relative error up to which a run is a success.
+    """
+
+    methods: str | None = None
+    materials: str | None = None
+    damping: str | None = None
+    prony: str | None = None
+    region: str | None = None
+    with_: list[Path] | None = None
+    starts: Starts
+    truth: list[str] | None = None
+    within: Positive = 0.01
+
+
+@command(
+    commands,
+    "compare problem.toml --methods reduced-space,shooting --starts 40",
+    "compare problem.toml --methods penalty,shooting --truth truth.toml",
+    "compare problem.toml --materials neo-hookean,yeoh",
+    "compare problem.toml --damping kelvin-voigt,material,rayleigh",
+)
+def compare(options: Compare) -> None:
+    """Compare methods from many starts, or fit several models and say which to use.
+
+    With --materials, --damping, --prony or --with each model is fitted to all recordings, and to
+    all but each of them, which it then predicts; of one recording the last third is held out. In a
+    body with regions all of it has the model, or --region. --with takes other problem files as
+    models, each with all of the materials, laws of damping and numbers of branches.
+
+    Finished runs are kept in the output folder: the same command resumes.
+    """
+    methods = parse_methods(options.methods) if options.methods is not None else ()
+    problem = options.read()
+    if options.with_ or {options.materials, options.damping, options.prony} != {None}:
+        _study("models", options, _planned_models(options, problem, methods))
+        return
+    if not methods:
+        raise InputError(
+            "nothing to compare; expected --methods, --materials, --damping, --prony or --with"
+        )
+    free = [item.name for item in problem.parameters.free]
+    truth = read_truth(options.truth or (), problem.parameters.names, free)
+    yardstick = SuccessCriterion(truth, options.within)
+    planned = plan_comparison(
+        problem,
+        methods,
+        options.set_ or (),
+        options.starts,
+        truth,
+        options.allow_code,
+    )
+    _study("compare", options, planned, yardstick)
+
+
+def _planned_models(
+    options: Compare, problem: Problem, methods: Sequence[str]
+) -> Sequence[PlannedRun]:
+    """Return the runs that compare models: materials, damping laws, branches, or other problem
+    files.
+
+    Raises
+    ------
+    InputError
+        For more than one method, or a model that the problem cannot have.
+    """
+    if len(methods) > 1:
+        raise InputError(
+            f"found {', '.join(methods)}; expected one method to compare models by, or methods "
+            "without --materials, --damping and --prony",
+            None,
+            "--methods",
+        )
+    others = [replace(options, problem=file).read() for file in options.with_ or ()]
+    materials = parse_materials(options.materials) if options.materials is not None else ()
+    dampings = parse_dampings(options.damping) if options.damping is not None else ()
+    branches = parse_branches(options.prony) if options.prony is not None else ()
+    variants = models(
+        [problem, *others],
+        options.set_ or (),
+        materials,
+        branches,
+        region=options.region,
+        dampings=dampings,
+    )
+    for variant in variants:  # a model that cannot be would fail every run
+        Problem.read(variant.path, variant.overrides, options.allow_code)
+    return plan_models(problem, variants, methods[0] if methods else None, options.allow_code)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions(Many):
+    """Options of `sweep`.
+
+    Attributes
+    ----------
+    over : KEY=VALUES
+        Key and its values: a,b,c or first:last:count or first:last:log:count.
+    method : str
+        The method, instead of the problem's.
+    """
+
+    over: list[str]
+    method: str | None = None
+
+
+@command(
+    commands,
+    "sweep problem.toml --over transcription.substeps=1,2,4",
+    "sweep problem.toml --over parameters.mu_pa.guess=50:5000:log:9",
+)
+def sweep(options: SweepOptions) -> None:
+    """Solve for every combination of values of some keys."""
+    method = parse_methods(options.method, "--method")[0] if options.method else None
+    over = parse_swept_keys(options.over)
+    overrides = options.set_ or ()
+    planned = plan_sweep(options.problem, over, overrides, method, options.allow_code)
+    # A missing file would fail every run.
+    Problem.read(options.problem, planned[0].overrides, options.allow_code)
+    _study("sweep", options, planned)
+
+
+def _study(
+    kind: str,
+    options: Many,
+    planned: Sequence[PlannedRun],
+    yardstick: SuccessCriterion | None = None,
+) -> None:
+    """Execute the runs that are not finished, write tables and plots, and print the tables.
+
+    Parameters
+    ----------
+    kind : str
+        Name of the study, for its folder and title.
+    options : Many
+    planned : sequence of PlannedRun
+    yardstick : SuccessCriterion, optional
+        True parameters and tolerance for the success of a run.
+
+    Raises
+    ------
+    typer.Exit
+        After an interrupt, with a message; finished runs are kept.
+    """
+    from ..plan.study_page import (
+        load_report,
+        plan_table,
+        report_json,
+        study_tables,
+        write_report,
+    )
+    from ..plan.study_progress import StudyProgress
+
+    name = run_name(options.problem)
+    folder = options.out or Path("runs") / f"{name}-{kind}"
+    store = RunStore(folder / "runs")
+    limits = options.limits
+    finished = [run.key for run in planned if store.load_finished(run.key, limits.time_limit_s)]
+    if options.dry_run:
+        if options.as_json:
+            listed = [{**run.as_dict(), "finished": run.key in finished} for run in planned]
+            typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
+        else:
+            show(plan_table(planned, finished))
+        return
+    require_possible(folder)
+    remaining = [run for run in planned if run.key not in finished]
+    is_complete = True
+    try:
+        with StudyProgress(errors, remaining, len(planned), options.quiet) as progress:
+            run_all(remaining, store, limits, progress.count_run)
+    except KeyboardInterrupt:
+        is_complete = False
+    report = load_report(f"{kind.capitalize()}: {name}", kind, planned, store, yardstick)
+    if report.records:
+        write_report(report, folder)
+    if not is_complete:
+        raise interrupted(f"{len(report.records)} of {len(planned)} runs are kept in {folder}")
+    options.tell(report_json(report), study_tables(report, folder))

@@ -1,0 +1,378 @@
+"""Constants that vary in space: the logarithm is a mean plus shapes with a smooth random prior.
+
+Use `Field` to declare such a constant; `FieldModes` evaluates it. The prior of the logarithm about
+its mean has the correlation exp(−r/l) between places at a distance r, which is Matérn's family with
+smoothness ½: it is the solution of a stochastic differential equation on the mesh (Lindgren, Rue &
+Lindström 2011). With the eigenpairs λ_i, v_i of the mass-weighted Laplacian, free at the surface,
+
+    ln c(X) = ln c̄ + Σ a_i φ_i(X),   φ_i ∝ v_i / (1/l² + λ_i),   a_i ~ N(0, 1),
+
+scaled so that the prior has the same deviation, the amplitude, everywhere. The constant eigenvector
+is omitted: it is the mean. Shapes beyond the first m have a share of the variance that is included
+in the interval of every element, see `FieldModes.omitted_deviation`.
+
+For a density with the stated value ρ_s the field is ρ / ρ_s instead of the logarithm: masses are
+linear in the coefficients, and densities vary little within a material.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Annotated, Literal
+
+import numpy as np
+import scipy.sparse as sp
+from annotated_types import MinLen
+from scipy.sparse.linalg import eigsh, splu
+
+from ..array_types import Array, Index
+from ..declarations import key, stated
+from ..errors import InputError
+from ..schema_tables import ByForm
+from ..validated_types import AtLeastOne, Positive, Text
+from .constants import DENSITY, YOUNG, Constant, field_coefficient, is_modulus
+from .elements import ELEMENTS, reference_geometry
+from .mesh import TetMesh
+
+# Parameter of a field of stiffness: all moduli of the material vary with it.
+ALL_MODULI = YOUNG.name
+# Number of random sign vectors for the estimate of a trace (Hutchinson's estimator).
+PROBES = 50
+# Prior standard deviation of the logarithm of the contrast of two phases: a factor of e.
+TWO_PHASE_AMPLITUDE = 1.0
+SMOOTH: Literal["smooth"] = "smooth"
+TWO_PHASE: Literal["two-phase"] = "two-phase"
+Prior = Literal["smooth", "two-phase"]
+Lengths = Annotated[Positive | Annotated[tuple[Positive, ...], MinLen(1)], ByForm((int, float))]
+
+
+@stated
+class Field:
+    """Stiffness, density or another constant that varies in space within a material.
+
+    Parameters
+    ----------
+    parameter : str
+        Constant of the material or its damping law; young_pa stands for all moduli of a material;
+        density_kg_m3.
+    length_m : float or list
+        Correlation length: places at this distance have the correlation 1/e. Of several lengths the
+        most likely one is used.
+    modes : int
+        Number of shapes of the field; one more costs as much as one more right-hand side.
+    amplitude : float, optional
+        Prior standard deviation of the logarithm, 0.5 by default; for a density that of the ratio
+        to its stated value, 0.3 by default. With prior = "two-phase", the prior standard deviation
+        of the logarithm of the contrast, 1 by default.
+    prior : {"smooth", "two-phase"}
+        "smooth": the logarithm is a normal field. "two-phase": two materials with a boundary
+        between them; the parameter contrast is the ratio of inclusions to surroundings.
+    """
+
+    length_m: float | tuple[float, ...] = key(Lengths)
+    parameter: str = key(Text, default=ALL_MODULI)
+    modes: int = key(AtLeastOne, default=40)
+    amplitude: float | None = key(Positive | None, default=None)
+    prior: Prior = key(Prior, default=SMOOTH)
+
+    @property
+    def lengths_m(self) -> tuple[float, ...]:
+        """Correlation lengths to choose from [m]."""
+        return self.length_m if isinstance(self.length_m, tuple) else (self.length_m,)
+
+    @property
+    def deviation(self) -> float:
+        """Prior standard deviation: the amplitude, or its default.
+
+        The default of a density is smaller, because a density, unlike a logarithm, could become
+        negative.
+        """
+        if self.prior == TWO_PHASE:
+            return self.amplitude or TWO_PHASE_AMPLITUDE
+        return self.amplitude or (0.3 if self.parameter == DENSITY.name else 0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Laplacian:
+    """Lowest eigenpairs of the mass-weighted Laplacian on some cells.
+
+    Attributes
+    ----------
+    values : (m,)
+        Eigenvalues λ [1/m²], without that of the constant eigenvector.
+    vectors : (m, E)
+        Eigenvectors v at the centre of each cell.
+    matrix : (n, n)
+        Matrix with the eigenvalues λ: Laplacian of the nodes, scaled by the square roots of their
+        masses.
+    basis : (n, m + 1)
+        Eigenvectors of this matrix, including the constant one.
+    """
+
+    values: Array
+    vectors: Array
+    matrix: sp.csc_array
+    basis: Array
+
+    @classmethod
+    def from_mesh(cls, mesh: TetMesh, cells: Index, count: int) -> Laplacian:
+        """Return the lowest eigenpairs after the constant eigenvector.
+
+        Parameters
+        ----------
+        mesh : TetMesh
+        cells : (k,) int
+            Indices of the cells.
+        count : int
+            Number m of eigenpairs.
+
+        Raises
+        ------
+        InputError
+            If the cells have too few nodes.
+        """
+        nodes, local_nodes = np.unique(mesh.tetrahedra[cells], return_inverse=True)
+        size = len(nodes)
+        local_nodes = local_nodes.reshape(-1, 4)
+        if not count + 2 < size:
+            raise InputError(f"modes is {count}; expected at most {size - 3}, with {size} nodes")
+        geometry = reference_geometry(mesh.points_m[nodes], local_nodes, ELEMENTS["tet4"])[:, 0]
+        slopes = geometry[:, :-1].reshape(-1, 4, 3)
+        volumes = geometry[:, -1]
+        stiffness = volumes[:, None, None] * slopes @ slopes.swapaxes(1, 2)
+        places = np.repeat(local_nodes, 4, axis=1).ravel(), np.tile(local_nodes, 4).ravel()
+        mass = np.bincount(local_nodes.ravel(), np.repeat(volumes / 4, 4), size)
+        root = sp.diags_array(1 / np.sqrt(mass))
+        matrix = (root @ sp.csc_array((stiffness.ravel(), places), (size, size)) @ root).tocsc()
+        # A shift slightly below zero makes the matrix regular; a fixed start makes it repeatable.
+        shift = -1e-3 * volumes.sum() ** (-2 / 3)
+        start = np.random.default_rng(0).normal(size=size)
+        values, basis = eigsh(matrix, count + 1, sigma=shift, v0=start)
+        # A body of several pieces has more than one that is constant on each of them.
+        order = np.argsort(values)
+        constant_vector = np.sqrt(mass / mass.sum())
+        values = values[order]
+        basis = basis[:, order]
+        constant = np.flatnonzero(values < 1e-9 * values[-1])
+        combination = np.column_stack(
+            [basis[:, constant].T @ constant_vector, np.eye(len(constant))]
+        )
+        basis[:, constant] = basis[:, constant] @ np.linalg.qr(combination)[0]
+        basis *= np.sign(basis[np.abs(basis).argmax(axis=0), np.arange(count + 1)])
+        vectors = (root @ basis[:, 1:])[local_nodes].mean(axis=1).T
+        return cls(np.maximum(values[1:], 0.0), vectors, matrix, basis)
+
+    def weights(self, length_m: float) -> Array:
+        """Return the prior deviations (m,) of the coefficients of the eigenvectors, up to a
+        factor.
+        """
+        return 1 / (1 / length_m**2 + self.values)
+
+    def variance_share(self, length_m: float) -> float:
+        """Return the share of the prior variance of these eigenvectors, without the constant one.
+
+        The trace that this needs is estimated with `PROBES` random sign vectors of a fixed seed.
+        """
+        size = len(self.basis)
+        own_variance = (self.weights(length_m) ** 2).sum()
+        # The trace of a square is how far random signs are stretched on average.
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(size, PROBES))
+        finer = signs - self.basis @ (self.basis.T @ signs)
+        operator = (self.matrix + sp.eye_array(size) / length_m**2).tocsc()
+        return float(
+            own_variance / (own_variance + (splu(operator).solve(finer) ** 2).sum() / PROBES)
+        )
+
+
+@dataclass(frozen=True)
+class FieldResolution:
+    """Resolution of a field by its shapes.
+
+    Attributes
+    ----------
+    modes : int
+        Number of shapes.
+    length_m, amplitude : float
+        Correlation length and prior standard deviation.
+    share : float
+        Share of the prior variance that the shapes represent; finer shapes have the rest.
+    detail_m : float
+        Half the shortest wavelength.
+    """
+
+    modes: int
+    length_m: float
+    amplitude: float
+    share: float
+    detail_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class FieldModes:
+    """Shapes of a field, evaluated in every cell of a part.
+
+    Attributes
+    ----------
+    field : Field
+    laplacian : Laplacian
+    scaled_indices : tuple of int
+        Indices of the constants of material and damping law that the field multiplies; empty for a
+        density.
+    length_m : float
+        Correlation length in use.
+    volumes_m3 : (E,)
+        Volumes of the cells.
+    """
+
+    field: Field
+    laplacian: Laplacian
+    scaled_indices: tuple[int, ...]
+    length_m: float
+    volumes_m3: Array
+
+    @classmethod
+    def from_field(
+        cls, field: Field, mesh: TetMesh, cells: Index, law: tuple[Constant, ...]
+    ) -> FieldModes:
+        """Return the shapes of a field on some cells.
+
+        Parameters
+        ----------
+        field : Field
+        mesh : TetMesh
+        cells : (E,) int
+            Indices of the cells.
+        law : tuple of Constant
+            Constants of the material and of the damping law.
+
+        Raises
+        ------
+        InputError
+            If the field's parameter is not one of these constants, all moduli, or the density.
+        """
+        names = [constant.name for constant in law]
+        moduli = [k for k, name in enumerate(names) if is_modulus(name)]
+        scaled = moduli if field.parameter == ALL_MODULI else []
+        if field.parameter in names:
+            scaled = [names.index(field.parameter)]
+        if not scaled and field.parameter != DENSITY.name:
+            known = [ALL_MODULI] * bool(moduli) + [*names, DENSITY.name]
+            raise InputError(
+                f"parameter of a field is {field.parameter!r}; expected one of {', '.join(known)}"
+            )
+        laplacian = Laplacian.from_mesh(mesh, cells, field.modes)
+        return cls(field, laplacian, tuple(scaled), field.lengths_m[0], mesh.volumes_m3[cells])
+
+    def logarithms(self, coefficients: Array) -> Array:
+        """Return ln c − ln c̄ (E,) in every cell, from the coefficients (k,) of `constants`."""
+        return self.shapes @ coefficients
+
+    def jacobian(self, coefficients: Array) -> Array:
+        """Return the derivatives (E, k) of `logarithms` by the coefficients (k,)."""
+        return self.shapes
+
+    def weighted_hessian(self, coefficients: Array, weights: Array) -> Array:
+        """Return the weighted sum over cells of the second derivatives of `logarithms`, (T, k, k).
+
+        It is zero here, because the logarithms are linear in the coefficients.
+
+        Parameters
+        ----------
+        coefficients : (k,)
+        weights : (T, E)
+            Weights of the cells.
+        """
+        return np.zeros((len(weights), len(coefficients), len(coefficients)))
+
+    @cached_property
+    def variance_share(self) -> float:
+        """Share of the prior variance that the shapes represent."""
+        return self.laplacian.variance_share(self.length_m)
+
+    @property
+    def omitted_deviation(self) -> float:
+        """Standard deviation of the logarithm due to finer shapes, which are omitted."""
+        return self.field.deviation * float(np.sqrt(1 - self.variance_share))
+
+    @cached_property
+    def shapes(self) -> Array:
+        """Shapes φ (E, m) in the cells."""
+        unscaled = self.laplacian.weights(self.length_m)[:, None] * self.laplacian.vectors
+        deviation = self.field.deviation * np.sqrt(self.variance_share)
+        return (deviation * unscaled / np.linalg.norm(unscaled, axis=0)).T
+
+    @property
+    def constants(self) -> tuple[Constant, ...]:
+        """Constants of the coefficients a."""
+        return tuple(field_coefficient(k) for k in range(self.field.modes))
+
+    @property
+    def resolution(self) -> FieldResolution:
+        """Resolution of the field, for reports."""
+        detail_m = float(np.pi / np.sqrt(self.laplacian.values[-1]))
+        return FieldResolution(
+            modes=self.field.modes,
+            length_m=self.length_m,
+            amplitude=self.field.deviation,
+            share=self.variance_share,
+            detail_m=detail_m,
+        )
+
+    def split_in_eight(self) -> FieldModes:
+        """Return this field on a mesh whose cells are split into eight."""
+        vectors = np.repeat(self.laplacian.vectors, 8, axis=1)
+        volumes_m3 = np.repeat(self.volumes_m3 / 8, 8)
+        laplacian = replace(self.laplacian, vectors=vectors)
+        return replace(self, laplacian=laplacian, volumes_m3=volumes_m3)
+
+    def with_length(self, length_m: float) -> FieldModes:
+        """Return this field with another correlation length [m]."""
+        return replace(self, length_m=length_m)
+
+
+@dataclass(frozen=True, eq=False)
+class FieldAssembly:
+    """Assembly of derivatives by the logarithm of each cell into derivatives by the coefficients.
+
+    Attributes
+    ----------
+    field : FieldModes
+    dofs : (E, d)
+        Dofs of the nodes of each cell.
+    size : int
+        Number of dofs of the body.
+    """
+
+    field: FieldModes
+    dofs: Index
+    size: int
+
+    @cached_property
+    def _incidence(self) -> sp.csr_array:
+        """Sparse matrix (size, E) from cells to dofs; its values number its entries, from 1 on."""
+        cells, dofs_per_cell = self.dofs.shape
+        rows = self.dofs.ravel()
+        columns = np.repeat(np.arange(cells), dofs_per_cell)
+        numbers = np.arange(1, rows.size + 1)
+        return sp.csr_array((numbers, (rows, columns)), shape=(self.size, cells))
+
+    def assemble_nodal(self, values: Array, slopes: Array, out: Array) -> None:
+        """Write derivatives of nodal values by the coefficients of the field to `out`.
+
+        Parameters
+        ----------
+        values : (T, E · d)
+            Derivatives by the logarithm of each cell.
+        slopes : (E, k)
+            Derivatives of these logarithms by the coefficients.
+        out : (T, size, k)
+            Result; overwritten.
+        """
+        incidence = self._incidence
+        order = incidence.data - 1
+        for value, derivatives in zip(values, out, strict=True):
+            matrix = sp.csr_array(
+                (value[order], incidence.indices, incidence.indptr), incidence.shape
+            )
+            derivatives[:] = matrix @ slopes

@@ -1,0 +1,704 @@
+"""One forward pass over a recording at one parameter point p: motion, sensitivities and residuals.
+
+A few rows of the grid at a time continue from the state of the previous ones (positions, forces,
+and the columns Z of derivatives by the parameters that affect the motion). They are linearised
+together at their initial guesses; each row is then solved once, for its Newton correction and its
+columns: a Gauss–Newton step on the collocation equations, whose error is of second order in the
+correction, as in the reduced-space method. A row with a long correction is linearised again, alone,
+at the corrected position.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..array_types import Array
+from ..fem.body import Linearisation
+from ..model.dynamics import StencilRow
+from ..program.initial_equilibrium import initial_state
+from ..program.least_squares import SquareRootInformation
+from ..program.measurement_residual import huber_as_least_squares, lagrange_weights
+from ..program.newton_solver import NewtonFailure, simulation_error
+from ..program.observables import ObservableDerivatives, ObservedMotion
+from ..program.scheme_simulation import RowEquations, extrapolate, solve_row
+from ..program.sweep import (
+    FactorisedStep,
+    ForwardState,
+    ForwardSubstitution,
+    PrescribedColumns,
+    SweepColumns,
+)
+from .grasp_reactions import DELAY_STEPS, GraspReactions, Poses
+from .live_model import ROW_TOLERANCE, ROWS_PER_CHUNK, LiveModel
+
+# Largest correction of a row, divided by the size of the body, after which the row is not
+# linearised again: the next correction would be about its square.
+LARGEST_CORRECTION = 3e-4
+# Factor of this limit for rows that are solved together; beyond the limit another pass follows.
+CHUNK_CORRECTION_FACTOR = 10
+# Largest delay of samples that are still used, in samples.
+LARGEST_SAMPLE_DELAY = 5
+
+
+class Sample(NamedTuple):
+    """Measured values of a time between or at rows.
+
+    Attributes
+    ----------
+    rows_back : float
+        Time of the sample, in rows before the row after which it is evaluated.
+    values : (M, 3) or (m,)
+        Marker positions, or values of an instrument; NaN where missing.
+    instrument : int
+        0 for markers, or the number of the instrument, from 1 on.
+    """
+
+    rows_back: float
+    values: Array
+    instrument: int = 0
+
+
+class LoggedRow(NamedTuple):
+    """Input of one row of the grid.
+
+    Attributes
+    ----------
+    poses : Poses
+        Poses of the grasps that move.
+    samples : list of Sample
+        Samples that are evaluated after this row.
+    """
+
+    poses: Poses
+    samples: list[Sample]
+
+
+class StoredRow(NamedTuple):
+    """Initial guess of a row for a later pass.
+
+    Attributes
+    ----------
+    transformed : (P,)
+        Transformed parameters of the pass, see `LiveModel.transformed`.
+    x : (3n,)
+        Positions [m].
+    columns : (3n, m) float32
+        Derivatives Z of the positions by these transformed parameters.
+    """
+
+    transformed: Array
+    x: Array
+    columns: NDArray[np.float32]
+
+
+class LinearisedResidual(NamedTuple):
+    """Residuals of a sample, linear in the transformed parameters, see `LiveModel.transformed`.
+
+    Attributes
+    ----------
+    at_zero : (G, 3) or (m,)
+        Residuals extrapolated to transformed parameters of zero; NaN where missing.
+    slope : (…, P)
+        Derivatives by the transformed parameters.
+    instrument : int
+        Instrument, see `Sample`.
+    """
+
+    at_zero: Array
+    slope: Array
+    instrument: int = 0
+
+    def evaluate_at(self, transformed: Array) -> Array:
+        """Return the residuals at transformed parameters, to first order."""
+        return self.at_zero + self.slope @ transformed
+
+
+# A row as `StoredRow`; positions and columns of markers and of the points of custom sensors,
+# (3M + …, 1 + m); and wrenches with their derivatives by all parameters, (sensors, 6, 1 + P).
+ObservedRow = tuple[StoredRow, Array, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class SweepState:
+    """State on which the next row depends.
+
+    Attributes
+    ----------
+    row : int
+        Number of rows done.
+    end : int
+        Index of the next row in the template.
+    x, force : (rows, 3n)
+        Positions and forces of the rows of the template.
+    prescribed_columns : (rows, g, 1 + m)
+        Columns of the prescribed positions of the grasped dofs.
+    reactions : GraspReactions
+        Reaction forces of grasps with a sensor.
+    last_rows : ForwardState or None
+        Columns of the last rows; None at the start.
+    observed_rows : tuple of Read
+        Observed quantities of the last rows, the latest one last.
+    """
+
+    row: int
+    end: int
+    x: Array
+    force: Array
+    prescribed_columns: Array
+    reactions: GraspReactions
+    last_rows: ForwardState | None
+    observed_rows: tuple[ObservedRow, ...]
+
+
+class StreamingSweep:
+    """Forward pass at parameters p, row after row.
+
+    Parameters
+    ----------
+    model : LiveModel
+    p : (P,)
+        Linearisation point.
+    known : SquareRootInformation
+        Information from before its first row.
+    start : SweepState, optional
+        State at which the pass begins; the start of the recording by default.
+    at : (P,), optional
+        Linearisation point of that state, which is moved to p along its columns. Columns by
+        transformed parameters stay the same.
+
+    Attributes
+    ----------
+    information : SquareRootInformation
+        Information at p in the transformed parameters, from `known` and all samples so far.
+    longest_m : float
+        Longest correction so far [m].
+
+    Raises
+    ------
+    SimulationError
+        If the start cannot be computed.
+    """
+
+    def __init__(
+        self,
+        model: LiveModel,
+        p: Array,
+        prior_information: SquareRootInformation,
+        start: SweepState | None = None,
+        at: Array | None = None,
+    ) -> None:
+        self.model = model
+        self.p = p
+        self.solver = model.solver
+        self.transformed = model.transformed(p)
+        self.rates = model.transformation_derivatives(self.transformed)
+        collocation = model.collocation
+        segment = model.segment
+        self.segment = segment
+        self.phi = p[collocation.nq :]
+        self.setting = segment.equations_at(p[: collocation.nq], self.phi)
+        self.dynamics = self.setting.dynamics
+        self.displaced_nodes = model.displaced_nodes(self.phi)
+        self.shape_functions = segment.markers.observable.shape_functions(self.phi)
+        points_and_weights = [
+            self.shape_functions,
+            *(points.shape_functions(self.phi) for points in model.observed_points),
+        ]
+        self._looked = tuple(
+            np.concatenate(part)
+            for part in zip(*((nodes, at.weights) for nodes, at in points_and_weights), strict=True)
+        )
+        self.longest_m = 0.0
+        self.grasped = segment.prescribed_motion.dofs
+        self.moving = segment.dynamic_parameters
+        self.sensed = segment.sensed_dofs
+        self.count = 1 + len(self.moving)
+        self.mass_kg = self.dynamics.mass.inertia_kg[0]
+        # Loads are always there: what acts on one row acts on every one.
+        self.forces = self.dynamics.forces.at_times(slice(1))
+        self._rows = {} if self.setting.mass_depends_on_parameters else model.cached_rows
+        self.information = prior_information
+        state = (
+            self._initial_state() if start is None or at is None else self._moved_state(start, at)
+        )
+        self._resume(state)
+
+    # State ------------------------------------------------------------------------------------
+
+    def _initial_state(self) -> SweepState:
+        """Return the state before the first row."""
+        rows = self.model.template_rows
+        dofs = self.segment.dof_count
+        empty = np.zeros((rows, dofs))
+        given = np.zeros((rows, len(self.grasped), self.count))
+        felt = GraspReactions.zeros(rows, len(self.sensed), self.count, len(self.model.first_poses))
+        return SweepState(0, 0, empty, empty, given, felt, None, ())
+
+    def _moved_state(self, state: SweepState, at: Array) -> SweepState:
+        """Return a state moved from the linearisation point `at` to p, to first order."""
+        if state.last_rows is None or (at == self.p).all():
+            return state
+        moving = self.moving
+        flat = self.model.transformed(at)
+        old_rates = self.model.transformation_derivatives(flat)
+        change = (self.transformed - flat)[moving]
+        step = change / old_rates[moving]
+        factors = np.ones(self.count)
+        factors[1:] = (self.rates / old_rates)[moving]
+        force = state.force.copy()
+        memory = state.last_rows
+        last = state.end - 1
+        for k, columns in enumerate(memory.increments[: last + 1]):
+            force[last - k, self.solver.free] += columns[:, 1:] @ step
+        solutions, increments = (
+            tuple(columns * factors for columns in each)
+            for each in (memory.solutions, memory.increments)
+        )
+        memory = replace(memory, solutions=solutions, increments=increments)
+        stored = [each for each, *_ in state.observed_rows]
+        columns_of_rows = np.empty((len(stored), self.segment.dof_count, self.count))
+        columns_of_rows[..., 1:] = [each.columns for each in stored]
+        columns_of_rows[..., 0] = columns_of_rows[..., 1:] @ change + [each.x for each in stored]
+        x = state.x.copy()
+        known_rows = min(len(stored), state.end)
+        x[state.end - known_rows : state.end] = columns_of_rows[len(stored) - known_rows :, :, 0]
+        point_columns = self._at_points(columns_of_rows)
+        point_columns[..., 1:] *= self.rates[moving]
+        stored_rows = [
+            StoredRow(self.transformed, w[:, 0], k.columns)
+            for w, k in zip(columns_of_rows, stored, strict=True)
+        ]
+        all_wrenches = np.array([wrenches for *_, wrenches in state.observed_rows])
+        all_wrenches[..., 0] += all_wrenches[..., 1:] @ ((self.transformed - flat) / old_rates)
+        all_wrenches[..., 1:] *= self.rates / old_rates
+        read = tuple(zip(stored_rows, point_columns, all_wrenches, strict=True))
+        felt = state.reactions.moved_to(step, factors)
+        return replace(
+            state, x=x, force=force, reactions=felt, last_rows=memory, observed_rows=read
+        )
+
+    def _resume(self, state: SweepState) -> None:
+        """Continue from a state, whose arrays are copied."""
+        self.row = state.row
+        self.end = state.end
+        self.x = state.x.copy()
+        self.force = state.force.copy()
+        self.given = state.prescribed_columns.copy()
+        grasped = None
+        if self.segment.nuisance.affects_grasps:
+            grasped = PrescribedColumns.from_columns(self.solver, self.grasped, self.given)
+        self.columns = SweepColumns(self.setting, self.count, has_step=True, prescribed=grasped)
+        self.felt = state.reactions.copy()
+        self.forward = ForwardSubstitution(
+            self.solver, self.columns, state.last_rows, self.felt.forces
+        )
+        most = (
+            (2 * self.model.neighbouring_samples + LARGEST_SAMPLE_DELAY + 2) * self.model.substeps
+            + 4
+            + ROWS_PER_CHUNK
+        )
+        most += self.model.largest_delay_rows
+        self.read: deque[ObservedRow] = deque(state.observed_rows, maxlen=most)
+
+    @property
+    def needs_another_pass(self) -> bool:
+        """Whether a correction was so long that its square is not negligible."""
+        return self.longest_m > LARGEST_CORRECTION * self.model.body_size_m
+
+    @property
+    def state(self) -> SweepState:
+        """Copy of the state on which the next row depends."""
+        return SweepState(
+            row=self.row,
+            end=self.end,
+            x=self.x.copy(),
+            force=self.force.copy(),
+            prescribed_columns=self.given.copy(),
+            reactions=self.felt.copy(),
+            last_rows=self.forward.state,
+            observed_rows=tuple(self.read),
+        )
+
+    # Rows -------------------------------------------------------------------------------------
+
+    def advance(self, poses: Sequence[Poses], guesses: Sequence[Array] = ()) -> list[StoredRow]:
+        """Compute further rows with given poses; return them for later passes.
+
+        Fewer rows than given are computed if one is far from its initial guess: later guesses are
+        then wrong, too.
+
+        Parameters
+        ----------
+        poses : sequence of Poses
+            Poses of the moving grasps, for at most `ROWS_PER_CHUNK` rows.
+        guesses : sequence of (3n,), optional
+            Initial guesses of the positions; extrapolated by default.
+
+        Returns
+        -------
+        list of Kept
+            The computed rows, at least one.
+
+        Raises
+        ------
+        SimulationError
+            If a row cannot be solved.
+        """
+        poses = [self.model.all_poses(each) for each in poses]
+        first = self._make_room(len(poses))
+        count = len(poses)
+        goals, slopes = self.model.prescribed_positions(self.displaced_nodes, poses)
+        self.felt.set_poses(first, poses)
+        self.given[first : first + count, :, 1 + self.segment.nq :] = slopes
+        if first < self.dynamics.first_row:
+            self.x[first] = self._start_positions(poses[0])
+            self._count_rows(1)
+            return self._store_rows([np.zeros(self.forward.shape)])
+        for k, t in enumerate(range(first, first + count)):
+            self.x[t] = guesses[k] if guesses else self._extrapolate(t, poses[k])
+            self.x[t, self.grasped] = goals[k]
+        remaining = range(first, first + count)
+        computed = []
+        last_length = np.inf
+        is_careful = False
+        while remaining:
+            limit = (
+                LARGEST_CORRECTION
+                * self.model.body_size_m
+                * (1 if len(remaining) == 1 else CHUNK_CORRECTION_FACTOR)
+            )
+            rows, length = self._solve_rows(remaining, limit)
+            accepted = len(remaining) if length is None else len(rows) - 1
+            computed += rows[:accepted]
+            self._count_rows(accepted)
+            if length is None:
+                break
+            t = remaining[accepted]
+            if length < last_length / 2:
+                self.x[t] += rows[accepted][:, 0]
+                last_length = length
+            elif not is_careful:
+                self.x[t] = self._solve_carefully(t, poses[t - first])
+                is_careful = True
+                last_length = np.inf
+            else:
+                self._fail(NewtonFailure(self.x[t], "Newton's steps do not get shorter"))
+            remaining = range(t, t + 1)
+        return self._store_rows(computed)
+
+    def _count_rows(self, count: int) -> None:
+        """Record that rows are done."""
+        self.row = self.row + count
+        self.end = self.end + count
+
+    def _make_room(self, count: int) -> int:
+        """Shift the template if necessary for more rows; return the index of the next row in it."""
+        surplus = self.end + count - self.model.template_rows
+        if surplus > 0:
+            for each in (self.x, self.force, self.given, *self.felt.arrays):
+                each[:-surplus] = each[surplus:]
+            self.end -= surplus
+        return self.end
+
+    def _extrapolate(self, t: int, poses: Poses) -> Array:
+        """Return x_t on a cubic polynomial through the last four rows, or through fewer at the
+        start.
+        """
+        if t == 0:
+            return self._start_positions(poses)
+        if t < 4:
+            return extrapolate(self.x[:t], np.zeros(self.segment.dof_count))
+        return 4 * (self.x[t - 1] + self.x[t - 3]) - 6 * self.x[t - 2] - self.x[t - 4]
+
+    def _start_positions(self, poses: Poses) -> Array:
+        """Return the positions of the start (3n,) with grasps at given poses."""
+        goals_m = np.full(self.segment.dof_count, np.nan)
+        goals_m[self.grasped] = self.model.prescribed_positions(self.displaced_nodes, [poses])[0][0]
+        experiment = self.model.at_start(poses)
+        return initial_state(experiment, self.forces, self.model.newton, prescribed_m=goals_m)[0]
+
+    def _linearise(self, here: range) -> tuple[Linearisation, tuple[Array, Array]]:
+        """Return forces with derivatives at guessed rows, and the right-hand sides of their
+        columns.
+
+        Corrections of the previous rows count as done and are set to zero.
+        """
+        for past in (*self.forward.past, *self.forward.past_increments):
+            past[:, 0] = 0.0
+        rows = slice(here.start, here.stop)
+        known = slice(here.stop)
+        p, q, w, s = (table[rows, known] for table in self.model.stencils)
+        x = self.x[known]
+        force = self.force[known]
+        free = self.solver.free
+        nu = q @ x
+        acceleration = s @ x
+        at = self.forces.linearise(p @ x, nu, self.model.linearisation_memory[: len(here)])
+        force[rows] = at.force
+        residual = (w @ force - self.mass_kg * acceleration)[:, free]
+        return at, self.columns.right_hand_sides(rows, at, acceleration, residual, free)
+
+    def _stencil_row(self, t: int) -> StencilRow:
+        """Return the coefficients of a row, cached while the masses do not depend on parameters."""
+        if t not in self._rows:
+            self._rows[t] = StencilRow.from_dynamics(self.dynamics, t)
+        return self._rows[t]
+
+    def _solve_rows(self, here: range, limit: float) -> tuple[list[Array], float | None]:
+        """Solve rows once; return their columns (3n, 1 + m), and None if all are accepted.
+
+        Otherwise the last columns are those of the first row that is not accepted, because its
+        correction is longer than the limit or its matrix is singular, and the second value is the
+        length of that correction or NaN.
+
+        Parameters
+        ----------
+        here : range
+            Indices of the rows in the template.
+        limit : float
+            Largest accepted correction [m].
+        """
+        solver = self.solver
+        forward = self.forward
+        at, sides = self._linearise(here)
+        solved: list[Array] = []
+        for k, (t, right, force) in enumerate(zip(here, *sides, strict=True)):
+            row = self._stencil_row(t)
+            before = forward.state
+            row_columns = np.zeros(forward.shape)
+            by_position = at.by_position[k]
+            by_velocity = at.by_velocity[k]
+            by_position_skew = at.by_position_skew[k]
+            by_velocity_skew = at.by_velocity_skew[k]
+            block = row.block(by_position, by_velocity, solver.pattern)
+            skew_block = row.skew_block(by_position_skew, by_velocity_skew)
+            solved.append(row_columns)
+            try:
+                factor = solver.factoriser.factorise(block, skew_block, self.model.factor_memory)
+                step = FactorisedStep(
+                    t,
+                    row,
+                    at.force[k],
+                    by_position,
+                    by_velocity,
+                    factor,
+                    by_position_skew,
+                    by_velocity_skew,
+                )
+                forward.solve_step(step, right, force, row_columns)
+            except np.linalg.LinAlgError:
+                return solved, np.nan
+            length = float(np.abs(row_columns[:, 0]).max(initial=0.0))
+            if not length <= limit:
+                self.forward = ForwardSubstitution(solver, self.columns, before, self.felt.forces)
+                return solved, length
+            self.longest_m = max(self.longest_m, length)
+            self.x[t] += row_columns[:, 0]
+            if forward.weighs_past:
+                # Correct the forces by their increment in this row.
+                self.force[t, solver.free] += forward.past_increments[0][:, 0]
+        return solved, None
+
+    def _store_rows(self, columns: Sequence[Array]) -> list[StoredRow]:
+        """Return the last rows for later passes, from their columns (3n, 1 + m).
+
+        Observed quantities of these rows are stored, too.
+        """
+        rows = slice(self.end - len(columns), self.end)
+        all_columns = np.array(columns)
+        all_columns[:, :, 0] = self.x[rows]
+        by_flat = (all_columns[:, :, 1:] / self.rates[self.moving]).astype(np.float32)
+        pairs = zip(self.x[rows].copy(), by_flat, strict=True)
+        stored_rows = [StoredRow(self.transformed, *pair) for pair in pairs]
+        self.felt.apply_correction(rows, all_columns[:, self.sensed])
+        self.read.extend(
+            zip(
+                stored_rows,
+                self._at_points(all_columns),
+                self._observed_wrenches(rows),
+                strict=True,
+            )
+        )
+        return stored_rows
+
+    def _observed_wrenches(self, here: slice) -> Array:
+        """Return wrenches and their derivatives available at rows, (rows, sensors, 6, 1 + P).
+
+        They are zero in the first rows, where they are not known.
+        """
+        sensors = self.model.wrench_sensors
+        size = self.model.parameter_count
+        wrenches = np.zeros((here.stop - here.start, len(sensors), 6, 1 + size))
+        if not sensors:
+            return wrenches
+        first = max(here.start, int(sensors[0][0].known_rows[0]) + DELAY_STEPS)
+        if first >= here.stop:
+            return wrenches
+        *_, w, s = self.model.stencils
+        x = self.x[: here.stop, self.sensed]
+        rows = np.arange(first, here.stop)
+        reactions, channels = self.felt.wrenches(sensors, self.setting, x, (w, s), rows)
+        motion = ObservedMotion(x, lambda: reactions)
+        for k, channel in enumerate(channels):
+            value, slopes = channel.linearise(motion, self.phi, self.moving, size)
+            sensor_wrenches = wrenches[first - here.start :, k]
+            sensor_wrenches[..., 0] = value.reshape(-1, 6)
+            sensor_wrenches[..., 1:] = slopes.by_common.reshape(-1, 6, size)
+        return wrenches
+
+    def _at_points(self, columns: Array) -> Array:
+        """Return the values at observed points (…, 3M + …, k) of columns (…, 3n, k) of the body."""
+        nodes, weights = self._looked
+        *rows, dofs, count = columns.shape
+        at = columns.reshape(*rows, dofs // 3, 3, count)[..., nodes, :, :]
+        return np.einsum("ma,...maik->...mik", weights, at).reshape(*rows, -1, count)
+
+    def _solve_carefully(self, t: int, poses: Poses) -> Array:
+        """Return x_t, with the displacement of the grasp applied in parts if necessary."""
+        if t == 0:
+            return self._start_positions(poses)
+        equations = RowEquations(self.dynamics, self.x, self.force, t)
+        goal = self.x[t, self.grasped]
+        try:
+            return solve_row(self.model.newton, equations, self.x[t], self.x[t - 1], goal)
+        except NewtonFailure as failure:
+            self._fail(failure)
+
+    def _fail(self, failure: NewtonFailure) -> NoReturn:
+        """Raise the `SimulationError` of a row that cannot be solved."""
+        model = self.model
+        what = f"the step at row {self.row}"
+        time_s = self.row * model.interval_s / model.substeps
+        raise simulation_error(model.newton, failure, time_s, what) from failure
+
+    # Readings ---------------------------------------------------------------------------------
+
+    def linearise_samples(self, pairs: Sequence[tuple[Sample, int]]) -> list[LinearisedResidual]:
+        """Return the linearised residuals of samples.
+
+        Parameters
+        ----------
+        pairs : sequence of (Sample, int)
+            Samples, and the number of rows computed since the row after which each is evaluated.
+        """
+        residuals: list[LinearisedResidual | None] = [None] * len(pairs)
+        for of in {sample.instrument for sample, _ in pairs}:
+            positions = [k for k, (sample, _) in enumerate(pairs) if sample.instrument == of]
+            samples = [pairs[k] for k in positions]
+            pairs_of_instrument = (
+                self._instrument_residuals(of, samples)
+                if of
+                else (self._marker_residuals(*pair) for pair in samples)
+            )
+            for k, (residual, slope) in zip(positions, pairs_of_instrument, strict=True):
+                slope /= self.rates
+                residuals[k] = LinearisedResidual(residual - slope @ self.transformed, slope, of)
+        return [each for each in residuals if each is not None]
+
+    def _instrument_residuals(
+        self, of: int, pairs: Sequence[tuple[Sample, int]]
+    ) -> Iterator[tuple[Array, Array]]:
+        """Yield residuals and derivatives by p of samples of an instrument.
+
+        They are evaluated from the rows around each sample.
+        """
+        model = self.model
+        reading, stencil, observable = self.model.instruments[of - 1]
+        at = [self.row - 1 - sample.rows_back - rows for sample, rows in pairs]
+        needed_rows = range(
+            stencil.rows_of_sample(min(at)).start, stencil.rows_of_sample(max(at)).stop
+        )
+        _, point_columns, wrenches = zip(
+            *(self.read[k + stencil.delay - self.row] for k in needed_rows), strict=True
+        )
+        step_s = model.interval_s / model.substeps
+        begins_s = float(model.experiment.t_s[0])
+        known_s, t_s = (begins_s + step_s * np.array(rows) for rows in (needed_rows, at))
+        sensor = reading.with_samples(
+            known_s, t_s, np.array([sample.values for sample, _ in pairs])
+        )
+        if isinstance(observable, slice):
+            columns = self.moving
+            place = slice(3 * observable.start, 3 * observable.stop)
+            values = np.array(point_columns)[:, place]
+        else:
+            columns = np.arange(model.parameter_count)
+            values = np.array(wrenches)[:, observable]
+        values = values.reshape(len(needed_rows), -1, 3, 1 + len(columns))
+        slopes = ObservableDerivatives.without_own(columns, values[..., 1:])
+        residual, slope = sensor.linearise(values[..., 0], slopes, self.phi, model.parameter_count)
+        return zip(
+            np.where(sensor.compared_with(len(needed_rows)), residual, np.nan), slope, strict=True
+        )
+
+    def _marker_residuals(self, reading: Sample, rows: int) -> tuple[Array, Array]:
+        """Return residuals (M, 3) of a marker sample and their derivatives (M, 3, P) by p.
+
+        Residuals of missing markers are NaN.
+
+        Parameters
+        ----------
+        reading : Sample
+        rows : int
+            Number of rows computed since the row after which the sample is evaluated.
+        """
+        model = self.model
+        neighbours = self.model.neighbouring_samples
+        markers = self.model.marker_model
+        back = reading.rows_back + rows
+        backs = [back - k * model.substeps for k in range(-neighbours, neighbours + 1)]
+        x, point_columns = (
+            np.array(part) for part in zip(*map(self._interpolated_row, backs), strict=True)
+        )
+        point_columns = point_columns[:, : 3 * len(self.shape_functions[0])]
+        values = point_columns[..., 0].reshape(len(point_columns), -1, 3)
+        slopes = markers.observable.derivatives_from(
+            x, self.shape_functions, self.moving, point_columns[..., 1:]
+        )
+        since_s = (self.row - 1 - back) / model.substeps * model.interval_s
+        markers = markers.shifted(since_s)
+        residual, slope = markers.linearise(values, slopes, self.phi, model.parameter_count)
+        return residual[0] - reading.values / markers.sigmas[:, None], slope[0]
+
+    def _interpolated_row(self, back: float) -> tuple[Array, Array]:
+        """Return positions and observed points at a time, in rows before the last one.
+
+        Times before the start give the start.
+        """
+        nearest = round(back)
+        last = len(self.read) - 1
+        if abs(back - nearest) <= ROW_TOLERANCE or not last:
+            stored, point_columns, _ = self.read[min(max(last - nearest, 0), last)]
+            return stored.x, point_columns
+        first = int(np.clip(np.floor(back) - 1, 0, max(0, last - 3)))
+        rows = [first + k for k in range(min(4, last + 1))]
+        weights = lagrange_weights(back, rows)
+        stored, point_columns, _ = zip(*(self.read[last - row] for row in rows), strict=True)
+        return np.tensordot(weights, [k.x for k in stored], 1), np.tensordot(
+            weights, point_columns, 1
+        )
+
+    def add_residuals(self, residuals: Sequence[LinearisedResidual]) -> None:
+        """Add linearised residuals to the information; missing ones are skipped."""
+        self.information = self.with_residuals(self.information, residuals)
+
+    def with_residuals(
+        self, known: SquareRootInformation, residuals: Sequence[LinearisedResidual]
+    ) -> SquareRootInformation:
+        """Return information with linearised residuals added, with the weights of the loss at p."""
+        if not residuals:
+            return known
+        at_zero = np.concatenate([each.at_zero for each in residuals])
+        is_present = np.isfinite(at_zero)
+        rows_present = is_present.any(axis=1)
+        slopes = np.concatenate([each.slope for each in residuals])[rows_present]
+        is_present = is_present[rows_present]
+        residual = np.where(is_present, at_zero[rows_present] + slopes @ self.transformed, 0.0)
+        rows, slopes = huber_as_least_squares(residual, slopes, self.model.collocation.huber)
+        return known.with_rows(rows[is_present], slopes[is_present], self.transformed)

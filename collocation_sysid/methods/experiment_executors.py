@@ -1,0 +1,349 @@
+"""Executors for the experiments of a search: threads of this process, or workers of a Dask cluster.
+
+Results for each experiment stay where they were computed, as values in this process or as Dask
+futures on a worker, until they are fetched. If a worker is lost, Dask repeats its computations on
+another.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import secrets
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import fields
+from functools import cache
+from importlib.metadata import version
+from typing import Any, Protocol, TypeVar
+from weakref import WeakKeyDictionary
+
+from ..cluster import connected, distributed
+from ..errors import InputError
+from ..fem.body import Body
+from ..fem.kernels import map_experiments, run_single_threaded
+from ..files import reason
+from ..program.collocation import Collocation
+from ..program.marker_association import MarkerAssociation
+from ..program.transcription import Transcription
+from ..recording.experiment import Experiment
+from .solution import Status
+from .solve_recorder import SearchEnded
+
+T = TypeVar("T")
+# How often it is looked whether there are workers at all.
+LOOK_EVERY_S = 10
+# glibc's M_TRIM_THRESHOLD and M_MMAP_THRESHOLD, and the most that it raises them to by itself.
+KEPT_BYTES = {-1: 64 * 2**20, -3: 32 * 2**20}
+
+
+class ExperimentExecutor(Protocol):
+    """Protocol of executors, which apply functions to experiments.
+
+    Stored values are lists with one entry per experiment, of a type that only the executor knows.
+    """
+
+    def store_segments(self, collocation: Collocation) -> list[Any]:
+        """Store the transcriptions of a problem, and return them as stored values."""
+        ...
+
+    def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
+        """Apply a function to every experiment, and return the results as stored values.
+
+        Parameters
+        ----------
+        run : callable
+            Function of one entry of each column.
+        columns : sequence
+            Arguments, one entry per experiment each; entries may be stored values.
+        """
+        ...
+
+    def fetch(self, stored: Sequence[Any]) -> list[Any]:
+        """Return stored values as values in this process; raise the exception of a function
+        that failed.
+        """
+        ...
+
+    def notes(self) -> list[str]:
+        """Return remarks for the user, for example on lost workers."""
+        ...
+
+
+class LocalExecutor:
+    """Executor with threads of this process, see `map_experiments`.
+
+    Parameters
+    ----------
+    threads : int
+        Number of threads.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self.threads = threads
+
+    def store_segments(self, collocation: Collocation) -> list[Any]:
+        """See `ExperimentExecutor`."""
+        return list(collocation.transcriptions)
+
+    def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
+        """See `ExperimentExecutor`."""
+        return map_experiments(lambda row: run(*row), [*zip(*columns, strict=True)], self.threads)
+
+    def fetch(self, stored: Sequence[Any]) -> list[Any]:
+        """See `ExperimentExecutor`."""
+        return list(stored)
+
+    def notes(self) -> list[str]:
+        """See `ExperimentExecutor`."""
+        return []
+
+
+class DaskExecutor:
+    """Executor with the workers of a Dask cluster; each experiment stays on one of them.
+
+    Parameters
+    ----------
+    client : distributed.Client
+        Client of the scheduler.
+
+    Raises
+    ------
+    InputError
+        If there are no workers, or they have another version of the package.
+    """
+
+    def __init__(self, client: Any) -> None:
+        self.client = client
+        self._sent: WeakKeyDictionary[object, Any] = WeakKeyDictionary()
+        self._homes: list[str] = []
+        self._first = _require_package(client)
+
+    def store_segments(self, collocation: Collocation) -> list[Any]:
+        """See `ExperimentExecutor`; each body and experiment is sent only once."""
+        segments = collocation.transcriptions
+        with self._end_search_if_lost():
+            known = all(segment.experiment in self._sent for segment in segments)
+            if not known or len(self._homes) != len(segments):
+                costs = [segment.variable_count for segment in segments]
+                self._homes = _assign_workers(costs, self.client.nthreads())
+            return [
+                self._send_segment(s, home) for s, home in zip(segments, self._homes, strict=True)
+            ]
+
+    def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
+        """See `ExperimentExecutor`."""
+        rows = zip(self._homes, *columns, strict=True)
+        with self._end_search_if_lost():
+            return [self._submit(home, run, *row) for home, *row in rows]
+
+    def fetch(self, stored: Sequence[Any]) -> list[Any]:
+        """Return stored values as values in this process, see `ExperimentExecutor`.
+
+        Raises
+        ------
+        Ended
+            If the scheduler or all workers are lost, or an experiment terminates every worker that
+            processes it.
+        """
+        with self._end_search_if_lost():
+            return [self._result(future) for future in stored]
+
+    def notes(self) -> list[str]:
+        """See `ExperimentExecutor`."""
+        with self._end_search_if_lost():
+            lost_workers = self._first - self.client.nthreads().keys()
+        said = f"{len(lost_workers)} of {len(self._first)} workers were lost on the way: "
+        return [f"{said}what they had was done again on others"] if lost_workers else []
+
+    def _result(self, future: Any) -> Any:
+        """Return the result of a future, and check from time to time that workers exist."""
+        while True:
+            try:
+                return future.result(timeout=LOOK_EVERY_S)
+            except distributed().TimeoutError:
+                _require_workers(self.client.nthreads())
+
+    @contextmanager
+    def _end_search_if_lost(self) -> Iterator[None]:
+        """Context that raises `SearchEnded` instead of Dask's exceptions if the cluster is lost."""
+        dask = distributed()
+        try:
+            yield
+        except dask.scheduler.KilledWorker as error:
+            raise _cluster_lost(
+                "A recording ended every worker that had it: mind their memory."
+            ) from error
+        except (Exception, dask.client.CancelledError) as error:
+            is_disconnected = isinstance(error, (OSError, dask.client.CancelledError))
+            if isinstance(error, SearchEnded) or (
+                self.client.status == "running" and not is_disconnected
+            ):
+                raise
+            raise _cluster_lost("Its scheduler answers no more.") from error
+
+    def _submit(self, home: str, run: Callable[..., Any], *arguments: Any) -> Any:
+        """Return a future of a function on a worker; Dask may choose another worker if that is
+        lost.
+
+        Keys begin with the function's name, from which Dask estimates the duration of a task.
+        """
+        # By the name of the function dask knows how long such tasks take.
+        key = f"{run.__name__}-{secrets.token_hex(16)}"
+        return self.client.submit(
+            _run_alone, run, *arguments, key=key, workers=[home], allow_other_workers=True
+        )
+
+    def _send_segment(self, transcription: Transcription, home: str) -> Any:
+        """Return a future of a transcription on a worker."""
+
+        def send_once(thing: T, make: Callable[[T], Any]) -> Any:
+            """Return the future of an object, which is made at the first call."""
+            if thing not in self._sent:
+                self._sent[thing] = make(thing)
+            return self._sent[thing]
+
+        def experiment(options: Experiment) -> Any:
+            return self._submit(
+                home, _with_body, _with_fields(options), send_once(options.body, body)
+            )
+
+        def body(options: Body) -> Any:
+            return self._submit(home, _identity, options)
+
+        def whole(options: Transcription) -> Any:
+            sent = send_once(options.experiment, experiment)
+            chart = _with_fields(options.association)
+            rest = {
+                n: v
+                for n, v in options.__getstate__().items()
+                if n not in ("experiment", "association")
+            }
+            return self._submit(home, _restore_segment, sent, chart, rest)
+
+        return send_once(transcription, whole)
+
+
+@contextmanager
+def connect_executor(scheduler: str | None) -> Iterator[DaskExecutor | None]:
+    """Context with an executor on the scheduler at an address; None if the address is None.
+
+    Raises
+    ------
+    InputError
+        If the connection fails or the workers do not fit, see `connected` and `DaskExecutor`.
+    """
+    if scheduler is None:
+        yield None
+        return
+    with connected(scheduler) as client:
+        yield DaskExecutor(client)
+
+
+def _assign_workers(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
+    """Return the worker address of each experiment.
+
+    The experiment with the highest cost is assigned first, each to the thread with the least work.
+    """
+    _require_workers(threads)
+    slots = [(address, k) for address, count in threads.items() for k in range(count)]
+    loads = dict.fromkeys(slots, 0)
+    homes = [""] * len(costs)
+    for number in sorted(range(len(costs)), key=lambda k: -costs[k]):
+        slot = min(loads, key=lambda slot: (loads[slot], slot[1]))
+        loads[slot] += costs[number]
+        homes[number] = slot[0]
+    return homes
+
+
+def _require_package(client: Any) -> set[str]:
+    """Return the addresses of the workers; raise `InputError` for those without this
+    package version.
+    """
+    own_version = version("collocation-sysid")
+    try:
+        versions = client.run(_version, on_error="return")
+    except (Exception, distributed().client.CancelledError) as error:
+        raise _refusal(
+            f"the scheduler stopped answering while its workers were asked for their versions "
+            f"({reason(error)}); start it again"
+        ) from error
+    if not versions:
+        raise _refusal("the scheduler has no workers; start some, as with dask worker ADDRESS")
+    for address, worker_version in versions.items():
+        if worker_version != own_version:
+            raise _refusal(
+                f"found {worker_version!r} on the worker {address}; expected collocation-sysid "
+                f"{own_version}"
+            )
+    return set(versions)
+
+
+def _refusal(message: str) -> InputError:
+    """Return an error that refers to the option --scheduler."""
+    return InputError(message, None, "--scheduler")
+
+
+def _require_workers(threads: dict[str, int]) -> None:
+    """Raise `SearchEnded` if no worker is left."""
+    if not threads:
+        raise _cluster_lost("No worker is left.")
+
+
+def _cluster_lost(reason: str) -> SearchEnded:
+    """Return the exception that ends the search because the cluster is lost."""
+    return SearchEnded(Status.CLUSTER_LOST, f"{Status.CLUSTER_LOST.sentence} {reason}")
+
+
+# On the workers -----------------------------------------------------------------------------------
+
+
+def _version() -> str:
+    """Return the version of this package; workers run this function."""
+    return version("collocation-sysid")
+
+
+def _run_alone(run: Callable[..., T], *arguments: Any) -> T:
+    """Return `run(*arguments)`, computed on a worker's thread without further threads."""
+    _retain_freed_memory()
+    return run_single_threaded(run, *arguments)
+
+
+@cache
+def _retain_freed_memory() -> None:
+    """Let the C library keep freed memory of this process for later arrays.
+
+    Dask's nannies set MALLOC_TRIM_THRESHOLD_, so that glibc returns every freed array to the
+    system; each sweep would then wait for new memory pages. No effect with other C libraries.
+    """
+    if mallopt := getattr(ctypes.pythonapi, "mallopt", None):  # glibc's only
+        for option, size in KEPT_BYTES.items():
+            mallopt(option, size)
+
+
+def _identity(thing: T) -> T:
+    """Return the argument; workers run it to store an object."""
+    return thing
+
+
+def _with_fields(thing: T, body: Body | None = None) -> T:
+    """Return a copy of an experiment or an association with another body; None removes it
+    for transfer.
+    """
+    stated = {field.name: getattr(thing, field.name) for field in fields(thing)}  # pyright: ignore[reportArgumentType]
+    other = object.__new__(type(thing))
+    vars(other).update(stated | {"body": body})
+    return other
+
+
+def _with_body(experiment: Experiment, body: Body) -> Experiment:
+    """Return the experiment with its body; workers run this function."""
+    return _with_fields(experiment, body)
+
+
+def _restore_segment(
+    experiment: Experiment, chart: MarkerAssociation, rest: dict[str, Any]
+) -> Transcription:
+    """Return a transcription from its experiment, its association without body, and its
+    other arguments.
+    """
+    return Transcription(experiment, association=_with_fields(chart, experiment.body), **rest)

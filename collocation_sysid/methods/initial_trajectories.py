@@ -1,0 +1,210 @@
+"""Initial trajectories: simulations at given parameters, as far as they succeed.
+
+Use `initial_variables` for a method that needs variables at the guess, and `simulate_trajectories`
+for
+simulations at any parameters. Where a simulation fails, `complete_variables` appends the initial
+shape moved
+rigidly with the grasp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..array_types import Array
+from ..errors import SimulationError
+from ..fem.kernels import map_experiments
+from ..model.forces import Forces
+from ..program.collocation import Collocation, ExperimentIterate
+from ..program.initial_equilibrium import initial_state
+from ..program.newton_solver import NewtonOptions, NewtonSolver
+from ..program.scheme_simulation import continue_simulation, simulate_scheme
+from ..program.stopwatch import Stopwatch
+from ..program.transcription import Transcription
+
+
+def associated_at_guess(collocation: Collocation) -> Collocation:
+    """Associate markers and cameras of unknown position with the body's initial shape at the guess.
+
+    The initial shape is the initial equilibrium or, if that fails, the undeformed shape moved with
+    the grasp. The collocation is returned unchanged if all positions are known.
+    """
+    if not any(segment.rows_to_place for segment in collocation.transcriptions):
+        return collocation
+    p = collocation.guess_p
+    positions = []
+    for segment in collocation.transcriptions:
+        experiment = segment.experiment
+        theta = segment.constants.theta(p[: segment.nq])
+        try:
+            first = Forces.from_experiment(experiment, experiment.t_s[:1], theta)
+            x, _ = initial_state(experiment, first, NewtonSolver(experiment))
+        except SimulationError:
+            x = experiment.rigid_positions(experiment.t_s[:1]).ravel()
+        positions.append(x[None])
+    return collocation.place_unknown_markers(p, positions)[0]
+
+
+def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
+    """Return variables z (variables,) at the guess, and notes for the user.
+
+    Each experiment is simulated at the guess with the collocation scheme. If that fails, the
+    initial shape is moved rigidly with the grasp and a note is added: collocation needs no feasible
+    start.
+    """
+    p = collocation.guess_p
+    positions = []
+    notes = []
+    for segment in collocation.transcriptions:
+        theta = segment.constants.theta(p[: segment.nq])
+        try:
+            positions.append(
+                simulate_scheme(segment.experiment, segment.dynamics.with_theta(theta))
+            )
+        except SimulationError as error:
+            positions.append(rigid_trajectory(segment, theta))
+            notes.append(
+                f"experiment '{segment.experiment.name}': the simulation at the guess failed "
+                f"({error}); started from the rest shape carried rigidly by the grasp"
+            )
+    return collocation.pack(p, positions), notes
+
+
+def simulate_trajectories(
+    collocation: Collocation,
+    p: Array,
+    known_rows: Sequence[Array] | None = None,
+    rows: Sequence[int] | None = None,
+    options: NewtonOptions | None = None,
+    stopwatch: Stopwatch | None = None,
+    guess: Sequence[Array] | None = None,
+) -> tuple[list[Array], SimulationError | None]:
+    """Simulate all experiments with the collocation scheme, as far as the simulations succeed.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem.
+    p : (np,) array
+        Shared and nuisance parameters (q, φ).
+    known_rows : sequence of (k, 3n) array, optional
+        First rows of every trajectory [m], which are continued; by default simulations begin at the
+        experiments' starts.
+    rows : sequence of int, optional
+        Number of grid rows of each trajectory; all by default.
+    options : NewtonOptions, optional
+        Tolerances of Newton's method.
+    stopwatch : Stopwatch, optional
+        Stopwatch that measures the simulations.
+    guess : sequence of (N, 3n) array, optional
+        Trajectories at other parameters [m], from which Newton's method starts to search for
+        equilibria.
+
+    Returns
+    -------
+    tuple of list of (m, 3n) array and SimulationError or None
+        Trajectories, which are shorter than requested where the simulation failed, and the first
+        failure; None if there was none.
+    """
+    parts = collocation.iterates_at(p, known_rows or _empty_trajectories(collocation))
+
+    def simulate_one(k: int) -> tuple[Array, SimulationError | None]:
+        """Simulate experiment number k, from 0."""
+        count = parts[k].segment.grid_times if rows is None else rows[k]
+        own_guess = None if guess is None else guess[k]
+        return continue_trajectory(parts[k], count, options, stopwatch, own_guess)
+
+    reached = map_experiments(simulate_one, range(len(parts)), collocation.threads)
+    failures = [failure for _, failure in reached if failure is not None]
+    return [x for x, _ in reached], failures[0] if failures else None
+
+
+def continue_trajectory(
+    iterate: ExperimentIterate,
+    rows: int,
+    options: NewtonOptions | None = None,
+    stopwatch: Stopwatch | None = None,
+    guess: Array | None = None,
+) -> tuple[Array, SimulationError | None]:
+    """Continue the trajectory of one experiment, as far as the simulation succeeds.
+
+    Parameters
+    ----------
+    iterate : ExperimentIterate
+        Experiment at its parameters, with its known first rows.
+    rows : int
+        Number of grid rows of the result.
+    options : NewtonOptions, optional
+        Tolerances of Newton's method.
+    stopwatch : Stopwatch, optional
+        Stopwatch that measures the simulation.
+    guess : (N, 3n) array, optional
+        Trajectory at other parameters [m], see `simulate_trajectories`.
+
+    Returns
+    -------
+    tuple of (m, 3n) array and SimulationError or None
+        Trajectory with the known rows [m], and the failure; None if the trajectory is complete.
+    """
+    return continue_simulation(
+        iterate.segment.experiment,
+        iterate.equations.dynamics.truncated_to(rows),
+        iterate.x if len(iterate.x) else None,
+        options,
+        stopwatch=stopwatch,
+        near_solution=guess,
+    )
+
+
+def complete_variables(
+    collocation: Collocation, p: Array, known_rows: Sequence[Array] | None = None
+) -> Array:
+    """Return variables z from parameters and the first rows of every trajectory.
+
+    Missing rows are those of `rigid_trajectory`.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem.
+    p : (np,) array
+        Shared and nuisance parameters (q, φ).
+    known_rows : sequence of (k, 3n) array, optional
+        First rows of every trajectory [m]; none by default.
+    """
+    trajectories = []
+    for part in collocation.iterates_at(p, known_rows or _empty_trajectories(collocation)):
+        x = part.x
+        if len(x) < part.segment.grid_times:
+            rigid_positions = rigid_trajectory(part.segment, part.equations.theta)
+            x = np.concatenate([x, rigid_positions[len(x) :]])
+        trajectories.append(x)
+    return collocation.pack(p, trajectories)
+
+
+def _empty_trajectories(collocation: Collocation) -> list[Array]:
+    """Return an empty trajectory (0, 3n) of each experiment."""
+    return [np.zeros((0, segment.dof_count)) for segment in collocation.transcriptions]
+
+
+def rigid_trajectory(transcription: Transcription, theta: Array) -> Array:
+    """Return a trajectory (N, 3n) in which the initial shape moves rigidly with the grasp [m].
+
+    Grasped nodes have their prescribed positions. The initial shape is the initial equilibrium at
+    constants `theta` (k,) or, if that fails, the undeformed shape.
+    """
+    experiment = transcription.experiment
+    t_s = transcription.dynamics.t_s
+    try:
+        first = Forces.from_experiment(experiment, t_s[:1], theta)
+        x0, _ = initial_state(experiment, first, NewtonSolver(experiment))
+    except SimulationError:
+        x0 = experiment.rigid_positions(t_s[:1]).ravel()
+    rotations, translations = experiment.rigid_motion(t_s)
+    shape = (x0.reshape(-1, 3) - translations[0]) @ rotations[0]  # in the grasp's frame
+    carried = np.einsum("tij,nj->tni", rotations, shape) + translations[:, None]
+    return transcription.with_prescribed_positions(
+        carried.reshape(len(t_s), -1), transcription.guess_phi
+    )

@@ -1,0 +1,149 @@
+"""Second derivatives of the loss that Gauss–Newton neglects.
+
+The Hessian of ‖r‖² is 2 (SᵀS + B) with S = ∂r/∂p and B = Σ r_i ∇²r_i, which is small if the
+residuals are small. If they are not, as with measurement noise, Gauss–Newton converges slowly.
+`secant_update` approximates B from the steps by the update of Dennis, Gay and Welsch (NL2SOL,
+1981),
+which converges superlinearly at no cost; `exact_curvature` computes B from the Lagrangian.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from ..array_types import Array
+from ..errors import InputError
+from ..program.collocation import Collocation
+from ..program.least_squares import SquareRootInformation
+from ..program.stopwatch import Stopwatch
+from .horizon import Iterate
+from .solution import constraint_multipliers
+
+# B may not take more than this share of the curvature of SᵀS away in any direction.
+LARGEST_SHARE = 0.9
+
+
+def secant_update(curvature: Array, previous: Iterate, after: Iterate) -> Array:
+    """Return B (np, np) after an accepted step, by the update of Dennis, Gay and Welsch.
+
+    Parameters
+    ----------
+    curvature : (np, np) array
+        B before the step.
+    previous : Iterate
+        Iterate before the step.
+    after : Iterate
+        Iterate after the step, which was evaluated as a trial from `previous`.
+    """
+    step = after.p - previous.p
+    change = after.fit.score - previous.fit.score
+    curvature_step = after.fit.score - after.previous_slopes_residual  # B · step
+    change_along_step = float(change @ step)
+    if change_along_step <= 0:
+        return curvature
+    previous_curvature = float(step @ curvature @ step)
+    if previous_curvature != 0:  # a B that has become too large shrinks to what this step saw
+        curvature = curvature * min(1.0, abs(float(step @ curvature_step) / previous_curvature))
+    missing = curvature_step - curvature @ step
+    rank_two = np.outer(missing, change) / change_along_step
+    return (
+        curvature
+        + rank_two
+        + rank_two.T
+        - (missing @ step) / change_along_step**2 * np.outer(change, change)
+    )
+
+
+def with_curvature(fit: SquareRootInformation, curvature: Array) -> SquareRootInformation:
+    """Return a least-squares problem with the normal matrix SᵀS + B instead of SᵀS.
+
+    The problem is returned unchanged if B is zero, S is rank-deficient, or B reduces the curvature
+    too much (`LARGEST_SHARE`).
+
+    Parameters
+    ----------
+    fit : SquareRootInformation
+        Residuals with slopes S.
+    curvature : (np, np) array
+        B, symmetric.
+    """
+    triangle = fit.jacobian[: len(curvature)]
+    right = fit.residual[: len(curvature)]
+    if not curvature.any() or np.abs(np.diag(triangle)).min() < 1e-12 * np.abs(triangle).max():
+        return fit
+    half = solve_triangular(triangle, curvature, trans=1)
+    relative = solve_triangular(triangle, half.T, trans=1)
+    relative = (relative + relative.T) / 2
+    if np.linalg.eigvalsh(relative)[0] < -LARGEST_SHARE:
+        return fit
+    factor = np.linalg.cholesky(np.eye(len(curvature)) + relative)
+    right = solve_triangular(factor, right, lower=True)
+    return SquareRootInformation(np.column_stack([factor.T @ triangle, right]))
+
+
+def require_second_derivatives(collocation: Collocation) -> None:
+    """Raise `InputError` if the problem has no exact second derivatives.
+
+    Raises
+    ------
+    InputError
+        For materials with memory, forces with internal variables, measured wrenches and custom
+        sensors of grasp forces.
+    """
+    if collocation.has_eliminated_histories:
+        raise InputError(
+            "hessian = 'exact' has no second derivatives of materials with memory (prony), nor of "
+            "forces that carry something; expected 'gauss-newton'"
+        )
+    if any(len(segment.sensed_dofs) for segment in collocation.transcriptions):
+        raise InputError(
+            "hessian = 'exact' has no second derivatives of measured wrenches, nor of readings of "
+            "grasps; expected "
+            "'gauss-newton'"
+        )
+
+
+def exact_curvature(
+    collocation: Collocation, iterate: Iterate, stopwatch: Stopwatch | None = None
+) -> Array:
+    """Return B (np, np) at an iterate of the complete recordings, by one backward sweep.
+
+    B follows from the reduced Hessian Wᵀ ∇²(L + yᵀ g) W of the Lagrangian with W = (I, Z), the
+    sensitivities Z and the multipliers y of the equations of motion.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem.
+    iterate : Iterate
+        Iterate of all rows; its trajectories must be in this process.
+    stopwatch : Stopwatch, optional
+        Stopwatch that measures the sweep.
+
+    Raises
+    ------
+    SimulationError
+        If the equations of a time step are singular.
+    """
+    projected = [each.x + each.tangent.step for each in iterate.trajectories]
+    z = collocation.pack(iterate.p, projected)
+    multipliers = constraint_multipliers(collocation, z, stopwatch)
+    directions = np.column_stack(
+        [_tangent_direction(collocation, iterate, k) for k in range(len(iterate.p))]
+    )
+    hessian = collocation.hessian(z, 1.0, multipliers)
+    reduced = directions.T @ (hessian @ directions) / (2 * collocation.loss_scale)
+    return (reduced + reduced.T) / 2 - iterate.fit.information
+
+
+def _tangent_direction(collocation: Collocation, iterate: Iterate, k: int) -> Array:
+    """Return the change of all variables per unit of parameter k (an index), along the
+    equations of motion.
+    """
+    unit = np.eye(len(iterate.p))[k]
+    position_changes = [
+        each.tangent.by_p @ unit[segment.parameter_indices[segment.dynamic_parameters]]
+        for each, segment in zip(iterate.trajectories, collocation.transcriptions, strict=True)
+    ]
+    return collocation.pack(unit, position_changes)

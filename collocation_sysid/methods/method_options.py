@@ -1,0 +1,73 @@
+"""Construction of methods from options by name, and shares of recordings.
+
+Use `method_from_options` to make a method from a table of the problem file. `Shares` is the type of
+options that
+list growing first parts of every recording, which are solved one after another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from itertools import pairwise
+from typing import Annotated, Any, TypeVar
+
+from pydantic import AfterValidator
+
+from ..errors import InputError, hint_at
+from ..validated_types import Options, Positive
+
+T = TypeVar("T", bound="Options")
+
+
+def method_from_options(kind: type[T], options: Mapping[str, Any], key: str) -> T:
+    """Return a method made from its options.
+
+    Parameters
+    ----------
+    kind : type
+        Class of the method, with a class attribute `name`.
+    options : mapping
+        Values by option name; options that are missing have their defaults.
+    key : str
+        Key of the problem file that contains the options, for messages.
+
+    Raises
+    ------
+    InputError
+        For an unknown option, with the most similar known one, or an invalid value.
+    """
+    known = [field.name for field in fields(kind)]
+    for name in options:
+        if name not in known:
+            has = f"it has {', '.join(known)}{hint_at(name, known)}"
+            raise InputError(f"{kind.name!r} has no option {name!r}; {has}", None, key)
+    try:
+        return kind(**options)
+    except InputError as error:
+        raise InputError(error.message, None, f"{key}.{error.where}") from error
+
+
+# Fewest samples, or rows of a grid, of a first part.
+FEWEST = 8
+
+
+def samples_in_share(count: int, share: float) -> int:
+    """Return the number of samples in a share of `count` samples, at least `FEWEST_SAMPLES` if
+    there are as many.
+    """
+    return min(count, max(FEWEST, round(share * count)))
+
+
+def _require_ascending(shares: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the shares if they are strictly ascending and end with 1; raise `ValueError`
+    otherwise.
+    """
+    is_ascending = all(a < b for a, b in pairwise(shares))
+    if not is_ascending or shares[-1:] != (1.0,):
+        raise ValueError(f"found {list(shares)}; expected numbers above 0 that ascend to 1")
+    return shares
+
+
+Shares = Annotated[tuple[Positive, ...], AfterValidator(_require_ascending)]
+SHARES = (0.25, 0.5, 1.0)

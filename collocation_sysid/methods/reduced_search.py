@@ -1,0 +1,526 @@
+"""Search of the reduced-space method: trust region, acceptance of trials, and increasing horizons.
+
+`SearchOptions` are the options that the user sets; `ReducedSearch` is the search itself. Where
+measurements are associated with the body at estimated positions (markers of unknown position, depth
+cameras), the search also updates the association.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from ..array_types import Array
+from ..errors import SimulationError
+from ..program.factorisation import Choice
+from ..validated_types import Count, Options, Positive
+from .horizon import Horizon, Iterate
+from .loss_curvature import exact_curvature, secant_update, with_curvature
+from .method_options import FEWEST, SHARES, Shares, samples_in_share
+from .solution import Iteration, Status
+from .solve_recorder import Recorder
+from .trajectory_sweeps import FitSummary
+
+if TYPE_CHECKING:
+    from ..program.collocation import Collocation
+    from .experiment_executors import ExperimentExecutor
+
+# Largest infeasibility of a trial over the length of its step.
+CONTRACTION = 0.5
+# Largest infeasibility of a trial over an edge of the mesh: the strain that it causes is then
+# small enough for Newton's next step to remove it. One of both limits is sufficient.
+SMALL_STRAIN = 0.1
+# Smallest share of the predicted decrease that a trial must reach.
+DECREASE = 1e-3
+# Infeasibility over the body's size that is due to rounding.
+FEASIBLE = 1e-12
+# Infeasibility over the body's size at which a search ends if steps no longer change the
+# parameters and the infeasibility no longer decreases.
+NEARLY_FEASIBLE = 1e-8
+# Infeasibility over the body's size above which a point is made feasible after a first rejection.
+INFEASIBLE = 1e-6
+# Length of the next trial over that of a rejected step.
+SHRINK = 0.25
+# Shortest step: shorter ones end the search as stalled.
+SMALLEST_TRUST = 1e-10
+# The last step is accepted without another sweep if its error, estimated from the rate at which
+# steps become shorter, is below this share of the tolerance.
+SAFETY = 0.3
+# Largest residual of the equations of motion after that step, in the scaling of the NLP.
+FEASIBLE_FORCE = 1e-10
+# Largest trust region.
+WIDEST = 4.0
+# Largest trust region with depth cameras, whose associations are valid only nearby.
+SEEING = 0.25
+# With depth cameras, a rejected step shorter than this ends the search.
+SEEN = 1e-3
+# Smallest share of the associated depth points that a step must keep.
+STILL_SEEN = 0.97
+# Largest increase of the mean loss of a depth point by a new association.
+AS_NEAR = 1.01
+# Largest step from which the curvature at the solution is learned.
+LOCAL = 0.1
+# Largest number of new associations of the measurements.
+REREADINGS = 40
+
+
+@dataclass(frozen=True)
+class SearchOptions(Options):
+    """Options of the search for parameters.
+
+    Attributes
+    ----------
+    tolerance : float
+        Largest last step of a parameter's logarithm.
+    max_iterations : int
+        Largest number of sweeps, over all horizons; a rejected trial counts.
+    trust : float
+        First trust region: longest step of a parameter's logarithm.
+    ladder : tuple of float
+        Shares of the recording solved one after another, ending with 1. Not used if the solve
+        starts from another run.
+    rung_decrease : float
+        Each horizon but the last ends when a step promises to decrease the loss by less than this
+        share.
+    rung_prior : float
+        Standard deviation of a prior of each parameter's logarithm around its guess, for all
+        horizons but the last. A short horizon does not determine all parameters, and without this
+        prior they would move to their bounds.
+    hessian : {"gauss-newton", "exact"}
+        Once a step moves no parameter by more than 10 %, "gauss-newton" approximates what
+        Gauss–Newton neglects from the steps, and "exact" computes it from the Lagrangian, which
+        takes a second sweep per iteration and helps with large residuals. Before, both are
+        Gauss–Newton.
+    factorisation : {"auto", "band", "sparse", "supernodal"}
+        Banded Cholesky, SuperLU, supernodal Cholesky (extra `large`), or whichever is estimated to
+        cost least.
+    """
+
+    tolerance: Positive = 1e-8
+    max_iterations: Count = 200
+    trust: Positive = 1.0
+    ladder: Shares = SHARES
+    rung_decrease: Positive = 0.05
+    rung_prior: Positive = 2.3
+    hessian: Literal["gauss-newton", "exact"] = "gauss-newton"
+    factorisation: Choice = "auto"
+
+
+class ReducedSearch:
+    """State of a reduced-space search: best parameters and trajectories, trust region, number of
+    sweeps.
+
+    Attributes
+    ----------
+    p : (np,) array
+        Best parameters (q, φ).
+    trajectories : list or None
+        Best trajectories, stored by the workers, see `trajectory.trajectory_positions`; None before
+        the first.
+    sweeps : int
+        Number of sweeps and simulations so far.
+    trust : float
+        Longest step, relative to `reach`.
+    reach : (np,) array
+        Change of each parameter that counts as a step of one.
+    has_depth_cameras : bool
+        Whether an experiment has depth cameras.
+    indefinite_steps : int
+        Time steps with an indefinite matrix at the best point.
+    most_measurements : int
+        Largest number of measurements that were associated.
+    reassociations : int
+        Number of new associations so far.
+    edge_m, size_m : float
+        Mesh edge and body size [m].
+
+    Parameters
+    ----------
+    options : SearchOptions
+        Options.
+    recorder : Recorder
+        Record of the solve; its collocation is replaced when measurements are associated again.
+    start : (variables,) array, optional
+        Initial variables; None means the guess and simulations.
+    workers : ExperimentExecutor, optional
+        Where the experiments are processed; None means threads.
+    """
+
+    def __init__(
+        self,
+        options: SearchOptions,
+        recorder: Recorder,
+        start: Array | None,
+        workers: ExperimentExecutor | None = None,
+    ) -> None:
+        self.options = options
+        self.recorder = recorder
+        self.collocation = collocation = recorder.collocation
+        self.sweeps = 0
+        # Points that depth cameras see belong to what is near: they tell of no long step.
+        self.has_depth_cameras = any(segment.depths for segment in collocation.transcriptions)
+        self.largest_trust = SEEING if self.has_depth_cameras else WIDEST
+        self.trust = min(options.trust, self.largest_trust)
+        self.indefinite_steps = 0
+        self.lower, self.upper = collocation.parameter_bounds
+        self.reassociations = 0
+        self.most_measurements = 0
+        self.is_associated = True
+        self.reach = collocation.reach_p
+        self.p: Array = collocation.guess_p
+        # Kept by the workers, see `trajectory.trajectory_positions`.
+        self.trajectories: list[Any] | None = None
+        self.workers = workers
+        if start is not None:
+            start = np.clip(start, *collocation.bounds())
+            self.p = collocation.parameters_from(start)
+            self.trajectories = [
+                part.segment.with_prescribed_positions(part.x, part.phi)
+                for part in collocation.iterates(start)
+            ]
+        self.point: Iterate | None = None
+        # The last trial, where cameras have looked anew.
+        self.camera_trial: Any = None, None, None
+        nodes = [segment.body.nodes_m for segment in collocation.transcriptions]
+        self.edge_m = min(segment.length_m for segment in collocation.transcriptions)
+        self.size_m = max(float(np.ptp(points, axis=0).max()) for points in nodes)
+
+    # The ladder -------------------------------------------------------------------------------
+
+    def run(self) -> tuple[Status, str]:
+        """Solve the complete problem from the given positions or, without any, on increasing
+        horizons.
+
+        Returns
+        -------
+        tuple of Status and str
+            Status and its sentence.
+
+        Raises
+        ------
+        SimulationError
+            If the simulation cannot be extended even after a fit of the rows that were reached.
+        """
+        status = self._solve_from_start() or self._solve_horizons()
+        return status, status.sentence
+
+    def _solve_from_start(self) -> Status | None:
+        """Solve the complete problem from the given positions.
+
+        Return None if there are none or the sweep fails; then the positions are discarded.
+        """
+        if self.trajectories is None:
+            return None
+        try:
+            rows = [segment.grid_times for segment in self.collocation.transcriptions]
+            return self._minimise(self._horizon(rows, last=True), is_last=True)
+        except SimulationError:
+            self.trajectories = self.point = None
+            return None
+
+    def _solve_horizons(self) -> Status:
+        """Solve one horizon after the other, and return the last status."""
+        status = Status.CONVERGED
+        for share in self.options.ladder:
+            last = share == self.options.ladder[-1]
+            rows = [
+                samples_in_share(segment.grid_times, share)
+                for segment in self.collocation.transcriptions
+            ]
+            rung = self._horizon(rows, last)
+            self._extend_to(rung)
+            status = self._minimise(rung, last)
+            if status is Status.ITERATION_LIMIT:
+                break
+        return status
+
+    def _horizon(self, rows: list[int], last: bool) -> Horizon:
+        """Return the problem on the first rows of each experiment, with a prior unless it
+        is the last.
+        """
+        prior = None if last else self.options.rung_prior
+        watch = self.recorder.stopwatch
+        choice = self.options.factorisation
+        return Horizon(self.collocation, rows, prior, watch, choice, self.workers)
+
+    def _extend_to(self, horizon: Horizon) -> None:
+        """Extend the trajectories to the length of a horizon.
+
+        If the simulation fails, the rows that were reached are fitted first, and then extended
+        again.
+
+        Raises
+        ------
+        SimulationError
+            If this does not reach further.
+        """
+        furthest = 0
+        while True:
+            previous = self.trajectories
+            reached, failure = horizon.simulate(self.p, previous)
+            self.sweeps += 1
+            if failure is not None and previous is not None:
+                # Rows that only nearly satisfy the equations may lead nowhere; simulated ones do.
+                restarted, restart_failure = horizon.simulate(self.p)
+                self.sweeps += 1
+                if sum(horizon.row_counts(restarted)) > sum(horizon.row_counts(reached)):
+                    reached = restarted
+                    failure = restart_failure
+            if failure is None:
+                self.trajectories = reached
+                self._associate_initially(horizon, is_first=previous is None)
+                return
+            rows = horizon.row_counts(reached)
+            fewest = min(FEWEST, *horizon.rows)
+            is_unstarted = previous is None and min(rows) < fewest
+            if is_unstarted or sum(rows) <= furthest or self.sweeps >= self.options.max_iterations:
+                raise failure
+            furthest = sum(rows)
+            self.trajectories = reached
+            self._associate_initially(horizon, is_first=previous is None)
+            self._minimise(self._horizon(rows, last=False), is_last=False)
+
+    # One rung ---------------------------------------------------------------------------------
+
+    def _minimise(self, horizon: Horizon, is_last: bool) -> Status:
+        """Take Gauss–Newton steps on one horizon until convergence, and return the status.
+
+        Parameters
+        ----------
+        horizon : Horizon
+            Problem on the first rows.
+        is_last : bool
+            Whether it is the complete problem, so that the tolerance applies instead of
+            `rung_decrease`.
+        """
+        assert self.trajectories is not None
+        tolerance = self.options.tolerance
+        self.trust = min(self.options.trust, self.largest_trust)
+        point = self._accept(horizon, horizon.evaluate(self.p, self.trajectories, self.point))
+        rejections = 0
+        curvature = np.zeros((len(point.p), len(point.p)))
+        previous = np.inf
+        while True:
+            step = self._next_step(point, curvature)
+            length = self._step_length(step)
+            # A step that the trust region cuts short says nothing about the distance to go.
+            is_full_step = length < 0.99 * self.trust
+            is_short = is_full_step and length <= tolerance
+            if is_short and point.feasibility_m <= FEASIBLE * self.size_m:
+                return Status.CONVERGED
+            rate = min(1.0, length / previous)
+            if is_last and is_full_step and length * rate <= SAFETY * tolerance:
+                final_positions = horizon.extrapolate(point, step)
+                summaries = horizon.fit_summaries(point.p + step, final_positions)
+                if self._are_feasible(summaries):
+                    self._record(
+                        point.p + step, final_positions, point.predicted_loss(step), summaries
+                    )
+                    return Status.CONVERGED
+            predicted_share = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
+            if not is_last and predicted_share < self.options.rung_decrease:
+                return Status.CONVERGED
+            if self.sweeps >= self.options.max_iterations:
+                return Status.ITERATION_LIMIT
+            trial = self._try(horizon, point, step)
+            is_better = trial is not None and self._judge(point, step, trial)
+            if (
+                trial is not None
+                and is_better
+                and self._is_better_for_cameras(horizon, point, trial)
+            ):
+                if is_last and length <= LOCAL:
+                    curvature = self._update_curvature(curvature, point, trial)
+                point = self._accept(horizon, trial)
+                rejections = 0
+                previous = length
+                continue
+            if is_short and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
+                return Status.CONVERGED  # rounding keeps it from getting better
+            if self.has_depth_cameras and length <= SEEN:
+                return Status.CONVERGED  # what is seen changes by more than such a step gains
+            if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
+                return Status.STALLED
+            self.trust = SHRINK * length
+            rejections += 1
+            if rejections == 1 and point.feasibility_m > INFEASIBLE * self.size_m:
+                point = self._make_feasible(horizon, point)
+
+    def _update_curvature(self, curvature: Array, previous: Iterate, after: Iterate) -> Array:
+        """Return what Gauss–Newton neglects of the Hessian (np, np) at `after`,
+        approximated or exact.
+        """
+        if self.options.hessian == "exact":
+            return exact_curvature(self.collocation, after, self.recorder.stopwatch)
+        return secant_update(curvature, previous, after)
+
+    def _step_length(self, step: Array) -> float:
+        """Return the largest change of a parameter relative to `reach`."""
+        return float(np.abs(step / self.reach).max(initial=0.0))
+
+    def _next_step(self, point: Iterate, curvature: Array) -> Array:
+        """Return the step (np,) that minimises the model within bounds and trust region."""
+        low = np.maximum(self.lower - point.p, -self.trust * self.reach)
+        high = np.minimum(self.upper - point.p, self.trust * self.reach)
+        # Rounding may leave a parameter on its bound by a hair.
+        low = np.minimum(low, 0.0) - 1e-15
+        high = np.maximum(high, 0.0) + 1e-15
+        return with_curvature(point.fit, curvature).minimiser(low, high)
+
+    def _try(self, horizon: Horizon, point: Iterate, step: Array) -> Iterate | None:
+        """Sweep after a step from `point`; None if that fails or is not finite."""
+        self.sweeps += 1
+        p = np.clip(point.p + step, self.lower, self.upper)
+        try:
+            trial = horizon.evaluate_step(p, point, step)
+        except SimulationError:
+            return None
+        return trial if trial.is_finite else None
+
+    def _judge(self, point: Iterate, step: Array, trial: Iterate) -> bool:
+        """Return whether a trial is accepted, and adapt the trust region if it is."""
+        predicted = point.loss - point.predicted_loss(step)
+        actual = point.loss - trial.loss
+        if trial.feasibility_m > max(
+            CONTRACTION * trial.position_change_m, SMALL_STRAIN * self.edge_m
+        ):
+            return False
+        noise = 1e-12 * point.loss + 1e-20
+        if actual < DECREASE * predicted - noise:
+            return False
+        length = self._step_length(step)
+        if actual > 0.75 * predicted and length > 0.9 * self.trust:
+            self.trust = min(2.0 * self.trust, self.largest_trust)
+        elif actual < 0.25 * predicted - noise:
+            self.trust = max(0.5 * length, SMALLEST_TRUST)
+        return True
+
+    def _make_feasible(self, horizon: Horizon, point: Iterate) -> Iterate:
+        """Return the point after its feasibility step or, if that does not converge, with a
+        simulation.
+
+        The loss of the projected trajectory is then accurate to a higher order, so that trials are
+        no longer compared with a loss that is too low.
+        """
+        refined = self._try(horizon, point, np.zeros(len(point.p)))
+        if refined is None or refined.feasibility_m > CONTRACTION * point.feasibility_m:
+            return self._resimulated(horizon, point)
+        return self._accept(horizon, refined)
+
+    def _resimulated(self, horizon: Horizon, point: Iterate) -> Iterate:
+        """Return the point with a simulated trajectory, or unchanged if the simulation fails."""
+        self.sweeps += 1
+        x, failure = horizon.simulate(point.p, guess=point)
+        if failure is not None:
+            return point
+        try:
+            resimulated = horizon.evaluate(point.p, x)
+        except SimulationError:
+            return point
+        return self._accept(horizon, resimulated) if resimulated.is_finite else point
+
+    def _are_feasible(self, summaries: list[FitSummary]) -> bool:
+        """Return whether the residuals of the equations of motion are much smaller than the
+        tolerance.
+        """
+        return all(
+            each.violation_n <= FEASIBLE_FORCE * segment.force_n
+            for each, segment in zip(summaries, self.collocation.transcriptions, strict=True)
+        )
+
+    # Where recordings are read ----------------------------------------------------------------
+
+    def _associate_initially(self, horizon: Horizon, is_first: bool) -> None:
+        """Associate markers and cameras of unknown position, from the first rows of the
+        trajectories.
+
+        Parameters
+        ----------
+        horizon : Horizon
+            Problem, which is updated.
+        is_first : bool
+            Whether these are the first trajectories of the search.
+        """
+        if (is_first or not self.is_associated) and self.trajectories is not None:
+            counts = [segment.rows_to_place for segment in self.collocation.transcriptions]
+            if any(counts):
+                rows = horizon.first_rows(self.trajectories, counts)
+                # What cameras see later is not there yet.
+                self.is_associated = not self.has_depth_cameras or [*map(len, rows)] == counts
+                self._set_collocation(
+                    horizon, *self.collocation.place_unknown_markers(self.p, rows)
+                )
+
+    def _set_collocation(self, horizon: Horizon, collocation: Collocation, p: Array) -> None:
+        """Use another collocation of the same problem in the search, the recorder and the
+        horizon.
+        """
+        self.collocation = self.recorder.collocation = collocation
+        horizon.set_collocation(collocation)
+        self.lower, self.upper = collocation.parameter_bounds
+        self.p = p
+
+    def _reassociate(self, horizon: Horizon, point: Iterate) -> Iterate:
+        """Return the point with measurements associated at its estimates; unchanged if they are the
+        same.
+
+        The association is not updated after `REREADINGS` updates.
+        """
+        trial, collocation, after = self.camera_trial
+        is_camera_trial = trial is point
+        if is_camera_trial:
+            p = after.p
+        else:
+            counts = [segment.rows_to_follow for segment in self.collocation.transcriptions]
+            rows = horizon.first_rows(point.trajectories, counts)
+            collocation, p = self.collocation.follow_estimates(point.p, rows)
+        if collocation is self.collocation or self.reassociations >= REREADINGS:
+            return point
+        self.reassociations += 1
+        self._set_collocation(horizon, collocation, p)
+        return after if is_camera_trial else horizon.reassociate(p, point)
+
+    def _is_better_for_cameras(self, horizon: Horizon, point: Iterate, trial: Iterate) -> bool:
+        """Return whether a trial is still acceptable with depth points associated at its estimates.
+
+        A depth point may then belong to another part of the surface, or to none. True without depth
+        cameras; false if the association may not be updated any more.
+        """
+        before = self.collocation
+        if not self.has_depth_cameras:
+            return True
+        if self.reassociations >= REREADINGS:
+            return False
+        self.most_measurements = max(self.most_measurements, before.measurement_count)
+        after = self._reassociate(horizon, trial)
+        self.reassociations -= self.collocation is not before
+        self.camera_trial = trial, self.collocation, after
+        measurements = self.collocation.measurement_count
+        each = after.loss / max(1, measurements)
+        before_each = point.loss / max(1, before.measurement_count)
+        self._set_collocation(horizon, before, point.p)
+        return measurements >= STILL_SEEN * self.most_measurements and each <= AS_NEAR * before_each
+
+    def _accept(self, horizon: Horizon, point: Iterate) -> Iterate:
+        """Make a point the best so far, associate its measurements, record it, and return it."""
+        self.point = point = self._reassociate(horizon, point)
+        self.indefinite_steps = sum(report.indefinite_steps for report in point.reports)
+        summaries = [report.fit_summary for report in point.reports]
+        self._record(point.p, point.trajectories, point.loss, summaries)
+        return point
+
+    def _record(self, p: Array, x: list[Any], loss: float, summaries: list[FitSummary]) -> None:
+        """Store parameters and trajectories as the best so far, and add them to the history."""
+        self.p = p
+        self.trajectories = x
+        squares_m2 = sum(each.squares_m2 for each in summaries)
+        rms_m = float(np.sqrt(squares_m2 / max(1, sum(each.samples for each in summaries))))
+        violation_n = max(each.violation_n for each in summaries)
+        values = self.collocation.parameter_values(p)
+        time_s = self.recorder.elapsed_s
+        share = sum(each.rows for each in summaries) / sum(
+            s.grid_times for s in self.collocation.transcriptions
+        )
+        self.recorder.add(Iteration(self.sweeps, loss, rms_m, violation_n, values, time_s, share))

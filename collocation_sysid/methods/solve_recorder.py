@@ -1,0 +1,203 @@
+"""Record of a running solve: history, time, notes, and the resulting `Solution`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from ..array_types import Array
+from ..errors import SimulationError
+from ..fem.constants import is_field_coefficient
+from ..program.collocation import Collocation
+from ..program.stopwatch import Stopwatch
+from .initial_trajectories import initial_variables
+from .solution import Iteration, Solution, Status, Timing, Watch
+
+
+class SearchEnded(Exception):
+    """Exception that ends a search from within.
+
+    Attributes
+    ----------
+    status : Status
+        Reason.
+    message : str
+        Sentence for the user; by default that of the status.
+    """
+
+    def __init__(self, status: Status, message: str = "") -> None:
+        super().__init__(message)
+        self.status = status
+        self.message = message or status.sentence
+
+
+class Recorder:
+    """History, clock and notes of one solve.
+
+    Attributes
+    ----------
+    history : list of Iteration
+        Entries so far.
+    notes : list of str
+        Remarks for the user.
+    stopwatch : Stopwatch
+        Stopwatch of evaluations and linear algebra.
+    start_s : float
+        `time.perf_counter()` at construction [s].
+
+    Parameters
+    ----------
+    method : str
+        Name of the method.
+    collocation : Collocation
+        Problem; methods replace it when measurements are associated again.
+    watch : callable, optional
+        Function that is called with every new `Iteration`.
+    max_time_s : float
+        Time after which `is_late` becomes true [s].
+    """
+
+    def __init__(
+        self,
+        method: str,
+        collocation: Collocation,
+        watch: Watch | None = None,
+        max_time_s: float = np.inf,
+    ) -> None:
+        self.start_s = time.perf_counter()
+        self.method = method
+        self.collocation = collocation
+        self.watch = watch
+        self.max_time_s = max_time_s
+        self.history: list[Iteration] = []
+        self.notes: list[str] = []
+        self.stopwatch = Stopwatch()
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time since construction [s]."""
+        return time.perf_counter() - self.start_s
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the elapsed time exceeds `max_time_s`."""
+        return self.elapsed_s > self.max_time_s
+
+    def initial_variables(self, start: Array | None) -> Array:
+        """Return the initial variables (variables,).
+
+        Parameters
+        ----------
+        start : (variables,) array or None
+            Variables to start from, which are returned as they are; None means a simulation at the
+            guess, whose notes are added to `notes`.
+        """
+        if start is not None:
+            return start
+        z, notes = initial_variables(self.collocation)
+        self.notes += notes
+        return z
+
+    def run_search(self, search: Callable[[], tuple[Status, str]]) -> tuple[Status, str]:
+        """Run a search and return its status and message, also if it ends by an exception.
+
+        Parameters
+        ----------
+        search : callable
+            The search; it returns status and message.
+
+        Returns
+        -------
+        tuple of Status and str
+            `SearchEnded` gives its own status, `SimulationError` gives `NOT_SIMULABLE`, and
+            `KeyboardInterrupt` gives `INTERRUPTED`. Other exceptions are not caught.
+        """
+        try:
+            return search()
+        except SearchEnded as end:
+            return end.status, end.message
+        except SimulationError as error:
+            return Status.NOT_SIMULABLE, f"{Status.NOT_SIMULABLE.sentence} {error}."
+        except KeyboardInterrupt:
+            return Status.INTERRUPTED, Status.INTERRUPTED.sentence
+
+    def add_variables(self, number: int, z: Array, loss: float) -> None:
+        """Evaluate the problem at variables z and add the result to the history.
+
+        Parameters
+        ----------
+        number : int
+            Number of the iteration.
+        z : (variables,) array
+            Variables.
+        loss : float
+            Loss L at z, which is not evaluated again.
+        """
+        collocation = self.collocation
+        violation_n = max(float(np.abs(r).max(initial=0.0)) for r in collocation.residuals_n(z))
+        line = Iteration(
+            number,
+            loss,
+            collocation.rms_marker_distance_m(z),
+            violation_n,
+            collocation.parameter_values(z),
+            self.elapsed_s,
+        )
+        self.add(line)
+
+    def add(self, line: Iteration) -> None:
+        """Add an entry to the history and pass it to `watch`.
+
+        Coefficients of spatially varying parameters are removed from the entry, because there are
+        many.
+        """
+        shown_values = {
+            name: value for name, value in line.parameters.items() if not is_field_coefficient(name)
+        }
+        line = replace(line, parameters=shown_values)
+        self.history.append(line)
+        if self.watch is not None:
+            self.watch(line)
+
+    def solution(
+        self,
+        status: Status,
+        message: str,
+        z: Array,
+        multipliers: Array | None,
+        iterations: int,
+        evaluations: int,
+    ) -> Solution:
+        """Return the solution with the recorded history, times and notes.
+
+        Parameters
+        ----------
+        status : Status
+            Reason why the solve ended.
+        message : str
+            Sentence for the user.
+        z : (variables,) array
+            Final variables.
+        multipliers : (constraints,) array or None
+            Multipliers of the method; None if it has none.
+        iterations : int
+            Iterations of the method.
+        evaluations : int
+            Evaluations of whole trajectories.
+        """
+        return Solution(
+            status,
+            message,
+            self.method,
+            self.collocation,
+            z,
+            multipliers,
+            iterations,
+            tuple(self.history),
+            Timing.since(self.stopwatch, self.start_s),
+            tuple(self.notes),
+            evaluations,
+        )

@@ -1,0 +1,548 @@
+"""Start without a guess: a scan of the stiffness from stiff to soft.
+
+At each stiffness the free moduli have values that are typical in relation to each other, and other
+parameters without a guess have typical values. The first part of every recording is simulated and
+compared with all measurements. A stiff body can always be simulated and moves rigidly with the
+grasp; a softer one sags more, follows later and needs less force, until it fits, and finally the
+simulation fails. So the best start is found by cheap simulations, and the search begins on the side
+where simulations succeed.
+
+The same scan is used if a guess cannot be simulated, or fits worse than a rigid body. Use
+`start_problem`
+before a method is called.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import groupby
+
+import numpy as np
+
+from ..array_types import Array, root_mean
+from ..errors import InputError, SimulationError
+from ..fem.constants import is_modulus, usual_value
+from ..model.parameters import Parameter, Parameters
+from ..program.collocation import Collocation, ExperimentIterate
+from ..program.newton_solver import NewtonOptions
+from ..program.transcription import Transcription
+from .initial_trajectories import simulate_trajectories
+from .method_options import SHARES, samples_in_share
+
+# Largest Young's modulus of the scan [Pa].
+STIFFEST_PA = 1e7
+# Smallest Young's modulus of the scan [Pa].
+SOFTEST_PA = 1e2
+# Number of moduli in the scan, equally spaced on a logarithmic scale.
+STEPS = 15
+# Largest and smallest modulus when the scan continues beyond an end [Pa].
+LIMITS_PA = 1e10, 1.0
+# Typical Young's modulus of a soft body, where nothing is known [Pa].
+SOFT_PA = 1e4
+# Tolerance of simulations that are only compared.
+LOOSE = NewtonOptions(tolerance=1e-4)
+# Number of failures in a row that end the scan.
+LOST = 2
+# Misfit over the best one that counts as a failure.
+WORSE = 3.0
+# The scan continues beyond an end as long as the misfit decreases by this share.
+BETTER = 0.01
+# Number of other starts where there are local minima: each costs a solve, and the right one was
+# next to the best in all twins.
+MORE_STARTS = 2
+# Largest misfit of another start over the best one.
+ALIKE = 4.0
+NO_GUESS = "no guess"
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Result of a scan of the stiffness.
+
+    Attributes
+    ----------
+    reason : str
+        Reason for the scan, the beginning of `sentence`.
+    young_pa : (k,) array
+        Young's moduli that were tried, ascending [Pa]. Moduli with a guess, and fixed ones, kept
+        their values.
+    misfit : (k,) array
+        Root mean square of the residuals of all measurements, in standard deviations; NaN where the
+        body could not be simulated.
+    best : int
+        Index of the modulus that was chosen.
+    parameters : Parameters
+        Parameters with the guesses to start from.
+    samples : int
+        Number of first samples that were compared, over all experiments.
+    time_s : float
+        Computing time [s].
+    starts : mapping of int to Parameters
+        Parameters with guesses by the index of a modulus, for `best` and `others`.
+    others : tuple of int
+        Indices of other moduli that may lead to a better solution where there are local minima:
+        those next to the best, and other minima of the misfit, in ascending order of the misfit.
+    """
+
+    reason: str
+    young_pa: Array
+    misfit: Array
+    best: int
+    parameters: Parameters
+    samples: int
+    time_s: float
+    starts: Mapping[int, Parameters] = field(default_factory=dict)
+    others: tuple[int, ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """Summary of the scan for the user."""
+        return (
+            f"{self.reason}: started from E = {self.young_pa[self.best]:.3g} Pa after a scan of "
+            f"{len(self.young_pa)} stiffnesses in {self.time_s:.2g} s"
+        )
+
+
+def start_problem(
+    collocation: Collocation, is_complete: bool = False
+) -> tuple[Collocation, Scan | None]:
+    """Return the problem with a guess of every parameter, and the scan; None if there was no scan.
+
+    Given guesses are kept, unless the body cannot be simulated with them or fits worse than an
+    undeformed one, and the scan finds better ones.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem.
+    is_complete : bool
+        Whether the simulation at the start must reach the end of the recordings.
+
+    Raises
+    ------
+    InputError
+        If parameters have no guess and the body cannot be simulated at any stiffness.
+    """
+    unguessed = collocation.parameters.names_without_guess
+    if any(is_modulus(name) for name in unguessed):
+        result = scan_stiffness(collocation, is_complete=is_complete)
+        return replace(collocation, parameters=result.parameters), result
+    if unguessed:
+        usual = typical_parameters(collocation.parameters, STIFFEST_PA)
+        collocation = replace(collocation, parameters=usual)
+    if not _has_free_modulus(collocation):
+        return collocation, None
+    trial = _TrialSimulation(collocation)
+    misfit, failure = trial.evaluate_guess(is_complete)
+    if failure is None and misfit <= trial.rigid_misfit:
+        return collocation, None
+    reason = f"the body cannot be simulated at the guess ({failure})"
+    if failure is None:
+        reason = "at the guess the measurements are missed by more than an undeformed body would"
+    result = rescue(collocation, reason, is_complete)
+    if result is None:
+        return collocation, None  # the method will tell what it needs
+    if failure is None and misfit <= result.misfit[result.best]:
+        return collocation, None
+    return replace(collocation, parameters=result.parameters), result
+
+
+def rescue(collocation: Collocation, reason: str, is_complete: bool = False) -> Scan | None:
+    """Return a scan without the given guesses; None if it finds no start.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem with guesses.
+    reason : str
+        Reason for the scan.
+    is_complete : bool
+        Whether the simulation at the start must reach the end of the recordings.
+    """
+    if not _has_free_modulus(collocation):
+        return None
+    try:
+        return scan_stiffness(without_guesses(collocation), reason, is_complete)
+    except InputError:
+        return None
+
+
+def scan_stiffness(
+    collocation: Collocation, reason: str = NO_GUESS, is_complete: bool = False
+) -> Scan:
+    """Simulate the problem at stiffnesses from stiff to soft, and return the best as a start.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem; parameters with a guess keep it.
+    reason : str
+        Reason for the scan, the beginning of `Scan.sentence`.
+    is_complete : bool
+        Whether the simulation at the start must reach the end of the recordings.
+
+    Raises
+    ------
+    InputError
+        If the body cannot be simulated at any stiffness.
+    """
+    began = time.perf_counter()
+    trial = _TrialSimulation(
+        replace(collocation, parameters=_with_units(collocation.parameters, 1.0))
+    )
+    trials = _ScanState(trial)
+    step = (SOFTEST_PA / STIFFEST_PA) ** (1 / (STEPS - 1))
+    trials.try_sequence([STIFFEST_PA * step**k for k in range(STEPS)])
+    if trials.is_best_at_end(softest=True):
+        trials.extend_range(min(trials.misfits), step)
+    if trials.is_best_at_end(softest=False):
+        trials.last_trajectories = None
+        trials.extend_range(max(trials.misfits), 1 / step)
+    young_pa = np.array(sorted(trials.misfits))
+    misfit = np.array([trials.misfits[young] for young in young_pa])
+    candidates = [
+        young
+        for young in _ranked_moduli(young_pa, misfit)
+        if not is_complete or trial.is_simulable(young)
+    ]
+    if not candidates:
+        raise InputError(
+            f"no start was found: the body cannot be simulated at any of {len(young_pa)} "
+            f"stiffnesses from E = {young_pa[-1]:.3g} to {young_pa[0]:.3g} Pa "
+            f"({trial.failure}); check grasp, mass and units, or give guesses",
+            None,
+            "parameters",
+        )
+    best = int(np.flatnonzero(young_pa == candidates[0])[0])
+    start = typical_parameters(collocation.parameters, candidates[0])
+    others = _other_starts(misfit, best) if not is_complete else ()
+    starts = {k: typical_parameters(collocation.parameters, young_pa[k]) for k in (best, *others)}
+    return Scan(
+        reason,
+        young_pa,
+        misfit,
+        best,
+        start,
+        samples=sum(trial.samples),
+        time_s=time.perf_counter() - began,
+        starts=starts,
+        others=others,
+    )
+
+
+def _other_starts(misfit: Array, best: int) -> tuple[int, ...]:
+    """Return indices of the next best starts, see `Scan.others`.
+
+    Parameters
+    ----------
+    misfit : (k,) array
+        Misfit by ascending stiffness, NaN where the body cannot be simulated.
+    best : int
+        Index of the stiffness that is chosen.
+    """
+    known = np.where(np.isfinite(misfit), misfit, np.inf)
+    padded = np.concatenate([[np.inf], known, [np.inf]])
+    is_minimum = (known < padded[:-2]) & (known <= padded[2:])
+    candidates = {best - 1, best + 1, *np.flatnonzero(is_minimum).tolist()} - {best}
+    possible = [k for k in candidates if 0 <= k < len(known) and known[k] <= ALIKE * known[best]]
+    return tuple(sorted(possible, key=lambda k: known[k])[:MORE_STARTS])
+
+
+def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
+    """Return parameters in which missing guesses are replaced by typical values at a Young's
+    modulus [Pa].
+
+    Parameters with a prior get its mean instead. Fixed parameters and those with a guess are kept.
+    """
+    guesses = {i.name: i.guess for i in parameters.items if i.tied is None and i.guess is not None}
+
+    def initial_value(item: Parameter) -> float:
+        """Return the guess of a parameter, its prior mean, or a typical value within its bounds."""
+        if item.guess is not None:
+            return item.guess
+        region, dot, _ = item.name.rpartition(".")
+        poisson = guesses.get(f"{region}{dot}poisson", guesses.get("poisson", 0.3))
+        usual = usual_value(item.name, young_pa, poisson)
+        if item.prior is not None:
+            usual = item.prior[0]
+        assert usual is not None  # by `parameter`
+        return float(np.clip(usual, item.lower, item.upper))
+
+    sized = _with_units(parameters, young_pa)
+    return sized.with_guess({item.name: initial_value(item) for item in parameters.free})
+
+
+def typical_constants(parameters: Parameters) -> dict[str, float]:
+    """Return values by parameter name: guesses, or typical ones of a soft body (`SOFT_PA`)."""
+    return typical_parameters(parameters, SOFT_PA).guesses
+
+
+def _ranked_moduli(young_pa: Array, misfit: Array) -> list[float]:
+    """Return the moduli that could be simulated: the best, followed by stiffer ones; empty
+    if none could.
+    """
+    if np.isnan(misfit).all():
+        return []
+    best = int(np.nanargmin(misfit))
+    return [float(young_pa[k]) for k in range(best, len(young_pa)) if np.isfinite(misfit[k])]
+
+
+def _with_units(parameters: Parameters, young_pa: float) -> Parameters:
+    """Return the parameters with a unit for linear ones without: a tenth of Young's modulus
+    [Pa].
+    """
+    unit = young_pa / 10
+    return Parameters(
+        tuple(replace(i, unit=unit) if np.isnan(i.unit) else i for i in parameters.items)
+    )
+
+
+def _has_free_modulus(collocation: Collocation) -> bool:
+    """Return whether a free modulus on a logarithmic scale exists."""
+    free = collocation.parameters.free
+    return any(is_modulus(item.name) and item.scale == "log" for item in free)
+
+
+def without_guesses(collocation: Collocation) -> Collocation:
+    """Return the problem without the guesses of free parameters that a prior or a typical
+    value can replace.
+    """
+
+    def without_guess(item: Parameter) -> Parameter:
+        """Return the parameter without its guess, if that can be replaced."""
+        is_replaceable = item.prior is not None or usual_value(item.name, 1.0) is not None
+        return replace(item, guess=None) if is_replaceable and item in free else item
+
+    free = collocation.parameters.free
+    items = tuple(map(without_guess, collocation.parameters.items))
+    return replace(collocation, parameters=Parameters(items))
+
+
+def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> float:
+    """Return the root mean square of all residuals, in standard deviations, on the first rows.
+
+    Markers of unknown position are associated with the body at the first samples.
+    """
+    collocation, p = collocation.place_unknown_markers(p, positions)
+    parts = collocation.iterates_at(p, positions)
+    return root_mean(np.concatenate([_residuals(part) for part in parts]) ** 2)
+
+
+def _residuals(iterate: ExperimentIterate) -> Array:
+    """Return the residuals of all measurements of one experiment, in standard deviations.
+
+    Offsets, clocks and tool parameters of sensors have the values that fit best, because nothing
+    else determines them beforehand and the residuals are nearly linear in them; their priors are
+    included.
+    """
+    residuals = []
+    slopes = []
+    predictions = iterate.observation.linearise_fixed_motion(iterate.x)
+    for reading, (residual, slope) in zip(iterate.segment.residuals, predictions, strict=True):
+        rough = reading.rough_residuals(iterate.x, iterate.phi)
+        if rough is not None:
+            residuals.append(rough)
+            slopes.append(np.zeros((len(rough), slope.shape[-1])))
+            continue
+        is_compared = reading.compared_with(len(iterate.observables[len(residuals)]))[
+            : len(residual)
+        ]
+        residuals.append(residual[is_compared])
+        slopes.append(slope[is_compared] * reading.has_offsets)
+    residual = np.concatenate(residuals)
+    slope = np.concatenate(slopes)
+    offset_slopes = slope[:, slope.any(axis=0)]
+    priors = np.eye(offset_slopes.shape[1])
+    residual = np.append(residual, np.zeros(len(priors)))
+    offset_slopes = np.concatenate([offset_slopes, priors])
+    return (
+        residual - offset_slopes @ np.linalg.lstsq(offset_slopes, residual, rcond=None)[0]
+        if offset_slopes.size
+        else residual
+    )
+
+
+def _compared_samples(transcription: Transcription) -> int:
+    """Return the number of first samples that are compared, with at least one of each
+    measurement.
+    """
+    t_s = transcription.experiment.t_s
+    seen = [transcription.experiment.markers.first_seen_sample]
+    for reading in transcription.residuals[1:]:
+        seen.append(
+            int(np.searchsorted(t_s, reading.first_needed_s)) + reading.observable.delay_steps
+        )
+    return min(len(t_s), max(samples_in_share(len(t_s), SHARES[0]), max(seen) + 1))
+
+
+class _TrialSimulation:
+    """Simulation of the first part of every recording, and its misfit.
+
+    Attributes
+    ----------
+    samples : list of int
+        Number of samples that are compared, by experiment.
+    rows : list of int
+        Number of grid rows that are compared, by experiment.
+    all_rows : list of int
+        Number of all grid rows, by experiment.
+    failure : SimulationError or None
+        Last failure; None before the first.
+    """
+
+    def __init__(self, collocation: Collocation) -> None:
+        self.collocation = collocation
+        self.samples = []
+        self.rows = []
+        self.all_rows = []
+        for segment in collocation.transcriptions:
+            self.samples.append(_compared_samples(segment))
+            self.rows.append((self.samples[-1] - 1) * segment.substeps + 1)
+            self.all_rows.append(segment.grid_times)
+        self.failure: SimulationError | None = None
+
+    @cached_property
+    def rigid_misfit(self) -> float:
+        """Misfit of an undeformed body that moves with the grasp, in standard deviations."""
+        positions = []
+        for segment, rows in zip(self.collocation.transcriptions, self.rows, strict=True):
+            rigid_positions = segment.experiment.rigid_positions(segment.dynamics.t_s[:rows])
+            positions.append(rigid_positions.reshape(rows, -1))
+        return _misfit(self.collocation, self.collocation.guess_p, positions)
+
+    def evaluate_guess(self, is_complete: bool) -> tuple[float, SimulationError | None]:
+        """Return the misfit of the guess and None, or NaN and the failure of its simulation."""
+        p = self.collocation.guess_p
+        positions, failure = self._simulate(p, None, self.all_rows if is_complete else self.rows)
+        if failure is not None:
+            return np.nan, failure
+        return self._evaluate(p, positions), None
+
+    def evaluate_at(
+        self, young_pa: float, guess: list[Array] | None
+    ) -> tuple[float, list[Array] | None]:
+        """Return misfit and trajectories at a Young's modulus [Pa]; NaN and None if the simulation
+        fails.
+
+        Parameters
+        ----------
+        young_pa : float
+            Young's modulus [Pa].
+        guess : list of (N, 3n) array or None
+            Trajectories at another modulus, near which equilibria are searched.
+        """
+        p = self._p(young_pa)
+        positions, failure = self._simulate(p, guess, self.rows)
+        if failure is not None:
+            self.failure = failure
+            return np.nan, None
+        return self._evaluate(p, positions), positions
+
+    def is_simulable(self, young_pa: float) -> bool:
+        """Return whether the complete recordings can be simulated at a Young's modulus [Pa]."""
+        _, failure = self._simulate(self._p(young_pa), None, self.all_rows)
+        self.failure = failure or self.failure
+        return failure is None
+
+    def parameter_key(self, young_pa: float) -> tuple[float, ...]:
+        """Return the parameters at a Young's modulus; moduli beyond all bounds have the
+        same key.
+        """
+        return tuple(self._p(young_pa).tolist())
+
+    def _p(self, young_pa: float) -> Array:
+        """Return the parameters p (np,) at a Young's modulus [Pa]."""
+        q = typical_parameters(self.collocation.parameters, young_pa).guess_q
+        return np.concatenate([q, np.zeros(self.collocation.nphi)])
+
+    def _evaluate(self, p: Array, positions: Sequence[Array]) -> float:
+        """Return the misfit of trajectories at p; NaN if it is not finite."""
+        first = [x[:rows] for x, rows in zip(positions, self.rows, strict=True)]
+        misfit = _misfit(self.collocation, p, first)
+        return misfit if np.isfinite(misfit) else np.nan
+
+    def _simulate(
+        self, p: Array, warm: list[Array] | None, rows: Sequence[int]
+    ) -> tuple[list[Array], SimulationError | None]:
+        """Return trajectories of so many rows at p, and the first failure, see
+        `simulate_trajectories`.
+        """
+        return simulate_trajectories(self.collocation, p, None, rows, LOOSE, guess=warm)
+
+
+class _ScanState:
+    """Moduli that were tried so far, with their misfits.
+
+    Attributes
+    ----------
+    misfits : dict of float to float
+        Misfit by Young's modulus [Pa]; NaN where the simulation failed.
+    last_trajectories : list or None
+        Trajectories of the last simulation that succeeded.
+    is_ended_early : bool
+        Whether the scan ended before the softest modulus.
+    """
+
+    def __init__(self, trial: _TrialSimulation) -> None:
+        self.trial = trial
+        self.misfits: dict[float, float] = {}
+        self.last_trajectories: list[Array] | None = None
+        self.is_ended_early = False
+
+    def try_sequence(self, young_pa: Sequence[float]) -> None:
+        """Try Young's moduli in the given order [Pa] until several in a row fail or fit badly.
+
+        Moduli that give the same parameters are tried once.
+        """
+        failures = 0
+        first, *others = ([*same] for _, same in groupby(young_pa, self.trial.parameter_key))
+        for young in (first[-1], *(same[0] for same in others)):
+            misfit = self._try(young)
+            finite_misfits = [m for m in self.misfits.values() if np.isfinite(m)]
+            is_failure = bool(finite_misfits) and not misfit <= WORSE * min(finite_misfits)
+            failures = failures + 1 if is_failure else 0
+            if failures == LOST:
+                self.is_ended_early = True
+                return
+
+    def extend_range(self, young_pa: float, factor: float) -> None:
+        """Try moduli beyond an end of the range, as long as the misfit decreases.
+
+        Parameters
+        ----------
+        young_pa : float
+            Modulus at the end, which was tried [Pa].
+        factor : float
+            Ratio of successive moduli.
+        """
+        best = self.misfits[young_pa]
+        beyond = young_pa * factor
+        while LIMITS_PA[1] < beyond < LIMITS_PA[0]:
+            if self.trial.parameter_key(beyond) == self.trial.parameter_key(beyond / factor):
+                return
+            misfit = self._try(beyond)
+            if not misfit < (1 - BETTER) * best:
+                return
+            best = misfit
+            beyond = beyond * factor
+
+    def is_best_at_end(self, softest: bool) -> bool:
+        """Return whether the best modulus is the softest (or else the stiffest) that was tried.
+
+        False for the softest end if the scan ended before it.
+        """
+        finite_misfits = {young: m for young, m in self.misfits.items() if np.isfinite(m)}
+        if not finite_misfits or (softest and self.is_ended_early):
+            return False
+        best = min(finite_misfits, key=lambda young: finite_misfits[young])
+        return best == (min(self.misfits) if softest else max(self.misfits))
+
+    def _try(self, young_pa: float) -> float:
+        """Simulate at a modulus, store the misfit, and return it."""
+        misfit, warm = self.trial.evaluate_at(young_pa, self.last_trajectories)
+        self.last_trajectories = warm or self.last_trajectories
+        self.misfits[young_pa] = misfit
+        return misfit

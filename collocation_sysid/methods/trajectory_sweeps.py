@@ -1,0 +1,386 @@
+"""One experiment's trajectory during a search: sweeps, trials and simulations.
+
+These functions run where the experiment is stored, in this process or on a worker of a cluster. A
+`SweepResult` is stored there because its size grows with the number of time steps; the search needs
+only
+its `SweepReport`, whose size does not. Parameters p are the (q, φ) of the experiment alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..array_types import Array
+from ..errors import SimulationError
+from ..program.collocation import ExperimentIterate
+from ..program.least_squares import SquareRootInformation
+from ..program.measurement_residual import huber_as_least_squares
+from ..program.newton_solver import NewtonOptions
+from ..program.scheme_simulation import continue_simulation
+from ..program.sweep import Sweep, Tangent
+from ..program.transcription import Transcription
+from .initial_trajectories import continue_trajectory
+
+# Rows are marched to this accuracy of a Newton step over the body's size: Newton's next one is
+# part of the first sweep.
+MARCHED = NewtonOptions(tolerance=1e-6)
+# Of equilibria near known ones. Those that are not found at once are too far for it.
+SETTLED = NewtonOptions(tolerance=1e-9, max_halvings=0)
+
+
+@dataclass(frozen=True)
+class FitSummary:
+    """Fit of one trajectory to its measurements.
+
+    Attributes
+    ----------
+    rows : int
+        Number of grid rows.
+    violation_n : float
+        Largest residual of the equations of motion, |c| [N].
+    squares_m2 : float
+        Sum of the squared distances between predicted and measured markers [m²].
+    samples : int
+        Number of these distances.
+    """
+
+    rows: int
+    violation_n: float
+    squares_m2: float
+    samples: int
+
+    @classmethod
+    def from_iterate(cls, iterate: ExperimentIterate, x: Array, violation_n: float) -> FitSummary:
+        """Return the fit of positions x (rows, 3n) [m] at the parameters of an experiment.
+
+        Parameters
+        ----------
+        iterate : ExperimentIterate
+            Experiment with its parameters; its positions are not used.
+        x : (rows, 3n) array
+            Positions at which the markers are evaluated [m].
+        violation_n : float
+            Largest residual of the equations of motion [N], as the caller knows it.
+        """
+        squares = iterate.segment.markers.squared_distances_m2(x, iterate.phi)
+        return cls(len(x), violation_n, float(squares.sum()), len(squares))
+
+
+@dataclass(frozen=True, eq=False)
+class SweepReport:
+    """Result of a sweep that the search needs; its size does not depend on the number of time
+    steps.
+
+    Attributes
+    ----------
+    fit : SquareRootInformation
+        Residuals linearised in a step of the k parameters.
+    previous_slopes_residual : (k,) array
+        S_0ᵀ r with the slopes S_0 of the previous trajectory; zeros without one.
+    feasibility_m : float
+        Largest coordinate of the feasibility step [m].
+    position_change_m : float
+        Largest change of a coordinate since the previous trajectory [m].
+    indefinite_steps : int
+        Number of time steps whose matrix is not positive definite.
+    fit_summary : FitSummary
+        Fit of the positions after the feasibility step.
+    times_s : tuple of three floats
+        Times for `Stopwatch.add` [s].
+    """
+
+    fit: SquareRootInformation
+    previous_slopes_residual: Array
+    feasibility_m: float
+    position_change_m: float
+    indefinite_steps: int
+    fit_summary: FitSummary
+    times_s: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class SweepResult:
+    """Trajectory with the result of one sweep.
+
+    Attributes
+    ----------
+    x : (rows, 3n) array
+        Positions [m], before the feasibility step.
+    tangent : Tangent
+        Feasibility step and sensitivities.
+    slope : (M, k) array
+        Derivatives S of all M measurement residuals by the parameters, after the feasibility step.
+    report : SweepReport
+        Result that the search needs.
+    """
+
+    x: Array
+    tangent: Tangent
+    slope: Array
+    report: SweepReport
+
+    def __sizeof__(self) -> int:
+        """Return the memory size in bytes, from which a scheduler estimates the cost of a
+        transfer.
+        """
+        # So that a scheduler knows what moving it would take.
+        arrays = (self.x, self.tangent.step, self.tangent.by_p, self.slope)
+        return object.__sizeof__(self) + sum(each.nbytes for each in arrays)
+
+
+@dataclass(frozen=True, eq=False)
+class SimulationResult:
+    """Simulated trajectory, complete or not.
+
+    Attributes
+    ----------
+    x : (rows, 3n) array
+        Positions [m], as far as the simulation succeeded.
+    failure : SimulationError or None
+        Reason why the simulation ended early; None if it is complete.
+    times_s : tuple of three floats
+        Times for `Stopwatch.add` [s].
+    """
+
+    x: Array
+    failure: SimulationError | None
+    times_s: tuple[float, float, float]
+
+
+def trajectory_positions(trajectory: SweepResult | SimulationResult | Array) -> Array:
+    """Return the positions (rows, 3n) [m] of a sweep result, a simulation, or an array of
+    positions.
+    """
+    return trajectory if isinstance(trajectory, np.ndarray) else trajectory.x
+
+
+def sweep(
+    solver: Sweep,
+    transcription: Transcription,
+    huber: float | None,
+    p: Array,
+    trajectory: SweepResult | SimulationResult | Array,
+    known_sweep: SweepResult | None = None,
+    previous: SweepResult | None = None,
+) -> SweepResult:
+    """Return the result of one sweep at parameters p and given positions.
+
+    Parameters
+    ----------
+    solver : Sweep
+        Solver of the experiment's linearised equations of motion.
+    transcription : Transcription
+        Transcription of the experiment.
+    huber : float or None
+        Not used: each measurement residual has a threshold of its own.
+    p : (k,) array
+        Parameters (q, φ) of the experiment.
+    trajectory : SweepResult, SimulationResult or (rows, 3n) array
+        Positions [m].
+    known_sweep : SweepResult, optional
+        Sweep of the first rows at the same p and positions, which is continued.
+    previous : SweepResult, optional
+        Previous trajectory, from which changes are measured.
+
+    Raises
+    ------
+    SimulationError
+        If a time step is singular or not finite, or a node has no mass.
+    """
+    part = _iterate(transcription, p, trajectory_positions(trajectory))
+    dynamics = part.equations.dynamics
+    if (massless := dynamics.body.mass_problem(dynamics.theta)) is not None:
+        raise SimulationError(massless, float(dynamics.t_s[0]))
+    tangent = solver.forward(part.x, part.equations, known_sweep.tangent if known_sweep else None)
+    return _sweep_result(part, huber, tangent, previous, solver.stopwatch.read_and_reset())
+
+
+def sweep_after_step(
+    solver: Sweep,
+    transcription: Transcription,
+    huber: float | None,
+    p: Array,
+    previous: SweepResult,
+    step: Array,
+) -> SweepResult:
+    """Return the result of one sweep after a step of the parameters to p.
+
+    The positions are those of `previous` extrapolated along the sensitivities. Static experiments
+    are
+    first solved for the equilibrium if one is near: a linear extrapolation stretches slender bodies
+    that rotate much, so that its loss would be meaningless.
+
+    Parameters
+    ----------
+    solver : Sweep
+        Solver of the experiment's linearised equations of motion.
+    transcription : Transcription
+        Transcription of the experiment.
+    huber : float or None
+        See `sweep`.
+    p : (k,) array
+        Parameters (q, φ) after the step.
+    previous : SweepResult
+        Trajectory before the step.
+    step : (k,) array
+        Step of the parameters.
+
+    Raises
+    ------
+    SimulationError
+        If a time step is singular or not finite.
+    """
+    part = _iterate(transcription, p, extrapolate(transcription, previous, step))
+    dynamics = part.equations.dynamics
+    x = part.x
+    if dynamics.is_static:
+        equilibria, failure = continue_simulation(
+            transcription.experiment,
+            dynamics.truncated_to(len(x)),
+            options=SETTLED,
+            stopwatch=solver.stopwatch,
+            near_solution=x,
+        )
+        x = equilibria if failure is None else x
+    return sweep(solver, transcription, huber, p, x, previous=previous)
+
+
+def reassociate(
+    solver: Sweep,
+    transcription: Transcription,
+    huber: float | None,
+    p: Array,
+    sweep_result: SweepResult,
+) -> SweepResult:
+    """Return the sweep with its measurements evaluated by another transcription.
+
+    The positions and sensitivities are not computed again.
+
+    Parameters
+    ----------
+    solver : Sweep
+        Solver, for its stopwatch.
+    transcription : Transcription
+        Transcription with new marker or camera associations.
+    huber : float or None
+        See `sweep`.
+    p : (k,) array
+        Parameters (q, φ) of the experiment.
+    sweep_result : SweepResult
+        Sweep at p.
+    """
+    return _sweep_result(
+        _iterate(transcription, p, sweep_result.x),
+        huber,
+        sweep_result.tangent,
+        None,
+        solver.stopwatch.read_and_reset(),
+    )
+
+
+def extrapolate(transcription: Transcription, sweep_result: SweepResult, step: Array) -> Array:
+    """Return positions (rows, 3n) [m] after the feasibility step and a step (k,) of the
+    parameters.
+    """
+    return (
+        sweep_result.x
+        + sweep_result.tangent.step
+        + sweep_result.tangent.by_p @ step[transcription.dynamic_parameters]
+    )
+
+
+def simulate_rows(
+    solver: Sweep,
+    transcription: Transcription,
+    p: Array,
+    known_rows: SweepResult | SimulationResult | Array | None,
+    guess: SweepResult | None,
+) -> SimulationResult:
+    """Simulate the rows of the solver at parameters p, as far as the simulation succeeds.
+
+    Parameters
+    ----------
+    solver : Sweep
+        Solver; its number of rows is that of the result.
+    transcription : Transcription
+        Transcription of the experiment.
+    p : (k,) array
+        Parameters (q, φ) of the experiment.
+    known_rows : SweepResult, SimulationResult, (m, 3n) array or None
+        First rows, which are continued; None for none.
+    guess : SweepResult or None
+        Trajectory at other parameters, near which equilibria are searched first.
+    """
+    part = _iterate(
+        transcription,
+        p,
+        np.zeros((0, transcription.dof_count))
+        if known_rows is None
+        else trajectory_positions(known_rows),
+    )
+    guess_positions = None if guess is None else guess.x
+    x, failure = continue_trajectory(
+        part, solver.dynamics.row_count, MARCHED, solver.stopwatch, guess_positions
+    )
+    return SimulationResult(x, failure, solver.stopwatch.read_and_reset())
+
+
+def fit_summary(transcription: Transcription, p: Array, x: Array) -> FitSummary:
+    """Return the fit of positions x (rows, 3n) [m] at parameters p, with residuals computed
+    from them.
+    """
+    part = _iterate(transcription, p, x)
+    return FitSummary.from_iterate(part, x, float(np.abs(part.residual_n).max()))
+
+
+def _iterate(transcription: Transcription, p: Array, x: Array) -> ExperimentIterate:
+    """Return the experiment at parameters p (k,) and positions x (rows, 3n)."""
+    return ExperimentIterate(transcription, p[: transcription.nq], p[transcription.nq :], x)
+
+
+def _sweep_result(
+    iterate: ExperimentIterate,
+    huber: float | None,
+    tangent: Tangent,
+    previous: SweepResult | None,
+    times_s: tuple[float, float, float],
+) -> SweepResult:
+    """Return the sweep result: measurement residuals and slopes after the feasibility step.
+
+    Parameters
+    ----------
+    iterate : ExperimentIterate
+        Experiment at the parameters and positions of the sweep.
+    huber : float or None
+        See `sweep`.
+    tangent : Tangent
+        Feasibility step and sensitivities.
+    previous : SweepResult or None
+        Previous trajectory; None for none.
+    times_s : tuple of three floats
+        Times for `Stopwatch.add` [s].
+    """
+    response = iterate.observation.response_of_array(tangent.by_p, tangent.grasp_forces)
+    predictions = iterate.observation.linearise(iterate.x, response, tangent.step)
+    matches = zip(predictions, iterate.segment.residuals, strict=True)
+    residuals_and_slopes = [
+        huber_as_least_squares(*each, reading.huber) for each, reading in matches
+    ]
+    residual = np.concatenate([values.ravel() for values, _ in residuals_and_slopes])
+    slope = np.concatenate(
+        [by.reshape(values.size, by.shape[-1]) for values, by in residuals_and_slopes]
+    )
+    report = SweepReport(
+        fit=SquareRootInformation.empty(slope.shape[1]).with_rows(residual, slope),
+        previous_slopes_residual=np.zeros(slope.shape[1])
+        if previous is None
+        else previous.slope.T @ residual,
+        feasibility_m=float(np.abs(tangent.step).max()),
+        position_change_m=0.0 if previous is None else float(np.abs(iterate.x - previous.x).max()),
+        indefinite_steps=tangent.indefinite_count,
+        fit_summary=FitSummary.from_iterate(iterate, iterate.x + tangent.step, tangent.violation_n),
+        times_s=times_s,
+    )
+    return SweepResult(iterate.x, tangent, slope, report)

@@ -1,0 +1,623 @@
+"""Nuisance parameters φ of one recording: marker places, clocks, gravity, grasp, loads and cameras.
+
+Every φ is a number of prior standard deviations, so its prior adds φ² to the loss. The table in
+`recording.nuisance` lists the possible rows; an entry of φ is one axis of one component of a row.
+
+A rigid motion x' = R(a) (x − c) + c + d of grasps and body in the frame of the markers has the
+middle c of the body in its first pose as pivot. In the frame of the body it changes only what
+markers measure, and the direction of gravity, which becomes R(a)ᵀ g.
+
+The pose of the undeformed body in its grasp is H X = R(a_h) (X − c_h) + c_h + d_h with the middle
+c_h of the grasped nodes; these are held at U_t H X.
+
+A tension T acts on the body as max(0, f T − b), a pressure p as f p − b.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import groupby
+from typing import Any, NamedTuple, TypeVar, get_args
+
+import casadi as ca
+import numpy as np
+
+from ..array_types import Array, Index
+from ..errors import InputError
+from ..fem.constants import unit_of, without_unit
+from ..files import reason
+from ..recording.experiment import Experiment
+from ..recording.grasp import Grasp, prescribed_nodes
+from ..recording.loads import Force, LoadTime, PointMass
+from ..recording.measured_wrench import COMPONENTS, UNITS, Wrench
+from ..recording.nuisance import (
+    DEPTH_BIAS,
+    DEPTH_EDGE,
+    DEPTH_SCALE,
+    GAUGE,
+    GRASP_SHIFT,
+    GRASP_TURN,
+    JOINING,
+    OBSTACLE_OFFSET,
+    OBSTACLE_TILT,
+    OBSTACLE_TIME,
+    PLACE,
+    POSE_TURN,
+    PRESSURE_OFFSET,
+    TARE,
+    TENSION_OFFSET,
+    TILT,
+    TIME,
+    ZERO,
+    Component,
+    NuisanceRow,
+    cayley_rotation,
+)
+from ..recording.obstacle import Obstacle
+from .generated_functions import GeneratedFunction
+
+Load = TypeVar("Load", PointMass, Force)
+
+# Largest deviation of a delay from the current whole number of samples: the range of interpolation.
+LARGEST_SHIFT_SAMPLES = 2.0
+# Largest delay as a fraction of the recording's duration; more would leave too few samples.
+LARGEST_DELAY_FRACTION = 0.25
+# Largest delay of a joining load, in prior standard deviations: more than any true value.
+LARGEST_JOINING_DELAY_SIGMAS = 4.0
+# Factor that keeps a joining load inside the recording: at its ends it would join at once or never.
+INSIDE_RECORDING_FACTOR = 1 - 1e-9
+# What a row must change (see `NuisanceRow.changes`) to affect the motion.
+CHANGES_OF_MOTION = {"gravity", "grasps", "loads", "drives"}
+
+
+class TimedLoad(NamedTuple):
+    """Load that joins or leaves at an estimated time.
+
+    Attributes
+    ----------
+    load : PointMass or Force
+    change : {"from_s", "until_s"}
+        Which time of the load is estimated.
+    """
+
+    load: PointMass | Force
+    change: LoadTime
+
+    @property
+    def stated_s(self) -> float:
+        """Time given by the user [s]."""
+        return getattr(self.load, self.change)
+
+
+@dataclass(frozen=True)
+class NuisanceEntry:
+    """One nuisance parameter.
+
+    Attributes
+    ----------
+    row : NuisanceRow
+        Row of the table of nuisance parameters.
+    number : int
+        Index of the component: marker, grasp, actuator, load, camera or sensor of the experiment.
+    axis : int
+        Index of the axis of a vector-valued row.
+    label : str
+        Label with unit, such as "place of tip, x [m]".
+    sigma : float
+        Prior standard deviation, in the unit of the label.
+    """
+
+    row: NuisanceRow
+    number: int
+    axis: int
+    label: str
+    sigma: float
+
+    @property
+    def unit(self) -> str:
+        """Unit of the parameter, taken from its label."""
+        return self.label.rpartition("[")[2].rstrip("]")
+
+
+@dataclass(frozen=True, eq=False)
+class NuisanceMap:
+    """Nuisance parameters φ of one experiment, and the quantities that depend on them.
+
+    Attributes
+    ----------
+    entries : (k,)
+        Definition of each parameter.
+    names : (k,)
+        Names with units, such as "swing: place of tip, x [m]".
+    scales : (k,)
+        Prior standard deviations, in the units of the names.
+    step_limits : (k,)
+        Largest change of φ in one step of the solver; infinite for parameters that enter linearly.
+    interval_s : float
+        Time between samples.
+    duration_s : float
+        Duration of the recording.
+    gravity_m_s2 : (3,)
+        Gravity as stated.
+    pivot_m : (3,)
+        Pivot c of the rigid motion in the frame of the markers.
+    grasp_pivot_m : (3,)
+        Pivot c_h of the motion of the body in its grasp.
+    stated_calibration : (A, 2)
+        Factor f and loss b of each tension and pressure, as stated.
+    timed_loads : tuple of TimedLoad
+        Loads with an estimated time, in the order of their parameters.
+    recorded_s : (float, float)
+        First and last time of the recording.
+    """
+
+    entries: tuple[NuisanceEntry, ...]
+    names: tuple[str, ...]
+    scales: Array
+    step_limits: Array
+    interval_s: float
+    duration_s: float
+    gravity_m_s2: Array
+    pivot_m: Array
+    grasp_pivot_m: Array
+    stated_calibration: Array
+    timed_loads: tuple[TimedLoad, ...]
+    recorded_s: tuple[float, float]
+
+    @classmethod
+    def from_experiment(cls, experiment: Experiment, pivot_m: Array | None = None) -> NuisanceMap:
+        """Return the nuisance parameters of an experiment.
+
+        A parameter that recordings share has the same name in all of them.
+
+        Parameters
+        ----------
+        experiment : Experiment
+        pivot_m : (3,), optional
+            Pivot c; by default the middle of the body in its first pose. Pass that of another
+            recording if the rigid motion is shared with it.
+
+        Raises
+        ------
+        InputError
+            If a custom expression fails, has the wrong shape, or is not finite at zero.
+        """
+        entries = tuple(_entries(experiment))
+        body = experiment.body
+        scope = experiment.nuisance.scope
+        middle_m = experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0)
+        scales = np.array([entry.sigma for entry in entries], dtype=float)
+        steps = {e.row.name: e.row.step(experiment) for e in entries if e.row.step is not None}
+        reach = [min(e.row.reach, steps.get(e.row.name, np.inf) / e.sigma) for e in entries]
+        grasped_nodes = prescribed_nodes(experiment.body_grasps)
+        nuisance_map = cls(
+            entries,
+            tuple(f"{scope.get(e.row.name, experiment.name)}: {e.label}" for e in entries),
+            scales,
+            np.array(reach),
+            experiment.timestep_s,
+            experiment.duration_s,
+            np.array(experiment.gravity_m_s2),
+            middle_m if pivot_m is None else pivot_m,
+            body.nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(axis=0),
+            np.array([a.factor_and_offset for a in experiment.actuators]).reshape(-1, 2),
+            tuple(timed for _, timed in _timed_loads(experiment)),
+            (float(experiment.t_s[0]), float(experiment.t_s[-1])),
+        )
+        for row in experiment.nuisance.own:
+            nuisance_map._require_valid_expression(row)
+        return nuisance_map
+
+    def _require_valid_expression(self, row: NuisanceRow) -> None:
+        """Raise an `InputError` if a custom reading or clock cannot be evaluated and
+        differentiated.
+        """
+        y = ca.SX.sym("y", 3)
+        t_s = ca.SX.sym("t_s")
+        values = ca.SX.sym("values", max(1, len(row.axes.split())))
+        what = "reading" if row.reading else "clock"
+        try:
+            expression: Any = row.reading and row.reading(y, values, t_s, self)
+            expression = ca.SX(row.clock(values, t_s, self) if row.clock else expression)
+        except Exception as error:
+            raise InputError(f"the {what} of {row.name} failed: {reason(error)}") from error
+        expected = (3, 1) if row.reading else (1, 1)
+        if expression.shape != expected:
+            problem = f"the {what} of {row.name} has the shape {expression.shape}"
+            raise InputError(f"{problem}; expected {expected}")
+        slopes = ca.Function(
+            "slopes", [y, values, t_s], [expression, ca.jacobian(expression, values)]
+        )
+        evaluated = slopes([0.1, 0.2, 0.3], 0.0, self.interval_s)
+        if not all(np.isfinite(part.full()).all() for part in evaluated):
+            raise InputError(f"the {what} of {row.name} or its slopes are not finite at zero")
+
+    @property
+    def size(self) -> int:
+        """Number k of nuisance parameters."""
+        return len(self.names)
+
+    def iterate_values(self, phi: Array) -> Iterator[tuple[NuisanceEntry, str, float]]:
+        """Yield entry, name and value with unit of each parameter, except for the places of
+        markers.
+        """
+        for entry, name, value in zip(self.entries, self.names, phi * self.scales, strict=True):
+            if entry.row != PLACE:
+                yield entry, name, float(value)
+
+    def indices_of_rows(self, *rows: NuisanceRow, component: int | None = None) -> Index:
+        """Return the indices in φ of some rows, of all components or of one.
+
+        Parameters
+        ----------
+        *rows : NuisanceRow
+        component : int, optional
+            Index of the component.
+        """
+        return self._indices_where(lambda e: e.row in rows and component in (None, e.number))
+
+    def _indices_where(self, chosen: Callable[[NuisanceEntry], bool]) -> Index:
+        """Return the indices in φ of the entries for which a function is true."""
+        return np.array([k for k, e in enumerate(self.entries) if chosen(e)], dtype=np.int64)
+
+    @cached_property
+    def motion_indices(self) -> Index:
+        """Indices in φ of the parameters that affect the motion: gravity, grasps, loads,
+        actuators.
+        """
+        return self._indices_where(lambda e: not CHANGES_OF_MOTION.isdisjoint(e.row.changes))
+
+    @cached_property
+    def actuator_indices(self) -> Index:
+        """Indices in φ of the calibration of tensions and pressures."""
+        return self._indices_where(lambda e: "drives" in e.row.changes)
+
+    def actuator_calibration_indices(self, number: int) -> tuple[int, int]:
+        """Return the indices in φ of factor and loss of an actuator.
+
+        −1 where they are not estimated.
+        """
+        indices = [-1, -1]
+        for k in self.actuator_indices:
+            if self.entries[k].number == number:
+                indices[self.entries[k].row in (TENSION_OFFSET, PRESSURE_OFFSET)] = int(k)
+        return indices[0], indices[1]
+
+    def actuator_calibration(self, phi: Array) -> Array:
+        """Return factor f and loss b (A, 2) of each tension and pressure at φ."""
+        calibration = self.stated_calibration.copy()
+        values = phi * self.scales
+        for number in range(len(calibration)):
+            for column, place in enumerate(self.actuator_calibration_indices(number)):
+                calibration[number, column] += 0.0 if place < 0 else values[place]
+        return calibration
+
+    # What markers read --------------------------------------------------------------------------
+
+    def marker_indices(self, count: int) -> Index:
+        """Return the indices in φ (count, f) on which the measurement of each of `count` markers
+        depends.
+        """
+        read = self._indices_where(lambda e: e.row.reading is not None or e.row.clock is not None)
+        single = [k for k in read if self.entries[k].row.of == "marker"]
+        of_marker = [[k for k in single if self.entries[k].number == m] for m in range(count)]
+        common = np.tile(np.setdiff1d(read, single), (count, 1))
+        return np.hstack(
+            [np.array(of_marker, dtype=np.int64).reshape(count, -1 if count else 0), common]
+        )
+
+    @cached_property
+    def clock_indices(self) -> Index:
+        """Indices in φ of the parameters that shift the times at which markers were measured."""
+        return self._indices_where(lambda e: e.row.clock is not None)
+
+    def marker_delay_s(self, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
+        """Return the delay of a marker's measurement relative to the time t_s [s].
+
+        Parameters
+        ----------
+        phi : SX
+            Parameters at the indices `indices_of_rows`.
+        places : array of int
+            Indices in φ of the marker, a row of `marker_indices`.
+        t_s : SX
+            Time of the sample.
+        """
+        values = self.values_by_row(phi, places)
+        return sum((row.clock(values[row], t_s, self) for row in values if row.clock), ca.SX(0))
+
+    def marker_measurement(self, y: ca.SX, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
+        """Return the measured position (3,) of a marker whose true position is y (3,).
+
+        Effects common to all markers are applied before those of the single marker.
+
+        Parameters
+        ----------
+        y : (3,) SX
+        phi : SX
+            Parameters at the indices `indices_of_rows`.
+        places : array of int
+            Indices in φ of the marker, a row of `marker_indices`.
+        t_s : SX
+            Time of the sample.
+        """
+        values = self.values_by_row(phi, places)
+        for row in sorted(values, key=lambda row: row.of == "marker"):
+            y = y if row.reading is None else row.reading(y, values[row], t_s, self)
+        return y
+
+    # What moves the body ------------------------------------------------------------------------
+
+    @cached_property
+    def affects_grasps(self) -> bool:
+        """Whether any φ that affects the motion is not of gravity, so that prescribed positions may
+        change.
+        """
+        return len(np.setdiff1d(self.motion_indices, self.gravity_indices)) > 0
+
+    def displacement_zero_indices(self, number: int) -> Index:
+        """Return the indices in φ of the zeros of a grasp's displacement, axis by axis."""
+        return self.indices_of_rows(ZERO, component=number)
+
+    def obstacle_parameters(self, number: int) -> list[tuple[NuisanceRow, int, int]]:
+        """Return row, axis and index in φ of every nuisance parameter of an obstacle.
+
+        Parameters
+        ----------
+        number : int
+            Index among the grasps, in which obstacles follow the grippers.
+        """
+        own = (k for k in self.motion_indices.tolist() if self.entries[k].row.of == "obstacle")
+        here = ((self.entries[k], k) for k in own if self.entries[k].number == number)
+        return [(entry.row, entry.axis, k) for entry, k in here]
+
+    def with_grasps(self, grasps: Sequence[Grasp], phi: Array) -> tuple[Grasp, ...]:
+        """Return the grasps and obstacles at their poses at φ."""
+        motion = self.grasp_motion_matrix(phi)
+        return tuple(self._with_grasp(k, grasp, motion, phi) for k, grasp in enumerate(grasps))
+
+    def _with_grasp(self, number: int, grasp: Grasp, motion: Array, phi: Array) -> Grasp:
+        """Return one grasp or obstacle at its pose at φ.
+
+        Parameters
+        ----------
+        number : int
+            Index of the grasp.
+        grasp : Grasp
+        motion : (4, 4)
+            Motion H of the body in its grasp.
+        phi : (k,)
+        """
+        if isinstance(grasp, Obstacle):
+            deviations: dict[NuisanceRow, Array] = {}
+            for row, axis, place in self.obstacle_parameters(number):
+                deviations.setdefault(row, np.zeros(2))[axis] = phi[place] * self.scales[place]
+            zeros = np.zeros(2)
+            offset, delay_s = (
+                deviations.get(r, zeros)[0] for r in (OBSTACLE_OFFSET, OBSTACLE_TIME)
+            )
+            return grasp.displaced(offset, deviations.get(OBSTACLE_TILT, zeros), delay_s)
+        zero_m = np.zeros(3)
+        for place in self.displacement_zero_indices(number):
+            zero_m[self.entries[place].axis] = phi[place] * self.scales[place]
+        return replace(grasp, poses=grasp.poses.after(motion).with_shift(zero_m))
+
+    def bounds(self, samples: int) -> tuple[Array, Array]:
+        """Return the lowest and the highest φ (k,) with valid measurements and loads.
+
+        Parameters
+        ----------
+        samples : int
+            Number of whole samples by which marker measurements are currently shifted; delays may
+            deviate from it by `LARGEST_SHIFT_SAMPLES`.
+        """
+        low = np.array([entry.row.low for entry in self.entries])
+        high = np.array([entry.row.high for entry in self.entries])
+        for k in self.indices_of_rows(TIME):
+            middle_s = samples * self.interval_s
+            unit = self.scales[k]
+            range_s = LARGEST_SHIFT_SAMPLES * self.interval_s
+            largest_s = max(range_s, LARGEST_DELAY_FRACTION * self.duration_s)
+            low[k] = max(middle_s - range_s, -largest_s) / unit
+            high[k] = min(middle_s + range_s, largest_s) / unit
+        for k, timed in zip(self.indices_of_rows(JOINING), self.timed_loads, strict=True):
+            margins = (np.array(self.recorded_s) - timed.stated_s) / self.scales[k]
+            low[k], high[k] = np.clip(
+                INSIDE_RECORDING_FACTOR * margins,
+                -LARGEST_JOINING_DELAY_SIGMAS,
+                LARGEST_JOINING_DELAY_SIGMAS,
+            )
+        return low, high
+
+    def with_times(self, experiment: Experiment, phi: Array) -> Experiment:
+        """Return the experiment with its loads joining and leaving at the times estimated by φ."""
+        if not self.timed_loads:
+            return experiment
+        late_s = (phi * self.scales)[self.indices_of_rows(JOINING)]
+
+        def moved(load: Load) -> Load:
+            times = {
+                timed.change: timed.stated_s + float(late)
+                for timed, late in zip(self.timed_loads, late_s, strict=True)
+                if timed.load is load
+            }
+            return replace(load, **times) if times else load
+
+        masses = map(moved, experiment.masses)
+        forces = map(moved, experiment.forces)
+        return replace(experiment, masses=masses, forces=forces)
+
+    @cached_property
+    def grasp_indices(self) -> Index:
+        """Indices in φ of rotation and shift of the body in its grasp."""
+        return self.indices_of_rows(GRASP_TURN, GRASP_SHIFT)
+
+    @cached_property
+    def grasp_motion(self) -> GeneratedFunction:
+        """Expression of H X for a point X, of the φ of `grasp_indices`."""
+        return GeneratedFunction(self._displaced_point, len(self.grasp_indices), 3)
+
+    def _displaced_point(self, phi: ca.SX, point: ca.SX) -> ca.SX:
+        """Return H X as an expression."""
+        values = self.values_by_row(phi, self.grasp_indices)
+        if GRASP_TURN in values:
+            pivot = ca.DM(self.grasp_pivot_m)
+            point = cayley_rotation(values[GRASP_TURN]) @ (point - pivot) + pivot
+        if GRASP_SHIFT in values:
+            point = point + values[GRASP_SHIFT]
+        return point
+
+    def grasp_motion_matrix(self, phi: Array) -> Array:
+        """Return H at φ as a 4×4 matrix [[R, p], [0, 1]]."""
+        points = np.hstack([np.zeros((3, 1)), np.eye(3)])
+        images = self.grasp_motion.evaluate(phi[self.grasp_indices], points)
+        matrix = np.eye(4)
+        matrix[:3] = np.column_stack([images[:, 1:] - images[:, :1], images[:, 0]])
+        return matrix
+
+    def gravity(self, phi: Array) -> Array:
+        """Return gravity (3,) in the frame of the body at φ [m/s²]."""
+        if not len(self.gravity_indices):
+            return self.gravity_m_s2
+        return ca.evalf(self.gravity_expression(ca.SX(phi[self.gravity_indices]))).full().ravel()
+
+    @cached_property
+    def gravity_indices(self) -> Index:
+        """Indices in φ of the parameters that rotate gravity in the frame of the body."""
+        return self.indices_of_rows(TILT, POSE_TURN)
+
+    def gravity_expression(self, phi: ca.SX) -> ca.SX:
+        """Return gravity (3,) in the frame of the body as an expression of the φ of
+        `gravity_indices`.
+        """
+        values = self.values_by_row(phi, self.gravity_indices)
+        gravity = ca.DM(self.gravity_m_s2)
+        if TILT in values:
+            gravity = self._tilted_gravity(values[TILT])
+        if POSE_TURN in values:
+            gravity = cayley_rotation(values[POSE_TURN]).T @ gravity
+        return ca.SX(gravity)
+
+    def values_by_row(self, phi: ca.SX, places: Index) -> dict[NuisanceRow, ca.SX]:
+        """Return parameters with units by row, each a column vector.
+
+        Parameters
+        ----------
+        phi : SX
+            Parameters at the indices `indices_of_rows`.
+        places : array of int
+            Indices in φ.
+        """
+        values = phi * self.scales[places][:, None]
+        parts = {}
+        for position, k in enumerate(places):
+            parts.setdefault(self.entries[k].row, []).append(values[position])
+        return {row: ca.vertcat(*each) for row, each in parts.items()}
+
+    def _tilted_gravity(self, angles: ca.SX) -> ca.SX:
+        """Return gravity of the stated magnitude, tilted by two angles [rad] about the axes across
+        it.
+        """
+        size = float(np.linalg.norm(self.gravity_m_s2))
+        if size == 0:
+            return ca.SX(ca.DM(self.gravity_m_s2))
+        down = self.gravity_m_s2 / size
+        # Two axes across gravity: those that complete it to a basis.
+        across = np.linalg.svd(down[None])[2][1:]
+        tilted = down + ca.mtimes(ca.DM(across.T), angles)
+        return ca.SX(size * tilted / ca.norm_2(tilted))
+
+
+def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
+    """Yield every nuisance parameter of an experiment, in the order of φ."""
+    for _, rows in groupby(experiment.nuisance.kinds, key=lambda row: row.of):
+        applicable = [row for row in rows if row.applies(experiment)]
+        for number, component_name in (
+            _components(experiment, applicable[0].of) if applicable else ()
+        ):
+            for row in applicable:
+                for axis, name, unit, sigma in _component_axes(experiment, row, number):
+                    label = row.label.format(which=component_name, axis=name)
+                    yield NuisanceEntry(row, number, axis, f"{label} [{unit}]", sigma)
+    for number, gauge in enumerate(experiment.readings):
+        for axis, (name, sigma) in enumerate(gauge.unknowns.items()):
+            label = f"{without_unit(name)} of {gauge.name} [{unit_of(name) or '1'}]"
+            yield NuisanceEntry(GAUGE, number, axis, label, sigma)
+
+
+def _components(experiment: Experiment, of: Component) -> Iterable[tuple[int, str]]:
+    """Return index and name of all components of one kind, such as all markers."""
+    names = experiment.markers.names
+    if of == "recording":
+        return [(0, "")]
+    if of == "marker":
+        return enumerate(names)
+    if of == "place":
+        return [(m, names[m]) for m in np.flatnonzero(experiment.place_sigma_m > 0).tolist()]
+    if of == "grasp":
+        return [(k, str(k + 1)) for k in range(len(experiment.body_grasps))]
+    if of == "obstacle":
+        return enumerate((each.name for each in experiment.obstacles), len(experiment.body_grasps))
+    if of == "depth":
+        return enumerate(depth.name for depth in experiment.depths)
+    if of == "load":
+        return enumerate(which for which, _ in _timed_loads(experiment))
+    if of == "sensor":
+        count = len(_wrenches(experiment))
+        return [(k, f" {k + 1}" if count > 1 else "") for k in range(count)]
+    if of == "tendon":
+        return enumerate(tendon.name for tendon in experiment.tendons)
+    pressures = (pressure.name for pressure in experiment.pressures)
+    return enumerate(pressures, start=len(experiment.tendons))
+
+
+def _component_axes(
+    experiment: Experiment, row: NuisanceRow, number: int
+) -> list[tuple[int, str, str, float]]:
+    """Return index, name, unit and prior deviation of each estimated axis of a component.
+
+    The list is empty if the component is exact or the row does not apply to it.
+    """
+    sigma = experiment.nuisance.sigma(row)
+    names = row.axes.split() or [""]
+    if row == PLACE:
+        sigma = float(experiment.place_sigma_m[number])
+        names = ["first", "second"] if experiment.markers.on_surface else names
+    if not sigma:
+        return []
+    if row == TARE:
+        wrench = _wrenches(experiment)[number]
+        measured = np.flatnonzero(wrench.measured_components).tolist()
+        return [(k, COMPONENTS[k], UNITS[k], sigma * float(wrench.sigmas[k])) for k in measured]
+    if row in (OBSTACLE_TILT, OBSTACLE_TIME):
+        obstacle = experiment.grasps[number]
+        assert isinstance(obstacle, Obstacle)
+        if not (obstacle.shape.has_tilt if row == OBSTACLE_TILT else len(obstacle.poses.t_s) > 1):
+            return []
+    if row in (DEPTH_BIAS, DEPTH_SCALE) and experiment.depths[number].camera.matrix is None:
+        return []
+    if row == DEPTH_EDGE and not len(experiment.depths[number].images_m):
+        return []
+    axes = [(axis, name, row.unit, sigma) for axis, name in enumerate(names)]
+    return [each for each in axes if row != ZERO or each[1] in experiment.grasps[number].zero]
+
+
+def _wrenches(experiment: Experiment) -> list[Wrench]:
+    """Return the wrench sensors of all grasps."""
+    return [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
+
+
+def _timed_loads(experiment: Experiment) -> list[tuple[str, TimedLoad]]:
+    """Return label and load for every time of a load that is to be estimated."""
+    if not experiment.nuisance.joining_s:
+        return []
+    verbs: dict[LoadTime, str] = {"from_s": "joining", "until_s": "leaving"}
+    return [
+        (f"{verbs[change]} of {kind} {number}", TimedLoad(load, change))
+        for kind, loads in (("mass", experiment.masses), ("force", experiment.forces))
+        for number, load in enumerate(loads, start=1)
+        for change in get_args(LoadTime)
+        if experiment.changes_within(load, change)
+    ]

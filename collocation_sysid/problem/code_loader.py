@@ -1,0 +1,171 @@
+"""Python files that a problem names: custom materials, forces, sensors and nuisance parameters.
+
+They are run only if the user allows it.
+"""
+
+from __future__ import annotations
+
+import runpy
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+from ..errors import InputError, hint_at, located
+from ..fem.materials import Energy, Material
+from ..fem.node_force import NodeForce
+from ..files import reason, require_regular
+from ..recording.formats.logs import stored_files
+from ..recording.node_selection import selection_from_section
+from ..recording.nuisance import NuisanceRow
+from .nuisance_schema import CustomNuisanceSection
+from .schema import CodeSection, NodeForceSection
+
+
+def existing_file(folder: Path, name: str, key: str) -> Path:
+    """Return the path of a file, or of a topic of a log, that a key of the problem file names.
+
+    Raises
+    ------
+    InputError
+        If it does not exist.
+    """
+    file = folder / name
+    require_regular(file, key)
+    if not stored_files(file):
+        fault = "is a folder" if file.is_dir() else "does not exist"
+        hint = folder / "README.md"
+        see = f"; see {hint} for how to get it" if hint.is_file() else ""
+        message = f"{file} {fault}; expected a file, named from the problem file's folder{see}"
+        raise InputError(message, where=key)
+    return file
+
+
+@dataclass(frozen=True)
+class CodeLoader:
+    """Loader of Python files, which runs them only if that is allowed.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder that contains the files.
+    is_allowed : bool
+        Whether files may be run.
+    """
+
+    folder: Path
+    is_allowed: bool
+
+    def material(self, section: CodeSection, key: str) -> Material:
+        """Return a custom material.
+
+        Raises
+        ------
+        InputError
+            See `function`; also if the function is no energy density, see `Material.from_energy`.
+        """
+        file, loaded = self.function(section.file, section.function, f"{key}.file")
+        if isinstance(loaded, Material):
+            return loaded
+        with located(file):
+            return Material.from_energy(cast(Energy, loaded), section.function)
+
+    def force(self, section: NodeForceSection, key: str) -> NodeForce:
+        """Return a custom force on nodes.
+
+        Raises
+        ------
+        InputError
+            See `function`; also if the function is no force, see `NodeForce.from_law`.
+        """
+        file, loaded = self.function(section.file, section.function, f"{key}.file")
+        nodes = None if section.nodes is None else selection_from_section(section.nodes)
+        name = section.function
+        carries = section.carries
+        if isinstance(loaded, NodeForce):
+            if carries not in (0, loaded.internal_variable_count):
+                message = f"found {carries}, but the force {name!r} says that it carries"
+                message += f" {loaded.internal_variable_count}; expected the key to be left out"
+                raise InputError(message, where=f"{key}.carries")
+            return loaded if nodes is None else replace(loaded, nodes=nodes)
+        with located(file):
+            return NodeForce.from_law(
+                loaded, nodes=nodes, name=name, on=section.on, carries=carries
+            )
+
+    def nuisance_row(self, section: CustomNuisanceSection) -> NuisanceRow:
+        """Return a custom nuisance parameter; see `function` for the errors."""
+
+        def is_row(value: Any) -> bool:
+            """Return whether a value of the file is a nuisance parameter."""
+            return isinstance(value, NuisanceRow)
+
+        key = "nuisance.own.file"
+        return self._load(section.file, section.row, key, "NuisanceRow", is_row)[1]
+
+    def function(self, file: str, name: str, key: str) -> tuple[Path, Callable[..., Any]]:
+        """Return the path of a file and a function in it.
+
+        Parameters
+        ----------
+        file : str
+            Name of the file.
+        name : str
+            Name of the function.
+        key : str
+            Key of the problem file that names it, for messages.
+
+        Raises
+        ------
+        InputError
+            If running code is not allowed, the file or the function does not exist, or the file
+            fails.
+        """
+
+        def is_function(value: Any) -> bool:
+            """Return whether a value of the file is a function or a force."""
+            return callable(value) or isinstance(value, NodeForce)
+
+        return self._load(file, name, key, "function", is_function)
+
+    def _load(
+        self, name: str, value_name: str, key: str, kind: str, is_kind: Callable[[Any], bool]
+    ) -> tuple[Path, Any]:
+        """Run a file, and return its path and the value with a name.
+
+        Parameters
+        ----------
+        name : str
+            Name of the file.
+        value_name : str
+            Name of the value.
+        key : str
+            Key of the problem file, for messages.
+        kind : str
+            Kind of value, for messages.
+        is_kind : callable
+            Function that returns whether a value is of this kind.
+
+        Raises
+        ------
+        InputError
+            See `function`.
+        """
+        if not self.is_allowed:
+            message = (
+                f"found the file {name}, which would be run as Python code; allow that with "
+                "--allow-code (allow_code=True from Python) if you trust it"
+            )
+            raise InputError(message, where=key.rpartition(".")[0])
+        file = existing_file(self.folder, name, key)
+        try:
+            names = runpy.run_path(str(file))
+        except (Exception, SystemExit) as error:
+            raise InputError(f"running it failed: {reason(error)}", file) from error
+        if not is_kind(names.get(value_name)):
+            known_names = [
+                n for n, value in names.items() if is_kind(value) and not n.startswith("_")
+            ]
+            known = f"{', '.join(known_names) or 'none'}{hint_at(value_name, known_names)}"
+            raise InputError(f"there is no {kind} {value_name!r}; expected one of {known}", file)
+        return file, names[value_name]

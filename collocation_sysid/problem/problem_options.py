@@ -1,0 +1,78 @@
+"""Options of the uncertainties and of the check by forward simulation, and the origin of a
+problem.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from ..statistics.shape_error import CORRELATION
+from ..statistics.systematic_effects import CORRELATION_KEY, Assumptions
+from ..statistics.uncertainty import ErrorModel
+from ..validated_types import Options, Positive, Text
+
+
+@dataclass(frozen=True)
+class RolloutOptions(Options):
+    """The forward simulation that checks the answer.
+
+    Attributes
+    ----------
+    integrator : {"newmark", "scheme"}
+        Newmark's method, or the scheme of the transcription.
+    timestep_s : float, optional
+        Time step of Newmark's method; a quarter of the sample interval by default.
+    """
+
+    integrator: Literal["newmark", "scheme"] = "newmark"
+    timestep_s: Positive | None = None
+
+
+@dataclass(frozen=True)
+class UncertaintyOptions(ErrorModel):
+    """Intervals of the estimates.
+
+    Attributes
+    ----------
+    profile : tuple of str
+        List of the parameters whose profile likelihood is computed.
+    numerical : bool
+        Solve again with half the step and on a finer mesh, to estimate the discretisation error.
+    assumptions : Assumptions
+        Standard deviations of systematic effects, by name.
+    surface_correlation : float
+        Correlation length of the error of the surface over the longest extent of the body.
+    """
+
+    profile: tuple[Text, ...] = ()
+    numerical: bool = False
+    assumptions: Assumptions = field(default_factory=Assumptions)
+    surface_correlation: Positive = CORRELATION
+
+    @property
+    def considered(self) -> dict[str, float | None]:
+        """Standard deviations of systematic effects and the surface's correlation length,
+        by name.
+        """
+        return self.assumptions.deviations | {CORRELATION_KEY: self.surface_correlation}
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Problem file of a problem.
+
+    Attributes
+    ----------
+    path : Path
+        Path of the problem file.
+    text : str
+        Text of the problem with the overrides that were applied.
+    files : tuple of Path
+        Data files that the problem names.
+    """
+
+    path: Path
+    text: str = field(repr=False)
+    files: tuple[Path, ...] = ()

@@ -1,0 +1,618 @@
+"""Reading of one experiment: its table and files are converted to an `Experiment` on one
+time grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ..array_types import Array
+from ..declarations import keys_of, tables_of
+from ..errors import InputError, hint_at, located
+from ..fem.body import Body
+from ..methods.stiffness_scan import typical_constants
+from ..model.parameters import Parameters
+from ..recording import (
+    Depth,
+    DepthCamera,
+    Experiment,
+    Gauge,
+    Grasp,
+    Markers,
+    MarkerTable,
+    Obstacle,
+    PoseSequence,
+    Wrench,
+    align,
+    displaced_axes,
+    prescribed_dofs,
+    read_displacement,
+    read_poses,
+    read_wrench,
+)
+from ..recording.checked_arrays import point_text
+from ..recording.depth_camera import points_from_image, samples_with_outlines
+from ..recording.formats.depth_files import DepthFileContent, read_depth
+from ..recording.formats.logs import stored_files
+from ..recording.formats.units import METRES_PER_UNIT
+from ..recording.poses import require_determined_motion
+from ..recording.sample_times import TIME_TOLERANCE_S
+from ..recording.time_tables import is_within_experiment, read_custom_sensor
+from ..schema_tables import stated_in
+from ..statistics.modal_misspecifications import find_misspecifications_by_modes
+from .bench_files import strain_length_m
+from .code_loader import CodeLoader, existing_file
+from .marker_tracking import (
+    gripper_markers,
+    poses_from_markers,
+    read_marker_tracks,
+    transform_to_body_frame,
+)
+from .nuisance_schema import nuisance_from_section
+from .problem_size import MOST_SAMPLES, Say, Size, require_feasible
+from .recording_schema import (
+    ExperimentSection,
+    GraspSection,
+    ObstacleSection,
+    ReadingSection,
+    TableSection,
+    WrenchSection,
+)
+
+Moved = GraspSection | ObstacleSection
+
+# Smallest span of the markers over the body's size: a wrong unit is a factor of 1000.
+LEAST_SPAN = 0.005
+# Largest span of the markers over the body's size.
+LARGEST_SPAN = 10.0
+# Largest distance of a marker from its rigidly moved position, over the body's size.
+LARGEST_MISS = 3.0
+
+
+@dataclass
+class RecordingReader:
+    """Reader of one experiment's files.
+
+    Attributes
+    ----------
+    section : ExperimentSection
+        Table of the experiment.
+    folder : Path
+        Folder that contains the files.
+    body : Body
+        Body of the experiment.
+    parameters : Parameters
+        Parameters, from which markers' plausibility is judged.
+    simulation : bool
+        Whether files of measurements may be missing.
+    code : CodeLoader
+        Loader of Python files.
+    air_density_kg_m3 : float or "none"
+        Density of the air.
+    notes : list of str
+        Assumptions that were made; reading adds to them.
+    size : Size or None
+        Size of the problem with one sample; None skips the check of memory.
+    say : callable or None
+        Function that is called with a sentence before long work.
+    """
+
+    section: ExperimentSection
+    folder: Path
+    body: Body
+    parameters: Parameters
+    simulation: bool
+    code: CodeLoader
+    air_density_kg_m3: float | Literal["none"]
+    notes: list[str] = field(default_factory=list)
+    size: Size | None = None
+    say: Say | None = None
+
+    def read(self) -> Experiment:
+        """Return the experiment.
+
+        Raises
+        ------
+        InputError
+            Names the file and line, or the key within the experiment's table.
+        """
+        section = self.section
+        t_s, poses, table = self._align([*map(self._poses, range(len(section.moved_sections)))])
+        grasps = [self._grasp(k, sequence, t_s) for k, sequence in enumerate(poses)]
+        if len(prescribed_dofs(grasps)) == 3 * (n := len(self.body.nodes_m)):
+            message = (
+                f"the selected nodes are all {n} there are, so nothing can move; select fewer, and "
+                "check length_unit of the object"
+            )
+            raise InputError(message, where="grasp")
+        loads: dict[str, Any] = {
+            name: [self._from_table(kind, word, k) for k in range(len(getattr(section, word)))]
+            for name, word, kind in tables_of(Experiment)
+        }
+        experiment = Experiment(
+            name=section.name,
+            body=self.body,
+            t_s=t_s,
+            grasps=grasps,
+            readings=[self._custom_sensor(k, each, t_s) for k, each in enumerate(section.reading)],
+            depths=[self._depth(k, t_s) for k in range(len(section.depth))],
+            markers=self._markers(t_s, table),
+            nuisance=nuisance_from_section(section.nuisance, self.code.nuisance_row),
+            air_density_kg_m3=self.air_density_kg_m3,
+            **stated_in(section, Experiment, ""),
+            **loads,
+        )
+        if section.has_markers and not self.simulation:
+            require_plausible_markers(experiment, typical_constants(self.parameters))
+        return experiment
+
+    @property
+    def _is_static(self) -> bool:
+        """Whether the samples are equilibria."""
+        return self.section.kind == "static"
+
+    def _add_notes(self, *notes: str) -> None:
+        """Add notes, which begin with the experiment's name."""
+        self.notes += [f"experiment '{self.section.name}': {note}" for note in notes]
+
+    # Files ----------------------------------------------------------------------------------------
+
+    def _must_read(self, name: str | None) -> bool:
+        """Return whether a file is to be read: always, unless it is missing and the problem
+        is simulated.
+        """
+        return not self.simulation or bool(name and stored_files(self.folder / name))
+
+    def _require_existing(self, name: str | None, key: str, what: str = "a file") -> Path:
+        """Return the path of a file; raise `InputError` if none is named or it does not exist."""
+        if name is None:
+            raise InputError(f"missing; expected {what}", where=key)
+        return existing_file(self.folder, name, key)
+
+    def _table_file(self, table: TableSection, key: str) -> Path:
+        """Return the file of a displacement or a wrench, its own or that of the experiment."""
+        key = "file" if table.file is None and self.section.file else key
+        return self._require_existing(
+            self.section.file_of(table), key, "a file here, or of the experiment"
+        )
+
+    @property
+    def _requires_times(self) -> bool:
+        """Whether files must contain times: not for equilibria of bodies without memory."""
+        return not self._is_static or self.body.has_memory
+
+    # Grasps ---------------------------------------------------------------------------------------
+
+    def _grasp_key(self, k: int, key: str = "") -> str:
+        """Return the key of grasp or obstacle number k, from 0, in messages."""
+        grasps = len(self.section.grasp_list)
+        one = f"grasp.{k}" if grasps > 1 else "grasp"
+        one = one if k < grasps else f"obstacle.{k - grasps}"
+        return f"{one}.{key}" if key else one
+
+    def _poses(self, k: int) -> PoseSequence:
+        """Return the poses of grasp or obstacle number k, from 0; constant if none are stated."""
+        grasp = self.section.moved_sections[k]
+        if grasp.markers is not None:
+            return self._poses_from_markers(grasp, self._grasp_key(k, "markers"))
+        if grasp.displacement is not None:
+            file = self._table_file(grasp.displacement, self._grasp_key(k, "displacement"))
+            layout = grasp.displacement.layout
+            layout |= {"length_m": strain_length_m(grasp.displacement, self.body)}
+            poses = read_displacement(file, **layout, timed=self._requires_times)
+        elif grasp.poses is None:
+            return PoseSequence.fixed()
+        else:
+            file = existing_file(self.folder, grasp.poses, self._grasp_key(k, "poses"))
+            poses = read_poses(file, grasp.quaternion, grasp.length_unit)
+        if (transform := grasp.gripper_to_body) is not None:
+            with located(where=self._grasp_key(k, "gripper_to_body")):
+                transform_pose = PoseSequence(
+                    [0.0], [transform.position_m], [transform.quaternion_xyzw]
+                )
+                poses = poses.after(transform_pose)
+        return replace(poses, interpolation=grasp.interpolation)
+
+    def _poses_from_markers(self, grasp: Moved, key: str) -> PoseSequence:
+        """Return the poses of a grasp fitted to its markers, and add notes on the fit."""
+        if self._marker_tracks is None:
+            message = "there are no tracks to fit the poses to; expected markers.file, or poses"
+            raise InputError(message, where=key)
+        _require_known_markers(grasp.markers or (), self._marker_tracks.names, key)
+        with located(where=key):
+            poses, notes = poses_from_markers(grasp, self._marker_tracks, self.section.window_s)
+        self._add_notes(*(f"{key}: {note}" for note in notes))
+        return poses
+
+    def _grasp(self, k: int, poses: PoseSequence, t_s: Array) -> Grasp:
+        """Return grasp or obstacle number k, from 0, on the body."""
+        section = self.section.moved_sections[k]
+        zero = ""
+        if (table := section.displacement) is not None:
+            file = self._table_file(table, self._grasp_key(k, "displacement"))
+            rest_m = strain_length_m(table, self.body)
+            zero = displaced_axes(file, table.columns, table.axis, rest_m)
+        is_obstacle = isinstance(section, ObstacleSection)
+        kind, word = (Obstacle, "force") if is_obstacle else (Grasp, "wrench")
+        number = k + 1 - len(self.section.grasp_list)
+        defaults = {"name": f"obstacle {number}"} if is_obstacle else {}
+        arguments: dict[str, Any] = defaults | stated_in(section, kind, self._grasp_key(k))
+        wrench = section.wrench and self._wrench(section.wrench, self._grasp_key(k, word), t_s)
+        with located(where=self._grasp_key(k)):
+            grasp = kind(**arguments, poses=poses, zero=zero, wrench=wrench)
+        if is_obstacle:
+            return grasp
+        with located(where=self._grasp_key(k, "nodes")):
+            return grasp.on_body(self.body, t_s)
+
+    # What is measured, and what acts --------------------------------------------------------------
+
+    def _read_wrench(self, section: WrenchSection, key: str) -> tuple[Array, Array]:
+        """Return times (S,) [s] and values (S, 6) of a wrench's file."""
+        file = self._table_file(section, f"{key}.file")
+        layout = section.layout
+        return read_wrench(file, **layout, symmetry=section.symmetry, timed=self._requires_times)
+
+    def _wrench(self, section: WrenchSection, key: str, t_s: Array) -> Wrench:
+        """Return the measured wrench within the experiment's time; zeros if a simulation
+        has no file.
+        """
+        name = self.section.file_of(section)
+        arguments: dict[str, Any] = stated_in(section, Wrench, key)
+        for sigma in {"sigma_n", "sigma_nm"} & arguments.keys():
+            arguments[sigma] /= section.symmetry
+        with located(where=key):
+            if not self._must_read(name):
+                return Wrench(t_s, np.zeros((len(t_s), 6)), **{"sigma_nm": 1.0, **arguments})
+            at_s, values = self._read_wrench(section, key)
+            is_used = is_within_experiment(at_s, t_s, str(name), self._is_static)
+            if self._is_static and not self.section.has_markers:
+                # Between equilibria it would be read off their chord, unless all of it is.
+                is_at_sample = np.abs(at_s[:, None] - t_s).min(axis=1) <= TIME_TOLERANCE_S
+                is_used &= is_at_sample if is_at_sample.any() else True
+            self._add_notes(f"{name}: {is_used.sum()} of {len(at_s)} samples are used")
+            return Wrench(at_s[is_used], values[is_used], **arguments)
+
+    def _custom_sensor(self, k: int, section: ReadingSection, t_s: Array) -> Gauge:
+        """Return custom sensor number k, from 0, with its values within the experiment's time.
+
+        Values are None if a simulation has no file.
+        """
+        key = f"reading.{k}"
+        arguments: dict[str, Any] = {"name": section.name, **stated_in(section, Gauge, key)}
+        _, arguments["expression"] = self.code.function(
+            section.code, section.function, f"{key}.code"
+        )
+        if section.grasp and section.grasp > (count := len(self.section.grasp_list)):
+            message = f"found {section.grasp}; expected the number of a grasp, 1 to {count}"
+            raise InputError(message, where=f"{key}.grasp")
+        with located(where=key):
+            if not self._must_read(section.file):
+                return Gauge(t_s=t_s, values=None, **arguments)
+            file = self._require_existing(section.file, f"{key}.file")
+            at_s, values, arguments["columns"] = read_custom_sensor(file, section.columns)
+            is_used = is_within_experiment(at_s, t_s, str(section.file), self._is_static)
+            self._add_notes(f"{section.file}: {is_used.sum()} of {len(at_s)} samples are used")
+            return Gauge(t_s=at_s[is_used], values=values[is_used], **arguments)
+
+    def _depth_images(self, k: int) -> tuple[DepthFileContent, Array]:
+        """Return the images or clouds of depth camera number k, from 0, and their times [s]."""
+        section = self.section.depth[k]
+        file = self.folder / section.file
+        if not file.is_dir():
+            file = existing_file(self.folder, section.file, f"depth.{k}.file")
+        unit_m = METRES_PER_UNIT[section.length_unit]
+        stated_keys = section.camera.model_fields_set
+        depth_file = read_depth(file, section.count_m, unit_m, stated_keys)
+        count = len(depth_file.images_m) or len(depth_file.clouds_m)
+        t_s = section.t_s if section.t_s is not None else depth_file.t_s
+        if t_s is None and count > 1 and not self._is_static:
+            message = f"{section.file} says no times of its {count} images; expected them here"
+            raise InputError(message, where=f"depth.{k}.t_s")
+        times = np.arange(float(count)) if t_s is None else np.array(t_s, dtype=float).ravel()
+        if len(times) != count:
+            message = f"found {len(times)} times for {count} images or clouds; expected as many"
+            raise InputError(message, where=f"depth.{k}.t_s")
+        return depth_file, times
+
+    def _depth(self, k: int, t_s: Array) -> Depth:
+        """Return the depth measurements of camera number k, from 0, within the experiment's
+        time.
+        """
+        section = self.section.depth[k]
+        where = f"depth.{k}"
+        depth_file, at_s = self._depth_images(k)
+        names = ("matrix", "pose", "distortion")
+        camera_arguments: dict[str, Any] = {name: getattr(depth_file, name) for name in names}
+        camera_arguments |= stated_in(section.camera, DepthCamera, f"{where}.camera")
+        if section.camera.poses is not None:
+            file = existing_file(self.folder, section.camera.poses, f"{where}.camera.poses")
+            camera_arguments["poses"] = read_poses(file)
+        with located(where=f"{where}.camera"):
+            camera = DepthCamera(
+                **{name: value for name, value in camera_arguments.items() if value is not None}
+            )
+        with located(where=where):
+            is_used = is_within_experiment(at_s, t_s, section.file, self._is_static)
+            used = np.flatnonzero(is_used).tolist()
+            clouds = [depth_file.clouds_m[k] for k in used] if depth_file.clouds_m else []
+            images = []
+            outlined = samples_with_outlines(len(used))
+            for number, sample in enumerate(used if len(depth_file.images_m) else ()):
+                image = depth_file.images_m[sample]
+                clouds.append(points_from_image(image, camera))
+                images.append(image if number in outlined else None)
+            arguments = {"name": section.name, **stated_in(section, Depth, where)}
+            depth = Depth(
+                t_s=at_s[is_used], clouds=clouds, camera=camera, images_m=images, **arguments
+            )
+        self._add_notes(f"{section.file}: {len(clouds)} of {len(at_s)} images are used")
+        return depth
+
+    def _from_table(self, kind: type, list_key: str, k: int) -> Any:
+        """Return the object of a table in a list, such as a tendon or a pressure, on the body.
+
+        Parameters
+        ----------
+        kind : type
+            Class of the object.
+        list_key : str
+            Key of the list.
+        k : int
+            Index of the table in it.
+        """
+        table = getattr(self.section, list_key)[k]
+        where = f"{list_key}.{k}"
+        defaults = {"name": f"{list_key}_{k + 1}"} if "name" in type(table).model_fields else {}
+        arguments = defaults | stated_in(table, kind, where)
+        for name, key in keys_of(kind):
+            if key.constant and key.read and (file_name := getattr(table, key.name)):
+                file = existing_file(self.folder, file_name, f"{where}.{key.name}")
+                arguments[name], arguments[key.constant] = key.read(file)
+        with located(where=f"{where}.nodes" if "nodes" in arguments else where):
+            return kind(**arguments).on_body(self.body)
+
+    # Markers --------------------------------------------------------------------------------------
+
+    @cached_property
+    def _marker_tracks(self) -> MarkerTable | None:
+        """Tracks of all markers that are used, in the body's frame; None if a simulation
+        has no file.
+        """
+        markers = self.section.markers
+        if not self.section.has_markers or not self._must_read(markers.file):
+            return None
+        file = self._require_existing(markers.file, "markers.file", "a file of marker tracks")
+        table = read_marker_tracks(self.section, file)
+        self._add_notes(*(f"{markers.file}: {note}" for note in table.notes))
+        _require_known_markers(markers.template_m or (), table.names, "markers.template_m")
+        with located(where="markers.template_m"):
+            table, notes = transform_to_body_frame(markers, table)
+        self._add_notes(*notes)
+        return table
+
+    def _fitted_tracks(self, poses: Sequence[PoseSequence]) -> MarkerTable:
+        """Return the tracks to fit; zeros at the times of the poses if a simulation has no file."""
+        if not self.section.has_markers:
+            times = self._sample_times(poses)
+            return MarkerTable(times, (), np.zeros((len(times), 0, 3)))
+        if self._marker_tracks is not None:
+            return self._select_tracks(self._marker_tracks)
+        markers = self.section.markers
+        names = tuple(markers.names or markers.reference_m)
+        names_without_position = [name for name in names if name not in markers.reference_m]
+        if names_without_position or not names:
+            message = (
+                f"there is no {markers.file or 'file'} yet and no place for "
+                f"{names_without_position[0] if names_without_position else 'any marker'}; "
+                "to simulate, expected an entry name = [x, y, z] for each marker"
+            )
+            raise InputError(message, where="markers.reference_m")
+        times = self._sample_times(poses)
+        return self._select_tracks(MarkerTable(times, names, np.zeros((len(times), len(names), 3))))
+
+    def _sample_times(self, poses: Sequence[PoseSequence]) -> Array:
+        """Return the sample times [s] without a marker file: those of a wrench, a camera,
+        or the poses.
+        """
+        section = self.section
+        wrench_sections = [
+            (k, grasp.wrench) for k, grasp in enumerate(section.moved_sections) if grasp.wrench
+        ]
+        if not (wrench_sections or section.has_markers or section.reading or section.depth):
+            message = "nothing is measured: expected markers, a wrench, a reading, or depth"
+            raise InputError(message, where="markers")
+        existing_wrenches = [
+            s for s in wrench_sections if stored_files(self.folder / str(section.file_of(s[1])))
+        ]
+        if existing_wrenches and not section.has_markers:
+            k, sensor = existing_wrenches[0]
+            return self._read_wrench(sensor, self._grasp_key(k, "wrench"))[0]
+        if self._is_static and section.depth and max(len(each.t_s) for each in poses) < 2:
+            return np.unique(
+                np.concatenate([self._depth_images(k)[1] for k in range(len(section.depth))])
+            )
+        times = max((sequence.t_s for sequence in poses), key=len, default=np.zeros(0))
+        fewest = 1 if self._is_static else 3
+        if len(times) < fewest:
+            message = (
+                f"neither markers.file nor poses with at least {fewest} times are there; "
+                "expected one of them, to simulate at its times"
+            )
+            raise InputError(message, where="grasp")
+        return times
+
+    def _select_tracks(self, table: MarkerTable) -> MarkerTable:
+        """Return the tracks to fit, without markers of the gripper alone and those of weight 0.
+
+        Raises
+        ------
+        InputError
+            If none remains, or a key names an unknown marker.
+        """
+        markers = self.section.markers
+        for key in ("reference_m", "reference_sigma_m", "sigma_m", "weights"):
+            if isinstance(by_name := getattr(markers, key), dict):
+                _require_known_markers(by_name, table.names, f"markers.{key}")
+        unweighted = [name for name in table.names if markers.weights.get(name) == 0]
+        if unweighted:
+            self._add_notes(f"left out, with the weight 0: {', '.join(unweighted)}")
+        # Markers that only the gripper or the template needs are read, and not fitted.
+        fitted_names = set(markers.names or set(table.names) - gripper_markers(self.section))
+        indices = [
+            k for k, n in enumerate(table.names) if n in fitted_names and n not in unweighted
+        ]
+        if not indices:
+            message = (
+                f"none is left of {', '.join(table.names)}: all are the gripper's or have the "
+                "weight 0; expected at least one that the body's motion is compared with"
+            )
+            raise InputError(message, where="markers")
+        names = tuple(table.names[k] for k in indices)
+        return MarkerTable(table.t_s, names, table.positions_m[:, indices])
+
+    def _align(
+        self, poses: list[PoseSequence]
+    ) -> tuple[Array, tuple[PoseSequence, ...], MarkerTable]:
+        """Return times [s], poses and tracks on one clock and time grid."""
+        section = self.section
+        table = self._fitted_tracks(poses)
+        static = self._is_static
+        intervals = [
+            each.model_dump(include={"from_s", "until_s"}) for each in section.moved_sections
+        ]
+        held_s = [
+            (-np.inf if first is None else first, np.inf if last is None else last)
+            for first, last in (each.values() for each in intervals)
+        ]
+        pose_files = [
+            grasp.poses or section.file_of(grasp.displacement) for grasp in section.moved_sections
+        ]
+        first_s, last_s = section.window_s or (-np.inf, np.inf)
+        t_s = table.t_s[table.t_s >= first_s - TIME_TOLERANCE_S]
+        t_s = t_s[t_s <= last_s + TIME_TOLERANCE_S]
+        for name, sequence, held in zip(pose_files, poses, held_s, strict=True):
+            if name is not None and len(t_s) and not static:
+                require_determined_motion(sequence, t_s, held, self.folder / name)
+        rate_hz = section.resample_hz
+        # The files that a simulation writes are thinned when they are read.
+        every = 1 if self.simulation else section.every
+        if self.size is not None and len(t_s):
+            samples = len(t_s) // every
+            if rate_hz and not static:
+                samples = int(min((t_s[-1] - t_s[0]) * rate_hz, MOST_SAMPLES)) + 1
+            require_feasible(replace(self.size, samples=samples), self.say)
+        try:
+            aligned = align(poses, table, section.window_s, rate_hz, every, held_s, static)
+        except InputError as error:
+            files = dict.fromkeys(name for name in (*pose_files, section.markers.file) if name)
+            raise InputError(error.message, where=" and ".join(files)) from error
+        self._add_notes(*aligned.notes)
+        if rate_hz and rate_hz > 1.01 / np.median(np.diff(table.t_s)):
+            self._add_notes(
+                "resample_hz is above the markers' own rate; interpolated samples count as "
+                "measured, so error bars come out too small"
+            )
+        return aligned.t_s, aligned.poses, aligned.table
+
+    def _markers(self, t_s: Array, table: MarkerTable) -> Markers:
+        """Return the markers; positions on the body are NaN where they are to be estimated."""
+        if not self.section.has_markers:
+            return Markers.none(t_s)
+        section = self.section.markers
+        names = table.names
+        sigma_m = _by_marker(section.sigma_m, names, np.nan)
+        known_m = section.reference_sigma_m
+        if np.isnan(sigma_m).any():
+            missing_name = names[int(np.isnan(sigma_m).argmax())]
+            message = f"no value for {missing_name!r}; expected one for every marker"
+            raise InputError(message, where="markers.sigma_m")
+        arguments: dict[str, Any] = stated_in(section, Markers, "markers")
+        return Markers(
+            t_s,
+            table.positions_m,
+            sigma_m / np.sqrt(_by_marker(section.weights, names, 1.0)),
+            names,
+            places_m=np.array([section.reference_m.get(name, [np.nan] * 3) for name in names]),
+            places_sigma_m=None if known_m is None else _by_marker(known_m, names, np.nan),
+            **arguments,
+        )
+
+
+def _by_marker(values: Mapping[str, float] | float, names: Sequence[str], default: float) -> Array:
+    """Return values (M,) of the markers, given for all or by name, with a default."""
+    by_name = values if isinstance(values, Mapping) else dict.fromkeys(names, values)
+    return np.array([by_name.get(name, default) for name in names])
+
+
+def _require_known_markers(requested: Iterable[str], names: Sequence[str], key: str) -> None:
+    """Raise `InputError` if a name is not that of a marker."""
+    present = set(names)
+    for name in requested:
+        if name not in present:
+            known = f"{', '.join(names)}{hint_at(name, names)}"
+            raise InputError(f"found {name!r}; expected names of the markers {known}", where=key)
+
+
+def require_plausible_markers(experiment: Experiment, constants: Mapping[str, float]) -> None:
+    """Raise `InputError` if the tracks cannot belong to this body, because of a wrong unit or
+    frame.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Experiment with markers.
+    constants : mapping of str to float
+        Physical values by name, to find the likely cause.
+    """
+    if (message := _implausible_markers(experiment)) is None:
+        return
+    likeliest = "".join(
+        f"; likely {cause.message}"
+        for cause in find_misspecifications_by_modes(experiment, constants)[:1]
+    )
+    raise InputError(message + likeliest, where="markers")
+
+
+def _implausible_markers(experiment: Experiment) -> str | None:
+    """Return why the tracks cannot belong to this body; None if they can."""
+    markers = experiment.markers
+    body_m = _diagonal(experiment.body.nodes_m)
+    k = int(markers.is_present.sum(axis=1).argmax())
+    is_measured = markers.is_present[k]
+    measured = markers.positions_m[k, is_measured]
+    span_m = _diagonal(measured)
+    if len(measured) > 1 and not LEAST_SPAN * body_m <= span_m <= LARGEST_SPAN * body_m:
+        return (
+            f"at t = {experiment.t_s[k]:.6g} s the markers span {span_m:.3g} m, but the body "
+            f"{body_m:.3g} m; check length_unit of the markers and of the object"
+        )
+    if not experiment.body_grasps:
+        return None
+    rigid_positions = markers.predict_positions(experiment.rigid_positions(experiment.t_s[[k]]))[
+        0, is_measured
+    ]
+    miss_m = np.linalg.norm(measured - rigid_positions, axis=1)
+    worst = int(miss_m.argmax())
+    if miss_m[worst] > LARGEST_MISS * body_m:
+        name = markers.names[np.flatnonzero(is_measured)[worst]]
+        return (
+            f"at t = {experiment.t_s[k]:.6g} s marker {name!r} is measured at "
+            f"{point_text(measured[worst])} m, {miss_m[worst]:.3g} m from where the grasp "
+            "carries its "
+            f"place on the body, {point_text(rigid_positions[worst])} m; check length_unit, the "
+            "marker's reference_m, that poses and markers share frame and clock, and that "
+            "the poses map undeformed to current positions"
+        )
+    return None
+
+
+def _diagonal(points_m: Array) -> float:
+    """Return the diagonal [m] of the box that contains points (n, 3)."""
+    return float(np.linalg.norm(np.ptp(points_m, axis=0)))

@@ -1,0 +1,186 @@
+"""Messages for validation errors of pydantic: key, what was found, and what was expected."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+
+from ..errors import InputError, excerpt, hint_at
+from ..validated_types import expected as wanted
+from .schema import ProblemFile, with_experiment_defaults
+
+Part = str | int
+Fault = Mapping[str, Any]
+
+
+def explain_validation_error(
+    error: ValidationError, content: dict[str, Any], path: Path, root: type[BaseModel] = ProblemFile
+) -> InputError:
+    """Return an `InputError` for the first fault, with the number of other faults.
+
+    Parameters
+    ----------
+    error : ValidationError
+        Error of pydantic.
+    content : dict
+        Content that was validated.
+    path : Path
+        File, for the message.
+    root : type
+        Model that the content was validated as.
+    """
+    faults = error.errors(include_url=False)
+    # An unknown key explains the others around it.
+    fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
+    message = _fault_message(fault, with_experiment_defaults(content), root)
+    where = _fault_location(fault, content, root)
+    others = {_fault_location(other, content, root) for other in faults} - {where}
+    if others:
+        message += f" (and {len(others)} more to mend)"
+    return InputError(message, path, where or None)
+
+
+def _fault_key(fault: Fault, root: type[BaseModel]) -> list[Part]:
+    """Return the key of a fault, without tags of unions and without indices in an array of
+    numbers.
+    """
+    loc = fault["loc"]
+    own = len(loc) - 1 if fault["type"] == "extra_forbidden" else len(loc)  # that is the file's
+    parts = [p for k, p in enumerate(loc) if k >= own or not str(p).startswith("<")]
+    field, depth = _schema_field(parts, root)
+    if field is not None and _table_model(field.annotation) is None:
+        while len(parts) > depth and isinstance(parts[-1], int):
+            parts.pop()
+    return parts
+
+
+def _fault_message(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> str:
+    """Return what was found and what was expected."""
+    key = _fault_key(fault, root)
+    field, _ = _schema_field(key, root)
+    description = (field.description if field else None) or ""
+    expected = description[:1].lower() + description[1:].rstrip(".").split(";")[0]
+    kind = fault["type"]
+    model = _table_model(field.annotation) if field else None
+    if kind == "extra_forbidden":
+        table, _ = _schema_field(key[:-1], root)
+        inside = _table_model(table.annotation) if table else None
+        known = list((inside or root).model_fields)
+        hint = hint_at(str(key[-1]), known)
+        return f"unknown key{hint or '; expected one of ' + ', '.join(known)}"
+    if kind == "value_error":
+        error = fault["ctx"]["error"]
+        return error.message if isinstance(error, InputError) else str(error)
+    in_array = key[-1:] != list(fault["loc"][-1:]) and isinstance(fault["loc"][-1], int)
+    if kind == "missing" and not in_array:
+        return f"missing; expected {expected or ('a value' if model is None else 'a table')}"
+    found = f"found {shortened(_value_at(key, content) if in_array else fault['input'])}"
+    if expected and (in_array or kind in ("tuple_type", "list_type", "too_long", "too_short")):
+        return f"{found}; expected {expected}"
+    if kind in ("model_type", "model_attributes_type") and model is not None:
+        return f"{found}; expected a table with some of the keys {', '.join(model.model_fields)}"
+    if kind == "literal_error":
+        choices = fault["ctx"]["expected"]
+        hint = hint_at(str(fault["input"]), re.findall("'(.*?)'", choices))
+        return f"{found}; expected {choices}{hint}"
+    return f"{found}; expected {wanted(fault)}"
+
+
+def _fault_location(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> str:
+    """Return the location of a fault as text.
+
+    An `InputError` that a validator raised contains the location within its value.
+    """
+    error = (fault.get("ctx") or {}).get("error")
+    known = error.where if isinstance(error, InputError) else None
+    return known or _written_key(_fault_key(fault, root), content)
+
+
+def _written_key(key: Sequence[Part], content: dict[str, Any]) -> str:
+    """Return the key as it is written in the file, with experiments by their names."""
+    value: Any = content
+    defaults = _item(content, "experiment_defaults")
+    if key[:1] == ["experiment"] and len(key) > 2:
+        own = _value_at(key[:2], content)
+        if isinstance(own, dict) and key[2] not in own and _item(defaults, key[2]) is not None:
+            key = ["experiment_defaults", *key[2:]]
+    written: list[str] = []
+    experiment = ""
+    for part in key:
+        value = _item(value, part)
+        written.append(str(part))
+        name = _item(value, "name")
+        if len(written) == 2 and written[0] == "experiment" and name and isinstance(name, str):
+            experiment = f"experiment {name!r}"
+            written = []
+    return ": ".join(text for text in (experiment, ".".join(written)) if text)
+
+
+def _value_at(key: Sequence[Part], content: dict[str, Any]) -> Any:
+    """Return the value of a key; None if it does not exist."""
+    value: Any = content
+    for part in key:
+        value = _item(value, part)
+    return value
+
+
+def _item(container: Any, iterate: Part) -> Any:
+    """Return an item of a table or list; None if it does not exist."""
+    try:
+        return container[iterate]
+    except (KeyError, IndexError, TypeError):
+        return None
+
+
+# The schema -----------------------------------------------------------------------------------
+
+
+def _schema_field(key: Sequence[Part], root: type[BaseModel]) -> tuple[FieldInfo | None, int]:
+    """Return the deepest field of the schema on the path of a key, and the number of parts up to
+    it.
+
+    The field is None if no part is in the schema.
+    """
+    model: type[BaseModel] | None = root
+    field = None
+    depth = 0
+    named = False
+    for count, part in enumerate(key, start=1):
+        if isinstance(part, int):
+            continue
+        if field is not None and get_origin(field.annotation) is dict and not named:
+            named = True  # a name of the user's, such as a parameter's
+            continue
+        if model is None or part not in model.model_fields:
+            break
+        field = model.model_fields[part]
+        depth = count
+        named = False
+        model = _table_model(field.annotation)
+    return field, depth
+
+
+def _table_model(annotation: Any) -> type[BaseModel] | None:
+    """Return the model of a field that is a table or a list of tables; None for other fields."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for argument in getattr(annotation, "__args__", ()):
+        model = _table_model(argument)
+        if model is not None:
+            return model
+    return None
+
+
+def shortened(value: Any) -> str:
+    """Return a value as text of at most 60 characters."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    try:
+        return excerpt(repr(value))
+    except (ValueError, RecursionError):  # beyond Python's limits of digits and of depth
+        return f"a {type(value).__name__} too large to show"

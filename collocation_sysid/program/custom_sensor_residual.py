@@ -1,0 +1,257 @@
+"""Custom sensors: measurements defined by a user's expression.
+
+The expression is a function of positions, velocities and accelerations of points of the body, or of
+the force and torque of a grasp. Velocities and accelerations are those of the polynomial through
+the five grid times around a sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from ..array_types import Array
+from ..model.nuisance_map import NuisanceMap
+from ..recording.custom_sensor import Gauge
+from ..recording.experiment import Experiment
+from ..recording.nuisance import GAUGE
+from ..recording.placement import place_markers
+from ..recording.sample_times import TIME_TOLERANCE_S
+from .marker_association import MarkerAssociation
+from .measurement_residual import (
+    GROUP,
+    Channel,
+    MeasurementResidual,
+    RowStencil,
+    lagrange_weights,
+    neighbouring_times,
+)
+from .observables import ObservedMotion, PointPositions
+from .wrench_observable import GraspWrench, ReactionGrid
+
+# Grid times around a sample, for positions, velocities and accelerations.
+NEIGHBOURS = 5
+# The same for equilibria, which have no velocities.
+STATIC_NEIGHBOURS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class CustomSensorResidual(MeasurementResidual):
+    """Measurement model of one custom sensor.
+
+    Attributes
+    ----------
+    sensor : Gauge
+        The user's sensor with its samples.
+    observable_s : (n,) array
+        Times of the observable [s].
+    is_static : bool
+        Whether the experiment is static: there are no velocities, and two times around a sample are
+        used.
+    """
+
+    sensor: Gauge
+    observable_s: Array
+    is_static: bool
+
+    sigma_key = "sigma"
+    has_offsets = True
+
+    @classmethod
+    def from_sensor(
+        cls,
+        sensor: Gauge,
+        number: int,
+        observable: Channel,
+        at_s: Array,
+        nuisance: NuisanceMap,
+        huber: float | None,
+        static: bool,
+    ) -> CustomSensorResidual:
+        """Build the measurement model of a custom sensor.
+
+        Parameters
+        ----------
+        sensor : Gauge
+            The user's sensor with its samples.
+        number : int
+            Index of the sensor in the experiment.
+        observable : Channel
+            Observable.
+        at_s : (n,) array
+            Times of the observable [s]; samples outside are not compared.
+        nuisance : NuisanceMap
+            Nuisance parameters of the experiment.
+        huber : float or None
+            Threshold of Huber's loss; None means a quadratic loss.
+        static : bool
+            Whether the experiment is static.
+        """
+        count = sensor.measured_values.shape[1]
+        groups = -(-count // GROUP)
+        padded = np.full((len(sensor.sample_times_s), 1, GROUP * groups), np.nan)
+        padded[:, 0, :count] = sensor.measured_values
+        is_compared = np.isfinite(padded) & _is_within(sensor.sample_times_s, at_s)[:, None, None]
+        which = [f" {k + 1}" if groups > 1 else "" for k in range(groups)]
+        return cls(
+            observable=observable,
+            nuisance=nuisance,
+            huber=huber,
+            names=tuple(f"{sensor.name}{each}" for each in which),
+            t_s=sensor.sample_times_s,
+            sigmas=np.full(groups, sensor.sigma),
+            measured=padded,
+            is_compared=is_compared.reshape(len(padded), groups, GROUP),
+            own_parameters=nuisance.indices_of_rows(GAUGE, component=number)[None],
+            sensor=sensor,
+            observable_s=at_s,
+            is_static=static,
+        )
+
+    def with_samples(
+        self, known_s: Array, t_s: Array, indices: Array, **changes: Any
+    ) -> CustomSensorResidual:
+        """Return the model of other samples, see `MeasurementResidual.with_samples`."""
+        return super().with_samples(known_s, t_s, indices, observable_s=known_s, **changes)
+
+    @cached_property
+    def _stencil(self) -> RowStencil:
+        """Stencil of all samples: indices of the neighbouring times, and the data of the
+        expression.
+        """
+        used = min(STATIC_NEIGHBOURS if self.is_static else NEIGHBOURS, len(self.observable_s))
+        times = neighbouring_times(self.observable_s, self.t_s + TIME_TOLERANCE_S, used)
+        each = np.arange(self.observable.vector_count)
+        places = (times[..., None] * self.observable.vector_count + each).reshape(len(times), 1, -1)
+        data = np.column_stack([self.observable_s[times] - self.t_s[:, None], self.t_s])
+        return RowStencil(places, data.T[..., None])
+
+    def stencil(self, phi: Array, known: int) -> RowStencil:
+        """Return the stencil of those first samples whose times are among the first `known`
+        ones.
+        """
+        last = self._stencil.indices[:, 0, -1] // self.observable.vector_count
+        samples = int(np.count_nonzero(last < known))
+        return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
+
+    @property
+    def first_needed_s(self) -> float:
+        """Last time [s] that the first compared sample is computed from."""
+        first = int(self.is_compared.any(axis=(1, 2)).argmax())
+        return float(
+            self.observable_s[self._stencil.indices[first, 0, -1] // self.observable.vector_count]
+        )
+
+    def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
+        """Return the user's expression, padded with zeros to a multiple of three numbers."""
+        *places, t_s = ca.vertsplit(data)
+        late = ca.SX.sym("late")
+        each = self.observable.vector_count
+        by_time = ca.reshape(values, GROUP * each, -1)
+        weights = ca.vertcat(*lagrange_weights(late, places))
+        at = []
+        for _ in range(3):
+            now = by_time @ ca.substitute(weights, late, ca.SX(0))
+            at.append(ca.reshape(now, GROUP, each))
+            weights = ca.jacobian(weights, late)
+        if self.sensor.grasp is not None:
+            at = ca.horzsplit(at[0])
+        unknowns = ca.vertsplit(phi * self.nuisance.scales[self.own_parameters[0]][:, None])
+        predicted = self.sensor.read(t_s, at, unknowns)
+        return ca.vertcat(predicted, ca.SX.zeros(self.measured.shape[2] - predicted.numel()))
+
+    @cached_property
+    def observable_sigmas(self) -> Array:
+        """Standard deviations (3 e,) of the observable as one sample determines it, from
+        the derivatives at zero.
+        """
+        nothing = np.zeros((self.observable.count, self.observable.vector_count, GROUP))
+        _, _, by_u = self._evaluate(nothing, np.zeros(self.nuisance.size))
+        by_looked = np.nan_to_num(by_u[..., : by_u.shape[3] - self.own_parameters.shape[1]])
+        each = GROUP * self.observable.vector_count
+        squares = np.sum(by_looked.reshape(-1, each) ** 2, axis=0) / max(1, self.is_compared.sum())
+        with np.errstate(divide="ignore"):
+            return 1 / np.sqrt(squares)
+
+    def predict_motion(self, motion: ObservedMotion, phi: Array) -> Array:
+        """Return predictions (S, G, 3) for a motion at the observable's times; NaN for
+        samples outside.
+        """
+        predicted = self.predict(self.observable.evaluate(motion, phi), phi)
+        return np.where(_is_within(self.t_s, self.observable_s)[:, None, None], predicted, np.nan)
+
+    def without_padding(self, predicted_m: Array) -> Array:
+        """Return the m numbers (S, m) of the sensor from predictions (S, G, 3)."""
+        return predicted_m.reshape(len(predicted_m), -1)[:, : self.sensor.measured_values.shape[1]]
+
+
+def _is_within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:
+    """Return the mask (S,) of samples within the range of ascending times; none if there
+    are no times.
+    """
+    if not len(at_s):
+        return np.zeros(len(t_s), dtype=bool)
+    return (t_s >= at_s[0] - TIME_TOLERANCE_S) & (t_s <= at_s[-1] + TIME_TOLERANCE_S)
+
+
+def custom_sensor_residuals(
+    experiment: Experiment,
+    t_s: Array,
+    grid: ReactionGrid,
+    nuisance: NuisanceMap,
+    huber: float | None = None,
+) -> tuple[CustomSensorResidual, ...]:
+    """Build the measurement models of all custom sensors of an experiment.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    t_s : (N,) array
+        Times of the rows of x [s].
+    grid : Table
+        Times at which reaction forces are known.
+    nuisance : NuisanceMap
+        Nuisance parameters of the experiment.
+    huber : float or None
+        Threshold of Huber's loss; None means a quadratic loss.
+    """
+    models = []
+    for number, gauge in enumerate(experiment.readings):
+        if gauge.grasp is None:
+            channel = observed_points(experiment, gauge, len(t_s))
+            at_s = t_s
+        else:
+            grasp = experiment.grasps[gauge.grasp - 1]
+            origin = np.zeros(3)
+            channel = GraspWrench.from_experiment(
+                experiment, grasp, gauge.frame, origin, grid, nuisance
+            )
+            at_s = channel.t_s
+        models.append(
+            CustomSensorResidual.from_sensor(
+                gauge,
+                number,
+                observable=channel,
+                at_s=at_s,
+                nuisance=nuisance,
+                huber=huber,
+                static=experiment.is_static,
+            )
+        )
+    return tuple(models)
+
+
+def observed_points(experiment: Experiment, sensor: Gauge, rows: int) -> PointPositions:
+    """Return the points of a custom sensor as an observable at the first `rows` grid times."""
+    body = experiment.body
+    points = np.asarray(sensor.points_m)
+    names = [f"{sensor.name} {k + 1}" for k in range(len(points))]
+    placement = place_markers(points, body.nodes.points_m, body, names=names)
+    chart = MarkerAssociation.from_exact_places(body, placement, points)
+    return PointPositions(np.arange(rows), chart, np.full((len(points), 3), -1))

@@ -1,0 +1,176 @@
+"""One experiment at given variables of the nonlinear program: its parameters, motion and
+observables.
+
+Methods and statistics use a `ExperimentIterate` to evaluate the loss, its gradient and the forces
+at one
+iterate; derived quantities are computed once and cached.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from ..array_types import Array
+from ..fem.body import Linearisation
+from ..model.equations_at_parameters import EquationsAtParameters
+from ..model.internal_variables import AnyHistory
+from .depth_residual import DepthResidual
+from .observables import ObservedMotion
+from .observation import Observation
+from .outline_residual import OutlineResidual
+from .transcription import Transcription
+
+
+@dataclass(frozen=True, eq=False)
+class ExperimentIterate:
+    """One experiment at given variables of the nonlinear program.
+
+    Attributes
+    ----------
+    segment : Transcription
+        Transcription of the experiment.
+    q : (nq,) array
+        Shared parameters.
+    phi : (k,) array
+        Nuisance parameters of the experiment in units of their priors.
+    x : (N, 3n) array
+        Positions [m], or their first rows.
+    lifted_histories : mapping of int to array
+        History variables by the index of the history, where they are variables of the program;
+        others follow from x.
+    lifted_pressures : mapping of int to array
+        Contact variables b (1, N, i) by the index of the force, where contact is a complementarity
+        problem (see `model.contact`); others follow from x.
+    lifted_observables : mapping of int to array
+        Observables by the index of the measurement, where they are variables of the program; others
+        follow from x.
+    has_observation_curvature : bool
+        If false, neglect the curvature of the observations (Gauss–Newton).
+    """
+
+    segment: Transcription
+    q: Array
+    phi: Array
+    x: Array
+    lifted_histories: Mapping[int, Array] = field(default_factory=dict)
+    lifted_pressures: Mapping[int, Array] = field(default_factory=dict)
+    lifted_observables: Mapping[int, Array] = field(default_factory=dict)
+    has_observation_curvature: bool = True
+
+    @cached_property
+    def equations(self) -> EquationsAtParameters:
+        """Equations of motion at q and φ."""
+        return self.segment.equations_at(self.q, self.phi)
+
+    @cached_property
+    def histories(self) -> tuple[AnyHistory, ...]:
+        """History variables of the body and of forces at all evaluations, followed by
+        lifted contact pressures.
+        """
+        dynamics = self.equations.dynamics
+        pressed = dynamics.contact_with_given_pressures(self.x, self.lifted_pressures)
+        return (*dynamics.histories(self.x, self.lifted_histories), *pressed)
+
+    @cached_property
+    def observation(self) -> Observation:
+        """Evaluation of the observables of this experiment."""
+        return Observation(self.segment, self.equations, self.phi)
+
+    @cached_property
+    def motion(self) -> ObservedMotion:
+        """Positions and reaction forces for the observables."""
+        return self.observation.motion(self.x, self.histories)
+
+    @cached_property
+    def observables(self) -> list[Array]:
+        """Observables (n, e, 3) of each measurement."""
+        return [
+            self.lifted_observables[k]
+            if k in self.lifted_observables
+            else reading.observable.evaluate(self.motion, self.phi)
+            for k, reading in enumerate(self.segment.residuals)
+        ]
+
+    @property
+    def depth_residuals(self) -> list[tuple[DepthResidual, Array]]:
+        """Measurement models of the depth cameras, each with its observables."""
+        return self.surface_residuals[: len(self.segment.depths)]
+
+    @property
+    def surface_residuals(self) -> list[tuple[DepthResidual, Array]]:
+        """Measurement models of the depth cameras, then of the outlines, each with its
+        observables.
+        """
+        readings = (*self.segment.depths, *self.segment.outlines)
+        return [
+            *zip(readings, self.observables[len(self.observables) - len(readings) :], strict=True)
+        ]
+
+    @property
+    def outline_distances_px(self) -> list[tuple[OutlineResidual, Array]]:
+        """Measurement models of the outlines, each with the distances (n,) of outline
+        points from their edges [pixels].
+        """
+        distances = []
+        for reading, looked in self.surface_residuals[len(self.segment.depths) :]:
+            assert isinstance(reading, OutlineResidual)
+            distances_px = reading.signed_distances_px(looked, self.phi)
+            distances.append((reading, distances_px[np.isfinite(distances_px)]))
+        return distances
+
+    @property
+    def loss(self) -> float:
+        """Loss of all measurements, without priors."""
+        pairs = zip(self.segment.residuals, self.observables, strict=True)
+        return sum(reading.loss(looked, self.phi) for reading, looked in pairs)
+
+    @cached_property
+    def loss_gradients(self) -> list[tuple[Array, Array]]:
+        """Gradient of the loss of each measurement by its observables (n, e, 3) and by φ (k,)."""
+        pairs = zip(self.segment.residuals, self.observables, strict=True)
+        return [reading.loss_gradient(looked, self.phi) for reading, looked in pairs]
+
+    def gradient(self) -> tuple[Array, Array]:
+        """Return the gradient of the loss by x (N, 3n) [1/m] and by (q, φ) (nq + k,).
+
+        Observables that are variables of the program (`lifted_observables`) are treated as
+        constant.
+        """
+        nq = self.segment.nq
+        phi = self.phi
+        by_x = np.zeros_like(self.x)
+        by_p = np.zeros(nq + len(phi))
+        by_reaction = None
+        pairs = zip(self.segment.residuals, self.loss_gradients, strict=True)
+        for k, (reading, (by_looked, by_phi)) in enumerate(pairs):
+            by_p[nq:] += by_phi
+            if k not in self.lifted_observables:
+                products = reading.observable.vjp(self.motion, phi, by_looked)
+                by_x = by_x + products.by_x
+                by_p[nq:] = by_p[nq:] + products.by_phi
+                if products.by_reaction is not None:
+                    by_reaction = products.by_reaction + (
+                        0.0 if by_reaction is None else by_reaction
+                    )
+        if by_reaction is not None:
+            through_x, through_p = self.observation.reaction_vjp(self.x, by_reaction)
+            by_x += through_x
+            by_p[self.segment.dynamic_parameters] += through_p
+        return by_x, by_p
+
+    @cached_property
+    def forces(self) -> Linearisation:
+        """Forces at the evaluations with their derivatives; valid until the segment
+        linearises again.
+        """
+        rows = self.segment.linearisation_buffer
+        return self.equations.dynamics.linearise(self.x, rows, self.histories)
+
+    @property
+    def residual_n(self) -> Array:
+        """Violation of the equations of motion (N, free dofs) [N]."""
+        return self.segment.residual_n(self.x, self.equations, self.histories)

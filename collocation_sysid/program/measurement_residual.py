@@ -1,0 +1,696 @@
+"""Measurement models: residuals between data and an expression of an observable and nuisance
+parameters.
+
+A sample measures y(c, φ, data), where c are a few vectors of its observable (such as the place of a
+marker at neighbouring times) and φ its nuisance parameters. The residual is r = (y − ŷ) / σ with
+the measurement ŷ, in groups of usually three numbers, and the loss is Σ ρ(‖r‖) over the groups. All
+derivatives are generated from the expression. Subclass `MeasurementResidual` for another kind of
+sensor.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
+
+import casadi as ca
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from ..array_types import Array, Index
+from ..model.generated_functions import GeneratedFunction
+from ..model.nuisance_map import NuisanceMap
+from .observables import ObservableDerivatives, PointPositions, SparseEntries
+from .wrench_observable import GraspWrench, ReactionGrid
+
+GROUP = 3
+
+# What can be looked at.
+Channel = PointPositions | GraspWrench
+
+T = TypeVar("T", float, ca.SX)
+Expression = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualExpression:
+    """Residual and loss of one sample as generated functions.
+
+    Attributes
+    ----------
+    expression : callable
+        ``expression(c, phi, data) -> y`` in CasADi operations; c is (3, vectors).
+    vector_count, nuisance_count, data_count : int
+        Numbers of vectors, of nuisance parameters and of data.
+    measured_count : int
+        Length of y, a multiple of the group.
+    huber : float or None
+        Threshold of Huber's loss in standard deviations: ρ(d) = d² up to it, linear beyond; None
+        means ρ(d) = d².
+    group_size : int
+        How many numbers of y the loss takes as one vector.
+    """
+
+    expression: Expression
+    vector_count: int
+    nuisance_count: int
+    data_count: int
+    measured_count: int
+    huber: float | None = None
+    group_size: int = GROUP
+
+    @cached_property
+    def residual(self) -> GeneratedFunction:
+        """Residual r of u = (c, φ), given the data, ŷ and 1/σ; the latter is zero where
+        nothing is measured.
+        """
+        return GeneratedFunction(self._residual_expression, self._input_count, self._data_count)
+
+    @cached_property
+    def loss(self) -> GeneratedFunction:
+        """Loss Σ ρ of the residual, of the same inputs."""
+        return GeneratedFunction(self._loss_expression, self._input_count, self._data_count)
+
+    @property
+    def is_quadratic(self) -> bool:
+        """Whether second derivatives of the loss are constant."""
+        return self.huber is None and self.residual.is_linear
+
+    def curvature(self, u: Array, data: Array, has_observation_curvature: bool = True) -> Array:
+        """Return second derivatives (k, k, …) of the loss by u.
+
+        Parameters
+        ----------
+        u : (k, …) array
+            Inputs (c, φ) of the samples.
+        data : array
+            Data, ŷ and 1/σ.
+        has_observation_curvature : bool
+            If false, neglect the curvature of the observations: the Gauss–Newton matrix, which is
+            convex. Outliers then have the weights ρ'/2d of reweighted least squares; this is an
+            upper bound of the curvature of ρ, and avoids the zero of ρ'' along their residuals.
+        """
+        if has_observation_curvature:
+            return self.loss.weighted_hessian(u, data)
+        residual, slopes = self.residual.evaluate_with_jacobian(u, data)
+        weights = np.full(residual.shape, 2.0)
+        if self.huber is not None:
+            groups = residual.reshape(-1, self.group_size, *residual.shape[1:])
+            lengths = np.linalg.norm(groups, axis=1)
+            weights *= np.repeat(
+                self.huber / np.maximum(lengths, self.huber), self.group_size, axis=0
+            )
+        return np.einsum("ai...,a...,aj...->ij...", slopes, weights, slopes, optimize=True)
+
+    @property
+    def _input_count(self) -> int:
+        """Number of inputs u."""
+        return GROUP * self.vector_count + self.nuisance_count
+
+    @property
+    def _data_count(self) -> int:
+        """Number of data, including ŷ and 1/σ."""
+        return self.data_count + 2 * self.measured_count
+
+    def _residual_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
+        """Expression of the residual."""
+        ends = [0, self.data_count, self.data_count + self.measured_count, self._data_count]
+        own, measured, weight = ca.vertsplit(data, ends)
+        vectors, phi = ca.vertsplit(u, [0, GROUP * self.vector_count, self._input_count])
+        predicted = self.expression(ca.reshape(vectors, GROUP, self.vector_count), phi, own)
+        return weight * (predicted - measured)
+
+    def _loss_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
+        """Expression of the loss."""
+        return self._robust_loss(self._residual_expression(u, data), data)
+
+    def _robust_loss(self, residual: ca.SX, _: ca.SX) -> ca.SX:
+        """Expression of Σ ρ over the groups of a residual."""
+        groups = ca.vertsplit(residual, self.group_size)
+        return sum(
+            (self._robust_loss_of_square(ca.sumsqr(group)) for group in groups), start=ca.SX(0)
+        )
+
+    def _robust_loss_of_square(self, square: ca.SX) -> ca.SX:
+        """Expression of ρ from the squared length of a group."""
+        if self.huber is None:
+            return square
+        limit = self.huber**2
+        beyond = 2 * self.huber * ca.sqrt(ca.fmax(square, limit)) - limit
+        return ca.if_else(square > limit, beyond, square)
+
+
+def huber_as_least_squares(
+    residual: Array, derivatives: Array, huber: float | None
+) -> tuple[Array, Array]:
+    """Scale residuals and derivatives such that their squares reproduce Huber's loss and its
+    gradient.
+
+    With d the length of a group and δ the threshold, ρ = d² up to δ and 2δd − δ² beyond. Beyond,
+    residuals are scaled by √ρ / d and derivatives by δ / √ρ, so that r'ᵀr' = Σρ and S'ᵀr' is half
+    the gradient (Huber 1964; reweighting after Triggs et al. 2000, sec. 4.3).
+
+    Parameters
+    ----------
+    residual : (…, 3) array
+        Residuals in standard deviations.
+    derivatives : (…, 3, p) array
+        Their derivatives by p parameters.
+    huber : float or None
+        Threshold δ; None returns both unchanged.
+    """
+    if huber is None:
+        return residual, derivatives
+    length = np.linalg.norm(residual, axis=-1, keepdims=True)
+    beyond = np.maximum(length, huber)
+    root = np.sqrt(2 * huber * beyond - huber**2)
+    shrunk = residual * np.where(length > huber, root / beyond, 1.0)
+    return shrunk, derivatives * np.where(length > huber, huber / root, 1.0)[..., None]
+
+
+def huber_as_weights(
+    residual: Array, derivatives: Array, huber: float | None
+) -> tuple[Array, Array]:
+    """Weight residuals and derivatives as Huber's loss does at its optimum, for statistics.
+
+    Derivatives get the square root of the weight in the normal equations. Residuals are shortened
+    to the threshold, so that a few outliers do not determine the noise of the others. Arguments as
+    in `huber_as_least_squares`.
+    """
+    if huber is None:
+        return residual, derivatives
+    length = np.linalg.norm(residual, axis=-1, keepdims=True)
+    weight = huber / np.maximum(length, huber)
+    return residual * weight, derivatives * np.sqrt(weight)[..., None]
+
+
+class RowStencil(NamedTuple):
+    """Vectors and data that samples are computed from.
+
+    Attributes
+    ----------
+    indices : (S, E, v) array
+        Indices of v vectors among those of the observable, flattened over times and points.
+    data : (d, S, E) array
+        Data of the expression.
+    """
+
+    indices: Index
+    data: Array
+
+
+@dataclass(frozen=True, eq=False)
+class PooledResiduals:
+    """Residuals as statistics use them, in M groups of three.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Name of each group.
+    sigmas : (M,) array
+        Standard deviations.
+    is_compared : (S, M, 3) array of bool
+        Numbers that exist.
+    places_m : (3M, 3) array or None
+        Place of each number on the undeformed body [m]; None if they have none.
+    """
+
+    names: tuple[str, ...]
+    sigmas: Array
+    is_compared: NDArray[np.bool_]
+    places_m: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MeasurementResidual(ABC):
+    """Measurement model: S samples of E entities at a time, of m numbers each, in one experiment.
+
+    Attributes
+    ----------
+    observable : Channel
+        Observable; its values c are (n, e, 3), at the first n of its times.
+    nuisance : NuisanceMap
+        Nuisance parameters of the experiment.
+    huber : float or None
+        Threshold of Huber's loss, see `ResidualExpression`; None means a quadratic loss.
+    names : (G,) tuple of str
+        Name of each group, G = E m / g.
+    t_s : (S,) array
+        Times of the samples [s].
+    sigmas : (G,) array
+        Stated standard deviations, in the unit of the measurement.
+    measured : (S, E, m) array
+        Measurements ŷ, NaN where missing.
+    is_compared : (S, G, g) array of bool
+        Numbers that are compared.
+    own_parameters : (E, f) array
+        Indices in φ of the nuisance parameters of each entity.
+    sigma_key : str
+        Key of σ in a problem file.
+    has_offsets : bool
+        Whether measurements have an unknown offset, such as a tare, which must be allowed for
+        before anything is fitted.
+    group_size : int
+        How many numbers the loss takes as one vector, g; three for a position.
+    has_fixed_stencils : bool
+        Whether the stencils do not depend on φ.
+    has_noise_floor : bool
+        Whether error bars never use a noise below σ, and the residuals are not used to estimate the
+        noise of other measurements. Set it for measurements with rounding errors, which may happen
+        to be small.
+    """
+
+    observable: Channel
+    nuisance: NuisanceMap
+    huber: float | None
+    names: tuple[str, ...]
+    t_s: Array
+    sigmas: Array
+    measured: Array
+    is_compared: NDArray[np.bool_]
+    own_parameters: Index
+
+    group_size: ClassVar[int] = GROUP
+    sigma_key: ClassVar[str] = "sigma_m"
+    has_offsets: ClassVar[bool] = False
+    has_fixed_stencils: ClassVar[bool] = True
+    has_noise_floor: ClassVar[bool] = False
+
+    @property
+    def first_needed_s(self) -> float:
+        """Time [s] that must be known before the first sample can be compared, for any φ."""
+        return float(self.t_s[self.is_compared.any(axis=(1, 2)).argmax()])
+
+    @cached_property
+    def pooled_groups(self) -> PooledResiduals:
+        """Groups that statistics use: those of the measurement, unless a subclass combines
+        neighbours.
+        """
+        return PooledResiduals(self.names, self.sigmas, self.is_compared)
+
+    def pool_values(self, values: Array) -> Array:
+        """Return residuals (S, G, g, …), or their derivatives, as values (S, M, 3, …) of
+        the groups of `pooled_groups`.
+        """
+        return values
+
+    @property
+    def observable_sigmas(self) -> Array:
+        """Standard deviations (3 e,) of the observable as one sample determines it;
+        infinite where it does not.
+        """
+        return np.repeat(self.sigmas, GROUP)
+
+    @abstractmethod
+    def expression(self, vectors: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
+        """Return the prediction y of one sample as a CasADi expression.
+
+        Parameters
+        ----------
+        vectors : (3, v) SX
+            Vectors of the observable.
+        phi : SX
+            Nuisance parameters of the entity.
+        data : SX
+            Data of the stencil.
+        """
+
+    @abstractmethod
+    def stencil(self, phi: Array, known: int) -> RowStencil:
+        """Return the stencil of those first samples for which the first `known` times of
+        the observable may suffice.
+        """
+
+    def all_stencils(self) -> Index:
+        """Return the indices (…, E, v) of vectors that samples may be computed from, for any φ."""
+        return self.stencil(np.zeros(self.nuisance.size), self.observable.count).indices
+
+    def compared_with(self, known: int) -> NDArray[np.bool_]:
+        """Return the mask (S, G, 3) of the numbers that can be compared if the first
+        `known` times are known.
+        """
+        return self.is_compared & self.is_covered(known)[:, None, None]
+
+    def is_covered(self, known: int) -> NDArray[np.bool_]:
+        """Return the mask (S,) of the samples for which the first `known` times suffice,
+        for any φ.
+        """
+        return np.ones(len(self.t_s), dtype=bool)
+
+    def rough_residuals(self, x: Array, phi: Array) -> Array | None:
+        """Return residuals for ranking first guesses, or None if the ordinary residuals are
+        suitable.
+        """
+        return None
+
+    # One sample -------------------------------------------------------------------------------
+
+    @cached_property
+    def _expressions(self) -> dict[tuple[int, int], ResidualExpression]:
+        """Generated functions by the numbers of vectors and of data."""
+        return {}
+
+    def with_samples(self, known_s: Array, t_s: Array, indices: Array, **changes: Any) -> Self:
+        """Return the model of other samples, sharing the generated functions.
+
+        Parameters
+        ----------
+        known_s : (n,) array
+            Times at which the observable is known [s].
+        t_s : (S,) array
+            Times of the samples [s].
+        indices : (S, m) array
+            Measurements, NaN where missing.
+        changes : Any
+            Other attributes to replace.
+        """
+        measured = np.full((len(t_s), 1, self.measured.shape[2]), np.nan)
+        measured[:, 0, : indices.shape[1]] = indices
+        is_compared = np.isfinite(measured).reshape(len(t_s), -1, GROUP)
+        changes |= {"t_s": t_s, "measured": measured, "is_compared": is_compared}
+        is_wrench = isinstance(self.observable, GraspWrench)
+        times = (
+            {"reaction_grid": ReactionGrid.from_times(known_s)}
+            if is_wrench
+            else {"rows": np.arange(len(known_s))}
+        )
+        changes["observable"] = replace(self.observable, **times)
+        other = replace(self, **changes)
+        # Derivatives of the same expression are generated once.
+        vars(other)["_expressions"] = self._expressions
+        return other
+
+    def expression_for(self, vectors: int, data: int) -> ResidualExpression:
+        """Return the generated functions for stencils of `vectors` vectors and `data` data."""
+        if (vectors, data) not in self._expressions:
+            self._expressions[vectors, data] = ResidualExpression(
+                self.expression,
+                vector_count=vectors,
+                nuisance_count=self.own_parameters.shape[1],
+                data_count=data,
+                measured_count=self.measured.shape[2],
+                huber=self.huber,
+                group_size=self.group_size,
+            )
+        return self._expressions[vectors, data]
+
+    @cached_property
+    def _data_and_weights(self) -> tuple[Array, Array]:
+        """Measurements ŷ (m, S, E), and 1/σ, which is zero where nothing is compared."""
+        weight = (self.is_compared / self.sigmas[:, None]).reshape(self.measured.shape)
+        return np.moveaxis(np.nan_to_num(self.measured), 2, 0), np.moveaxis(weight, 2, 0)
+
+    def _inputs_at(
+        self, values: Array, phi: Array
+    ) -> tuple[ResidualExpression, RowStencil, Array, Array]:
+        """Return generated functions, stencil, inputs u (k, s, E) and data of the samples
+        that can be computed.
+        """
+        window = self.stencil(phi, len(values))
+        samples, each, vectors = window.indices.shape
+        around = values.reshape(-1, GROUP)[window.indices].reshape(samples, each, GROUP * vectors)
+        own = np.broadcast_to(
+            phi[self.own_parameters.T][:, None], (self.own_parameters.shape[1], samples, each)
+        )
+        measured, weight = (part[:, :samples] for part in self._data_and_weights)
+        is_covered = self.is_covered(len(values))[:samples, None]
+        data = np.concatenate([window.data, measured, weight * is_covered])
+        u = np.concatenate([around.transpose(2, 0, 1), own])
+        return self.expression_for(vectors, len(window.data)), window, u, data
+
+    def _grouped(self, values: Array) -> Array:
+        """Return values (m, s, E) as groups (s, G, g)."""
+        return values.transpose(1, 2, 0).reshape(values.shape[1], len(self.names), self.group_size)
+
+    # All samples ------------------------------------------------------------------------------
+
+    def predict(self, values: Array, phi: Array) -> Array:
+        """Return predictions y (s, G, g), for the first samples that the values suffice for.
+
+        Parameters
+        ----------
+        values : (n, e, 3) array
+            Values of the observable.
+        phi : (k,) array
+            Nuisance parameters.
+        """
+        instrument, window, u, data = self._inputs_at(values, phi)
+        own = len(window.data)
+        measured = self.measured.shape[2]
+        data[own : own + measured] = 0.0
+        data[own + measured :] = 1.0
+        return self._grouped(instrument.residual.evaluate(u, data))
+
+    def residuals(self, values: Array, phi: Array) -> Array:
+        """Return residuals (y − ŷ) / σ (s, G, g), zero where missing; arguments as in
+        `predict`.
+        """
+        instrument, _, u, data = self._inputs_at(values, phi)
+        return self._grouped(instrument.residual.evaluate(u, data))
+
+    def linearise(
+        self, values: Array, observable_derivatives: ObservableDerivatives, phi: Array, size: int
+    ) -> tuple[Array, Array]:
+        """Return residuals (s, G, g) and their derivatives (s, G, g, size) by all parameters.
+
+        Parameters
+        ----------
+        values : (n, e, 3) array
+            Values of the observable.
+        observable_derivatives : MemoryForwardColumns
+            Their derivatives.
+        phi : (k,) array
+            Nuisance parameters; they are the last of all parameters.
+        size : int
+            Number of all parameters.
+        """
+        if not len(values):
+            none = np.zeros((len(self.stencil(phi, 0).indices), len(self.names), self.group_size))
+            return none, np.zeros((*none.shape, size))
+        window, residual, by_u = self._evaluate(values, phi)
+        samples, each, vectors = window.indices.shape
+        by_looked = by_u[..., : GROUP * vectors]
+        by_own = by_u[..., GROUP * vectors :]
+        derivatives = np.zeros((*by_u.shape[:3], size))
+        first = size - len(phi)
+        derivatives[..., observable_derivatives.columns] = by_looked @ _gather(
+            observable_derivatives.by_common, window.indices
+        )
+        if len(observable_derivatives.entities):
+            entities = observable_derivatives.entities
+            times = window.indices[:, entities] // values.shape[1]
+            number = np.arange(len(entities))[:, None]
+            shape = samples, len(entities), GROUP * vectors, observable_derivatives.by_own.shape[3]
+            around = observable_derivatives.by_own[times, number].reshape(shape)
+            _add_columns(
+                derivatives,
+                entities,
+                first + observable_derivatives.own_parameters,
+                by_looked[:, entities] @ around,
+            )
+        if self.own_parameters.size:
+            _add_columns(derivatives, np.arange(each), first + self.own_parameters, by_own)
+        grouped = residual.reshape(samples, len(self.names), self.group_size)
+        return grouped, derivatives.reshape(*grouped.shape, size)
+
+    def _evaluate(self, values: Array, phi: Array) -> tuple[RowStencil, Array, Array]:
+        """Return the stencil, residuals (s, E, m) and their derivatives (s, E, m, u) by the
+        inputs.
+        """
+        if self._linear_part is None or len(values) < self.observable.count:
+            instrument, window, u, data = self._inputs_at(values, phi)
+            residual, by_u = instrument.residual.evaluate_with_jacobian(u, data)
+            return window, residual.transpose(1, 2, 0), by_u.transpose(2, 3, 0, 1)
+        window, at_zero, by_u = self._linear_part
+        samples, each, vectors = window.indices.shape
+        around = values.reshape(-1, GROUP)[window.indices].reshape(samples, each, GROUP * vectors)
+        if self.own_parameters.size:
+            own = np.broadcast_to(phi[self.own_parameters], (samples, *self.own_parameters.shape))
+            around = np.concatenate([around, own], axis=2)
+        return window, at_zero + (by_u @ around[..., None])[..., 0], by_u
+
+    @cached_property
+    def _linear_part(self) -> tuple[RowStencil, Array, Array] | None:
+        """Stencil, residuals and derivatives at zero inputs; None if derivatives are not
+        constant.
+        """
+        if not self.has_fixed_stencils or not self._full_expression.residual.is_linear:
+            return None
+        nothing = np.zeros((self.observable.count, self.observable.vector_count, GROUP))
+        instrument, window, u, data = self._inputs_at(nothing, np.zeros(self.nuisance.size))
+        residual, by_u = instrument.residual.evaluate_with_jacobian(u, data)
+        by_u = np.ascontiguousarray(by_u.transpose(2, 3, 0, 1))
+        return window, np.ascontiguousarray(residual.transpose(1, 2, 0)), by_u
+
+    def residual_changes(self, values: Array, by: Array, phi: Array) -> Array:
+        """Return the changes (s, M, 3, c) of the pooled residuals if the observable changes
+        by `by` (n, e, 3, c).
+        """
+        size = by.shape[3] + len(phi)
+        slopes = ObservableDerivatives.without_own(np.arange(by.shape[3]), by)
+        return self.pool_values(self.linearise(values, slopes, phi, size)[1][..., : by.shape[3]])
+
+    def loss(self, values: Array, phi: Array) -> float:
+        """Return the loss Σ ρ of values (n, e, 3) at φ (k,)."""
+        if not len(values):
+            return 0.0
+        instrument, _, u, data = self._inputs_at(values, phi)
+        return float(instrument.loss.evaluate(u, data).sum())
+
+    def loss_gradient(self, values: Array, phi: Array) -> tuple[Array, Array]:
+        """Return the gradient of the loss by the observable (n, e, 3) and by φ (k,)."""
+        by_values = np.zeros_like(values)
+        by_phi = np.zeros(len(phi))
+        if not len(values):
+            return by_values, by_phi
+        instrument, window, u, data = self._inputs_at(values, phi)
+        by_u = instrument.loss.evaluate_with_jacobian(u, data)[1][0]
+        places = window.indices
+        by_looked, by_own = np.split(by_u, [GROUP * places.shape[2]])
+        by_looked = by_looked.reshape(places.shape[2], GROUP, *places.shape[:2])
+        where = np.moveaxis(places, 2, 0).ravel()
+        count = values.size // GROUP
+        for axis in range(GROUP):
+            by_values[..., axis] = np.bincount(
+                where, by_looked[:, axis].ravel(), minlength=count
+            ).reshape(values.shape[:2])
+        np.add.at(by_phi, self.own_parameters, by_own.sum(axis=1).T)
+        return by_values, by_phi
+
+    # Second derivatives -----------------------------------------------------------------------
+
+    def _gather_matrix(self, places: Index) -> sp.csr_array:
+        """Return ∂u/∂(c, φ) of samples with stencils (s, E, v); rows by sample, then by input."""
+        samples, each, vectors = places.shape
+        of_looked = GROUP * places[..., None] + np.arange(GROUP)
+        first = GROUP * self.observable.count * self.observable.vector_count
+        own = np.broadcast_to(first + self.own_parameters, (samples, *self.own_parameters.shape))
+        columns = np.concatenate([of_looked.reshape(samples, each, GROUP * vectors), own], axis=2)
+        rows = np.arange(columns.size + 1)
+        shape = columns.size, first + self.nuisance.size
+        return sp.csr_array((np.ones(columns.size), columns.ravel(), rows), shape=shape)
+
+    @property
+    def is_quadratic(self) -> bool:
+        """Whether second derivatives of the loss by the observable are constant."""
+        return self._full_expression.is_quadratic
+
+    @cached_property
+    def _full_expression(self) -> ResidualExpression:
+        """Generated functions for the stencil of all times."""
+        window = self.stencil(np.zeros(self.nuisance.size), self.observable.count)
+        return self.expression_for(window.indices.shape[2], len(window.data))
+
+    @cached_property
+    def _curvature_pattern(self) -> NDArray[np.bool_]:
+        """Mask (u, u) of the second derivatives that a sample may have."""
+        return self._full_expression.loss.hessian_pattern
+
+    def hessian_structure(self, derivatives: sp.csr_array) -> tuple[Index, Index]:
+        """Return rows and columns of ∂²loss by some variables, upper triangle, sorted by column.
+
+        Parameters
+        ----------
+        derivatives : sparse array
+            Structure of the derivatives of (c, φ) by these variables, all ones.
+        """
+        places = self.all_stencils()
+        instances = int(np.prod(places.shape[:2]))
+        ones = np.broadcast_to(
+            self._curvature_pattern.astype(float), (instances, *self._curvature_pattern.shape)
+        )
+        # Positive numbers cannot cancel, so that no entry is lost.
+        entries = _congruence(self._gather_matrix(places) @ derivatives, ones)
+        order = np.lexsort(entries[:2])
+        return entries.rows[order], entries.columns[order]
+
+    def hessian(
+        self,
+        values: Array,
+        phi: Array,
+        derivatives: sp.csr_array,
+        has_observation_curvature: bool = True,
+    ) -> SparseEntries:
+        """Return the entries of ∂²loss by some variables, upper triangle; entries may be missing or
+        repeated.
+
+        Parameters
+        ----------
+        values : (n, e, 3) array
+            Values of the observable.
+        phi : (k,) array
+            Nuisance parameters.
+        derivatives : sparse array
+            Derivatives of (c, φ) by the variables.
+        has_observation_curvature : bool
+            If false, neglect the curvature of the observations, see `ResidualExpression.curvature`.
+        """
+        instrument, window, u, data = self._inputs_at(values, phi)
+        by_u = np.moveaxis(instrument.curvature(u, data, has_observation_curvature), (0, 1), (2, 3))
+        by_u = by_u.reshape(-1, *by_u.shape[2:])
+        return _congruence(self._gather_matrix(window.indices) @ derivatives, by_u)
+
+
+def _gather(by: Array, places: Index) -> Array:
+    """Return changes (s, E, 3 v, c) of the stencils' vectors from changes (n, e, 3, c) of
+    the observable.
+    """
+    times, each, _, count = by.shape
+    flat = by.reshape(times * each, GROUP, count)[places]
+    return flat.reshape(*places.shape[:2], GROUP * places.shape[2], count)
+
+
+def _add_columns(slope: Array, entities: Index, columns: Index, values: Array) -> None:
+    """Add values (s, e, m, k) to columns (e, k) of the derivatives (s, E, m, size) of
+    entities (e,), in place.
+    """
+    slope[:, entities[:, None], :, columns] += values.transpose(1, 3, 0, 2)
+
+
+def _congruence(slopes: sp.csr_array, blocks: Array) -> SparseEntries:
+    """Return the upper triangle of Sᵀ B S, B being block-diagonal with the blocks
+    (instances, u, u).
+    """
+    count = np.arange(len(blocks) + 1)
+    middle = sp.bsr_array((blocks, count[:-1], count))
+    upper = sp.coo_array(sp.triu(slopes.T @ (middle.tocsr() @ slopes), format="coo"))
+    rows, columns = (np.asarray(index, dtype=np.int64) for index in upper.coords)
+    return SparseEntries(rows, columns, np.asarray(upper.data, dtype=np.float64))
+
+
+def neighbouring_times(known_s: Array, at_s: Array, count: int) -> Index:
+    """Return the indices (S, count) of consecutive times around each sample, as evenly as possible.
+
+    Parameters
+    ----------
+    known_s : (n,) array
+        Ascending times.
+    at_s : (S,) array
+        Times of the samples.
+    count : int
+        Number of neighbours, at most n.
+    """
+    beside = np.searchsorted(known_s, at_s, side="right") - 1
+    first = np.clip(beside - (count - 1) // 2, 0, len(known_s) - count)
+    return first[:, None] + np.arange(count)
+
+
+def lagrange_weights(position: T, places: Sequence[T]) -> list[Any]:
+    """Return Lagrange's weights of values at some places, for the value at `position`.
+
+    Parameters
+    ----------
+    position : float or SX
+        Place of interpolation.
+    places : sequence of float or SX
+        Distinct places of the values.
+    """
+    return [
+        math.prod((position - other) / (own - other) for j, other in enumerate(places) if j != i)
+        for i, own in enumerate(places)
+    ]

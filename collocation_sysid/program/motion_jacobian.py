@@ -1,0 +1,351 @@
+"""Equations of motion of selected dofs as rows of a sparse Jacobian, in scaled quantities.
+
+Rows are c / `force_n`, differentiated by x / `strain_length_m`; a prescribed dof has the row (x − u
+x̄) /
+`strain_length_m` instead. A dof that is prescribed for a part of the time has a grasp row at those
+times
+instead of an equation of motion, and the force on it at those times counts in no later row (see
+`Dynamics.is_temporarily_held`): where a grasp begins or ends, entries differ from those of the
+scheme, and
+`ReleasedGrasps` corrects them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..array_types import Array, Index
+from ..fem.body import Linearisation
+from ..fem.pattern import SymmetricPattern
+from ..model.dynamics import Dynamics
+from .block_band import BandBlock, BlockBand, BlockTerm, full_skew_values, skew_block_band
+
+
+@dataclass(frozen=True, eq=False)
+class MotionJacobian:
+    """Structure and values of ∂c/∂x of one experiment; row indices count from its first row.
+
+    Attributes
+    ----------
+    dynamics : Dynamics
+        Equations of motion with inputs as stated; determines the structure.
+    constrained_dofs : (k,) array
+        Dof of each row of a grid time, ascending.
+    free_dofs : array
+        Those of `constrained_dofs` with an equation of motion; the others are prescribed at all
+        times.
+    length_m : float
+        Unit of positions [m].
+    force_n : float
+        Unit of forces [N].
+    """
+
+    dynamics: Dynamics
+    constrained_dofs: Index
+    free_dofs: Index
+    length_m: float
+    force_n: float
+
+    @property
+    def pattern(self) -> SymmetricPattern:
+        """Sparsity pattern of the blocks."""
+        return self.dynamics.pattern
+
+    @cached_property
+    def structure(self) -> BlockBand:
+        """Sparsity structure of ∂c/∂x by columns."""
+        return BlockBand(self.pattern.size, self._row_starts, self._blocks())
+
+    @cached_property
+    def _skew(self) -> BlockBand:
+        """Structure of `structure` for adding the skew parts of ∂F/∂x and ∂F/∂v."""
+        spins = self.dynamics.forces.has_skew_damping
+        return skew_block_band(
+            self.pattern.size, self._row_starts, self._blocks(), by_velocity=spins
+        )
+
+    @property
+    def _row_starts(self) -> Index:
+        """Return the index of the first row of each grid time, −1 where there are no rows."""
+        first_row = self.dynamics.first_row
+        starts = (np.arange(self.dynamics.row_count) - first_row) * len(self.constrained_dofs)
+        return np.maximum(starts, -1) if first_row else starts
+
+    def _blocks(self) -> list[BandBlock]:
+        """Return the blocks of ∂c_t/∂x_{t−lag}, with the terms that fill them."""
+        rows, columns, source = self.pattern.full
+        place = np.full(self.pattern.size, -1)
+        moving = np.zeros(self.pattern.size, dtype=bool)
+        place[self.constrained_dofs] = np.arange(len(self.constrained_dofs))
+        moving[self.free_dofs] = True
+        has_motion = moving[rows]
+        is_prescribed = ~moving[rows] & (place[rows] >= 0)
+        scale = self.length_m / self.force_n
+        blocks = []
+        for lag in range(self.dynamics.largest_lag + 1):
+            terms = [
+                # Column time t has the block of row t + lag, whose coefficients are at t + lag.
+                BlockTerm(
+                    lag - j - self.dynamics.first_row,
+                    scale * shifted_back(a, lag),
+                    scale * shifted_back(b, lag),
+                )
+                for j, a, b in self.dynamics.block_terms(lag)
+            ]
+            is_stored = has_motion.copy() if terms else has_motion & (rows == columns)
+            if lag == 0:
+                is_stored |= is_prescribed & (rows == columns)
+            # Grasp rows hold constants only: they are written after the terms.
+            blocks.append(
+                BandBlock(
+                    offset=lag,
+                    rows=place[rows[is_stored]],
+                    columns=columns[is_stored],
+                    lower_positions=source[is_stored],
+                    terms=terms,
+                    full_positions=np.flatnonzero(is_stored),
+                )
+            )
+        return blocks
+
+    def _inertia_rows(self, lag: int) -> Index:
+        """Return the grid times whose equations of motion have inertia at a lag."""
+        rows = np.arange(max(self.dynamics.first_row, lag), self.dynamics.row_count)
+        return rows[self.dynamics.inertia_coefficient(lag)[rows] != 0]
+
+    @cached_property
+    def _constant_positions(self) -> tuple[Index, Index]:
+        """Positions of the inertia entries, and of the unit entries of grasp rows, in the
+        values.
+        """
+        place = np.searchsorted(self.constrained_dofs, self.free_dofs)
+        positions = [np.zeros(0, dtype=np.int64)]
+        for lag in range(self.dynamics.largest_lag + 1):
+            columns = self._inertia_rows(lag) - lag
+            positions.append(self.structure.positions(columns, lag, place, self.free_dofs).ravel())
+        prescribed = np.setdiff1d(self.constrained_dofs, self.free_dofs)
+        rows = np.arange(self.dynamics.first_row, self.dynamics.row_count)
+        grasps = self.structure.positions(
+            rows, 0, np.searchsorted(self.constrained_dofs, prescribed), prescribed
+        )
+        return np.concatenate(positions), grasps.ravel()
+
+    def _inertia(self, dynamics: Dynamics) -> Array:
+        """Return the inertia entries of ∂c/∂x in the order of their positions."""
+        mass = dynamics.mass.inertia_kg[:, self.free_dofs] * self.length_m / self.force_n
+        values = [np.zeros(0)]
+        for lag in range(self.dynamics.largest_lag + 1):
+            rows = self._inertia_rows(lag)
+            coefficient = self.dynamics.inertia_coefficient(lag)
+            values.append((coefficient[rows, None] * mass[rows]).ravel())
+        return np.concatenate(values)
+
+    @cached_property
+    def _constant_inertia(self) -> Array:
+        """Inertia entries of ∂c/∂x at the stated masses."""
+        return self._inertia(self.dynamics)
+
+    @cached_property
+    def _released_grasps(self) -> ReleasedGrasps:
+        """Corrections where grasps begin or end."""
+        scale = self.length_m / self.force_n
+        return ReleasedGrasps.from_dynamics(
+            self.dynamics,
+            self.structure,
+            self._row_starts,
+            self.pattern,
+            self.constrained_dofs,
+            scale,
+        )
+
+    def fill(
+        self, values: Array, forces: Linearisation, dynamics: Dynamics, has_variable_mass: bool
+    ) -> None:
+        """Write the values of ∂c/∂x.
+
+        Parameters
+        ----------
+        values : (band.nnz,) array
+            Values, overwritten.
+        forces : Linearisation
+            Derivatives of the forces at the evaluations.
+        dynamics : Dynamics
+            Equations of motion at the parameters.
+        has_variable_mass : bool
+            Whether the mass depends on the parameters; if not, the stated mass is used.
+        """
+        threads = dynamics.body.threads
+        self.structure.fill(values, forces.by_position, forces.by_velocity, threads)
+        positions, grasps = self._constant_positions
+        values[positions] += (
+            self._inertia(dynamics) if has_variable_mass else self._constant_inertia
+        )
+        skew = full_skew_values(self.pattern, forces.by_position_skew)
+        of_rates = full_skew_values(self.pattern, forces.by_velocity_skew)
+        if skew.size:
+            self._skew.fill(values, skew, of_rates if of_rates.size else skew, threads)
+        self._released_grasps.correct(
+            values, forces.by_position, forces.by_velocity, skew=skew, rate_skew=of_rates
+        )
+        values[grasps] = 1.0
+
+
+def shifted_back(values: Array, steps: int) -> Array:
+    """Return values[t + steps] at index t, zero beyond the end."""
+    shifted = np.zeros_like(values)
+    shifted[: len(values) - steps] = values[steps:]
+    return shifted
+
+
+@dataclass(frozen=True, eq=False)
+class _DroppedForce:
+    """Entries a G + b C of one evaluation that the Jacobian does not have, because a grasp
+    prescribed the dof.
+
+    Attributes
+    ----------
+    positions : (e,) array
+        Positions in the values of the Jacobian.
+    evaluation : int
+        Index of the evaluation.
+    source : (e,) array
+        Entries in lower triangles.
+    whole : (e,) array
+        Entries in both triangles, in the order of `full_skew_values`.
+    a, b : float
+        Coefficients of G = ∂F/∂ξ and C = ∂F/∂ν.
+    """
+
+    positions: Index
+    evaluation: int
+    source: Index
+    whole: Index  # the same in both triangles, as `skew_values` has them
+    a: float
+    b: float
+
+
+@dataclass(frozen=True, eq=False)
+class ReleasedGrasps:
+    """Corrections of ∂c/∂x for grasps that hold for a part of the time.
+
+    Attributes
+    ----------
+    dropped : tuple of _DroppedForce
+        Forces to subtract.
+    zeros : array
+        Positions of entries to set to zero.
+    ones : array
+        Positions of entries to set to one.
+    """
+
+    dropped: tuple[_DroppedForce, ...]
+    zeros: Index
+    ones: Index
+
+    @classmethod
+    def from_dynamics(
+        cls,
+        dynamics: Dynamics,
+        band: BlockBand,
+        row_starts: Index,
+        pattern: SymmetricPattern,
+        row_dofs: Index,
+        scale: float,
+    ) -> ReleasedGrasps:
+        """Compute the corrections of an experiment's Jacobian.
+
+        Parameters
+        ----------
+        dynamics : Dynamics
+            Equations of motion.
+        band : BlockBand
+            Structure of the Jacobian.
+        row_starts : (N,) array
+            First row of each grid time, −1 where there are no rows.
+        pattern : SymmetricPattern
+            Sparsity pattern of the blocks.
+        row_dofs : (k,) array
+            Dof of each row of a grid time.
+        scale : float
+            Factor of the rows, `strain_length_m` / `force_n`.
+        """
+        is_prescribed = dynamics.is_temporarily_held
+        nothing = np.zeros(0, dtype=np.int64)
+        place = np.full(pattern.size, -1)
+        place[row_dofs] = np.arange(len(row_dofs))
+        times, dofs = np.nonzero(is_prescribed)
+        has_row = times >= dynamics.first_row
+        times = times[has_row]
+        dofs = dofs[has_row]
+        zeros = np.flatnonzero(np.isin(band.indices, row_starts[times] + place[dofs]))
+        ones = [
+            band.positions(np.array([t]), 0, place[[dof]], np.array([dof])).ravel()
+            for t, dof in zip(times, dofs, strict=True)
+        ]
+        dropped = tuple(_dropped_forces(dynamics, band, pattern, place, scale))
+        return cls(dropped, zeros, np.concatenate([nothing, *ones]))
+
+    def correct(
+        self, values: Array, by_position: Array, by_velocity: Array, skew: Array, rate_skew: Array
+    ) -> None:
+        """Correct the values of ∂c/∂x in place.
+
+        Parameters
+        ----------
+        values : (band.nnz,) array
+            Values without corrections, modified.
+        by_position, by_velocity : (evaluations, m) arrays
+            Lower triangles of the symmetric parts of G and C.
+        skew, rate_skew : arrays
+            Entries of the skew parts of G and C, see `full_skew_values`; empty where there are
+            none.
+        """
+        for entry in self.dropped:
+            force = entry.a * by_position[entry.evaluation, entry.source]
+            values[entry.positions] -= force + entry.b * by_velocity[entry.evaluation, entry.source]
+            if skew.size:
+                values[entry.positions] -= entry.a * skew[entry.evaluation, entry.whole]
+            if rate_skew.size:
+                values[entry.positions] -= entry.b * rate_skew[entry.evaluation, entry.whole]
+        values[self.zeros] = 0.0
+        values[self.ones] = 1.0
+
+
+def _dropped_forces(
+    dynamics: Dynamics, band: BlockBand, pattern: SymmetricPattern, place: Index, scale: float
+) -> list[_DroppedForce]:
+    """Return the entries of forces that act while a dof is prescribed, in later rows where
+    it is free.
+    """
+    tables = dynamics.tables
+    step_s = dynamics.step_s
+    dropped = []
+    rows, columns, source = pattern.full
+    for k in range(dynamics.first_row, dynamics.row_count):
+        for j in range(1, min(dynamics.largest_lag, dynamics.row_count - 1 - k) + 1):
+            weight = scale * tables.w[k + j, j]
+            released = dynamics.is_temporarily_held[k] & ~dynamics.is_temporarily_held[k + j]
+            if weight == 0 or not released.any():
+                continue
+            entries = np.flatnonzero(released[rows])
+            for i in range(min(dynamics.largest_lag - j, k) + 1):
+                a = weight * tables.p[k, i]
+                b = weight * tables.q[k, i] / step_s
+                if a or b:
+                    positions = band.positions(
+                        np.array([k - i]), i + j, place[rows[entries]], columns[entries]
+                    )
+                    dropped.append(
+                        _DroppedForce(
+                            positions.ravel(),
+                            evaluation=k - dynamics.first_row,
+                            source=source[entries],
+                            whole=entries,
+                            a=a,
+                            b=b,
+                        )
+                    )
+    return dropped

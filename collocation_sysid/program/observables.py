@@ -1,0 +1,403 @@
+"""Observables of a moving body: quantities that measurements are functions of, with their
+derivatives.
+
+An observable has values c (n, e, 3) at n of the grid times: positions of e points of the body
+(`PointPositions`, here), or force and torque of a grasp (`wrench_channel.GraspWrench`). `reading`
+turns
+them into residuals. An observable is `local` if it depends on few positions at each time; then it
+provides derivatives by these positions. Other observables can be lifted to variables of the
+program, see `lifted_variables`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..array_types import Array, Index
+from ..recording.grasp import Grasp
+from .marker_association import MarkerAssociation, ShapeFunctions
+
+
+@dataclass(frozen=True, eq=False)
+class ReactionForces:
+    """Reaction forces on the sensed dofs at the first grid times.
+
+    Attributes
+    ----------
+    reaction : (N, g) array
+        Reaction forces R [N].
+    position_m : (N, g) array
+        Positions of the dofs [m].
+    reaction_by, position_by : (N, g, c) arrays or None
+        Their changes with c columns; None where they are not needed.
+    """
+
+    reaction: Array
+    position_m: Array
+    reaction_by: Array | None = None
+    position_by: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedMotion:
+    """A motion as observables use it.
+
+    Attributes
+    ----------
+    x : (rows, 3n) array
+        Positions of the first grid times [m].
+    compute_reactions : callable
+        Returns the reaction forces; called at most once.
+    changes : (R, p, c) array or None
+        Changes with c columns of the observable's operator applied to x; None means no change.
+    """
+
+    x: Array
+    compute_reactions: Callable[[], ReactionForces]
+    changes: Array | None = None
+
+    @cached_property
+    def reactions(self) -> ReactionForces:
+        """Reaction forces, computed on first use."""
+        return self.compute_reactions()
+
+
+class ObservableDerivatives(NamedTuple):
+    """Derivatives of the values c (n, e, 3) of an observable.
+
+    Attributes
+    ----------
+    columns : (c,) array
+        Indices of the common parameters.
+    by_common : (n, e, 3, c) array
+        Derivatives by the common parameters.
+    entities : (E,) array
+        Indices of points that have parameters of their own.
+    own_parameters : (E, k) array
+        Indices in φ of these parameters.
+    by_own : (n, E, 3, k) array
+        Derivatives of these points by them.
+    """
+
+    columns: Index
+    by_common: Array
+    entities: Index
+    own_parameters: Index
+    by_own: Array
+
+    @classmethod
+    def without_own(cls, columns: Index, by: Array) -> ObservableDerivatives:
+        """Build derivatives (n, e, 3, c) by the parameters at `columns` (c,) alone."""
+        none = np.zeros(0, dtype=np.int64)
+        return cls(columns, by, none, none.reshape(0, 0), by[:, :0, :, :0])
+
+
+class VectorJacobianProduct(NamedTuple):
+    """Derivatives of a scalar by positions, reaction forces and nuisance parameters.
+
+    Attributes
+    ----------
+    by_x : (N, 3n) array
+        Derivatives by the positions [1/m].
+    by_reaction : (N, g) array or None
+        Derivatives by the reaction forces [1/N]; None if it does not depend on them.
+    by_phi : (k,) array
+        Derivatives by φ.
+    """
+
+    by_x: Array
+    by_reaction: Array | None
+    by_phi: Array
+
+
+class SparseEntries(NamedTuple):
+    """Entries of a sparse matrix; values with the same row and column are summed."""
+
+    rows: Index
+    columns: Index
+    values: Array
+
+
+@dataclass(frozen=True, eq=False)
+class PointPositions:
+    """Positions of points X of the body, h(x_t) = Σ_a N_a(X) x_{t,a}, as an observable.
+
+    Attributes
+    ----------
+    rows : (T,) array
+        Grid times.
+    association : MarkerAssociation
+        Elements of the points.
+    coordinate_parameters : (e, k) array
+        Indices in φ of the estimated coordinates of X; −1 for points that are exact.
+    delay_steps : int
+        Number of grid times after which a value is known; 0.
+    """
+
+    rows: Index
+    association: MarkerAssociation
+    coordinate_parameters: Index
+
+    delay_steps: ClassVar[int] = 0
+
+    @property
+    def local(self) -> PointPositions:
+        """The observable itself, because it depends on few positions (None for observables
+        that do not).
+        """
+        return self
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether its derivatives are constant."""
+        return not len(self.association.estimated)
+
+    @property
+    def count(self) -> int:
+        """Number of times."""
+        return len(self.rows)
+
+    @property
+    def vector_count(self) -> int:
+        """Number of points."""
+        return len(self.association.prior_places_m)
+
+    @property
+    def node_count(self) -> int:
+        """Number of nodes of the body."""
+        return len(self.association.body.nodes_m)
+
+    def shape_functions(self, phi: Array) -> tuple[Index, ShapeFunctions]:
+        """Return the nodes (e, npe) of each point and their shape functions at φ (k,)."""
+        return self.association.shape_functions(np.append(phi, 0.0)[self.coordinate_parameters])
+
+    def operator(self, phi: Array) -> sp.csr_array:
+        """Return the matrix H (3e, 3n) from positions to points at φ (k,); row 3 m + axis,
+        column 3 node + axis.
+        """
+        nodes, shape = self.shape_functions(phi)
+        return interpolation_matrix(nodes, shape.weights, self.node_count)
+
+    def _interpolate(self, x: Array, nodes: Index, weights: Array) -> Array:
+        """Return Σ_a weights[m, a, …] x_a for the known grid times, (R, m, 3, …)."""
+        rows = self.rows[self.rows < len(x)]
+        at = x[rows].reshape(len(rows), -1, 3)[:, nodes]
+        return np.einsum("ma...,tmai->tmi...", weights, at)
+
+    def _coordinate_derivatives(self, x: Array, shape: tuple[Index, ShapeFunctions]) -> Array:
+        """Return the derivatives (R, estimated, 3, k) of estimated points by their own
+        coordinates.
+        """
+        nodes, functions = shape
+        estimated = self.association.estimated
+        if not len(estimated):
+            return np.zeros((len(self.rows), 0, 3, self.coordinate_parameters.shape[1]))
+        return self._interpolate(x, nodes[estimated], functions.gradients[estimated])
+
+    def evaluate(self, motion: ObservedMotion, phi: Array) -> Array:
+        """Return the positions (R, e, 3) of the points in a motion [m], at those times that
+        the motion covers.
+        """
+        return self.evaluate_positions(motion.x, phi)
+
+    def evaluate_positions(self, x: Array, phi: Array) -> Array:
+        """Return the positions (R, e, 3) of the points [m] for the first rows x (rows, 3n)."""
+        nodes, shape = self.shape_functions(phi)
+        return self._interpolate(x, nodes, shape.weights)
+
+    def linearise(
+        self, motion: ObservedMotion, phi: Array, columns: Index, size: int
+    ) -> tuple[Array, ObservableDerivatives]:
+        """Return the values (R, e, 3) and their derivatives.
+
+        Parameters
+        ----------
+        motion : ModesCheck
+            The motion, with its changes `by` (R, 3e, c).
+        phi : (k,) array
+            Nuisance parameters.
+        columns : (c,) array
+            Indices of the parameters of the changes among all parameters.
+        size : int
+            Number of all parameters; not used here.
+        """
+        values = self.evaluate(motion, phi)
+        by = (
+            np.zeros((len(values), 3 * self.vector_count, 0))
+            if motion.changes is None
+            else motion.changes
+        )
+        return values, self.derivatives_from(motion.x, self.shape_functions(phi), columns, by)
+
+    def derivatives_from(
+        self,
+        x: Array,
+        shape_functions: tuple[Index, ShapeFunctions],
+        columns: Index,
+        changes: Array,
+    ) -> ObservableDerivatives:
+        """Return the derivatives of the values if H x changes by (R, 3e, c) with the
+        parameters at `columns`.
+        """
+        estimated = self.association.estimated
+        changes = changes.reshape(len(changes), self.vector_count, 3, changes.shape[2])
+        return ObservableDerivatives(
+            columns,
+            changes,
+            estimated,
+            self.coordinate_parameters[estimated],
+            self._coordinate_derivatives(x, shape_functions),
+        )
+
+    def vjp(self, motion: ObservedMotion, phi: Array, by_values: Array) -> VectorJacobianProduct:
+        """Vector–Jacobian product: derivatives of a scalar from those by the values.
+
+        Parameters
+        ----------
+        motion : ModesCheck
+            The motion, over all grid times.
+        phi : (k,) array
+            Nuisance parameters.
+        by_values : (R, e, 3) array
+            Derivatives of the scalar by the values.
+        """
+        by_x = np.zeros_like(motion.x)
+        by_phi = np.zeros(len(phi))
+        here = self.association.estimated
+        flat = by_values.reshape(len(by_values), -1)
+        by_x[self.rows] = (self.operator(phi).T @ flat.T).T
+        if len(here):
+            own = np.einsum(
+                "tmi,tmik->mk",
+                by_values[:, here],
+                self._coordinate_derivatives(motion.x, self.shape_functions(phi)),
+            )
+            by_phi[self.coordinate_parameters[here]] = own
+        return VectorJacobianProduct(by_x, None, by_phi)
+
+    def frame_changes(
+        self, grasp: Grasp, motion: ObservedMotion, phi: Array, shifts: Array, rotations: Array
+    ) -> Array | float:
+        """Return the changes of the values due to sensor frames moved by pose errors: 0 for points
+        of the body.
+
+        The signature is that of `GraspWrench.frame_changes`.
+        """
+        return 0.0
+
+    # By (x, φ) --------------------------------------------------------------------------------
+
+    @cached_property
+    def _dependencies(self) -> tuple[Index, Index]:
+        """Point and corner of its element, both (w,), for each node that a value can depend on."""
+        reads = self.association.weights != 0
+        reads[self.association.estimated] = True
+        marker, corner = np.nonzero(reads)
+        return marker, corner
+
+    def _derivative_entries(self, variables: int, size: int) -> tuple[Index, Index]:
+        """Return rows and columns of ∂(c, φ)/∂(x, φ) in the order of `derivative_matrix`; all x
+        precede all φ.
+        """
+        nodes, _ = self.shape_functions(np.zeros(size))
+        marker, corner = self._dependencies
+        axes = np.arange(3)
+        dofs = 3 * self.node_count
+        first = 3 * self.vector_count * np.arange(self.count)[:, None, None]
+        estimated = self.association.estimated
+        row_place = np.broadcast_to(
+            first[..., None] + 3 * estimated[:, None, None] + axes[:, None],
+            (self.count, len(estimated), 3, self.coordinate_parameters.shape[1]),
+        )
+        pairs = (
+            (
+                first + 3 * marker[:, None] + axes,
+                (self.rows * dofs)[:, None, None] + 3 * nodes[marker, corner][:, None] + axes,
+            ),
+            (
+                row_place,
+                np.broadcast_to(
+                    variables + self.coordinate_parameters[estimated][:, None], row_place.shape
+                ),
+            ),
+            (3 * self.vector_count * self.count + np.arange(size), variables + np.arange(size)),
+        )
+        rows = np.concatenate([row.ravel() for row, _ in pairs])
+        return rows, np.concatenate([column.ravel() for _, column in pairs])
+
+    def derivative_matrix(self, x: Array | None, phi: Array, position_count: int) -> sp.csr_array:
+        """Return the sparse matrix ∂(c, φ)/∂(x, φ).
+
+        Parameters
+        ----------
+        x : (N, 3n) array or None
+            Positions [m]; None gives the structure, with ones.
+        phi : (k,) array
+            Nuisance parameters.
+        position_count : int
+            Number of positions N · 3n.
+        """
+        size = len(phi)
+        entries = self._derivative_entries(position_count, len(phi))
+        if x is None:
+            values = np.ones(len(entries[0]))
+        else:
+            nodes, shape = self.shape_functions(phi)
+            weights = shape.weights[self._dependencies][:, None]
+            of_x = np.broadcast_to(weights, (self.count, len(weights), 3))
+            own = self._coordinate_derivatives(x, (nodes, shape))
+            values = np.concatenate([of_x.ravel(), own.ravel(), np.ones(size)])
+        row_count = 3 * self.vector_count * self.count + size
+        return sp.csr_array((values, entries), shape=(row_count, position_count + size))
+
+    def curvature(
+        self, x: Array, phi: Array, by_values: Array, position_count: int
+    ) -> SparseEntries:
+        """Return Σ by_values · ∂²c/∂(x, φ)², upper triangle; non-zero for estimated points only.
+
+        Parameters
+        ----------
+        x : (N, 3n) array
+            Positions [m].
+        phi : (k,) array
+            Nuisance parameters.
+        by_values : (T, e, 3) array
+            Weights.
+        position_count : int
+            Number of positions N · 3n.
+        """
+        estimated = self.association.estimated
+        nodes, shape = self.shape_functions(phi)
+        weights = by_values[:, estimated]
+        dofs = 3 * self.node_count
+        dof = 3 * nodes[estimated][:, :, None] + np.arange(3)  # (m, a, axis)
+        row = self.rows[:, None, None, None, None] * dofs + dof[..., None]
+        column = position_count + self.coordinate_parameters[estimated]
+        value = np.einsum("tmi,mak->tmaik", weights, shape.gradients[estimated])
+        rows, columns = np.broadcast_arrays(row, column[:, None, None])
+        by_coordinates = self._interpolate(x, nodes[estimated], shape.hessians[estimated])
+        by_coordinates = np.einsum("tmi,tmikl->mkl", weights, by_coordinates)
+        upper = np.nonzero(
+            np.broadcast_to(np.triu(np.ones(by_coordinates.shape[1:])), by_coordinates.shape)
+        )
+        return SparseEntries(
+            np.concatenate([rows.ravel(), column[upper[0], upper[1]]]),
+            np.concatenate([columns.ravel(), column[upper[0], upper[2]]]),
+            np.concatenate([value.ravel(), by_coordinates[upper]]),
+        )
+
+
+def interpolation_matrix(nodes: Index, weights: Array, node_count: int) -> sp.csr_array:
+    """Return the matrix (3M, 3n) of Σ_a weights[m, a] x_a; row 3 m + axis, column 3 node + axis."""
+    marker = np.repeat(np.arange(len(nodes)), nodes.shape[1])
+    per_node = sp.csr_array(
+        (weights.ravel(), (marker, nodes.ravel())), shape=(len(nodes), node_count)
+    )
+    per_node.eliminate_zeros()
+    return sp.csr_array(sp.kron(per_node, sp.eye_array(3), format="csr"))

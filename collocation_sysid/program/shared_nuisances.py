@@ -1,0 +1,165 @@
+"""Nuisance parameters shared by several experiments: one entry of p, one prior, one chart.
+
+Experiments share those nuisance parameters whose `scope` is the same word in both, and whose label
+is the same: the place of a marker by its name, the pose of the cameras or of the clamp by its axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..array_types import Array, Index
+from ..errors import InputError
+from ..model.nuisance_map import NuisanceEntry, NuisanceMap
+from ..recording.experiment import Experiment
+from ..recording.nuisance import PLACE, POSE_TURN, NuisanceRow
+from .marker_association import MarkerAssociation
+
+# What a chart has for each marker.
+OF_MARKERS = (
+    "prior_places_m",
+    "cells",
+    "centre_places_m",
+    "axes",
+    "crossed_edges",
+    "crossing_counts",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class NuisanceIndices:
+    """Indices of an experiment's nuisance parameters φ in p.
+
+    Attributes
+    ----------
+    indices : (k,) array
+        Index in p = (q, φ_1, φ_2, …) of each, that of the first experiment that shares it.
+    is_first : (k,) array of bool
+        False for those that an earlier experiment has already.
+    pivot_m : (3,) array or None
+        Point about which the shared camera pose rotates [m]; None means the experiment's own.
+    """
+
+    indices: Index
+    is_first: NDArray[np.bool_]
+    pivot_m: Array | None = None
+
+
+def nuisance_indices(experiments: Sequence[Experiment], first: int) -> list[NuisanceIndices]:
+    """Assign the nuisance parameters of each experiment to entries of p.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+        The experiments in their order.
+    first : int
+        Index in p of the first nuisance parameter.
+
+    Raises
+    ------
+    InputError
+        If experiments share a parameter of things that differ, or with different priors.
+    """
+    indices = []
+    known = dict[Any, tuple[int, NuisanceEntry, Experiment]]()
+    leaders = dict[Any, Experiment]()
+    for experiment in experiments:
+        nuisance = NuisanceMap.from_experiment(experiment)
+        scopes = experiment.nuisance.scope
+        places = np.zeros(nuisance.size, dtype=np.int64)
+        before = first
+        for k, entry in enumerate(nuisance.entries):
+            scope = scopes.get(entry.row.name)
+            # What is not shared is nobody else's.
+            which = (len(indices), k) if scope is None else (scope, entry.label)
+            places[k], other, of = known.setdefault(which, (first, entry, experiment))
+            first += places[k] == first
+            leader = leaders.setdefault((scope, entry.row), experiment)
+            if scope is not None:
+                _require_same_objects(leader, experiment, entry.row)
+                _require_same_prior((of, other), (experiment, entry))
+        leader = leaders.get((scopes.get(POSE_TURN.name), POSE_TURN), experiment)
+        pivot_m = None if leader is experiment else NuisanceMap.from_experiment(leader).pivot_m
+        indices.append(NuisanceIndices(places, places >= before, pivot_m))
+    return indices
+
+
+def _require_same_objects(leader: Experiment, experiment: Experiment, row: NuisanceRow) -> None:
+    """Raise InputError if a nuisance parameter is shared by experiments whose objects differ."""
+    theirs = row.same(leader)
+    ours = row.same(experiment)
+    for thing in ours:
+        if theirs[thing] != ours[thing]:
+            raise _sharing_error(
+                experiment, row, f"'{leader.name}', which has another {thing}", f"the same {thing}"
+            )
+
+
+def _require_same_prior(
+    one: tuple[Experiment, NuisanceEntry], other: tuple[Experiment, NuisanceEntry]
+) -> None:
+    """Raise InputError if a shared φ has two priors, or a shared marker two stated places."""
+    leader, first = one
+    experiment, second = other
+    row = second.row
+    label = second.label
+    if not np.isclose(first.sigma, second.sigma, rtol=1e-9):
+        difference = f"'{leader.name}', where the {label} has the prior {first.sigma:g}"
+        raise _sharing_error(experiment, row, difference, f"the one here, {second.sigma:g}")
+    if row == PLACE:
+        given = [_stated_place(*one), _stated_place(*other)]
+        if not np.allclose(*given, rtol=0, atol=1e-9, equal_nan=True):
+            difference = f"'{leader.name}', which gives another {label.partition(',')[0]}"
+            raise _sharing_error(
+                experiment, row, difference, "the same place given in both, or in neither"
+            )
+
+
+def _stated_place(experiment: Experiment, entry: NuisanceEntry) -> Array:
+    """Return the stated place (3,) of a marker, NaN if there is none."""
+    markers = experiment.markers
+    at = markers.predict_positions(experiment.body.nodes_m)[entry.number]
+    return at if markers.located[entry.number] else np.full(3, np.nan)
+
+
+def _sharing_error(
+    experiment: Experiment, row: NuisanceRow, result: str, expected: str
+) -> InputError:
+    """Return the error message for a parameter that cannot be shared."""
+    key = row.key or row.name
+    message = f"{key} is shared with {result}; expected {expected}, or a scope of its own"
+    return InputError(message, None, f"experiment '{experiment.name}'")
+
+
+def shared_charts(
+    experiments: Iterable[tuple[NuisanceIndices, NuisanceMap, MarkerAssociation]],
+) -> list[MarkerAssociation]:
+    """Return the charts, with shared places and clocks equal to those of the first
+    experiment that shares them.
+    """
+    leaders = dict[int, tuple[MarkerAssociation, int]]()
+    samples = dict[int, int]()
+    charts = []
+    for local, nuisance, chart in experiments:
+        replaced = []
+        for k in nuisance.indices_of_rows(PLACE):
+            number = nuisance.entries[k].number
+            leader = leaders.setdefault(int(local.indices[k]), (chart, number))
+            if leader[0] is not chart:
+                replaced.append((number, *leader))
+        for k in nuisance.clock_indices:
+            shared = samples.setdefault(int(local.indices[k]), chart.clock_samples)
+            chart = chart if shared == chart.clock_samples else replace(chart, clock_samples=shared)
+        if replaced:
+            own = {name: getattr(chart, name).copy() for name in OF_MARKERS}
+            for name, values in own.items():
+                for number, leader, theirs in replaced:
+                    values[number] = getattr(leader, name)[theirs]
+            chart = replace(chart, **own)
+        charts.append(chart)
+    return charts

@@ -1,0 +1,229 @@
+"""Custom sensors: instruments whose reading is an expression of body points or of a grasp's
+force.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, cast
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..array_types import Array
+from ..declarations import Key, as_given, key, stated
+from ..errors import InputError
+from ..files import reason
+from ..schema_tables import Vector
+from ..validated_types import AtLeastOne, Positive, Text
+from .checked_arrays import read_only_floats
+from .measured_wrench import Frame
+from .sample_times import first_unordered_time
+
+
+@dataclass(frozen=True)
+class Look:
+    """Quantities that a custom sensor may measure, as CasADi expressions at the time of a sample.
+
+    Attributes
+    ----------
+    t_s : expression
+        Time of the sample.
+    position_m, velocity_m_s, acceleration_m_s2 : (3, P) expressions
+        Of the sensor's points; None for a sensor at a grasp.
+    force_n, torque_nm : (3,) expressions
+        Force and torque that the grasp exerts on the body, in the sensor's frame and about its
+        origin; None for a sensor on points.
+    """
+
+    t_s: Any
+    position_m: Any = None
+    velocity_m_s: Any = None
+    acceleration_m_s2: Any = None
+    force_n: Any = None
+    torque_nm: Any = None
+
+
+POINT_INPUTS = ("position_m", "velocity_m_s", "acceleration_m_s2")
+GRASP_INPUTS = ("force_n", "torque_nm")
+
+
+_POINTS = Key("points_m", list[Vector], default=[])
+_COLUMNS = Key("columns", list[Text], default=[])
+_GRASP = Key(
+    "grasp",
+    AtLeastOne | None,
+    said="In place of points: the number of the grasp, from 1, whose force and torque it looks at.",
+)
+
+
+@stated
+class Gauge:
+    """A custom sensor: its reading is an expression of a few points of the body, or of a grasp.
+
+    Parameters
+    ----------
+    name : str
+    expression : callable
+        ``expression(at, **unknowns) -> numbers``, of `Look` and of the sensor's unknowns, in CasADi
+        operations; one number, or a column of m.
+    t_s : (S,) array
+        Sample times, ascending, within those of the experiment, at any rate.
+    values : (S,) or (S, m) array, or None
+        Measured values; NaN where missing. None before they are simulated.
+    sigma : float
+        Standard deviation of the noise of each number, in its unit.
+    points_m : (P, 3) array, optional
+        Places [x, y, z] on the undeformed body whose motion the sensor measures.
+    unknowns : mapping of name to float
+        Prior standard deviation of each unknown of the sensor, about zero, by the argument's name.
+    grasp : int, optional
+        In place of points: the number of the grasp, counted from 1, whose force and torque the
+        sensor measures; obstacles count after the grasps.
+    frame : {"grasp", "world"}
+        Axes and origin of force and torque: those of the undeformed body as the grasp carries it,
+        or the poses' world.
+    columns : sequence of str, optional
+        Columns of the numbers in the file, in their order; all besides t_s by default.
+    unit : str
+        Unit of the numbers, for the terminal, reports and figures.
+
+    Raises
+    ------
+    InputError
+        If shapes disagree, time does not increase, nothing is measured, a standard deviation is not
+        above zero, or the expression cannot be evaluated or is not smooth at rest.
+    """
+
+    description_name: ClassVar[str] = "reading"
+
+    name: str
+    expression: Callable[..., Any]
+    t_s: ArrayLike
+    values: ArrayLike | None
+    sigma: float = key(Positive)
+    points_m: ArrayLike = key(_POINTS, converter=as_given, default=())
+    unknowns: Mapping[str, float] = key(dict[str, Positive], default_factory=dict)
+    grasp: int | None = key(_GRASP, converter=as_given, default=None)
+    frame: Frame = key(Frame, default="grasp")
+    columns: Sequence[str] = key(_COLUMNS, converter=as_given, default=())
+    unit: str = key(str, default="")
+
+    def __post_init__(self) -> None:
+        where = f"the reading '{self.name}'"
+        points = cast(Sequence[Any], self.points_m)
+        times = read_only_floats(self.t_s, (None,), f"t_s of {where}")
+        points = read_only_floats(
+            points if len(points) else np.zeros((0, 3)), (None, 3), f"points_m of {where}"
+        )
+        vars(self).update(t_s=times, points_m=points)
+        if fault := first_unordered_time(times):
+            raise InputError(f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}")
+        if (self.grasp is None) == (not len(points)):
+            both = "both points_m and grasp" if len(points) else "neither points_m nor grasp"
+            raise InputError(f"{where} has {both}; expected one of them to look at")
+        count = self._count_of_values()
+        names = [f"{self.name}_{k + 1}" for k in range(count)] if count > 1 else [self.name]
+        vars(self).update(values=self._checked_values(count), columns=tuple(self.columns or names))
+
+    def _checked_values(self, count: int) -> Array:
+        """Return the values (S, m), zeros if none were given; `count` is m by the expression."""
+        where = f"the reading '{self.name}'"
+        samples = len(self.sample_times_s)
+        if self.values is None:
+            return read_only_floats(np.zeros((samples, count)), (None, None), where)
+        columns = np.array(self.values, dtype=float)
+        columns = columns[:, None] if columns.ndim == 1 else columns
+        values = read_only_floats(columns, (samples, None), f"values of {where}", finite=False)
+        if np.isinf(values).any():
+            raise InputError(f"{where} holds an infinite value; expected numbers, NaN if missing")
+        if not np.isfinite(values).any():
+            raise InputError(f"{where} has no sample; leave it out, or check its file")
+        if values.shape[1] != count:
+            raise InputError(
+                f"the expression of {where} gives {count} numbers; expected {values.shape[1]}, as "
+                "many as its values have columns"
+            )
+        return values
+
+    def __repr__(self) -> str:
+        samples = len(self.sample_times_s)
+        count = self.measured_values.shape[1]
+        return f"Gauge({self.name!r}: {samples} samples of {count})"
+
+    @property
+    def sample_times_s(self) -> Array:
+        """(S,) sample times of the sensor [s]."""
+        return np.asarray(self.t_s)
+
+    @property
+    def measured_values(self) -> Array:
+        """(S, m) measured values; NaN where missing."""
+        return np.asarray(self.values)
+
+    @property
+    def is_measured(self) -> NDArray[np.bool_]:
+        """(S, m) whether each value is measured."""
+        return np.isfinite(self.measured_values)
+
+    # The expression ---------------------------------------------------------------------------
+
+    def read(self, t_s: ca.SX, inputs: Sequence[ca.SX], unknowns: Sequence[ca.SX]) -> ca.SX:
+        """Evaluate the expression of the sensor.
+
+        Parameters
+        ----------
+        t_s : SX
+            Time of the sample.
+        inputs : sequence of SX
+            Position, velocity and acceleration (3, P) of its points, or force and torque (3,) of
+            its grasp.
+        unknowns : sequence of SX
+            Values of the sensor's unknowns, in the order of `unknowns`.
+
+        Returns
+        -------
+        (m,) SX
+            Predicted numbers.
+        """
+        names = POINT_INPUTS if self.grasp is None else GRASP_INPUTS
+        at = Look(t_s, **dict(zip(names, inputs, strict=True)))
+        read = self.expression(at, **dict(zip(self.unknowns, unknowns, strict=True)))
+        return ca.vec(ca.SX(ca.vertcat(*read) if isinstance(read, (list, tuple)) else read))
+
+    def _count_of_values(self) -> int:
+        """Return the number m of values of the expression, after evaluating it and its Jacobian at
+        rest.
+
+        Raises
+        ------
+        InputError
+            If the expression cannot be evaluated, or it or its Jacobian is not finite at rest.
+        """
+        points = np.asarray(self.points_m).T
+        zero_rates = np.zeros_like(points)
+        of_points = [points, zero_rates, zero_rates]
+        rest = of_points if self.grasp is None else [np.ones(3), np.ones(3)]
+        looked = [ca.SX.sym("c", *np.atleast_2d(np.transpose(each)).T.shape) for each in rest]
+        t_s = ca.SX.sym("t_s")
+        own = ca.SX.sym("own", len(self.unknowns))
+        names = POINT_INPUTS if self.grasp is None else GRASP_INPUTS
+        try:
+            read = self.read(t_s, looked, ca.vertsplit(own) if self.unknowns else [])
+        except (Exception, SystemExit) as error:
+            raise InputError(
+                f"the reading '{self.name}' cannot be evaluated ({reason(error)}); expected a "
+                f"function of at, which has t_s, {', '.join(names)}, and of its unknowns "
+                f"{', '.join(self.unknowns) or '(none)'}, in CasADi operations"
+            ) from error
+        u = ca.veccat(*looked, own)
+        slopes = ca.Function("slopes", [t_s, u], [read, ca.jacobian(read, u)])
+        at_rest = np.concatenate([*(each.ravel("F") for each in rest), np.zeros(own.numel())])
+        if not all(np.isfinite(e.full()).all() for e in slopes(self.sample_times_s[0], at_rest)):
+            raise InputError(
+                f"the reading '{self.name}' or its slope is not finite where the body is at rest; "
+                "expected a smooth expression, such as sqrt(v·v + 1e-12) in place of |v|"
+            )
+        return read.numel()

@@ -1,0 +1,448 @@
+"""Depth cameras and scanners: images or clouds of unlabelled points of a body's surface.
+
+Points are in the camera's frame: x to the right, y downwards, z along the optical axis. Images are
+converted to points when they are read; clouds are points already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, ClassVar, Literal, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..array_types import Array
+from ..declarations import as_given, key, stated
+from ..errors import InputError
+from ..fem.selection import Selection
+from ..schema_tables import Vector
+from ..validated_types import Finite, Positive
+from .checked_arrays import read_only_floats
+from .node_selection import Nodes, selection_from_section
+from .poses import PoseSequence
+from .sample_times import TIME_TOLERANCE_S, first_unordered_time
+
+MatrixRow = tuple[Finite, Finite, Finite, Finite]
+PoseMatrix = tuple[MatrixRow, MatrixRow, MatrixRow, MatrixRow]
+# Relative difference of the depths of neighbouring pixels above which they show two surfaces.
+LARGEST_RELATIVE_JUMP = 0.02
+# Fixed-point iterations that invert the distortion; each gains two digits for usual lenses.
+UNDISTORTION_ITERATIONS = 12
+# Largest number of images of a recording whose outlines are compared: they are stored in memory,
+# and one of 640 x 480 pixels takes 1.2 MB.
+MOST_OUTLINE_IMAGES = 40
+
+Background = Literal["auto", "empty", "unknown"]
+
+
+def _require_poses(poses: Any) -> PoseSequence:
+    """Return `poses` unchanged; an `InputError` if it is no `PoseSequence`."""
+    if not isinstance(poses, PoseSequence):
+        raise InputError(f"poses of a camera is {type(poses).__name__}; expected a PoseSequence")
+    return poses
+
+
+@stated
+class DepthCamera:
+    """A depth camera, or the frame of a scanner.
+
+    Parameters
+    ----------
+    matrix : (3, 3) array, optional
+        Pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs none; with it
+        a bias and a scale of the depth are estimated, and surfaces that face away are left out.
+    distortion : sequence of up to five numbers
+        k1, k2, p1, p2, k3 of the model of Brown and Conrady.
+    pose : (4, 4) array
+        From the camera's frame to the world, or, with `poses`, to the frame that these move
+        (hand–eye transform).
+    poses : PoseSequence, optional
+        Motion of the frame that carries the camera; at rest by default.
+
+    Raises
+    ------
+    InputError
+        If the matrix is not that of a pinhole camera, or the pose is no rigid motion.
+    """
+
+    matrix: Any = key(tuple[Vector, Vector, Vector] | None, converter=as_given, default=None)
+    distortion: Any = key(list[Finite], converter=as_given, default=())
+    pose: Any = key(PoseMatrix | None, converter=as_given, default=None)
+    poses: PoseSequence | None = key(converter=_require_poses, default=None)
+
+    def __post_init__(self) -> None:
+        pose = read_only_floats(np.eye(4) if self.pose is None else self.pose, (4, 4), "pose")
+        turn = pose[:3, :3]
+        rigid = np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) and np.linalg.det(turn) > 0
+        if not rigid or not np.allclose(pose[3], [0, 0, 0, 1]):
+            raise InputError(
+                f"pose of a camera is {pose.tolist()}; expected a rigid motion "
+                "[[R, p], [0, 0, 0, 1]] from its frame to the world, in metres"
+            )
+        distortion = read_only_floats(self.distortion, (None,), "distortion of a camera")
+        if len(distortion) > 5:
+            raise InputError(
+                f"distortion has {len(distortion)} numbers; expected k1, k2, p1, p2, k3"
+            )
+        vars(self).update(pose=pose, distortion=distortion)
+        if self.matrix is not None:
+            matrix = read_only_floats(self.matrix, (3, 3), "matrix of a camera")
+            lower = matrix[[1, 2, 2, 2], [0, 0, 1, 2]]
+            if not (np.diag(matrix) > 0).all() or not np.allclose(lower, [0, 0, 0, 1]):
+                raise InputError(
+                    f"matrix of a camera is {matrix.tolist()}; expected "
+                    "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+                )
+            vars(self)["matrix"] = matrix
+
+    def pose_at(self, t_s: ArrayLike) -> tuple[Array, Array]:
+        """Return rotations (S, 3, 3) and translations (S, 3) [m] from the camera's frame to the
+        world.
+        """
+        times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
+        rotation = self.pose[:3, :3]
+        translation = self.pose[:3, 3]
+        if self.poses is None:
+            return np.tile(rotation, (len(times), 1, 1)), np.tile(translation, (len(times), 1))
+        rotations, translations = self.poses.at(times)
+        return rotations @ rotation, rotations @ translation + translations
+
+    def points_at_unit_depth(self, pixels: Array) -> Array:
+        """Return the points (P, 3) at depth z = 1 that appear at the pixels (P, 2), u and v.
+
+        Distortion is inverted by a fixed-point iteration.
+        """
+        distorted = np.linalg.solve(
+            self.matrix, np.column_stack([pixels, np.ones(len(pixels))]).T
+        ).T
+        k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
+        undistorted = distorted[:, :2].copy()
+        for _ in range(UNDISTORTION_ITERATIONS if len(self.distortion) else 0):
+            x, y = undistorted.T
+            r2 = x**2 + y**2
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            across = 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+            down = p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+            undistorted = (distorted[:, :2] - np.column_stack([across, down])) / radial[:, None]
+        return np.column_stack([undistorted, np.ones(len(undistorted))])
+
+    def distorted_pixels(self, points_m: Array) -> Array:
+        """Return the pixels (P, 2), u and v, of points (P, 3) in the camera's frame, with
+        distortion.
+
+        This is the inverse of `points_at_unit_depth`. Points must be in front of the camera, z > 0.
+        """
+        x, y = (points_m[:, :2] / points_m[:, 2:]).T
+        k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
+        r2 = x**2 + y**2
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        distorted = np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
+                y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
+                np.ones_like(x),
+            ]
+        )
+        return (self.matrix @ distorted)[:2].T
+
+    def undistorted_pixels(self, points_m: Array) -> Array:
+        """Return the pixels (P, 2), u and v, of points (P, 3) in the camera's frame, without
+        distortion.
+        """
+        projected = points_m @ self.matrix.T
+        return projected[:, :2] / projected[:, 2:]
+
+
+def _require_selection(faces: Any) -> Selection:
+    """Return `faces` unchanged; an `InputError` if it is no `Selection`."""
+    if not isinstance(faces, Selection):
+        raise InputError(f"faces of a depth camera is {faces!r}; expected a selection")
+    return faces
+
+
+@stated
+class Depth:
+    """Depth images, or clouds of points of a body, of one camera, one for each sample time.
+
+    Parameters
+    ----------
+    name : str
+    t_s : (S,) array
+        Sample times, ascending, within those of the experiment, at any rate.
+    clouds : sequence of (P, 3) or (P, 6) arrays
+        Points in the camera's frame, with normals of the surface behind them where these are known;
+        NaN where missing. An empty cloud is a dropout. `Depth.of_images` makes clouds from images.
+    sigma_m : float
+        Standard deviation of the noise along the normal of the surface.
+    camera : DepthCamera
+    spacing_m : float
+        Points are thinned to about this distance, as the noise of neighbouring pixels is
+        correlated.
+    gate_m : float
+        Points farther than this from the surface are taken to belong to something else and are left
+        out.
+    faces : Selection, optional
+        Faces that may be visible: those whose corners are all selected. All by default.
+    background : {"auto", "empty", "unknown"}
+        Meaning of a pixel without a depth. "empty": nothing is there, so that the body cannot be
+        there. "unknown": anything may be there, as where the sensor gets no echo from dark or steep
+        surfaces. "auto": "empty" in images where hardly any pixel shows something far behind the
+        body, otherwise "unknown". A measured depth well behind the body shows in either case that
+        the body is not there.
+    outline_sigma_px : float
+        Standard deviation [pixels] of the distance between the body's outline and the edge of its
+        silhouette in an image, at points of the outline that are `spacing_m` apart. Rounding to
+        pixels alone gives 0.3.
+    images_m : sequence of (rows, columns) arrays or None
+        Depth images that the clouds were made from, NaN or 0 without depth, one for each time; None
+        where the outline of the body is not compared with that sample. Empty for clouds, whose
+        outlines are unknown.
+
+    Raises
+    ------
+    InputError
+        If shapes disagree, time does not increase, or there is no point.
+    """
+
+    description_name: ClassVar[str] = "depth camera"
+
+    name: str
+    t_s: Any
+    clouds: Sequence[Any]
+    sigma_m: float = key(Positive)
+    camera: DepthCamera = key(converter=as_given, default=DepthCamera())
+    spacing_m: float = key(Positive, default=0.004)
+    gate_m: float = key(Positive, default=0.01)
+    faces: Selection | None = key(
+        Nodes | None, converter=_require_selection, read=selection_from_section, default=None
+    )
+    background: Background = key(Background, default="auto")
+    outline_sigma_px: float = key(Positive, default=0.5)
+    images_m: Sequence[Any] = ()
+
+    def __post_init__(self) -> None:
+        where = f"the depth camera '{self.name}'"
+        times = read_only_floats(self.t_s, (None,), f"t_s of {where}")
+        if fault := first_unordered_time(times):
+            raise InputError(f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}")
+        if len(times) != len(self.clouds):
+            raise InputError(
+                f"{where} has {len(times)} times and {len(self.clouds)} images or clouds; "
+                "expected as many"
+            )
+        clouds = tuple(self._thin_cloud(np.asarray(cloud, dtype=float)) for cloud in self.clouds)
+        if not any(len(cloud) for cloud in clouds):
+            raise InputError(f"{where} has no point; check its file and the unit of its depth")
+        vars(self).update(t_s=times, clouds=clouds, images_m=self._check_images(len(times)))
+
+    def _check_images(self, count: int) -> tuple[Array | None, ...]:
+        """Return `images_m` in single precision, with NaN for pixels without depth; empty if there
+        are none.
+
+        Parameters
+        ----------
+        count : int
+            Number of sample times.
+
+        Raises
+        ------
+        InputError
+            If the number of images is neither zero nor `count`, one is not two-dimensional, or the
+            camera has no matrix.
+        """
+        where = f"the depth camera '{self.name}'"
+        if not len(self.images_m):
+            return ()
+        if len(self.images_m) != count or self.camera.matrix is None:
+            raise InputError(
+                f"{where} has {len(self.images_m)} images for {count} times; expected as many, or "
+                "none, and the matrix of the camera with them"
+            )
+        images = []
+        for image in self.images_m:
+            if image is None:
+                images.append(None)
+                continue
+            depth = np.array(image, dtype=np.float32)
+            if depth.ndim != 2:
+                raise InputError(
+                    f"an image of {where} has the shape {depth.shape}; expected (rows, columns)"
+                )
+            depth[~(np.isfinite(depth) & (depth > 0))] = np.nan
+            images.append(depth)
+        return tuple(images)
+
+    @classmethod
+    def of_images(
+        cls,
+        name: str,
+        images_m: ArrayLike,
+        camera: DepthCamera,
+        sigma_m: float,
+        t_s: ArrayLike = (0.0,),
+        **options: Any,
+    ) -> Depth:
+        """Return the measurements of depth images (S, rows, columns) or (rows, columns), see
+        `points_from_image`.
+
+        At most `MOST_OUTLINED` of the images are stored, for the outlines of the body.
+        """
+        images = np.asarray(images_m, dtype=float)
+        images = images[None] if images.ndim == 2 else images
+        clouds = [points_from_image(image, camera) for image in images]
+        outlined = samples_with_outlines(len(images))
+        options["images_m"] = [image if k in outlined else None for k, image in enumerate(images)]
+        return cls(name, t_s, clouds, sigma_m, camera, **options)
+
+    def _thin_cloud(self, cloud: Array) -> Array:
+        """Return the finite points of a cloud (P, 3) or (P, 6), one for each cube of a grid of
+        `spacing_m`.
+
+        Of the points in a cube the one nearest to its centre across the optical axis is kept.
+        """
+        if cloud.ndim != 2 or cloud.shape[1] not in (3, 6):
+            raise InputError(
+                f"a cloud of the depth camera '{self.name}' has the shape {cloud.shape}; expected "
+                "(points, 3), or (points, 6) with normals"
+            )
+        cloud = cloud[np.isfinite(cloud).all(axis=1)]
+        cubes = np.floor(cloud[:, :3] / self.spacing_m)
+        # Across the view only: noise of the depth must not choose.
+        away = np.linalg.norm((cloud[:, :3] / self.spacing_m - cubes - 0.5)[:, :2], axis=1)
+        order = np.lexsort((away, *cubes.T))
+        first = np.ones(len(order), dtype=bool)
+        first[1:] = (np.diff(cubes[order], axis=0) != 0).any(axis=1)
+        return cloud[np.sort(order[first])]
+
+    def __repr__(self) -> str:
+        points = sum(map(len, self.clouds))
+        return f"Depth({self.name!r}: {len(self.t_s)} images of {points} points together)"
+
+    @property
+    def sample_times_s(self) -> Array:
+        """(S,) sample times of the camera [s]."""
+        return cast(Array, self.t_s)
+
+    @property
+    def points_m(self) -> list[Array]:
+        """Points (P, 3) of each sample in the camera's frame [m], without normals."""
+        return [cloud[:, :3] for cloud in self.clouds]
+
+    def until_time(self, end_s: float) -> Depth | None:
+        """Return the samples up to the time `end_s`; None if these have no point."""
+        count = int(np.searchsorted(self.sample_times_s, end_s, side="right"))
+        if not any(map(len, self.clouds[:count])):
+            return None
+        images_m = self.images_m[:count]
+        return replace(
+            self, t_s=self.sample_times_s[:count], clouds=self.clouds[:count], images_m=images_m
+        )
+
+    @property
+    def first_sample_with_points(self) -> int:
+        """Index of the first sample that has points."""
+        return next(k for k, cloud in enumerate(self.clouds) if len(cloud))
+
+
+def samples_with_outlines(count: int) -> set[int]:
+    """Return the indices of the samples, of `count`, whose images are stored for their outlines.
+
+    At most `MOST_OUTLINED`, evenly spread.
+    """
+    return set(
+        np.unique(np.linspace(0, count - 1, min(count, MOST_OUTLINE_IMAGES)).astype(int)).tolist()
+    )
+
+
+def until_all_cameras_see(
+    depths: Sequence[Depth], t_s: Array, count: int, fewest: int
+) -> tuple[int, list[Depth]]:
+    """Return how many first samples of an experiment include points of every depth camera.
+
+    Parameters
+    ----------
+    depths : sequence of Depth
+    t_s : (T,) array
+        Times of the experiment.
+    count : int
+        Least number of samples.
+    fewest : int
+        Least number of images of each camera, as far as it has so many.
+
+    Returns
+    -------
+    count : int
+        Number of first samples of the experiment.
+    depths : list of Depth
+        Images until then, of the cameras that have points by then.
+    """
+    for depth in depths:
+        last_s = depth.sample_times_s[
+            min(max(fewest - 1, depth.first_sample_with_points), len(depth.sample_times_s) - 1)
+        ]
+        count = max(count, int(np.searchsorted(t_s, last_s - TIME_TOLERANCE_S)) + 1)
+    end_s = t_s[:count][-1] + TIME_TOLERANCE_S
+    shorter = (depth.until_time(end_s) for depth in depths)
+    return count, [depth for depth in shorter if depth is not None]
+
+
+def points_from_image(image_m: Array, camera: DepthCamera) -> Array:
+    """Return the points (P, 3) [m] of a depth image (rows, columns) [m]; zero and NaN are no depth.
+
+    Pixels beside a jump of the depth, beside a pixel without depth or at the border of the image
+    are left out, as they may mix two surfaces.
+
+    Raises
+    ------
+    InputError
+        If the camera has no matrix.
+    """
+    if camera.matrix is None:
+        raise InputError("a depth image needs the matrix of its camera; a cloud does without")
+    depth = np.where(np.isfinite(image_m) & (image_m > 0), image_m, np.nan)
+    is_inner = np.isfinite(depth)
+    for axis in (0, 1):
+        for way in (1, -1):
+            is_inner &= np.abs(
+                np.roll(depth, way, axis) - depth
+            ) < LARGEST_RELATIVE_JUMP * np.nan_to_num(depth)
+    is_inner[[0, -1]] = is_inner[:, [0, -1]] = False
+    v, u = np.nonzero(is_inner)
+    return camera.points_at_unit_depth(np.column_stack([u, v]).astype(float)) * depth[v, u][:, None]
+
+
+def depth_image(camera: DepthCamera, shape: tuple[int, int], triangles_m: Array) -> Array:
+    """Render a depth image [m] of opaque triangles.
+
+    Parameters
+    ----------
+    camera : DepthCamera
+        Its distortion is ignored.
+    shape : (int, int)
+        Rows and columns.
+    triangles_m : (F, 3, 3) array
+        Corners in the camera's frame; triangles that reach behind the camera are left out.
+
+    Returns
+    -------
+    (rows, columns) array
+        Depth of the nearest triangle, NaN where there is none.
+    """
+    image = np.full(shape, np.inf)
+    for corners in triangles_m[(triangles_m[:, :, 2] > 0).all(axis=1)]:
+        pixels = camera.undistorted_pixels(corners)
+        low = np.maximum(np.ceil(pixels.min(axis=0)), 0).astype(int)
+        high = np.minimum(np.floor(pixels.max(axis=0)), [shape[1] - 1, shape[0] - 1]).astype(int)
+        sides = (pixels[1:] - pixels[0]).T
+        if (high < low).any() or abs(np.linalg.det(sides)) < 1e-12:
+            continue
+        u, v = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
+        share = np.linalg.solve(sides, np.stack([u.ravel(), v.ravel()]) - pixels[0][:, None])
+        share = np.vstack([1 - share.sum(axis=0), share])
+        # What is linear over a triangle in the image is one over the depth.
+        depth = np.where((share >= -1e-9).all(axis=0), 1 / (share.T @ (1 / corners[:, 2])), np.inf)
+        window = image[low[1] : high[1] + 1, low[0] : high[0] + 1]
+        np.minimum(window, depth.reshape(window.shape), out=window)
+    return np.where(np.isfinite(image), image, np.nan)

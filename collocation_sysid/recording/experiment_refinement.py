@@ -1,0 +1,58 @@
+"""An experiment moved to a finer mesh of its body, for estimates of the discretisation error."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from ..array_types import Array
+from ..fem.refinement import refine_nodes
+from .experiment import Experiment
+from .placement import place_markers
+
+if TYPE_CHECKING:
+    from ..fem.body import Body
+
+
+def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
+    """Return the experiment on a finer body.
+
+    Selections of nodes are evaluated on the finer mesh. Markers are material points: their places
+    on the undeformed body stay, whether they are nodes, inside elements or beyond the surface.
+    """
+    body = experiment.body
+    markers = experiment.markers
+
+    def anew(load):
+        return replace(load, nodes=refine_nodes(load.nodes, load.selection, body, finer))
+
+    placement = place_markers(
+        markers.predict_positions(body.nodes_m),
+        finer.nodes.points_m,
+        finer,
+        "embedded",
+        float("inf"),
+    )
+    return replace(
+        experiment,
+        body=finer,
+        grasps=(*map(anew, experiment.body_grasps), *experiment.obstacles),
+        masses=tuple(map(anew, experiment.masses)),
+        forces=tuple(map(anew, experiment.forces)),
+        pressures=tuple(pressure.on_refined_body(body, finer) for pressure in experiment.pressures),
+        markers=replace(markers, placement=placement, places_m=None),
+        start_positions_m=_interpolated(experiment.start_positions_m, body, finer),
+        start_velocities_m_s=_interpolated(experiment.start_velocities_m_s, body, finer),
+    )
+
+
+def _interpolated(state: Array | None, body: Body, finer: Body) -> Array | None:
+    """Interpolate nodal vectors (n, 3) to the nodes of the finer body by the shape functions; None
+    stays.
+    """
+    if state is None:
+        return None
+    here_m = finer.nodes.points_m
+    there_m = body.nodes.points_m
+    places = place_markers(here_m, there_m, body, "embedded")
+    return (places.weights[:, :, None] * state[places.nodes]).sum(axis=1)

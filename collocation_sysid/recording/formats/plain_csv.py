@@ -1,0 +1,107 @@
+"""Plain CSV of marker tracks, the project's own format, with a row of column names.
+
+Wide: t_s, then <name>_x, <name>_y, <name>_z for each marker, in metres. Long: t_s, marker, and x_m,
+y_m, z_m (or _cm, _mm, _in; or x, y, z and a given unit); a marker without a row at a time is
+missing there. In both, a blank cell or NaN is a missing sample, and (0, 0, 0) is a measured place.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from ...errors import InputError
+from ..sample_times import first_unordered_time
+from .raw_tracks import LabelChooser, RawTracks, tracks_of_table
+from .text import TextTable, numeric_cells, read_table
+from .units import METRES_PER_UNIT
+
+
+def read(text: str, choose: LabelChooser) -> RawTracks:
+    """Read a plain CSV file, wide or long; `choose` picks the markers."""
+    table = read_table(text)
+    return (_read_long if "marker" in table.columns else _read_wide)(table, choose)
+
+
+def _read_wide(table: TextTable, choose: LabelChooser) -> RawTracks:
+    """Read a table with three columns for each marker."""
+    labels = _wide_labels(table)
+    place = {column: k for k, column in enumerate(table.columns)}
+    places = [[place[f"{label}_{axis}"] for axis in "xyz"] for label in labels]
+    return tracks_of_table(
+        table,
+        labels,
+        places,
+        choose(labels),
+        place["t_s"],
+        zeros_are_missing=False,
+        default_unit="m",
+    )
+
+
+def _wide_labels(table: TextTable) -> list[str]:
+    """Names of the markers in the file, in the order of their first columns.
+
+    Raises
+    ------
+    InputError
+        If a column is missing, unknown or repeated, or there is no marker.
+    """
+    header = table.columns
+    labels = dict.fromkeys(
+        column[:-2] for column in header if len(column) > 2 and column[-2:] in ("_x", "_y", "_z")
+    )
+    expected = ["t_s", *(f"{label}_{axis}" for label in labels for axis in "xyz")]
+    counts = Counter(header)
+    known = set(expected)
+    faulty = {
+        "unknown": [column for column in header if column not in known],
+        "missing": [column for column in expected if column not in counts],
+        "repeated": sorted(column for column, count in counts.items() if count > 1),
+    }
+    faults = [f"{what} {', '.join(columns)}" for what, columns in faulty.items() if columns]
+    if not faults and labels:
+        return list(labels)
+    raise InputError(
+        f"columns {'; '.join(faults) or 'hold no markers'}; expected t_s and, for each marker, "
+        f"<name>_x, <name>_y, <name>_z; found {', '.join(header)}; or a C3D, TRC, Qualisys TSV or "
+        "Motive CSV file",
+        where="line 1",
+    )
+
+
+def _read_long(table: TextTable, choose: LabelChooser) -> RawTracks:
+    """Read a table with one row for each marker and time."""
+    axes, unit = _long_columns(table)
+    of_row = [row.cells[table.columns.index("marker")] for row in table.rows]
+    if "" in of_row:
+        raise table.error_at("column marker is blank; expected a name", of_row.index(""))
+    labels = list(dict.fromkeys(of_row))
+    chosen = [labels[k] for k in choose(labels)]
+    row_t_s = numeric_cells(table, [table.columns.index("t_s")], blank_allowed=False)[:, 0]
+    t_s, frame = np.unique(row_t_s, return_inverse=True)
+    coordinates = np.full((len(t_s), len(chosen), 3), np.nan)
+    for k, label in enumerate(chosen):
+        own = [i for i, other in enumerate(of_row) if other == label]
+        rows = TextTable(table.columns, [table.rows[i] for i in own])
+        if fault := first_unordered_time(row_t_s[own]):
+            raise rows.error_at(f"marker '{label}': {fault[1]}", fault[0])
+        columns = [table.columns.index(axis) for axis in axes]
+        coordinates[frame[own], k] = numeric_cells(rows, columns, blank_allowed=True)
+    return RawTracks(chosen, coordinates, unit, "the columns' names", t_s, zeros_are_missing=False)
+
+
+def _long_columns(table: TextTable) -> tuple[list[str], str | None]:
+    """Return the names of the columns of x, y and z, and the unit in these names; None
+    without one.
+    """
+    for unit in (None, *METRES_PER_UNIT):
+        axes = [f"{axis}_{unit}" if unit else axis for axis in "xyz"]
+        if sorted(table.columns) == sorted(["t_s", "marker", *axes]):
+            return axes, unit
+    raise InputError(
+        f"the columns are {', '.join(table.columns)}; expected t_s, marker, and x_m, y_m, z_m "
+        "(or _cm, _mm, _in, or x, y, z)",
+        where="line 1",
+    )

@@ -1,0 +1,249 @@
+"""Marker tracks from files of any known format, through one function."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..array_types import Array
+from ..declarations import key, stated
+from ..errors import InputError, hint_at, listed
+from .checked_arrays import float_converter, read_only_tracks
+from .formats import c3d, motive, plain_csv, qualisys, trc
+from .formats.raw_tracks import LabelChooser, RawTracks
+from .formats.text import decode, names_file_in_errors, read_bytes
+from .formats.units import METRES_PER_UNIT, require_length_unit
+from .sample_times import first_unordered_time
+
+# A frame rate and a column of times agree within this part.
+_RATE_TOLERANCE = 0.01
+# What the first line begins with.
+_TEXT_FORMATS = {
+    trc.BEGINNING: trc.read,
+    qualisys.BEGINNING: qualisys.read,
+    motive.BEGINNING: motive.read,
+}
+
+
+@stated
+class MarkerTable:
+    """Marker tracks as measured, before they are tied to a body.
+
+    Parameters
+    ----------
+    t_s : (T,) array
+        Sample times, strictly increasing.
+    names : tuple of str
+        M marker names.
+    positions_m : (T, M, 3) array
+        NaN where missing; a sample with one coordinate missing loses all three.
+    notes : tuple of str
+        What was missing or assumed in the file, a sentence each.
+    """
+
+    t_s: Array = key(converter=float_converter((None,), "t_s of the markers"))
+    names: tuple[str, ...] = key(converter=tuple[str, ...])
+    positions_m: Array = key(converter=np.asarray)
+    notes: tuple[str, ...] = key(converter=tuple[str, ...], default=())
+
+    def __post_init__(self) -> None:
+        if fault := first_unordered_time(self.t_s):
+            raise InputError(fault[1], where=f"row {fault[0] + 1}")
+        shape = (len(self.t_s), len(self.names), 3)
+        tracks = read_only_tracks(self.positions_m, shape, "marker positions")
+        vars(self)["positions_m"] = tracks
+
+
+@names_file_in_errors
+def read_markers(
+    path: str | Path,
+    *,
+    names: Sequence[str] | None = None,
+    labels: Mapping[str, str] | None = None,
+    length_unit: str | None = None,
+    rate_hz: float | None = None,
+) -> MarkerTable:
+    """Read marker tracks; the format is recognised by the file's content.
+
+    Known are C3D (with the extra ``collocation-sysid[c3d]``), TRC, Qualisys TSV, Motive CSV, and
+    plain CSV, wide (t_s, <name>_x, <name>_y, <name>_z …, in metres) or long (t_s, marker, x_m,
+    y_m, z_m). A blank cell or NaN is a missing sample; in motion-capture formats, though not in
+    plain CSV, so is one at exactly (0, 0, 0).
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    names : sequence of str, optional
+        Markers to take, in this order; by default all, in the file's order.
+    labels : mapping of str to str, optional
+        From labels in the file to names here; other markers keep their labels as names.
+    length_unit : {"m", "cm", "mm", "in"}, optional
+        Unit of the coordinates, where the file does not state it.
+    rate_hz : float, optional
+        Frame rate, where the file states neither it nor times; the first frame is then at 0 s.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the line or key: where the file is damaged or contradicts itself or
+        what is given here, a unit or rate is neither in the file nor given, or a marker is not
+        there.
+    """
+    require_length_unit(length_unit)
+    if rate_hz is not None and not 0 < rate_hz < np.inf:
+        raise InputError(f"rate_hz is {rate_hz:g}; expected a rate above 0")
+    labels = dict(labels or {})
+    raw = _read_tracks(path, _label_chooser(names, labels))
+    metres = METRES_PER_UNIT[_length_unit(raw, length_unit)]
+    t_s = _times_s(raw, rate_hz)
+    names_taken = [labels.get(label, label) for label in raw.labels]
+    coordinates, notes = _mark_missing(raw, names_taken)
+    return MarkerTable(t_s, tuple(names_taken), coordinates * metres, (*raw.notes, *notes))
+
+
+def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
+    """Read the markers that `choose` picks from a file of any known format."""
+    content = read_bytes(path)
+    if c3d.is_c3d(content):
+        return c3d.read(path, content, choose)
+    text = decode(content)
+    start = text.lstrip().lstrip('"')
+    known = (read for beginning, read in _TEXT_FORMATS.items() if start.startswith(beginning))
+    return next(known, plain_csv.read)(text, choose)
+
+
+def _label_chooser(names: Sequence[str] | None, renamed: Mapping[str, str]) -> LabelChooser:
+    """Return the function that picks the requested markers from the labels in a file.
+
+    Parameters
+    ----------
+    names : sequence of str or None
+        Names after renaming; None for all.
+    renamed : mapping of str to str
+        From labels in the file to names.
+    """
+
+    def choose(labels: Sequence[str], excluded: Collection[str] = ()) -> list[int]:
+        _require_distinct(labels, "two markers are labelled")
+        for label in renamed:
+            _require_one_of(label, labels, "label")
+        known = [renamed.get(label, label) for label in labels]
+        _require_distinct(known, "after renaming two markers are named")
+        if names is None:
+            wanted = [
+                k for k, label in enumerate(labels) if label not in excluded or label in renamed
+            ]
+            if not labels:
+                raise InputError("holds no markers")
+            if not wanted:
+                remedy = f"label them, or rename with labels: {', '.join(labels)}"
+                raise InputError(f"holds unlabelled markers only; {remedy}")
+            return wanted
+        if not names:
+            raise InputError("no markers are asked for; leave the names out to take all of them")
+        for name in names:
+            _require_one_of(name, known, "marker")
+        _require_distinct(names, "asked for more than once: marker")
+        index_of = {name: k for k, name in enumerate(known)}
+        return [index_of[name] for name in names]
+
+    return choose
+
+
+def _require_distinct(names: Sequence[str], message: str) -> None:
+    """Raise an `InputError` that begins with `message` if a name occurs twice."""
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise InputError(f"{message} '{name}'; expected names that differ")
+
+
+def _require_one_of(name: str, known: Sequence[str], what: str) -> None:
+    """Raise an `InputError` if a name is not among the names in the file."""
+    if name not in known:
+        hint = hint_at(name, known)
+        raise InputError(f"no {what} '{name}'; the file has {', '.join(known)}{hint}")
+
+
+def _length_unit(raw: RawTracks, length_unit: str | None) -> str:
+    """Return the unit of length by the file or by the user; an `InputError` if they differ or both
+    lack.
+    """
+    if length_unit and raw.unit and length_unit != raw.unit:
+        raise InputError(
+            f"length_unit is '{length_unit}', but {raw.unit_key} says '{raw.unit}'; expected the "
+            "same, or no length_unit"
+        )
+    unit = length_unit or raw.unit or raw.default_unit
+    if unit is None:
+        raise InputError(
+            f"no unit of length is stated by {raw.unit_key}; expected length_unit, one of "
+            f"{', '.join(METRES_PER_UNIT)}"
+        )
+    return unit
+
+
+def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
+    """Return the times (T,) of the frames [s]: as in the file, else from the frame rate."""
+    t_s = raw.t_s
+    rates = {raw.rate_key: raw.rate_hz, "rate_hz": rate_hz}
+    stated_rates = {key: rate for key, rate in rates.items() if rate}
+    if t_s is not None:
+        for key, rate in stated_rates.items():
+            _require_rate(t_s, key, rate)
+        return t_s
+    if not stated_rates:
+        raise InputError(
+            f"neither {raw.rate_key} nor a column of times states when the frames were taken; "
+            "expected rate_hz"
+        )
+    first, *others = stated_rates.values()
+    if not all(math.isclose(first, other, rel_tol=1e-6) for other in others):
+        raise InputError(
+            f"rate_hz is {rate_hz:g}, but {raw.rate_key} says {first:g}; expected the same, or no "
+            "rate_hz"
+        )
+    return np.arange(len(raw.coordinates)) / first
+
+
+def _require_rate(t_s: Array, key: str, rate_hz: float) -> None:
+    """Raise an `InputError` if neither the mean nor the median time step agrees with a frame rate.
+
+    Lost frames change the mean step, and coarsely printed times the median: one of them must agree.
+    """
+    if len(t_s) < 2:
+        return
+    steps = np.diff(t_s)
+    mean_hz = 1 / steps.mean()
+    median_hz = 1 / np.median(steps)
+    if min(abs(mean_hz / rate_hz - 1), abs(median_hz / rate_hz - 1)) > _RATE_TOLERANCE:
+        raise InputError(
+            f"{key} is {rate_hz:g} Hz, but the times are {1 / mean_hz:.6g} s apart, "
+            f"{mean_hz:.6g} Hz; expected the same"
+        )
+
+
+def _mark_missing(raw: RawTracks, names: Iterable[str]) -> tuple[Array, list[str]]:
+    """Return coordinates (T, M, 3) with NaN for missing samples, and notes on how many are missing.
+
+    Markers with the same losses share a note.
+    """
+    x = raw.coordinates
+    blank = np.asarray(np.isnan(x).any(axis=2))
+    zero = np.asarray((x == 0.0).all(axis=2)) & raw.zeros_are_missing
+    markers_by_loss: dict[str, list[str]] = {}
+    for k, name in enumerate(names):
+        counts = {"blank": blank[:, k].sum(), "zeros": zero[:, k].sum()}
+        if missing := sum(counts.values()):
+            kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+            loss = f"{missing} of {len(x)} samples missing ({kinds})"
+            markers_by_loss.setdefault(loss, []).append(name)
+    notes = [
+        f"{listed(markers)}: {'each ' * (len(markers) > 1)}{loss}"
+        for loss, markers in markers_by_loss.items()
+    ]
+    return np.where((blank | zero)[:, :, None], np.nan, x), notes

@@ -1,0 +1,102 @@
+"""Selections of mesh nodes: node numbers, geometric selections, or tables in a problem file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import model_validator
+
+from ..array_types import Index
+from ..errors import InputError
+from ..fem.selection import Ball, Box, Face, FaceName, Indices, Named, Selection
+from ..schema_tables import ByForm, Corner, Section, Vector, require_one
+from ..validated_types import Positive, Text, Whole
+from .checked_arrays import read_only_nodes
+
+if TYPE_CHECKING:
+    from ..fem.body import Body
+
+
+class NodesSection(Section):
+    """A selection of mesh nodes, by exactly one of these keys.
+
+    Attributes
+    ----------
+    box_m : list, optional
+        Lowest and highest corner [[x, y, z], [x, y, z]].
+    ball_m : list, optional
+        Centre and radius [[x, y, z], radius].
+    indices : list of int, optional
+        List of node numbers as in the mesh file, counted from 0.
+    face : str, optional
+        top or bottom: nodes with the highest or lowest z of the body; side_x or side_y: nodes with
+        its lowest x or y that are on neither.
+    name : str, optional
+        A point array of the mesh, 1 where selected, or a physical group of elements of any
+        dimension.
+    """
+
+    box_m: tuple[Corner, Corner] | None = None
+    ball_m: tuple[Vector, Positive] | None = None
+    face: FaceName | None = None
+    indices: list[Whole] | None = None
+    name: Text | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> NodesSection:
+        require_one(self, *type(self).model_fields)
+        return self
+
+
+Nodes = Annotated[Text | NodesSection, ByForm(str)]
+
+
+KINDS: dict[str, Any] = {
+    "box_m": Box,
+    "ball_m": Ball,
+    "face": Face,
+    "indices": Indices,
+    "name": Named,
+}
+
+
+def selection_from_section(section: NodesSection | str) -> Selection:
+    """Return the selection that a table states, or that a text names."""
+    if isinstance(section, str):
+        return Named(section)
+    ((kind, value),) = ((KINDS[key], value) for key, value in section if value is not None)
+    return kind(*value) if kind in (Box, Ball) else kind(value)
+
+
+def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:
+    """Return a converter to sorted distinct node numbers; a `Selection` is returned unchanged.
+
+    Parameters
+    ----------
+    what : str
+        Owner of the nodes, for messages.
+
+    Raises
+    ------
+    InputError
+        By the converter: if there are no nodes, or as `read_only_nodes` does.
+    """
+
+    def chosen(wanted: Any) -> Any:
+        if isinstance(wanted, Selection):
+            return wanted
+        nodes = np.unique(read_only_nodes(wanted, (None,), f"nodes of {what}"))
+        if nodes.size == 0:
+            raise InputError(f"{what} needs at least one node; its selection found none")
+        nodes.setflags(write=False)
+        return nodes
+
+    return chosen
+
+
+def select_on_body(nodes: Index | Selection, body: Body) -> Index:
+    """Return the nodes of a body that a selection selects; node numbers are returned unchanged."""
+    return body.select(nodes) if isinstance(nodes, Selection) else nodes

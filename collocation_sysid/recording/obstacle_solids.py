@@ -1,0 +1,344 @@
+"""Rigid solids that a body may touch, each given by its signed distance."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from pydantic import model_validator
+
+from ..array_types import Array
+from ..declarations import key, stated
+from ..errors import InputError
+from ..schema_tables import Section, Vector, require_one, section_of, stated_in
+from ..validated_types import NotNegative, Positive
+from .checked_arrays import float_converter
+
+# Added to squared distances [m²]: the square root has no derivative at zero.
+SMALLEST_SQUARE_M2 = 1e-24
+
+
+class Solid(ABC):
+    """A rigid solid in the frame of its obstacle: the world's frame if the obstacle is at rest."""
+
+    @abstractmethod
+    def signed_distance(self, point: ca.SX) -> ca.SX:
+        """Signed distance of a point (3,) from the surface [m], an expression; negative inside."""
+
+    @abstractmethod
+    def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
+        """Return polylines (k, 3) that draw the solid.
+
+        Parameters
+        ----------
+        about_m : (3,) array
+            Point near which an unbounded solid is drawn.
+        size_m : float
+            Length of the drawn part of an unbounded solid.
+        """
+
+    @property
+    def offset_direction(self) -> Array:
+        """(3,) unit vector along which the solid's position is uncertain."""
+        return np.array([0.0, 0.0, 1.0])
+
+    @property
+    def has_tilt(self) -> bool:
+        """Whether a tilt of the solid may be estimated."""
+        return False
+
+    @property
+    def tilt_centre_m(self) -> Array:
+        """(3,) point about which the solid is tilted [m]."""
+        return np.zeros(3)
+
+
+def _unit_vector_converter(name: str) -> Any:
+    """Return a converter that normalises a vector (3,); it raises an `InputError` for a zero
+    vector.
+    """
+
+    def made(value: Any) -> Array:
+        vector = float_converter((3,), name)(value)
+        length = float(np.linalg.norm(vector))
+        if not length > 0:
+            raise InputError(f"{name} is zero; expected a direction")
+        return vector / length
+
+    return made
+
+
+@stated
+class Plane(Solid):
+    """The half-space behind a plane.
+
+    Parameters
+    ----------
+    normal : (3,) array
+        Direction out of the solid.
+    point_m : (3,) array
+        A point on the plane.
+    """
+
+    normal: Array = key(
+        Vector, converter=_unit_vector_converter("normal of a plane"), default=(0.0, 0.0, 1.0)
+    )
+    point_m: Array = key(
+        Vector, converter=float_converter((3,), "point_m of a plane"), default=(0.0,) * 3
+    )
+
+    @property
+    def offset_direction(self) -> Array:
+        """Normal (3,) of the plane."""
+        return self.normal
+
+    @property
+    def has_tilt(self) -> bool:
+        """Always true: a tilt of a plane may be estimated."""
+        return True
+
+    @property
+    def tilt_centre_m(self) -> Array:
+        """(3,) stated point of the plane [m]."""
+        return self.point_m
+
+    def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
+        """Return a square with edges of `body_size_m` about the point of the plane that is nearest
+        to
+        `about_m`.
+        """
+        middle = about_m - (about_m - self.point_m) @ self.normal * self.normal
+        u, v = orthogonal_axes(self.normal) * size_m / 2
+        corners = [middle + a * u + b * v for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))]
+        return [np.array(corners)]
+
+    def signed_distance(self, point: ca.SX) -> ca.SX:
+        """Signed distance of a point (3,) from the plane along its normal [m]; negative behind the
+        plane.
+        """
+        return ca.dot(ca.DM(self.normal), point - ca.DM(self.point_m))
+
+
+@stated
+class Sphere(Solid):
+    """A ball, such as the tip of a probe.
+
+    Parameters
+    ----------
+    radius_m : float
+    centre_m : (3,) array
+    """
+
+    radius_m: float = key(Positive)
+    centre_m: Array = key(Vector, converter=float_converter((3,), "centre_m"), default=(0.0,) * 3)
+
+    def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
+        """Return three circles, one across each axis; both arguments are ignored."""
+        return [_circle(self.centre_m, axis, self.radius_m) for axis in np.eye(3)]
+
+    def signed_distance(self, point: ca.SX) -> ca.SX:
+        """Signed distance of a point (3,) from the sphere [m]; negative inside."""
+        return _length(point - ca.DM(self.centre_m)) - self.radius_m
+
+
+def _checked_ends(value: Any) -> Array:
+    """Check the two ends (2, 3) of an axis; an `InputError` is raised if they coincide."""
+    ends = float_converter((2, 3), "ends_m")(value)
+    if (ends[0] == ends[1]).all():
+        raise InputError("the ends of an axis are at the same place; expected two places")
+    return ends
+
+
+@stated
+class _AxialSolid(Solid):
+    """A solid of revolution about an axis between two ends."""
+
+    radius_m: float = key(Positive)
+    ends_m: Array = key(tuple[Vector, Vector], converter=_checked_ends)
+
+    def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
+        """Return a circle at each end and four lines between them; both arguments are ignored."""
+        axis = np.diff(self.ends_m, axis=0)[0]
+        first, last = (_circle(end, axis, self.radius_m) for end in self.ends_m)
+        quarters = range(0, len(first) - 1, (len(first) - 1) // 4)
+        return [first, last, *(np.array([first[k], last[k]]) for k in quarters)]
+
+    def _cylindrical_coordinates(self, point: ca.SX) -> tuple[ca.SX, ca.SX, float]:
+        """Return the cylindrical coordinates of a point (3,) and half of the length of the axis
+        [m].
+
+        The coordinates are the distance along the axis from its middle, and the distance from the
+        axis.
+        """
+        first, last = self.ends_m
+        half = float(np.linalg.norm(last - first)) / 2
+        axis = ca.DM((last - first) / (2 * half))
+        offset = point - ca.DM((first + last) / 2)
+        axial = ca.dot(axis, offset)
+        return axial, _length(offset - axial * axis), half
+
+
+@stated
+class Cylinder(_AxialSolid):
+    """A cylinder with flat ends, whose edges may be rounded.
+
+    Parameters
+    ----------
+    radius_m : float
+    ends_m : (2, 3) array
+        Centres of both ends.
+    rounding_m : float
+        Radius of its edges.
+    """
+
+    rounding_m: float = key(NotNegative, default=0.0)
+
+    def signed_distance(self, point: ca.SX) -> ca.SX:
+        """Signed distance of a point (3,) from the cylinder [m]; negative inside."""
+        axial, radial, half = self._cylindrical_coordinates(point)
+        beyond = ca.vertcat(radial - self.radius_m, ca.fabs(axial) - half)
+        return _corner_distance(beyond + self.rounding_m) - self.rounding_m
+
+
+@stated
+class Capsule(_AxialSolid):
+    """A cylinder with a half-ball at each end, such as a finger.
+
+    Parameters
+    ----------
+    radius_m : float
+    ends_m : (2, 3) array
+        Centres of the balls.
+    """
+
+    def signed_distance(self, point: ca.SX) -> ca.SX:
+        """Signed distance of a point (3,) from the capsule [m]; negative inside."""
+        axial, radial, half = self._cylindrical_coordinates(point)
+        beyond = ca.fmax(ca.fabs(axial) - half, 0)
+        return _length(ca.vertcat(beyond, radial)) - self.radius_m
+
+
+@stated
+class Cuboid(Solid):
+    """A box along the axes of its frame, whose edges may be rounded.
+
+    Parameters
+    ----------
+    corners_m : (2, 3) array
+        Its lowest and its highest corner.
+    rounding_m : float
+        Radius of its edges.
+    """
+
+    corners_m: Array = key(tuple[Vector, Vector], converter=float_converter((2, 3), "corners_m"))
+    rounding_m: float = key(NotNegative, default=0.0)
+
+    def __post_init__(self) -> None:
+        if not (self.corners_m[0] < self.corners_m[1]).all():
+            raise InputError("the corners of a box have to be its lowest, then its highest")
+
+    @property
+    def has_tilt(self) -> bool:
+        """Always true: a tilt of a box may be estimated."""
+        return True
+
+    @property
+    def tilt_centre_m(self) -> Array:
+        """(3,) centre of the box [m]."""
+        return self.corners_m.mean(axis=0)
+
+    def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
+        """Return the twelve edges; both arguments are ignored."""
+        corners = np.array(list(product(*self.corners_m.T)))
+        differences = (corners[:, None] != corners).sum(axis=2)
+        return [corners[[i, j]] for i, j in np.argwhere(differences == 1) if i < j]
+
+    def signed_distance(self, point: ca.SX) -> ca.SX:
+        """Signed distance of a point (3,) from the box [m]; negative inside."""
+        low, high = self.corners_m
+        beyond = ca.fabs(point - ca.DM((low + high) / 2)) - ca.DM((high - low) / 2)
+        return _corner_distance(beyond + self.rounding_m) - self.rounding_m
+
+
+def orthogonal_axes(normal: Array) -> Array:
+    """Return two unit vectors (2, 3) orthogonal to a direction (3,) and to each other."""
+    return np.linalg.svd(normal[None])[2][1:]
+
+
+def _circle(centre_m: Array, axis: Array, radius_m: float) -> Array:
+    """Return a closed polyline (33, 3) of the circle about a centre (3,) across an axis (3,)."""
+    angle = np.linspace(0, 2 * np.pi, 33)
+    round_m = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ orthogonal_axes(axis)
+    return centre_m + radius_m * round_m
+
+
+def _length(vector: ca.SX) -> ca.SX:
+    """Euclidean norm with finite second derivatives at zero."""
+    return ca.sqrt(ca.sumsqr(vector) + SMALLEST_SQUARE_M2)
+
+
+def _corner_distance(beyond: ca.SX) -> ca.SX:
+    """Signed distance from a convex corner, by the signed distances from each of its sides."""
+    return _length(ca.fmax(beyond, 0)) + ca.fmin(ca.mmax(beyond), 0)
+
+
+if TYPE_CHECKING:
+    PlaneSection = SphereSection = CylinderSection = CapsuleSection = CuboidSection = Section
+else:
+    PlaneSection, SphereSection, CylinderSection, CapsuleSection, CuboidSection = (
+        section_of(kind, f"{kind.__name__}Section")
+        for kind in (Plane, Sphere, Cylinder, Capsule, Cuboid)
+    )
+
+
+class SolidSection(Section):
+    """The solid, by exactly one of these keys, in the frame of its poses; without poses in the
+    body's.
+
+    Attributes
+    ----------
+    plane : PlaneSection, optional
+        The half-space behind a plane: normal, point_m.
+    sphere_m : SphereSection, optional
+        A ball: radius_m, centre_m.
+    cylinder_m : CylinderSection, optional
+        A cylinder: radius_m, ends_m, rounding_m.
+    capsule_m : CapsuleSection, optional
+        A cylinder with a half-ball at each end: radius_m, ends_m.
+    box_m : CuboidSection, optional
+        A box: corners_m, rounding_m.
+    """
+
+    plane: PlaneSection | None = None
+    sphere_m: SphereSection | None = None
+    cylinder_m: CylinderSection | None = None
+    capsule_m: CapsuleSection | None = None
+    box_m: CuboidSection | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> SolidSection:
+        require_one(self, *type(self).model_fields)
+        return self
+
+
+KINDS: dict[str, type[Solid]] = {
+    "plane": Plane,
+    "sphere_m": Sphere,
+    "cylinder_m": Cylinder,
+    "capsule_m": Capsule,
+    "box_m": Cuboid,
+}
+
+
+def solid_key(solid: Solid) -> str:
+    """Key of a solid's kind in a problem file, such as "sphere_m"."""
+    return next(name for name, kind in KINDS.items() if isinstance(solid, kind))
+
+
+def solid_from_section(section: SolidSection) -> Solid:
+    """Return the solid that a `SolidSection` states."""
+    ((name, own),) = ((name, own) for name, own in section if own is not None)
+    return KINDS[name](**stated_in(own, KINDS[name], name))

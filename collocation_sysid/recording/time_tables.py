@@ -1,0 +1,328 @@
+"""Tables of loads and measurements over time: columns with units, in any order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..array_types import Array
+from ..errors import InputError, hint_at
+from .formats.columns import (
+    DISPLACEMENT,
+    DISPLACEMENTS,
+    FORCE,
+    FORCES,
+    PRESSURE,
+    STRAIN,
+    STRESS,
+    TENSION,
+    TORQUES,
+    Quantity,
+    QuantityTable,
+    read_columns,
+)
+from .formats.text import (
+    decode,
+    names_file_in_errors,
+    numeric_cells,
+    read_bytes,
+    read_table,
+    times_in_column,
+)
+from .poses import PoseSequence
+from .sample_times import TIME_TOLERANCE_S, unrounded_s
+
+WRENCH_COLUMNS = tuple(quantity.column for quantity in (*FORCES, *TORQUES))
+# Largest plausible pressure [Pa]: larger ones are likely in another unit.
+LARGEST_PA = 1e8
+# Largest plausible tension [N]: larger ones are likely in another unit, or raw counts of a sensor.
+LARGEST_N = 1e5
+# Least number of samples of a file within a moving experiment: fewer come from different clocks.
+FEWEST_SHARED_SAMPLES = 3
+
+
+def read_forces(path: str | Path) -> tuple[Array, Array]:
+    """Read a force over time: t_s, fx_n, fy_n, fz_n, columns in any order.
+
+    Returns
+    -------
+    t_s : (T,) array
+    force_n : (T, 3) array
+
+    Raises
+    ------
+    InputError
+        If a column is missing or unknown, a cell is not a number, or time does not increase; the
+        line is named.
+    """
+    table = read_columns(path, FORCES, requires_all=True)
+    return table.t_s, np.column_stack([table.values[quantity.key] for quantity in FORCES])
+
+
+def read_tension(path: str | Path) -> tuple[Array, Array]:
+    """Read the tension of a tendon, `t_s` (T,) and `tension_n` (T,), columns in any order.
+
+    Raises
+    ------
+    InputError
+        If a column is missing or unknown, a cell is not a number, time does not increase, or a
+        tension is negative; the line is named.
+    """
+    return _read_limited(path, TENSION, LARGEST_N, at_least=0.0)
+
+
+def read_pressure(path: str | Path) -> tuple[Array, Array]:
+    """Read a pressure above the surroundings', `t_s` (T,) and `pressure_pa` (T,), columns in any
+    order.
+
+    Raises
+    ------
+    InputError
+        If a column is missing or unknown, a cell is not a number, time does not increase, or a
+        pressure is implausibly large; the line is named.
+    """
+    return _read_limited(path, PRESSURE, LARGEST_PA)
+
+
+@names_file_in_errors
+def _read_limited(
+    path: str | Path, quantity: Quantity, largest: float, at_least: float = -np.inf
+) -> tuple[Array, Array]:
+    """Return times (T,) and values (T,) of one quantity, with limits on the values.
+
+    Raises
+    ------
+    InputError
+        As `read_columns`, or if a value is below `at_least` or larger in magnitude than `largest`.
+    """
+    table = read_columns(path, [quantity])
+    values = table.values[quantity.key]
+    for row in (~((values >= at_least) & (abs(values) <= largest))).nonzero()[0]:
+        is_so = f"{quantity.column} is {values[row]:g}"
+        if abs(values[row]) > largest:
+            why = ", which no soft body bears; check the unit of the column"
+        else:
+            why = "; expected 0 or more, since a tendon only pulls: take the sensor's offset off"
+        raise table.grid.error_at(is_so + why, int(row))
+    return table.t_s, values
+
+
+# Of a grasp, as a robot or a test bench tells it --------------------------------------------------
+
+
+def read_wrench(
+    path: str | Path,
+    columns: Mapping[str, str] | None = None,
+    axis: str = "z",
+    sign: int = 1,
+    area_m2: float | None = None,
+    symmetry: int = 1,
+    timed: bool = True,
+) -> tuple[Array, Array]:
+    """Read force and torque of a grasp over time, columns in any order; blank cells are missing.
+
+    Parameters
+    ----------
+    path : str or Path
+    columns : mapping, optional
+        Names of the columns of fx, fy, fz, tx, ty, tz, or of a machine's force or stress, and of t,
+        if their names are not recognised.
+    axis : {"x", "y", "z"}
+        Axis of a machine's force or stress.
+    sign : {1, -1}
+        Factor on the file's values: -1 if a positive value pulls the body against the axis.
+    area_m2 : float, optional
+        Undeformed area that an engineering stress multiplies; given if the file holds a stress.
+    symmetry : int
+        Number of equal parts of the specimen, of which the body is one; loads are divided by it.
+    timed : bool
+        Whether times are required; otherwise rows are numbered in seconds if there are no times.
+
+    Returns
+    -------
+    t_s : (S,) array
+    values : (S, 6) array
+        fx, fy, fz [N], tx, ty, tz [N m]; NaN where missing.
+
+    Raises
+    ------
+    InputError
+        If a column names no unit or a wrong one, is unknown or repeated, a cell is not a number, or
+        time does not increase; the line is named.
+    """
+    quantities = (*FORCES, *TORQUES, FORCE) if area_m2 is None else (STRESS,)
+    table = read_columns(path, quantities, columns, blank_allowed=True, requires_times=timed)
+    factor = sign * (area_m2 or 1.0) / symmetry
+    return _without_rounding(table.t_s), factor * _axis_components(table, (*FORCES, *TORQUES), axis)
+
+
+def read_displacement(
+    path: str | Path,
+    columns: Mapping[str, str] | None = None,
+    axis: str = "z",
+    sign: int = 1,
+    length_m: float | None = None,
+    timed: bool = True,
+) -> PoseSequence:
+    """Read displacements from the undeformed place over time, such as those of a crosshead.
+
+    A table has t_s and any of x_m, y_m and z_m (or _cm, _mm, _in), or a machine's displacement or
+    strain, in any order; along the other axes nothing moves.
+
+    Parameters
+    ----------
+    path : str or Path
+    columns : mapping, optional
+        Names of the columns of x, y, z, or of a machine's displacement or strain, and of t, if
+        their names are not recognised.
+    axis : {"x", "y", "z"}
+        Axis of a machine's displacement or strain.
+    sign : {1, -1}
+        Factor on the file's values: -1 if positive values go against the axis.
+    length_m : float, optional
+        Undeformed length that an engineering strain multiplies; given if the file holds a strain.
+    timed : bool
+        Whether times are required; otherwise rows are numbered in seconds if there are no times.
+
+    Returns
+    -------
+    PoseSequence
+        Pure translations.
+
+    Raises
+    ------
+    InputError
+        If a column is missing, unknown, repeated or without unit, a cell is not a number, or time
+        does not increase; the line is named.
+    """
+    table = _read_displacements(path, columns, length_m, timed)
+    shifts_m = (
+        sign * (length_m or 1.0) * np.nan_to_num(_axis_components(table, DISPLACEMENTS, axis))
+    )
+    return PoseSequence(table.t_s, shifts_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1)))
+
+
+def displaced_axes(
+    path: str | Path,
+    columns: Mapping[str, str] | None = None,
+    axis: str = "z",
+    length_m: float | None = None,
+) -> str:
+    """Return the axes along which a file has displacements, such as "z"; see
+    `read_displacement`.
+    """
+    shifts = _axis_components(
+        _read_displacements(path, columns, length_m, timed=False), DISPLACEMENTS, axis
+    )
+    is_present = np.asarray(np.isfinite(shifts).any(axis=0))
+    return "".join(each for each, there in zip("xyz", is_present, strict=True) if there)
+
+
+def _read_displacements(
+    path: str | Path, columns: Mapping[str, str] | None, length_m: float | None, timed: bool
+) -> QuantityTable:
+    """Read the columns of a displacement, or of a strain if the undeformed length is given."""
+    quantities = (*DISPLACEMENTS, DISPLACEMENT) if length_m is None else (STRAIN,)
+    return read_columns(path, quantities, columns, requires_times=timed)
+
+
+def _axis_components(table: QuantityTable, wanted: Sequence[Quantity], axis: str) -> Array:
+    """Return the (T, n) values of the `wanted` quantities; NaN where missing.
+
+    A machine's quantity, whose name contains no axis, becomes the component along `axis`.
+    """
+    places = {quantity.key: k for k, quantity in enumerate(wanted)}
+    values = np.full((len(table.t_s), len(wanted)), np.nan)
+    for key, column in table.values.items():
+        values[:, places.get(key, "xyz".index(axis))] = column
+    return values
+
+
+def _without_rounding(t_s: Array) -> Array:
+    """Return times without the rounding of the file, see `unrounded_s`; two or fewer stay."""
+    return unrounded_s(t_s) if len(t_s) > 2 else t_s
+
+
+# Of an instrument ---------------------------------------------------------------------------------
+
+
+@names_file_in_errors
+def read_custom_sensor(
+    path: str | Path, columns: Sequence[str] = ()
+) -> tuple[Array, Array, list[str]]:
+    """Read the values of a custom sensor over time.
+
+    Parameters
+    ----------
+    path : str or Path
+    columns : sequence of str
+        Columns of the values; all besides t_s by default.
+
+    Returns
+    -------
+    t_s : (S,) array
+    values : (S, m) array
+        NaN where a cell is blank.
+    columns : list of str
+        Names of the columns of the values.
+
+    Raises
+    ------
+    InputError
+        If a column is missing or repeated, a cell is not a number, or time does not increase; the
+        line is named.
+    """
+    grid = read_table(decode(read_bytes(path)))
+    wanted = list(columns) or [name for name in grid.columns if name != "t_s"]
+    for name in ("t_s", *wanted):
+        if (count := grid.columns.count(name)) != 1:
+            there = f"{count} columns are called" if count else "there is no column"
+            hint = "" if count else hint_at(name, grid.columns)
+            among = ", ".join(grid.columns)
+            raise grid.error_at(f"{there} {name!r}; expected one among {among}{hint}")
+    t_s = times_in_column(grid, grid.columns.index("t_s"))
+    values = numeric_cells(grid, [grid.columns.index(name) for name in wanted], True)
+    return _without_rounding(t_s), np.asarray(values), wanted
+
+
+def is_within_experiment(
+    sample_times_s: Array, t_s: Array, name: str, is_static: bool
+) -> NDArray[np.bool_]:
+    """Return which samples lie within an experiment's times, as (S,) bool.
+
+    Parameters
+    ----------
+    sample_times_s : (S,) array
+        Sample times of a file.
+    t_s : (T,) array
+        Times of the experiment.
+    name : str
+        What was sampled, for messages.
+    is_static : bool
+        Whether one sample is enough.
+
+    Raises
+    ------
+    InputError
+        If fewer than three samples do (one if static), as when clocks or units differ.
+    """
+    is_inside = (sample_times_s >= t_s[0] - TIME_TOLERANCE_S) & (
+        sample_times_s <= t_s[-1] + TIME_TOLERANCE_S
+    )
+    fewest = 1 if is_static else FEWEST_SHARED_SAMPLES
+    if is_inside.sum() >= fewest:
+        return is_inside
+    span = [f"{t[0]:.6g} s to {t[-1]:.6g} s" for t in (sample_times_s, t_s)]
+    ratio = np.ptp(sample_times_s) / max(np.ptp(t_s), TIME_TOLERANCE_S)
+    hint = (
+        f"{name} seems to be in milliseconds"
+        if 300 < ratio < 3000
+        else "both need one clock, in seconds; subtract where they began"
+    )
+    raise InputError(
+        f"{name} runs from {span[0]}, the experiment from {span[1]}: {int(is_inside.sum())} "
+        f"samples are in common; expected {fewest} at least. {hint}"
+    )

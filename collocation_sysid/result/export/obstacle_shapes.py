@@ -1,0 +1,357 @@
+"""Obstacles as simulators represent them: simple shapes (`Primitive`), or facets (`Facets`,
+`Wall`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from ...array_types import Array, Index
+from ...errors import listed
+from ...model.contact import contact_terms
+from ...recording import Capsule, Cuboid, Cylinder, Obstacle, Plane, Solid, Sphere
+from ...recording.obstacle_solids import solid_key
+from .identified import Identified
+
+# Smallest and largest width of the facets of round surfaces [rad].
+FACET_RAD = np.pi / 36, np.pi / 12
+# Side of the square that represents a plane, over the extent of the body.
+SHEET = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Primitive:
+    """Plane, sphere, box, cylinder or capsule in the frame of its obstacle.
+
+    Attributes
+    ----------
+    kind : str
+        "plane", "sphere", "box", "cylinder" or "capsule".
+    size_m : (k,)
+        Radius, then half the length between the ends; half of each side for a box; empty for a
+        plane.
+    place_m : (3,)
+        Centre; for a plane a point on it.
+    turn : Rotation
+        Rotation of the z axis to the axis of the shape, or to the normal of a plane.
+    """
+
+    kind: str
+    size_m: Array
+    place_m: Array
+    turn: Rotation
+
+    @classmethod
+    def of(cls, solid: Solid) -> Primitive:
+        """Return the primitive of a solid; rounded edges are left out."""
+        kind = solid_key(solid).removesuffix("_m")
+        turn = Rotation.identity()
+        if isinstance(solid, Plane):
+            return cls(kind, np.zeros(0), solid.point_m, _upright(solid.normal))
+        if isinstance(solid, Sphere):
+            return cls(kind, np.array([solid.radius_m]), solid.centre_m, turn)
+        if isinstance(solid, Cuboid):
+            return cls(kind, np.diff(solid.corners_m, axis=0)[0] / 2, solid.tilt_centre_m, turn)
+        assert isinstance(solid, (Cylinder, Capsule))
+        way = np.diff(solid.ends_m, axis=0)[0]
+        size = np.array([solid.radius_m, np.linalg.norm(way) / 2])
+        return cls(kind, size, solid.ends_m.mean(axis=0), _upright(way))
+
+    def placed(self, obstacle: Obstacle, t_s: float) -> tuple[Array, Rotation]:
+        """Return position (3,) [m] and rotation in the world at a time."""
+        (rotation,), (place,) = obstacle.poses.at([t_s])
+        return place + rotation @ self.place_m, Rotation.from_matrix(rotation) * self.turn
+
+
+def _upright(axis: Array) -> Rotation:
+    """Return a rotation of the z axis to a vector (3,)."""
+    return Rotation.align_vectors(axis[None], np.array([[0.0, 0.0, 1.0]]))[0]
+
+
+def grown(solid: Solid, by_m: float) -> Solid:
+    """Return a solid whose surface is further out by `by_m`; negative inwards.
+
+    Inwards the surface moves at most by half of the solid's smallest half width.
+    """
+    if isinstance(solid, Plane):
+        return replace(solid, point_m=solid.point_m + by_m * solid.normal)
+    by_m = max(by_m, -float(Primitive.of(solid).size_m.min()) / 2)
+    outwards = by_m * np.array([[-1.0], [1.0]])
+    if isinstance(solid, Cuboid):
+        return replace(solid, corners_m=solid.corners_m + outwards)
+    assert isinstance(solid, (Sphere, Cylinder, Capsule))
+    wider = replace(solid, radius_m=solid.radius_m + by_m)
+    if not isinstance(wider, Cylinder):
+        return wider
+    way = np.diff(wider.ends_m, axis=0)
+    return replace(wider, ends_m=wider.ends_m + outwards * way / np.linalg.norm(way))
+
+
+@dataclass(frozen=True, eq=False)
+class Facets:
+    """Surface of a solid as flat facets, with a point behind all of them.
+
+    Attributes
+    ----------
+    points_m : (p, 3)
+        Corners, and as the last point the one behind all facets.
+    triangles : (f, 3)
+        Point indices, counter-clockwise as seen from outside.
+    """
+
+    points_m: Array
+    triangles: Index
+
+    @classmethod
+    def of(cls, solid: Solid, about_m: Array, size_m: float, depth_m: float) -> Facets:
+        """Return the facets of a solid; of a plane a square.
+
+        On round surfaces the middles of facets are as deep below the surface as their corners are
+        above it,
+        by `depth_m` or as the allowed facet widths `FACET_RAD` permit.
+
+        Parameters
+        ----------
+        solid : Solid
+        about_m : (3,)
+            Centre of the square for a plane.
+        size_m : float
+            Side of the square for a plane.
+        depth_m : float
+            Allowed distance between facets and surface.
+        """
+        if isinstance(solid, Plane):
+            corners = solid.outline_polylines(about_m, size_m)[0][:4]
+            behind = corners.mean(axis=0) - size_m / 4 * solid.normal
+            return cls(np.vstack([corners, behind]), np.array([(0, 1, 2), (0, 2, 3)]))._outwards()
+        places = _extremes(Primitive.of(solid), getattr(solid, "rounding_m", 0.0), depth_m)
+        hull = ConvexHull(places)
+        used, triangles = np.unique(hull.simplices, return_inverse=True)
+        points = places[used]
+        behind = points.mean(axis=0)
+        return cls(np.vstack([points, behind]), triangles.reshape(-1, 3))._outwards()
+
+    def depth_m(self, places_m: Array) -> float:
+        """Return the penetration [m] of the deepest of points (n, 3); 0 if all are outside."""
+        return max(0.0, -float(self._above(places_m).max(axis=0).min()))
+
+    def towards(self, places_m: Array) -> Facets:
+        """Return the facets that have at least one of the points (n, 3) in front of them."""
+        is_facing = (self._above(places_m) > 0).any(axis=1)
+        used, triangles = np.unique(self.triangles[is_facing], return_inverse=True)
+        return Facets(self.points_m[[*used, -1]], triangles.reshape(-1, 3))
+
+    def _above(self, places_m: Array) -> Array:
+        """Return the distance (f, n) [m] of points (n, 3) in front of the plane of each facet."""
+        corners = self.points_m[self.triangles]
+        normals = _normals(corners)
+        return normals @ places_m.T - np.einsum("fk,fk->f", corners[:, 0], normals)[:, None]
+
+    def _outwards(self) -> Facets:
+        """Return the facets with triangles ordered counter-clockwise as seen from outside."""
+        corners = self.points_m[self.triangles]
+        inwards = np.einsum("fk,fk->f", self.points_m[-1] - corners[:, 0], _normals(corners)) > 0
+        order = np.where(inwards[:, None], [2, 1, 0], [0, 1, 2])
+        return replace(self, triangles=np.take_along_axis(self.triangles, order, axis=1))
+
+
+def _normals(corners: Array) -> Array:
+    """Return the unit normals (f, 3) of triangles with corners (f, 3, 3)."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normals / np.linalg.norm(normals, axis=1)[:, None]
+
+
+def _extremes(shape: Primitive, rounding_m: float, depth_m: float) -> Array:
+    """Return points (p, 3) of a solid that are the furthest along some direction; their hull is the
+    solid.
+
+    Parameters
+    ----------
+    shape : Primitive
+    rounding_m : float
+        Radius of rounded edges.
+    depth_m : float
+        Allowed distance between the hull and the surface.
+    """
+    radius_m = rounding_m if shape.kind == "box" else shape.size_m[0]
+    wide = float(np.clip(4 * np.sqrt(depth_m / max(radius_m, depth_m)), *FACET_RAD))
+    count = int(np.ceil(np.pi / wide))
+    middles = (np.arange(2 * count) + 0.5) * np.pi / count
+    azimuth, inclination = np.meshgrid(middles, middles[:count])
+    azimuth = azimuth.ravel()
+    inclination = inclination.ravel()
+    level = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)], axis=1)
+    axial = np.cos(inclination)[:, None] * [0.0, 0.0, 1.0]
+    direction = np.sin(inclination)[:, None] * level + axial
+    stretch = 1 + wide**2 / 16
+    if shape.kind == "box":
+        core = np.sign(direction) * (shape.size_m - rounding_m)
+    elif shape.kind == "cylinder":
+        core = stretch * (radius_m - rounding_m) * level
+        core = core + np.sign(axial) * (shape.size_m[1] - rounding_m)
+    else:
+        rounding_m = radius_m
+        core = np.sign(axial) * (shape.size_m[1] if shape.kind == "capsule" else 0.0)
+    places = core + stretch * rounding_m * direction
+    return np.unique(shape.place_m + shape.turn.apply(places).round(12), axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Wall:
+    """Obstacle as facets whose contact pressure is proportional to the penetration.
+
+    To match the pressure law of this package inside the obstacle, the surface is half of its width
+    δ
+    further out, and twice as stiff.
+
+    Attributes
+    ----------
+    obstacle : Obstacle
+        Obstacle whose friction coefficient is a number.
+    facets : Facets
+        Facets in the obstacle's frame.
+    back_m : (3,)
+        Displacement from the place at the first sample to one without contact.
+    start_m : (p, 3)
+        Points of the facets at the place without contact, in the world.
+    nodes, cells : int
+        Numbers of nodes and cells of the body and of earlier walls, which precede those of this
+        wall.
+    stiffness_pa_m, node_n_m : float
+        Contact stiffness per area, and for each node.
+    width_m : float
+        Width δ of the pressure law.
+    faces : (k,)
+        Indices of the boundary triangles that may touch the obstacle.
+    """
+
+    obstacle: Obstacle
+    facets: Facets
+    back_m: Array
+    start_m: Array
+    nodes: int
+    cells: int
+    stiffness_pa_m: float
+    node_n_m: float
+    width_m: float
+    faces: Index
+
+    def points_m(self, t_s: float) -> Array:
+        """Return the points of the facets (p, 3) in the world at a time."""
+        (rotation,), (place,) = self.obstacle.poses.at([t_s])
+        return self.facets.points_m @ rotation.T + place
+
+    @property
+    def triangles(self) -> Index:
+        """Node indices of the facets (f, 3)."""
+        return self.facets.triangles + self.nodes
+
+    @property
+    def tetrahedra(self) -> Index:
+        """Node indices (f, 4) of a tetrahedron under each facet."""
+        inner = np.full((len(self.triangles), 1), self.nodes + len(self.start_m) - 1)
+        return np.hstack([self.triangles[:, [0, 2, 1]], inner])
+
+
+def walls(body: Identified) -> tuple[Wall, ...]:
+    """Return the obstacles of a body as walls; facets that never face the body are left out."""
+    if body.touching is None:
+        return ()
+    times = body.touching.t_s
+    shape = body.touching.rigid_positions([body.start_s])
+    made: list[Wall] = []
+    nodes = len(body.nodes_m)
+    cells = len(body.body.cells)
+    for obstacle, contact in zip(body.obstacles, contact_terms(body.touching), strict=True):
+        law = contact.law_of_contact
+        depth_m, normal = contact.deepest_point(shape.ravel())
+        rotations, places = obstacle.poses.at(times)
+        rigid_m = body.experiment.rigid_positions(times)
+        ends = np.stack([rigid_m.min(axis=1), rigid_m.max(axis=1)], axis=2) - places[..., None]
+        corners = np.array([list(product(*each)) for each in ends])
+        box_m = np.einsum("tki,tij->tkj", corners, rotations).reshape(-1, 3)
+        size_m = SHEET * float(np.ptp(box_m, axis=0).max())
+        area_m2 = law.surface.area_m2
+        stiffness = 2 * float(np.average(law.stiffness_at(body.theta), weights=area_m2))
+        width_m = float(np.average(law.widths_m, weights=area_m2))
+        solid = grown(obstacle.shape, width_m / 2)
+        facets = Facets.of(solid, box_m.mean(axis=0), size_m, width_m / 2)
+        faces = law.surface.faces
+        touching = np.unique(body.body.nodes.nodes_of_faces(body.body.mesh.surface[faces]))
+        # Nodes may be deeper than the points at which ours are pushed.
+        back_m = -max(depth_m, 0.0) * normal
+        nearest = (rigid_m[0, touching] - places[0] - back_m) @ rotations[0]
+        back_m -= facets.depth_m(nearest) * normal
+        of_node = stiffness * float(area_m2.sum()) / len(touching)
+        shown = facets.towards(
+            np.concatenate([box_m, box_m[: len(corners[0])] - back_m @ rotations[0]])
+        )
+        start_m = shown.points_m @ rotations[0].T + places[0] + back_m
+        made.append(
+            Wall(
+                obstacle,
+                shown,
+                back_m=back_m,
+                start_m=start_m,
+                nodes=nodes,
+                cells=cells,
+                stiffness_pa_m=stiffness,
+                node_n_m=of_node,
+                width_m=width_m,
+                faces=faces,
+            )
+        )
+        nodes = nodes + len(start_m)
+        cells = cells + len(shown.triangles)
+    return tuple(made)
+
+
+@dataclass(frozen=True)
+class OneContact:
+    """Contact constants of Newton, which has one set for all obstacles of a soft body.
+
+    Attributes
+    ----------
+    friction : float
+    node_n_m : float
+        Contact stiffness of a node.
+    radius_m : float
+        Radius of particles: half of the width δ of the pressure law.
+    lost : tuple of str
+        Sentence on obstacles that differ in these constants; empty if they agree.
+    """
+
+    friction: float
+    node_n_m: float
+    radius_m: float
+    lost: tuple[str, ...]
+
+    @classmethod
+    def of(cls, touched: Sequence[Wall]) -> OneContact:
+        """Return the friction of the first wall, and the largest stiffness and width; zeros without
+        walls.
+        """
+        constants = {
+            "friction": [float(wall.obstacle.friction) for wall in touched],
+            "stiffness": [wall.node_n_m for wall in touched],
+            "width": [wall.width_m for wall in touched],
+        }
+        friction, stiffness, width = (values or [0.0] for values in constants.values())
+        unlike = [
+            name
+            for name, values in constants.items()
+            if not np.allclose(values, values[:1], atol=0)
+        ]
+        sentence = (
+            f"obstacles differ in {listed(unlike)}, of which a soft body in Newton has one: here "
+            f"the first's friction {friction[0]:.4g}, with which that of each other is averaged, "
+            f"and of all the largest stiffness {max(stiffness):.4g} N/m of a node and width "
+            f"{max(width):.4g} m"
+        )
+        return cls(friction[0], max(stiffness), max(width) / 2, (sentence,) * bool(unlike))

@@ -1,0 +1,155 @@
+"""Points of a depth camera over outlines of the body's surface, and their distances from the
+surface.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from ...array_types import Array
+from ..figure_style import PAGE_MM, SMALL_PT, VERMILION
+
+MM_PER_INCH = 25.4
+# Largest width of a panel, as a share of the page.
+WIDEST = 0.6
+# Height of a title [inch].
+TITLES = 0.4
+# Smallest and largest height of a panel over its width.
+HIGH = (0.3, 1.0)
+# Rows of outlines above which lines are thinner than 1 pt.
+FACES = 600
+# Share of the area of the points that their dots cover.
+COVERED = 0.3
+# Percentile of the distances at which the colour scale ends.
+SHOWN = 95
+# Distance from the points up to which outlines are shown, over the extent of the points.
+BEYOND = 0.5
+
+
+def depth_picture(seen: Array) -> Figure:
+    """Draw depth images with outlines of the surface, and below them the distances from the
+    surface.
+
+    The samples that have outlines are shown side by side. Without a fit there is no second row; if
+    no
+    point counts, the picture has only a sentence about that.
+
+    Parameters
+    ----------
+    seen : (k, 8)
+        Rows of `Replay.fit_summary`.
+    """
+    times = np.unique(seen[np.isnan(seen[:, 3]), 0])
+    points = seen[np.isfinite(seen[:, 3])]
+    if not len(points):
+        return _sentence("no point is near enough to the body to count")
+    fitted = bool(np.isfinite(points[:, 4]).any())
+    axes, dot = _sheet(points, times, 1 + fitted)
+    nearest, farthest = np.percentile(points[:, 3], [1, 99])
+    depth = {"cmap": "viridis", "vmin": nearest, "vmax": farthest, "s": dot}
+    end = max(1e-3, 1e3 * float(np.nanpercentile(np.abs(points[:, 4]), SHOWN))) if fitted else 1.0
+    behind = {"cmap": "RdBu", "vmin": -end, "vmax": end, "s": dot}
+    for column, t_s in zip(axes.T, times, strict=True):
+        here = points[points[:, 0] == t_s]
+        lines = seen[(seen[:, 0] == t_s) & np.isnan(seen[:, 3]), 1:3]
+        image = _panel(column[0], here[:, 1:3], here[:, 3], lines, VERMILION, depth)
+        scales = [(image, "depth [m]")]
+        title = f"t = {t_s:.4g} s" if len(times) > 1 else ""
+        column[0].set_title(title, fontsize=SMALL_PT)
+        if fitted:
+            used = here[np.isfinite(here[:, 4])]
+            unused = here[~np.isfinite(here[:, 4])]
+            column[1].plot(*unused[:, 1:3].T, ".", ms=1.5, color="0.7")
+            distances = _panel(column[1], used[:, 1:3], 1e3 * used[:, 4], lines, "0.6", behind)
+            scales.append((distances, "behind surface [mm]"))
+            rms = np.sqrt(np.mean((1e3 * used[:, 4]) ** 2))
+            column[1].set_title(f"{rms:.2g} mm RMS, {len(used):,} points", fontsize=SMALL_PT)
+    for row, (scale, label) in zip(axes, scales, strict=True):
+        bar = row[0].figure.colorbar(scale, ax=row)
+        bar.set_label(label, fontsize=SMALL_PT)
+        bar.ax.tick_params(labelsize=SMALL_PT, width=0.6)
+        row[0].set_ylabel("v", fontsize=SMALL_PT)
+    for panel in axes[-1]:
+        panel.set_xlabel("u", fontsize=SMALL_PT)
+    return axes[0, 0].figure
+
+
+def _sentence(text: str) -> Figure:
+    """Return a small figure that has only a sentence."""
+    figure = Figure(figsize=(WIDEST * PAGE_MM / MM_PER_INCH, TITLES), layout="constrained")
+    axes = figure.subplots()
+    axes.set_axis_off()
+    axes.text(0.5, 0.5, text, ha="center", va="center", fontsize=SMALL_PT)
+    return figure
+
+
+def _sheet(points: Array, times: Array, rows: int) -> tuple[NDArray[np.object_], float]:
+    """Return panels (rows, times) with the proportions of the points' extent, and the area of a
+    dot.
+
+    Parameters
+    ----------
+    points : (P, 8)
+        Points of `Replay.fit_summary`.
+    times : (m,)
+        Times of the samples, one column each.
+    rows : int
+
+    Returns
+    -------
+    axes : (rows, m) array of Axes
+    dot : float
+        Area of a dot [pt²], such that dots cover the share `COVERED` of the extent.
+    """
+    inch = PAGE_MM / MM_PER_INCH
+    count = len(times)
+    across = min(1 / count, WIDEST)
+    width, height = np.ptp(points[:, 1:3], axis=0)
+    panel = across * inch * float(np.clip(height / max(width, 1e-12), *HIGH)) + TITLES
+    size = (max(WIDEST, across * count) * inch, panel * rows)
+    dot = COVERED * (72 * across * inch) ** 2 * HIGH[0] / max(1, len(points) / count)
+    return Figure(figsize=size, layout="constrained").subplots(rows, count, squeeze=False), dot
+
+
+def _panel(
+    axes: Axes, places: Array, values: Array, lines: Array, colour: str, looks: dict[str, Any]
+) -> PathCollection:
+    """Draw points and outlines, and return the points; outlines far from all points are cut off.
+
+    Parameters
+    ----------
+    axes : Axes
+    places : (P, 2)
+        u and v of the points.
+    values : (P,)
+        Values that colour the points.
+    lines : (k, 2)
+        u and v of the outlines, NaN after each face.
+    colour : str
+        Colour of the outlines.
+    looks : dict
+        Further arguments of `Axes.scatter`.
+    """
+    drawn = axes.scatter(*places.T, c=values, linewidths=0, zorder=1, **looks)
+    # Of more faces thinner ones, or these would hide the points.
+    thin = min(0.5, FACES / max(1, len(lines)))
+    axes.plot(*lines.T, color=colour, linewidth=thin, zorder=2)
+    low = places.min(axis=0)
+    high = places.max(axis=0)
+    room = BEYOND * (high - low).max()
+    both = np.vstack([places, lines[np.isfinite(lines).all(axis=1)]])
+    low = np.maximum(both.min(axis=0), low - room)
+    high = np.minimum(both.max(axis=0), high + room)
+    margin = 0.03 * (high - low).max()
+    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(high[1] + margin, low[1] - margin))
+    axes.set(aspect="equal")
+    axes.tick_params(labelsize=SMALL_PT, width=0.6)
+    if not ((lines >= low) & (lines <= high)).all(axis=1).any():
+        axes.text(0.5, 0.02, "the body is not in view", transform=axes.transAxes, ha="center")
+    return drawn

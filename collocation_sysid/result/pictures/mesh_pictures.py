@@ -1,0 +1,249 @@
+"""Pictures of the undeformed mesh: grasped nodes, markers from two sides, element quality."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from ...array_types import Array
+from ...fem.mesh_checks import edge_lengths, mean_ratios
+from ..figure_style import BLUE, COLUMN_MM, SMALL_PT, VERMILION, dress, framed_figure
+from ..replay import Replay
+from .projection import ELEVATION_DEG, Camera, Triangles
+from .scene import (
+    Drawn,
+    View,
+    draw_directions,
+    draw_key,
+    draw_scale,
+    key,
+    sheet,
+    skin_key,
+    width_over_height,
+)
+
+# More names than this would be a list, not a picture.
+MOST_NAMES = 24
+HEAD_MM = 6.0
+FOOT_MM = 14.0
+GAP_MM = 3.0
+# Height of a line of text.
+LINE_MM = 3.2
+# Mean width of a letter.
+LETTER_MM = 1.4
+TALLEST_MM = 70.0
+# Shortest distance on paper at which two marks are drawn apart: nearer ones cover each other.
+SEEN_MM = 0.4
+GIVEN = "place given"
+UNKNOWN = "no place given"
+TENDON = "tendons"
+LOOKS: dict[str, dict[str, Any]] = {
+    GIVEN: {"ls": "", "marker": "x", "ms": 3.2, "mec": BLUE, "mew": 0.8},
+    TENDON: {"color": BLUE, "lw": 1.0, "marker": ".", "ms": 2.0},
+    UNKNOWN: {"ls": "", "marker": "s", "ms": 5.0, "mfc": "none", "mec": BLUE, "mew": 0.6},
+}
+
+
+def mesh_picture(seen: Replay) -> Figure:
+    """Draw the undeformed body from the front and from behind, with names of its markers.
+
+    Tendons are drawn through the body. A cross is the stated place of a marker whose estimated
+    place
+    differs; a frame surrounds a marker whose place was not stated.
+    """
+    nodes_m = seen.undeformed_m
+    surface = seen.surface
+    up = seen.up
+    names = seen.marker_names
+    places_m = seen.marker_places_m
+    stated_m = seen.given_places_m
+    is_grasped = np.asarray(seen.held.any(axis=0))
+    part_names = seen.part_names
+    front = Camera.facing(nodes_m[None], up)
+    behind = front.raised(-ELEVATION_DEG).turned(180.0, up).raised(ELEVATION_DEG)
+    everything = np.vstack([nodes_m, places_m, stated_m])
+    aspect = width_over_height(front, everything)
+    named = 0 < len(names) <= MOST_NAMES
+    margin = min(26.0, 4.0 + LETTER_MM * max(map(len, names))) if named else 2.0
+    is_side_by_side = aspect < 1.0
+    room = COLUMN_MM - 2 * margin
+    width = (room - GAP_MM) / 2 if is_side_by_side else room
+    height = min(width / aspect, TALLEST_MM / (1 if is_side_by_side else 2))
+    elsewhere = not np.array_equal(stated_m, places_m)
+    marked = elsewhere or seen.tendons_m is not None
+    head = HEAD_MM + LINE_MM * ((len(part_names) > 1) + marked)
+    total = head + FOOT_MM + (height if is_side_by_side else 2 * height + GAP_MM)
+    figure, axes = sheet(COLUMN_MM, total)
+    corners = (
+        (margin, total - head - height),
+        (margin + width + GAP_MM, FOOT_MM) if is_side_by_side else (margin, FOOT_MM),
+    )
+    first = _seen_first(front, behind, places_m, nodes_m, surface)
+    views = []
+    marks = set[str]()
+    for camera, corner, mine in zip((front, behind), corners, (first, ~first), strict=True):
+        view = View.fitting(camera, everything, (width, height), corner)
+        Drawn(axes, view, surface, seen.surface_parts, seen.surface_nodes).show(
+            nodes_m, is_grasped, places_m
+        )
+        marks |= _draw_given(axes, view, places_m, stated_m)
+        if seen.tendons_m is not None:
+            axes.plot(*view.places(seen.tendons_m).T, zorder=5.5, **LOOKS[TENDON])
+            marks.add(TENDON)
+        if named:
+            dots = view.places(places_m[mine])
+            own = [name for name, here in zip(names, mine, strict=True) if here]
+            _write_names(axes, dots, own, COLUMN_MM / 2, (margin - 1, COLUMN_MM - margin + 1))
+        views.append(view)
+    for view, x in zip(views, (0.15, 0.85), strict=True):
+        draw_directions(axes, view.camera, (COLUMN_MM * x, 5.0), 4.5)
+    draw_scale(axes, views[0].mm_per_m, (COLUMN_MM / 2 - 12, 4.0), 15.0)
+    entries = ["grasped"] if is_grasped.any() else []
+    entries += ["markers", "behind the body"] if len(names) else []
+    lines = [key(*entries), [Line2D([], [], label=w, **LOOKS[w]) for w in sorted(marks)]]
+    if len(part_names) > 1:
+        lines.append([skin_key(k, name or "rest") for k, name in enumerate(part_names)])
+    for k, handles in enumerate(filter(None, lines)):
+        draw_key(axes, handles, (1.0, total - 1.5 - k * LINE_MM))
+    return figure
+
+
+def _draw_given(axes: Axes, view: View, places_m: Array, given_m: Array) -> set[str]:
+    """Mark markers whose estimated place differs from the stated one, or that have no stated place.
+
+    Parameters
+    ----------
+    axes : Axes
+    view : DepthCameraModel
+    places_m, given_m : (M, 3)
+        Estimated and stated places; stated ones are NaN where there is none.
+
+    Returns
+    -------
+    set of str
+        The kinds of marks that were drawn, for the legend.
+    """
+    estimated_mm = view.places(places_m)
+    stated_mm = view.places(given_m)
+    drawn = set[str]()
+    unknown = np.isnan(given_m[:, 0])
+    moved = np.linalg.norm(estimated_mm - stated_mm, axis=1) > SEEN_MM  # False for NaN
+    if unknown.any():
+        axes.plot(*estimated_mm[unknown].T, zorder=6, **LOOKS[UNKNOWN])
+        drawn.add(UNKNOWN)
+    if moved.any():
+        axes.plot(*stated_mm[moved].T, zorder=6, **LOOKS[GIVEN])
+        segments = np.stack([stated_mm[moved], estimated_mm[moved]], axis=1)
+        axes.add_collection(LineCollection(list(segments), colors=BLUE, linewidths=0.5, zorder=6))
+        drawn.add(GIVEN)
+    return drawn
+
+
+def _seen_first(
+    front: Camera, behind: Camera, places_m: Array, nodes_m: Array, surface: Triangles
+) -> NDArray[np.bool_]:
+    """Return for each marker (M,) whether its name is written in the front view, else in the one
+    from behind.
+    """
+    hidden = [camera.hidden(places_m, nodes_m, surface) for camera in (front, behind)]
+    is_in_front = front.nearness(places_m) >= front.nearness(nodes_m).mean()
+    return np.where(hidden[0] == hidden[1], is_in_front, ~hidden[0])
+
+
+def _write_names(
+    axes: Axes,
+    dots: Array,
+    names: Sequence[str],
+    middle: float,
+    edges: tuple[float, float],
+) -> None:
+    """Write names in the margins, level with their markers but not overlapping, with a line to
+    each.
+
+    Parameters
+    ----------
+    axes : Axes
+    dots : (k, 2)
+        Positions of the markers on the sheet [mm].
+    names : (k,) str
+    middle : float
+        Markers left of this have their names in the left margin [mm].
+    edges : (float, float)
+        Inner edges of the left and the right margin [mm].
+    """
+    on_left = dots[:, 0] < middle
+    for edge, members, align in zip(
+        edges, (np.flatnonzero(on_left), np.flatnonzero(~on_left)), ("right", "left"), strict=True
+    ):
+        members = members[np.argsort(dots[members, 1])]
+        for m, level in zip(members, apart(dots[members, 1], LINE_MM), strict=True):
+            inner = edge + (1.5 if align == "right" else -1.5)
+            axes.plot(
+                [dots[m, 0], inner, edge], [dots[m, 1], level, level], color="#707070", lw=0.4,
+                zorder=3.5,
+            )  # fmt: skip
+            text: dict[str, Any] = {"ha": align, "va": "center_baseline", "fontsize": SMALL_PT}
+            axes.text(edge + (-0.5 if align == "right" else 0.5), level, names[int(m)], **text)
+
+
+def apart(levels: Array, gap: float) -> Array:
+    """Return ascending levels (k,), moved as little as possible to be at least `gap` from each
+    other.
+    """
+    steps = gap * np.arange(len(levels))
+    # The nearest ascending sequence to levels − steps: neighbours out of order share their mean.
+    blocks: list[list[float]] = []
+    for value in levels - steps:
+        blocks.append([value])
+        while len(blocks) > 1 and np.mean(blocks[-2]) > np.mean(blocks[-1]):
+            last = blocks.pop()
+            blocks[-1] += last
+    means = [np.full(len(block), np.mean(block)) for block in blocks]
+    return np.concatenate([*means, np.zeros(0)]) + steps
+
+
+BINS = 24
+
+
+def elements_picture(nodes_m: Array, tetrahedra: NDArray[np.integer]) -> Figure:
+    """Draw histograms of the size and the quality of the elements.
+
+    The size is the root mean square edge, the quality the mean ratio 12 (3V)^(2/3) / Σ l², which is
+    1 for
+    the regular tetrahedron and near 0 for a flat one.
+
+    Parameters
+    ----------
+    nodes_m : (n, 3)
+        Nodes of the undeformed body.
+    tetrahedra : (E, 4)
+        Corner nodes of the elements.
+    """
+    quality = np.minimum(mean_ratios(nodes_m, tetrahedra), 1.0)  # rounding
+    size_mm = 1e3 * np.sqrt((edge_lengths(nodes_m, tetrahedra) ** 2).mean(axis=1))
+    figure = framed_figure(COLUMN_MM, 42, 13, 2, 9.5, 5.5)
+    left, right = figure.subplots(1, 2, sharey=True, gridspec_kw={"wspace": 0.08})
+    widest = float(size_mm.max())
+    spread = np.ptp(size_mm) > 0.02 * widest
+    limits = (float(size_mm.min()), widest) if spread else (0.9 * widest, 1.1 * widest)
+    left.hist(size_mm, BINS, range=limits, color=BLUE)
+    right.hist(quality, BINS, range=(0.0, 1.0), color=BLUE)
+    worst = float(quality.min())
+    right.axvline(worst, color=VERMILION, lw=1.0)
+    dress(left, f"{len(tetrahedra)} elements", "size [mm]", "elements")
+    dress(right, f"worst {worst:.2f}", "quality, 1 = regular")
+    right.title.set_color(VERMILION)
+    for axes in (left, right):
+        axes.grid(False, axis="x")
+        axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+    left.xaxis.set_major_locator(MaxNLocator(4))
+    right.set_xticks((0.0, 0.5, 1.0))
+    return figure

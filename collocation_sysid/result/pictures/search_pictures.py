@@ -1,0 +1,172 @@
+"""Pictures of the search: the initial scan of the stiffness, and the iterations of the method."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from ...array_types import Array
+from ...fem.constants import unit_of
+from ...methods.solution import Iteration
+from ..figure_style import (
+    BLACK,
+    BLUE,
+    COLUMN_MM,
+    CYCLE,
+    LINE_PT,
+    ORANGE,
+    SMALL_PT,
+    TEXT_PT,
+    VERMILION,
+    dress,
+    framed_figure,
+    legend_above,
+    log_axis,
+    mathematical,
+)
+
+_RUNG = "#808080"
+
+
+def convergence(
+    history: Sequence[Iteration],
+    names: Sequence[str] | None = None,
+    truth: Mapping[str, float] | None = None,
+) -> Figure:
+    """Draw marker error, loss, violation of the dynamics, and parameters against the iteration
+    number.
+
+    Parameters
+    ----------
+    history : sequence of Iteration
+    names : sequence of str, optional
+        Parameters to draw; all by default.
+    truth : mapping, optional
+        True values by parameter, relative to which parameters are drawn; their final values by
+        default.
+    """
+    figure = framed_figure(COLUMN_MM, 132, 14, 2, 9.5, 4)
+    heights = (1.0, 1.0, 1.0, 0.2, 1.4)  # a gap for the legend
+    grid = figure.add_gridspec(5, 1, height_ratios=heights, hspace=0.12)
+    panels = [figure.add_subplot(grid[row]) for row in (0, 1, 2, 4)]
+    numbers = [iteration.number for iteration in history]
+    curves = (
+        ("RMS [mm]", [1e3 * i.rms_m for i in history], BLUE),
+        ("loss", [i.loss for i in history], BLUE),
+        ("violation [N]", [i.violation_n for i in history], VERMILION),
+    )
+    rungs = _rungs(history)
+    for axes, (label, values, colour) in zip(panels, curves, strict=False):
+        for part in rungs:
+            style: dict[str, Any] = {"ms": 2.5, "lw": LINE_PT, "color": colour}
+            axes.plot(numbers[part], _positive(values[part]), "o-", **style)
+        dress(axes, "", "", label)
+        log_axis(axes)
+    _mark_rungs(panels[:3], history, rungs)
+    drawn = list(history[0].parameters) if names is None and history else list(names or ())
+    _draw_parameters(panels[3], history, drawn, truth)
+    panels[3].set_xlabel("iteration", fontsize=TEXT_PT)
+    for axes in panels:
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.yaxis.set_label_coords(-0.145, 0.5)
+        axes.tick_params(labelbottom=axes is panels[3])
+    return figure
+
+
+def _rungs(history: Sequence[Iteration]) -> list[slice]:
+    """Return the ranges of iterations over which the same share of the timesteps was fitted."""
+    shares = [iteration.share for iteration in history]
+    starts = [k for k in range(len(shares)) if k == 0 or shares[k] != shares[k - 1]]
+    return [slice(a, b) for a, b in pairwise([*starts, len(shares)])] if starts else []
+
+
+def _mark_rungs(
+    panels: Sequence[Axes], history: Sequence[Iteration], rungs: Sequence[slice]
+) -> None:
+    """Mark the iterations at which the fit takes in more timesteps; loss and error increase there.
+
+    Parameters
+    ----------
+    panels : sequence of Axes
+    history : sequence of Iteration
+    rungs : sequence of slice
+        Ranges of `_rungs`; a single range is not marked.
+    """
+    if len(rungs) < 2:
+        return
+    for part in rungs:
+        first = history[part.start]
+        if part.start:
+            between = (history[part.start - 1].number + first.number) / 2
+            for axes in panels:
+                axes.axvline(between, color=_RUNG, lw=0.8, ls=(0, (2, 2)), zorder=0.5)
+    shares = ", ".join(f"{100 * history[part.start].share:.3g}" for part in rungs)
+    panels[0].set_title(f"fitted: {shares} % of the timesteps in turn", fontsize=SMALL_PT)
+
+
+def _draw_parameters(
+    axes: Axes,
+    history: Sequence[Iteration],
+    names: Sequence[str],
+    truth: Mapping[str, float] | None,
+) -> None:
+    """Draw the parameters over the iterations, relative to `truth` or to their final values."""
+    axes.axhline(1.0, color=BLACK, lw=0.6)
+    numbers = [iteration.number for iteration in history]
+    for k, name in enumerate(names if history else ()):
+        values = np.array([iteration.parameters[name] for iteration in history], dtype=float)
+        symbol = mathematical(name)
+        unit = unit_of(name)
+        reference = values[-1] if truth is None else truth[name]
+        label = f"{symbol} = {values[-1]:.4g} {unit}"
+        style = {"ms": 2.5, "lw": LINE_PT, "color": CYCLE[k % len(CYCLE)]}
+        axes.plot(numbers, _positive(values / (reference or 1.0)), "o-", label=label, **style)
+    dress(axes, "", "", f"θ / {'final θ' if truth is None else 'truth'}")
+    log_axis(axes)
+    if history and names:
+        legend_above(axes, columns=2)
+
+
+def _positive(values: Sequence[float] | Array) -> Array:
+    """Return values with NaN where they are not positive and finite, for a logarithmic axis."""
+    array = np.asarray(values, dtype=float)
+    return np.where((array > 0) & np.isfinite(array), array, np.nan)
+
+
+HEIGHT_MM = 52
+
+
+def scan_picture(young_pa: Array, misfit: Array, best: int) -> Figure:
+    """Draw the misfit of a scan over Young's modulus.
+
+    Parameters
+    ----------
+    young_pa : (k,)
+        Young's moduli, ascending.
+    misfit : (k,)
+        Misfit in standard deviations, NaN where the motion could not be simulated.
+    best : int
+        Index of the modulus at which the solve starts.
+    """
+    figure = framed_figure(COLUMN_MM, HEIGHT_MM, 14, 2, 9.5, 6)
+    axes = figure.subplots()
+    axes.plot(young_pa, misfit, "o-", ms=2.5, lw=LINE_PT, color=BLUE, label="simulated")
+    dress(axes, "", "Young's modulus E [Pa]", "misfit [σ]")
+    axes.set_xscale("log")
+    log_axis(axes)
+    failed = np.isnan(misfit)
+    if failed.any():
+        foot = np.full(int(failed.sum()), axes.get_ylim()[0])
+        axes.plot(
+            young_pa[failed], foot, "x", ms=5, color=VERMILION, clip_on=False, zorder=3,
+            label="not simulable",
+        )  # fmt: skip
+    axes.plot(young_pa[best], misfit[best], "D", ms=5, color=ORANGE, zorder=3, label="start")
+    legend_above(axes, columns=3)
+    return figure

@@ -1,0 +1,355 @@
+"""Writing of a run folder: result.json, arrays, ParaView frames and pictures.
+
+`write_run` writes the folder of a finished run; `draw_run` adds the pictures afterwards; `replays`
+gives the arrays of each experiment to pictures and films without a folder.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..array_types import Array
+from ..errors import InputError
+from ..fem.body import Body
+from ..files import RESULT_FILE, write_whole
+from ..program.contact_summary import surface_gaps_and_pressures
+from ..program.depth_comparison import SurfaceComparison
+from ..recording.experiment import Experiment
+from ..runs.forward_simulation import ForwardSimulation
+from ..runs.result_builder import build_result
+from ..runs.result_content import Result
+from ..runs.solved_problem import SolvedProblem
+from ..serialisation import as_json
+from .element_fields import ElementFields
+from .replay import Replay
+from .run_writers import run_folder, write_frames
+
+REFINEMENT_FILE = "refinement.json"
+
+
+def write_run(
+    finished: SolvedProblem, folder: str | Path, *, frames: bool = True, pictures: bool = True
+) -> Path:
+    """Write the folder of a run completely or not at all, then its pictures, and return the folder.
+
+    The folder gets ``result.json``, ``problem.toml`` as it was run if the problem has a file,
+    ``trajectory.npz``, and ``frames/`` with ``trajectory.pvd`` for ParaView. With several
+    experiments,
+    the name of the experiment precedes the names of arrays and the folders of frames. `draw_run`
+    adds
+    the pictures after the folder is in its place, so that an error while drawing does not lose the
+    result.
+
+    Parameters
+    ----------
+    finished : SolvedProblem
+        The solved problem.
+    folder : str or Path
+        An earlier, unchanged run at this place is replaced.
+    frames, pictures : bool
+        Whether to write ParaView frames, and pictures.
+
+    Raises
+    ------
+    InputError
+        If the folder holds anything but an earlier run; see `writers.run_folder`.
+    """
+    result = build_result(finished)
+    with run_folder(folder) as place:
+        origin = finished.problem.origin
+        if origin is not None:
+            (place / "problem.toml").write_text(origin.text, encoding="utf-8")
+        (place / RESULT_FILE).write_text(_as_text(result), encoding="utf-8")
+        if finished.refinement is not None and finished.refinement.levels:
+            text = as_json(finished.refinement)
+            (place / REFINEMENT_FILE).write_text(text + "\n", encoding="utf-8")
+        arrays = _arrays(replays(finished))
+        np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **arrays)
+        if frames:
+            _write_all_frames(finished, place)
+    if pictures:
+        draw_run(finished, Path(folder))
+    return Path(folder)
+
+
+def draw_run(
+    finished: SolvedProblem, folder: Path, say: Callable[[str], None] | None = None
+) -> Result:
+    """Draw the pictures of a run into its folder, and store in ``result.json`` how long that took.
+
+    Parameters
+    ----------
+    finished : SolvedProblem
+        The solved problem.
+    folder : Path
+        The folder that `write_run` wrote for this solved problem.
+    say : callable, optional
+        Called with a sentence about each picture before it is drawn.
+
+    Returns
+    -------
+    Result
+        The content of ``result.json`` afterwards.
+
+    Raises
+    ------
+    InputError
+        If the folder holds another result, or cannot be written to.
+    """
+    began_s = time.perf_counter()
+    result = build_result(finished)
+    file = folder / RESULT_FILE
+    _write_pictures(finished, result, folder, say or (lambda _: None))
+    if not file.is_file() or file.read_text(encoding="utf-8") != _as_text(result):
+        raise InputError(
+            f"{RESULT_FILE} was changed while the pictures were drawn; draw them again with: "
+            f"collocation-sysid plot {folder}",
+            folder,
+        )
+    pictures_s = time.perf_counter() - began_s
+    result = replace(result, elapsed_s=replace(result.elapsed_s, pictures=pictures_s))
+    write_whole(file, _as_text(result))
+    return result
+
+
+def _as_text(result: Result) -> str:
+    """Return the text of ``result.json``."""
+    return as_json(result) + "\n"
+
+
+def _write_pictures(
+    finished: SolvedProblem, result: Result, folder: Path, say: Callable[[str], None]
+) -> None:
+    """Draw all pictures of a run, including the Jacobian's structure, and write them into its
+    folder.
+    """
+    say("drawing the pictures")
+    # matplotlib takes a while to import, and nothing else needs it.
+    from .pictures import album, jacobian_sparsity, save_pictures
+
+    solution = finished.solution
+    jacobian = jacobian_sparsity(solution.collocation, solution.z)
+    save_pictures(folder, album(replays(finished), result) | {"jacobian": jacobian}, say)
+
+
+def _told_of_cells(finished: SolvedProblem, body: Body) -> dict[str, Any]:
+    """Return the cell data that are the same in every frame: region numbers and spatially varying
+    constants.
+
+    Each array has one row for each of the E elements. A constant has four: its estimate, the ends
+    of its
+    95 % interval (suffixes ``_lower``, ``_upper``), and its posterior over its prior standard
+    deviation
+    (suffix ``_over_prior``).
+    """
+    data: dict[str, Any] = {"region": body.part_of_cells} if len(body.parts) > 1 else {}
+    for name, values in _in_cells(finished, body).items():
+        heads = (name, f"{name}_lower", f"{name}_upper", f"{name}_over_prior")
+        data |= dict(zip(heads, values.T, strict=True))
+    return data
+
+
+def _write_all_frames(finished: SolvedProblem, place: Path) -> None:
+    """Write the ParaView frames of every fitted experiment into the folder `place`.
+
+    With several fitted experiments each has a subfolder of its name.
+    """
+    for part in finished.solution.parts:
+        segment = part.segment
+        positions = part.x.reshape(len(part.x), -1, 3)
+        here = place if len(finished.solution.parts) == 1 else place / segment.experiment.name
+        here.mkdir(exist_ok=True)
+        body = segment.body
+        residual = np.zeros((len(positions), segment.dof_count))
+        residual[:, segment.free_dofs] = part.residual_n
+        write_frames(
+            here,
+            segment.dynamics.t_s,
+            positions,
+            body.cells,
+            body.element,
+            body.nodes_m,
+            {"residual_force_n": residual.reshape(positions.shape)},
+            fields=ElementFields.of(body, body.theta_from_values(finished.solution.parameters)),
+            cell_data=_told_of_cells(finished, body),
+        )
+
+
+def replays(finished: SolvedProblem) -> list[Replay]:
+    """Return each experiment with its measured, fitted and simulated motion, for pictures and
+    files.
+
+    The fitted experiments come first, then those for validation. A validation experiment whose
+    forward
+    simulation failed is left out.
+    """
+    fitted = {}
+    collected = []
+    for part, readings in zip(finished.solution.parts, finished.solution.readings_m, strict=True):
+        x = part.x[part.segment.markers.sample_rows]
+        fitted[part.segment.experiment.name] = x.reshape(len(x), -1, 3), readings
+    for experiment in sorted(finished.problem.experiments, key=lambda each: each.validation):
+        rollout = finished.rollouts[experiment.name]
+        rolled_out = None
+        if isinstance(rollout, ForwardSimulation):
+            rolled_out = rollout.trajectory.positions_m, rollout.trajectory.markers_m
+        fit = fitted.get(experiment.name)
+        if (shown := fit or rolled_out) is not None:
+            motion = finished.modes_by_experiment.get(experiment.name)
+            natural = motion and np.array([mode.frequency_hz for mode in motion.modes])
+            places_m = _places_m(finished, experiment.name)
+            replay = Replay.of(
+                experiment,
+                fit,
+                rolled_out=rolled_out,
+                natural_hz=natural,
+                places_m=places_m,
+                wrenches=_sensed(finished, experiment),
+                readings=_own_readings(finished, experiment),
+                touched=_touched(finished, experiment, shown[0]),
+            )
+            of_cells = _in_cells(finished, experiment.body)
+            of_cameras = _seen(finished, experiment)
+            collected.append(replace(replay, fields=of_cells, seen=of_cameras))
+    return collected
+
+
+def _seen(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
+    """Return the points of each depth camera on the fitted surface, or else on the simulated one.
+
+    The arrays are as in `Replay.fit_summary`, by name of the camera; empty where neither surface is
+    known.
+    """
+    part = finished.solution.part_of(experiment.name)
+    rollout = finished.rollouts[experiment.name]
+    surfaces: Mapping[str, SurfaceComparison] = {}
+    if part is not None:
+        surfaces = {
+            reading.correspondences.camera.depth.name: SurfaceComparison.from_fit(
+                reading, part.x, values, part.phi
+            )
+            for reading, values in part.depth_residuals
+        }
+    elif isinstance(rollout, ForwardSimulation):
+        surfaces = rollout.depth_surfaces
+    if not surfaces:
+        return {}
+    from .depth_overlays import compared_rows  # which needs matplotlib
+
+    return {
+        name: compared_rows(surface, experiment.upward_direction)
+        for name, surface in surfaces.items()
+    }
+
+
+def _touched(
+    finished: SolvedProblem, experiment: Experiment, positions_m: Array
+) -> tuple[Array, Array] | None:
+    """Return gap [m] and contact pressure [Pa] on the surface, (T, F) each; None without obstacles.
+
+    `positions_m` are the node positions (T, n, 3).
+    """
+    if not experiment.obstacles:
+        return None
+    if (part := finished.solution.part_of(experiment.name)) is not None:
+        experiment = part.segment.corrected_experiment(part.phi)
+    theta = experiment.body.theta_from_values(finished.solution.parameters)
+    return surface_gaps_and_pressures(
+        experiment, np.array(theta), positions_m.reshape(len(positions_m), -1)
+    )
+
+
+def _in_cells(finished: SolvedProblem, body: Body) -> dict[str, Array]:
+    """Return the estimates (E, 4) of each spatially varying constant, by name of the field.
+
+    The columns are those of `Replay.fields`. Rows of elements in other regions are NaN.
+    """
+    estimates = {}
+    for part in body.parts:
+        if part.field is not None:
+            estimates[part.field_name] = np.full((len(body.cells), 4), np.nan)
+            estimates[part.field_name][part.cells] = finished.fields[part.field_name].by_element
+    return estimates
+
+
+def _sensed(finished: SolvedProblem, experiment: Experiment) -> list[Array]:
+    """Return an array (S, 19) for each force sensor: time, and the wrench measured, fitted and
+    simulated.
+
+    The wrenches are those of the whole specimen also where symmetry reduces the model to a part of
+    it.
+    NaN where the experiment was not fitted or not simulated.
+    """
+    sensors = experiment.wrenches
+    rollout = finished.rollouts[experiment.name]
+    fitted = finished.solution.wrenches
+    fit = fitted.get(experiment.name, [None] * len(sensors))
+    rolled = rollout.wrenches if isinstance(rollout, ForwardSimulation) else [None] * len(sensors)
+    both = zip(sensors, fit, rolled, strict=True)
+    sensed = []
+    for sensor, *models in both:
+        columns = _compared(sensor.t_s, sensor.values, *models)
+        columns[:, 1:] *= sensor.symmetry
+        sensed.append(columns)
+    return sensed
+
+
+def _own_readings(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
+    """Return an array (S, 1 + 3m) for each custom sensor, by name.
+
+    The columns are the time [s], and its m numbers as measured, fitted and simulated; NaN where the
+    experiment was not fitted or not simulated.
+    """
+    rollout = finished.rollouts[experiment.name]
+    fit = finished.solution.readings
+    rolled = rollout.readings if isinstance(rollout, ForwardSimulation) else {}
+    both = fit.get(experiment.name, {}), rolled
+    return {
+        gauge.name: _compared(
+            gauge.sample_times_s, gauge.measured_values, *(each.get(gauge.name) for each in both)
+        )
+        for gauge in experiment.readings
+    }
+
+
+def _compared(t_s: Array, measured: Array, *models: Array | None) -> Array:
+    """Return the columns time, measured values and the values of each model, as one array.
+
+    `t_s` is (S,), `measured` and each of `models` (S, m); the columns of a model that is None are
+    NaN.
+    """
+    columns = (np.full_like(measured, np.nan) if each is None else each for each in models)
+    return np.column_stack([t_s, measured, *columns])
+
+
+def _places_m(finished: SolvedProblem, experiment: str) -> Array | None:
+    """Return the estimated places (M, 3) of the markers on the undeformed body; None where that
+    failed.
+    """
+    if experiment in finished.places:
+        places = [place.position_m for place in finished.places[experiment].values()]
+        return np.array(places).reshape(-1, 3)
+    rollout = finished.rollouts[experiment]
+    if not isinstance(rollout, ForwardSimulation):
+        return None
+    return np.array([*rollout.places_m.values()]).reshape(-1, 3)
+
+
+def _arrays(seen: Sequence[Replay]) -> dict[str, Array]:
+    """Return the arrays of trajectory.npz by name.
+
+    The name of the experiment precedes the names of its arrays, except if it is the only fitted
+    one.
+    """
+    alone = sum(replay.positions_m is not None for replay in seen) == 1
+    arrays = {}
+    for replay in seen:
+        bare = alone and replay.positions_m is not None
+        arrays |= replay.arrays("" if bare else f"{replay.name}/")
+    return arrays

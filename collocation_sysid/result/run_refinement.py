@@ -1,0 +1,209 @@
+"""Measured discretisation error of a finished run, added to its folder.
+
+`refine_run` solves the problem of a run folder again at finer steps and meshes, and updates
+``result.json``; `refined` does the update alone.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from ..errors import InputError
+from ..files import RESULT_FILE, require_own, whole_file
+from ..model.parameters import Parameters
+from ..problem import Problem
+from ..runs.numerical_error import solve_refined
+from ..runs.result_content import ReportedEstimate, Result
+from ..runs.verdict import combined_concerns
+from ..runs.warm_start import WarmStart
+from ..serialisation import as_json, read
+from ..statistics.assessment import NUMERICAL, Assessment, numerical_concerns
+from ..statistics.combined_intervals import combine
+from ..statistics.discretisation_error import DiscretisationError, Refinement, RefinementLevel
+from ..statistics.estimates import Estimate
+from ..statistics.uncertainty_budget import NUMERICAL as DISCRETISATION
+from .replay import reading_run
+from .run_record import REFINEMENT_FILE
+
+# Code of the concern that is derived again from the new budget.
+UNDETERMINED = "information/combined"
+
+
+def refine_run(
+    folder: str | Path,
+    levels: int = 2,
+    allow_code: bool = False,
+    say: Callable[[str], None] | None = None,
+) -> tuple[Refinement, Result]:
+    """Solve the problem of a run folder again at finer discretisations, and update the folder.
+
+    ``refinement.json`` holds the levels; levels that it holds already are not solved again. In
+    ``result.json`` the values of parameters and moduli are corrected for the measured error, their
+    combined intervals and the budget contain it, and the verdict takes it into account.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The run folder.
+    levels : int
+        Number of discretisations, with that of the run: 2, or 3 to observe the orders of
+        convergence.
+    allow_code : bool
+        Whether Python files that the problem names may run.
+    say : callable, optional
+        Called with a sentence about what is being done.
+
+    Returns
+    -------
+    Refinement, Result
+        The measured errors, and the content of ``result.json``.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no converged run of a problem file, or files of the problem are missing.
+    KeyboardInterrupt
+        After an interrupt; the levels that were finished are in the folder.
+    """
+    run = Path(folder)
+    before = Result.read(folder)
+    file = run / RESULT_FILE
+    levels_file = run / REFINEMENT_FILE
+    home = before.problem_folder(file, "use collocation_sysid.refine")
+    if not before.converged:
+        raise InputError("the run did not converge: there is no answer to refine", file)
+    problem = Problem.read(run / "problem.toml", allow_code=allow_code, folder=home)
+    problem = replace(problem, substeps=before.problem.substeps)
+    estimates = _at_optimum(before, problem.parameters)
+    with reading_run(run):
+        known = _known_levels(levels_file, estimates)
+        answer = WarmStart.from_result(before, run)
+
+    def keep(refinement: Refinement) -> Result:
+        """Write a refinement and the updated result into the folder, and return the latter."""
+        after = refined(before, refinement, problem.parameters)
+        with whole_file(levels_file) as levels, whole_file(file) as draft:
+            levels.write_text(as_json(refinement) + "\n", encoding="utf-8")
+            draft.write_text(as_json(after) + "\n", encoding="utf-8")
+        return after
+
+    refinement = solve_refined(problem, answer, estimates, levels, say, known, keep)
+    return refinement, keep(refinement)
+
+
+def refined(before: Result, refinement: Refinement, parameters: Parameters) -> Result:
+    """Return a result with the measured discretisation error in place of the estimated one.
+
+    Parameters
+    ----------
+    before : Result
+        Content of ``result.json`` after the solve; not modified.
+    refinement : Refinement
+        The measured discretisation errors.
+    parameters : Parameters
+        Parameters of the problem, with their coordinates and bounds.
+    """
+    optimum = _at_optimum(before, parameters)
+
+    def corrected(values: Mapping[str, ReportedEstimate]) -> dict[str, ReportedEstimate]:
+        """Return estimates by name, corrected where the refinement measured their error."""
+        return {
+            name: _corrected(name, each, optimum[name], refinement.errors[name], parameters)
+            if name in optimum and name in refinement.errors
+            else each
+            for name, each in values.items()
+        }
+
+    after = replace(
+        before, parameters=corrected(before.parameters), derived=corrected(before.derived)
+    )
+    budget = {
+        name: _shares(shares, before.values[name], after.values[name])
+        for name, shares in before.budget.items()
+    }
+    uncertainties = {name: each.combined_std_error for name, each in after.values.items()}
+    others = [each for each in before.trust.concerns if each.code not in (*NUMERICAL, UNDETERMINED)]
+    concerns = (
+        *others,
+        *numerical_concerns(optimum, uncertainties, refinement),
+        *combined_concerns(parameters, after.values, budget),
+    )
+    return replace(after, budget=budget, trust=Assessment.from_concerns(concerns))
+
+
+def _at_optimum(result: Result, parameters: Parameters) -> dict[str, Estimate]:
+    """Return the estimates before the correction of the discretisation error, by name."""
+    return {
+        name: each.at_optimum(name, linear=name in parameters.linear_names)
+        for name, each in result.values.items()
+    }
+
+
+def _corrected(
+    name: str,
+    before: ReportedEstimate,
+    optimum: Estimate,
+    error: DiscretisationError,
+    parameters: Parameters,
+) -> ReportedEstimate:
+    """Return an estimate corrected for its measured discretisation error.
+
+    Parameters
+    ----------
+    name : str
+    before : ReportedEstimate
+    optimum : Estimate
+        The estimate at the optimum, before any correction.
+    error : DiscretisationError
+        The measured discretisation error.
+    parameters : Parameters
+    """
+    linear, bounds = parameters.scale_and_bounds(name)
+    combined = combine(
+        name,
+        optimum,
+        error,
+        before.systematic,
+        known_effect=before.known_effect or 0.0,
+        linear=linear,
+        bounds=bounds,
+    )
+    return replace(before, **vars(combined), numerical_error=error)
+
+
+def _shares(
+    shares: Mapping[str, float], before: ReportedEstimate, after: ReportedEstimate
+) -> dict[str, float]:
+    """Return the contributions to an estimate's variance with the measured discretisation error.
+
+    Parameters
+    ----------
+    shares : mapping of source to share
+        The contributions before; they sum to one.
+    before, after : ReportedEstimate
+        The estimate with the estimated and with the measured error.
+    """
+    if not before.combined_std_error or not after.combined_std_error:
+        return dict(shares)
+    ratio = (before.combined_std_error / after.combined_std_error) ** 2
+    # Standard errors are relative to their values, see `IntervalCoordinate`.
+    ratio *= (after.value / before.value) ** 2 if before.value else 1.0
+    others = {name: share * ratio for name, share in shares.items() if name != DISCRETISATION}
+    total = max(1.0, sum(others.values()))
+    corrected = {name: share / total for name, share in others.items()}
+    corrected[DISCRETISATION] = 1.0 - sum(corrected.values())
+    return dict(sorted(corrected.items(), key=lambda item: -item[1]))
+
+
+def _known_levels(file: Path, names: Iterable[str]) -> list[RefinementLevel]:
+    """Return the levels that an earlier call finished, with the values of `names` alone; empty if
+    none.
+    """
+    if not file.is_file():
+        return []
+    require_own(file)
+    levels = read(Refinement, json.loads(file.read_text(encoding="utf-8"))).levels
+    return [replace(each, values={name: each.values[name] for name in names}) for each in levels]

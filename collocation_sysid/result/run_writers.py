@@ -1,0 +1,375 @@
+"""ParaView frames, and safe replacement of run folders.
+
+`write_frames` writes a trajectory for ParaView. `run_folder` is the context in which a run folder
+is
+written: it appears at the end, complete or not at all, and never replaces files of others.
+"""
+
+from __future__ import annotations
+
+import glob
+import os
+import platform
+import re
+import secrets
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape, quoteattr
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+from ..fem.elements import Element
+from ..files import RESULT_FILE, naming
+from ..written_files import LIST_FILE, foreign_files, list_files
+from .element_fields import ElementFields
+
+VTK_CELL_TYPES = ("tetra", "tetra10")  # by meshio's names
+# More frames take disk space and add little to an animation.
+MAX_FRAMES = 200
+FRAMES_FILE = "trajectory.pvd"
+
+
+# Frames ---------------------------------------------------------------------------------------
+
+
+def write_vtu(
+    path: str | Path,
+    points_m: ArrayLike,
+    cells: ArrayLike,
+    meshio_type: str,
+    point_data: Mapping[str, ArrayLike] | None = None,
+    cell_data: Mapping[str, ArrayLike] | None = None,
+) -> None:
+    """Write an unstructured grid of one cell type as VTK XML with base64 data.
+
+    Parameters
+    ----------
+    path : str or Path
+    points_m : (n, 3)
+        Positions of the points.
+    cells : (E, nodes per cell)
+        Point indices of each cell.
+    meshio_type : {"tetra", "tetra10"}
+    point_data : mapping of name to (n,) or (n, k), optional
+    cell_data : mapping of name to (E,) or (E, k), optional
+
+    Raises
+    ------
+    InputError
+        For an unknown cell type, or data of another length.
+    """
+    import meshio  # which takes a while to import
+
+    if meshio_type not in VTK_CELL_TYPES:
+        raise InputError(
+            f"no cell type {meshio_type!r}; available: {', '.join(VTK_CELL_TYPES)}", path
+        )
+    points = np.asarray(points_m, dtype=float)
+    nodes = np.asarray(cells, dtype=np.int64)
+    at_points = _arrays("point", point_data or {}, len(points), path)
+    in_cells = _arrays("cell", cell_data or {}, len(nodes), path)
+    by_block: dict[str, Any] = {name: [array] for name, array in in_cells.items()}
+    mesh = meshio.Mesh(points, [(meshio_type, nodes)], {**at_points}, by_block)
+    meshio.vtu.write(path, mesh, compression="")
+
+
+def _arrays(
+    kind: str, data: Mapping[str, ArrayLike], count: int, path: str | Path
+) -> dict[str, NDArray]:
+    """Return data as arrays of types that VTK has, with names escaped for XML.
+
+    Parameters
+    ----------
+    kind : {"point", "cell"}
+        The kind of data, for messages.
+    data : mapping of name to (count,) or (count, k)
+    count : int
+        Required number of rows.
+    path : str or Path
+        File that an error names.
+
+    Raises
+    ------
+    InputError
+        For data with another number of rows or of dimensions.
+    """
+    arrays = {name: np.asarray(values) for name, values in data.items()}
+    for name, array in arrays.items():
+        if array.ndim not in (1, 2) or len(array) != count:
+            raise InputError(
+                f"{kind} data '{name}' has shape {array.shape}, expected one row for each of "
+                f"{count} {kind}s",
+                path,
+            )
+        if array.dtype.kind == "b":
+            arrays[name] = array.astype(np.int8)
+    return {escape(name, {'"': "&quot;"}): array for name, array in arrays.items()}
+
+
+def write_pvd(path: str | Path, frames: Sequence[tuple[float, str | Path]]) -> None:
+    """Write the list of frames that ParaView opens as one animation.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to write.
+    frames : sequence of (float, str or Path)
+        Time [s] and file of each frame; files are stored relative to the folder of `path`.
+    """
+    folder = Path(path).parent.resolve()
+    lines = []
+    for t_s, file in frames:
+        name = Path(os.path.relpath(Path(file).resolve(), folder)).as_posix()
+        lines.append(f'<DataSet timestep="{t_s:.9g}" part="0" file={quoteattr(name)}/>\n')
+    Path(path).write_text(
+        '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n<Collection>\n'
+        f"{''.join(lines)}</Collection>\n</VTKFile>\n",
+        encoding="utf-8",
+    )
+
+
+def write_frames(
+    folder: str | Path,
+    t_s: ArrayLike,
+    positions_m: ArrayLike,
+    cells: ArrayLike,
+    element: Element,
+    undeformed_m: ArrayLike,
+    point_series: Mapping[str, ArrayLike] | None = None,
+    max_frames: int = MAX_FRAMES,
+    fields: ElementFields | None = None,
+    cell_data: Mapping[str, ArrayLike] | None = None,
+) -> Path:
+    """Write a trajectory as frames/frame_0000.vtu, … and trajectory.pvd, and return the latter.
+
+    Every frame has `displacement_m` and `velocity_m_s` at the points, and the `fields` in the
+    cells. Of
+    more than `max_frames` samples every second, third, … is written.
+
+    Parameters
+    ----------
+    folder : str or Path
+        An existing folder.
+    t_s : (T,)
+        Evenly spaced times.
+    positions_m : (T, n, 3)
+        Positions of the nodes.
+    cells : (E, nodes per element)
+        Node indices of each element.
+    element : Element
+    undeformed_m : (n, 3)
+        Nodes of the undeformed body.
+    point_series : mapping of name to (T, n) or (T, n, k), optional
+        Further data at the points.
+    max_frames : int
+    fields : ElementFields, optional
+        Stress, energy density and det F of each element.
+    cell_data : mapping of name to (E,), optional
+        Further data of the cells, the same in every frame.
+    """
+    times = np.asarray(t_s, dtype=float)
+    positions = np.asarray(positions_m, dtype=float)
+    alone = len(times) == 1
+    velocities = np.zeros_like(positions) if alone else np.gradient(positions, times, axis=0)
+    series = {name: np.asarray(values) for name, values in (point_series or {}).items()}
+    frames = Path(folder) / "frames"
+    frames.mkdir(exist_ok=True)
+    written = []
+    for number, k in enumerate(range(0, len(times), -(-len(times) // max_frames))):
+        file = frames / f"frame_{number:04d}.vtu"
+        data = {
+            "displacement_m": positions[k] - undeformed_m,
+            "velocity_m_s": velocities[k],
+            **{name: values[k] for name, values in series.items()},
+        }
+        in_cells = dict(cell_data or {})
+        if fields is not None:
+            in_cells |= {name: values[0] for name, values in fields.at(positions[k]).items()}
+        write_vtu(file, positions[k], cells, element.meshio_type, data, in_cells)
+        written.append((float(times[k]), file))
+    listing = Path(folder) / FRAMES_FILE
+    write_pvd(listing, written)
+    return listing
+
+
+# Folder ---------------------------------------------------------------------------------------
+
+
+@contextmanager
+def run_folder(
+    path: str | Path, overwrite: bool = True, mark: str = RESULT_FILE, what: str = "run"
+) -> Iterator[Path]:
+    """Yield a temporary folder to write into, and rename it to `path` at the end.
+
+    An earlier run at `path` is replaced completely, at the end, if this program wrote every file in
+    it
+    and none was changed since. After an exception the temporary folder is removed and `path` is
+    unchanged. The folder gets a list of its files, see `written_files`.
+
+    Parameters
+    ----------
+    path : str or Path
+    overwrite : bool
+        Whether an earlier run may be replaced.
+    mark : str
+        Name of a file by which an earlier run is recognised.
+    what : str
+        Word for the content in messages.
+
+    Raises
+    ------
+    InputError
+        If there is anything else at `path`, or a link; this is checked before the temporary folder
+        is
+        given, so that no work is lost, and again at the end.
+    """
+    target = _unlinked(Path(path))
+    require_replaceable(target, overwrite, mark, what)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    _remove_stale(target)
+    owner = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"
+    temporary = target.with_name(f".{target.name}.{owner}.partial")
+    temporary.mkdir()
+    try:
+        with naming(target, temporary):
+            yield temporary
+            list_files(temporary)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    try:
+        require_replaceable(target, overwrite, mark, what)
+        _put_in_place(temporary, target, target.with_name(f".{target.name}.{owner}.old"))
+    except (InputError, OSError) as error:
+        kept = target.with_name(f"{target.name}-{owner}")
+        with suppress(OSError):
+            temporary = temporary.rename(kept)
+        raise InputError(
+            f"the finished run cannot be put there ({error}); it is kept in {temporary}", target
+        ) from error
+
+
+def _unlinked(path: Path) -> Path:
+    """Return the absolute path with all links resolved, except a link at `path` itself."""
+    return path.resolve() if path.name in ("", "..") else path.parent.resolve() / path.name
+
+
+def _remove_stale(target: Path) -> None:
+    """Remove temporary folders beside `target` that a killed process of this machine left behind.
+
+    On Windows nothing is removed, because it cannot be known whether a process with that number
+    runs.
+    """
+    if os.name != "posix":
+        return
+    for folder in target.parent.glob(f".{glob.escape(target.name)}.*.partial"):
+        pattern = rf".*\.{re.escape(platform.node())}-(\d+)-\w+\.partial"
+        match = re.fullmatch(pattern, folder.name)
+        if match and not _runs(int(match[1])):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _runs(process: int) -> bool:
+    """Return whether a process with this number is running on this machine."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # another user's
+        return True
+    return True
+
+
+def require_replaceable(
+    target: Path, overwrite: bool = True, mark: str = RESULT_FILE, what: str = "run"
+) -> None:
+    """Refuse a place for a run folder that holds anything but an earlier run.
+
+    Parameters are those of `run_folder`.
+
+    Raises
+    ------
+    InputError
+        Naming the place, and the first link or file there that this program did not write.
+    """
+    require_no_link(target)
+    if not target.exists():
+        return
+    if not target.is_dir():
+        raise InputError("is a file, expected a folder for the run; choose another", target)
+    if os.path.ismount(target):
+        raise InputError("is a mount point and cannot be replaced; choose a folder in it", target)
+    if not any(target.iterdir()):
+        return
+    if not (target / mark).is_file():
+        raise InputError(
+            f"the folder has files but no {mark}, so it is not an earlier {what} and is left "
+            "alone; choose another folder",
+            target,
+        )
+    if not overwrite:
+        raise InputError(
+            "the folder holds an earlier run; choose another, or allow it to be overwritten", target
+        )
+    require_only_written(target)
+
+
+def require_no_link(folder: Path) -> None:
+    """Refuse a link where a folder is to be written.
+
+    Raises
+    ------
+    InputError
+        Naming the link.
+    """
+    if folder.is_symlink():
+        raise InputError(
+            f"is a link to {os.readlink(folder)}, and nothing is written through links; give that "
+            "folder itself or another, or remove the link",
+            folder,
+        )
+
+
+def require_only_written(folder: Path) -> None:
+    """Refuse a folder with a link, with a file that this program did not write, or with a changed
+    file.
+
+    Raises
+    ------
+    InputError
+        Naming the folder and the first such file.
+    """
+    file = next(foreign_files(folder), None)
+    if file is None:
+        return
+    name = file.relative_to(folder).as_posix()
+    if file.is_symlink():
+        why = f"{name} in it is a link"
+    elif (folder / LIST_FILE).is_file():
+        why = f"{name} in it was not written by this program, or was changed since"
+    else:
+        why = f"it has no {LIST_FILE}, which lists what this program wrote, but has {name}"
+    raise InputError(
+        f"{why}, so the folder is left alone; choose another, or move that away", folder
+    )
+
+
+def _put_in_place(new: Path, target: Path, aside: Path) -> None:
+    """Rename the folder `new` to `target`, moving an existing `target` to `aside` until that
+    succeeded.
+    """
+    if not target.exists():
+        new.rename(target)
+        return
+    target.rename(aside)
+    try:
+        new.rename(target)
+    except OSError:
+        aside.rename(target)
+        raise
+    shutil.rmtree(aside, ignore_errors=True)

@@ -1,0 +1,408 @@
+"""Check of a body: size, mesh, suitability of its elements, and grasps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from ...array_types import Array
+from ...fem.body import Body
+from ...fem.constants import is_field_coefficient
+from ...fem.mesh import TetMesh
+from ...fem.mesh_checks import edge_lengths, mean_ratios
+from ...fem.moduli import engineering_constants
+from ...fem.spatial_field import FieldResolution
+from ...recording.experiment import Experiment
+from ...recording.grasp import Grasp
+from ...statistics.concerns import Concern, concern_if
+
+# Mean-ratio quality below which an element's shape functions are poor.
+POOR_QUALITY = 0.1
+# Too stiff from this Poisson's ratio on: linear tetrahedra cannot keep their volume and bend;
+# with quadratic ones a beam's stiffness is found 6 % too low at 0.45, and 12 % at 0.49.
+LOCKING_POISSON = {"tet4": 0.4, "tet10": 0.45}
+# Rounding of Poisson's ratio, which is converted to λ and μ and back, and of the elements across.
+ROUNDING = 1e-6
+# Ratio of length to thickness above which a body bends like a beam.
+LEAST_SLENDERNESS = 2.5
+# Elements needed across the thickness of a bending body: with averaged dilatation one element
+# sags by half too much, two by 4 to 8 %.
+CELLS_ACROSS = {"tet4": 4.0, "tet10-p0": 2.0}
+# Name of the linear element.
+LINEAR = "tet4"
+# Remedies in messages.
+FOR_BENDING = 'set object.element = "tet10"'
+FOR_VOLUME = 'set object.element = "tet10-p0"'
+
+_FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
+
+
+@dataclass(frozen=True)
+class ElementShape:
+    """Shape of an element, compared with the regular tetrahedron.
+
+    Attributes
+    ----------
+    element : int
+        Its index.
+    quality : float
+        Mean ratio: 1 for the regular tetrahedron, towards 0 the flatter it is.
+    aspect_ratio : float
+        Longest edge over smallest height: 1.22 for the regular tetrahedron.
+    longest_edge_m : float
+    """
+
+    element: int
+    quality: float
+    aspect_ratio: float
+    longest_edge_m: float
+
+
+@dataclass(frozen=True)
+class Slenderness:
+    """Slenderness of a body, and number of elements across its thickness.
+
+    Attributes
+    ----------
+    length_m, thickness_m : float
+    cells_across : float
+        Thickness over the size of a cell of six tetrahedra.
+    """
+
+    length_m: float
+    thickness_m: float
+    cells_across: float
+
+
+def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
+    """Return the `count` elements of lowest quality, worst first."""
+    corners = mesh.points_m[mesh.tetrahedra]
+    areas = [_areas(corners[:, face]) for face in _FACES]
+    heights = 3 * mesh.volumes_m3 / np.max(areas, axis=0)
+    quality = mean_ratios(mesh.points_m, mesh.tetrahedra)
+    longest = edge_lengths(mesh.points_m, mesh.tetrahedra).max(axis=1)
+    return tuple(
+        ElementShape(int(e), float(quality[e]), float(longest[e] / heights[e]), float(longest[e]))
+        for e in np.argsort(quality, kind="stable")[:count]
+    )
+
+
+def slenderness(mesh: TetMesh) -> Slenderness:
+    """Return length and thickness of a body, and the number of elements across its thickness."""
+    # Edges of the box with the same second moments, however it is turned.
+    edges = np.sqrt(12 * np.linalg.eigvalsh(_covariance(mesh)))
+    # A bent or hollow body is thinner than its extents: six times volume over surface is a cube's
+    # edge, and more than the thickness of beams and plates.
+    area = float(_areas(mesh.points_m[mesh.surface]).sum())
+    thickness = min(float(edges[0]), 6 * mesh.volume_m3 / area)
+    cell = float(np.cbrt(6 * np.median(mesh.volumes_m3)))
+    return Slenderness(float(edges[-1]), thickness, thickness / cell)
+
+
+def element_concerns(
+    body: Body, theta: Array, shape: Slenderness, worst: ElementShape
+) -> list[Concern]:
+    """Return concerns about flat elements, locking, and too few elements across the thickness.
+
+    Parameters
+    ----------
+    body : Body
+    theta : array
+        Constants θ at the guess.
+    shape : Slenderness
+    worst : ElementShape
+        Element of the lowest quality.
+    """
+    name = body.element.name
+    needed = CELLS_ACROSS.get(body.element.name, 0.0)
+    poisson = max(engineering_constants(*lame)[1] for lame in body.lame(theta).values())
+    limit = LOCKING_POISSON.get(name, np.inf)
+    slender = shape.length_m > LEAST_SLENDERNESS * shape.thickness_m
+    off, level = ("stiff", "low") if name == LINEAR else ("soft", "high")
+    return [
+        *concern_if(
+            worst.quality < POOR_QUALITY,
+            False,
+            "mesh/flat",
+            number=worst.element,
+            quality=worst.quality,
+            aspect_ratio=worst.aspect_ratio,
+        ),
+        *concern_if(
+            poisson >= limit - ROUNDING,
+            False,
+            "mesh/locks",
+            poisson=poisson,
+            element=name,
+            limit=limit,
+            remedy=FOR_VOLUME,
+        ),
+        *concern_if(
+            slender and shape.cells_across < needed - ROUNDING,
+            False,
+            "mesh/few",
+            cells=shape.cells_across,
+            element=name,
+            thickness_mm=1e3 * shape.thickness_m,
+            off=off,
+            level=level,
+            remedy=f"{FOR_BENDING}, or refine" if name == LINEAR else "refine",
+            needed=needed,
+        ),
+    ]
+
+
+def _covariance(mesh: TetMesh) -> Array:
+    """Mean of (x − x̄)(x − x̄)ᵀ over the volume, (3, 3) [m²]."""
+    shares = mesh.volumes_m3 / mesh.volume_m3
+    corners = mesh.points_m[mesh.tetrahedra]
+    corners = corners - shares @ corners.mean(axis=1)
+    # Over a tetrahedron the mean of x xᵀ is (Σ xᵢ xᵢᵀ + Σ xᵢ Σ xᵢᵀ) / 20.
+    sums = corners.sum(axis=1)
+    squares = np.einsum("e,eci,ecj->ij", shares, corners, corners)
+    return (squares + np.einsum("e,ei,ej->ij", shares, sums, sums)) / 20
+
+
+def _areas(triangles: Array) -> Array:
+    """Return the areas (k,) of triangles (k, 3, 3)."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return np.linalg.norm(normals, axis=1) / 2
+
+
+# Shapes that hold less of a field's variance leave most of it to the interval.
+LEAST_FIELD_VARIANCE = 0.5
+
+
+@dataclass(frozen=True)
+class BodyCheck:
+    """Size, mesh and guess of a body.
+
+    Attributes
+    ----------
+    experiments : tuple of str
+        Names of its experiments.
+    element : str
+    size_m : (x, y, z) extents along the axes
+    edges_m : shortest, mean and longest edge
+    worst_elements : tuple of ElementShape, worst first
+    cells_across : float
+        Number of elements across the body's thickness.
+    guess : mapping of name to float
+        Values of the constants, and of E and ν at small strain, at the guess.
+    concerns : tuple of Concern
+        Concerns about the elements; `warnings` are their sentences.
+    fields : mapping of the name of a constant to FieldResolution
+        Constants that vary in space.
+    rest_shape : str or None
+        "stress_free" or "under_gravity" where that is stated or follows from how the mesh was made.
+    rest_shape_change_m : float
+        Largest distance of the mesh from the stress-free shape at the guess; NaN where there is no
+        such shape.
+    """
+
+    SERIALISED_PROPERTIES: ClassVar = ("warnings",)
+
+    experiments: tuple[str, ...]
+    nodes: int
+    elements: int
+    element: str
+    volume_m3: float
+    mass_kg: float
+    size_m: tuple[float, float, float]
+    edges_m: tuple[float, float, float]
+    smallest_element_quality: float
+    median_element_quality: float
+    worst_elements: tuple[ElementShape, ...]
+    cells_across: float
+    guess: dict[str, float]
+    concerns: tuple[Concern, ...]
+    fields: dict[str, FieldResolution]
+    rest_shape: str | None = None
+    rest_shape_change_m: float = 0.0
+
+    @property
+    def diagonal_m(self) -> float:
+        """Length of the diagonal of the body's bounding box [m]."""
+        return float(np.linalg.norm(self.size_m))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences of the concerns about this body."""
+        return tuple(concern.message for concern in self.concerns)
+
+
+def check_body(body: Body, theta: Array, experiments: tuple[str, ...]) -> BodyCheck:
+    """Return size, mesh and guess of a body.
+
+    Parameters
+    ----------
+    body : Body
+    theta : array
+        Constants θ at the guess.
+    experiments : tuple of str
+        Names of its experiments.
+    """
+    mesh = body.mesh
+    fields = {part.field_name: part.field.resolution for part in body.parts if part.field}
+    quality = mesh.quality()
+    worst = worst_elements(mesh)
+    shape = slenderness(mesh)
+    x, y, z = np.ptp(mesh.bounds_m, axis=0).tolist()
+    return BodyCheck(
+        experiments,
+        nodes=len(body.nodes.points_m),
+        elements=len(body.cells),
+        element=body.element.name,
+        volume_m3=mesh.volume_m3,
+        mass_kg=float(body.mass_of_dofs(theta).sum()) / 3,
+        size_m=(x, y, z),
+        edges_m=(quality.edge_min_m, quality.edge_mean_m, quality.edge_max_m),
+        smallest_element_quality=quality.quality_min,
+        median_element_quality=quality.quality_median,
+        worst_elements=worst,
+        cells_across=shape.cells_across,
+        guess=_constants_at_guess(body, theta),
+        concerns=(*element_concerns(body, theta, shape, worst[0]), *_field_concerns(fields)),
+        fields=fields,
+        rest_shape=_rest_shape(body),
+        rest_shape_change_m=_rest_shape_change_m(body, theta),
+    )
+
+
+def _rest_shape(body: Body) -> str | None:
+    """Return the kind of the stated rest shape; None if none is stated."""
+    if body.rest_shape is None:
+        return None
+    return "stress_free" if body.scan_conditions is None else "under_gravity"
+
+
+def _rest_shape_change_m(body: Body, theta: Array) -> float:
+    """Return the largest distance of the mesh from the stress-free shape [m], NaN without one."""
+    if body.inverse_equilibrium is None:
+        return 0.0
+    if body.rest_shape_failure(theta) is not None:
+        return float("nan")
+    change_m = body.inverse_equilibrium.solve(theta).positions_m - body.nodes.points_m
+    return float(np.linalg.norm(change_m, axis=1).max())
+
+
+def _field_concerns(fields: Mapping[str, FieldResolution]) -> Iterator[Concern]:
+    """Yield a concern for each field with too few shapes for its correlation length."""
+    for name, field in fields.items():
+        if field.share < LEAST_FIELD_VARIANCE:
+            yield Concern("field/shapes", data={"name": name, **vars(field)})
+
+
+def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
+    """Return constants, and E and ν at small strain, by name."""
+    moduli = {}
+    for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
+        young, poisson = engineering_constants(*lame)
+        moduli |= {part.full_name("young_pa"): young, part.full_name("poisson"): poisson}
+    constants = zip(body.constants, theta.tolist(), strict=True)
+    return moduli | {name: value for name, value in constants if not is_field_coefficient(name)}
+
+
+# Distance from the box of the held nodes, in mean edges, below which it is by chance whether a node
+# is held.
+NEAR_EDGES = 0.1
+# Distance from that box, in mean edges, that is rounding.
+ROUND_OFF_EDGES = 1e-6
+# Largest distance from that box, in mean edges, of the neighbours of the held nodes.
+NEIGHBOUR_EDGES = 1.5
+
+
+@dataclass(frozen=True)
+class GraspCheck:
+    """The nodes of one grasp.
+
+    Attributes
+    ----------
+    experiment : str
+    nodes : int
+        Number of nodes.
+    low_m, high_m : (3,) corners of the box around them, on the undeformed body
+    share : float
+        Share of all nodes.
+    nearly_held : int
+        Number of free nodes beside the box, less than a tenth of an edge beyond one of its faces.
+    nearly_free : int
+        Number of held nodes less than a tenth of an edge inside a face beyond which the body
+        continues, and not in that face.
+    axes : str
+        Axes along which the grasp holds.
+    """
+
+    experiment: str
+    nodes: int
+    low_m: tuple[float, ...]
+    high_m: tuple[float, ...]
+    share: float
+    nearly_held: int
+    nearly_free: int
+    axes: str = "xyz"
+
+
+def check_grasps(experiment: Experiment, mean_edge_m: float) -> tuple[GraspCheck, ...]:
+    """Return the held nodes of each grasp; `mean_edge_m` is the mean edge length of the mesh."""
+    points_m = experiment.body.nodes.points_m
+    return tuple(
+        _check_grasp(experiment.name, points_m, g, mean_edge_m) for g in experiment.body_grasps
+    )
+
+
+def _check_grasp(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -> GraspCheck:
+    """Return the held nodes of one grasp."""
+    nodes = grasp.nodes
+    held_m = points_m[nodes]
+    free_m = np.delete(points_m, nodes, axis=0)
+    low = held_m.min(axis=0)
+    high = held_m.max(axis=0)
+    outside_m = np.concatenate([low - free_m, free_m - high], axis=1)
+    is_neighbour = outside_m.max(axis=1, initial=-np.inf) < NEIGHBOUR_EDGES * mean_edge_m
+    # Behind faces of the box that the body goes on beyond, as far as the nearest held node.
+    inner = (outside_m > 0).any(axis=0)
+    depth_m = np.concatenate([held_m - low, high - held_m], axis=1)[:, inner]
+    least_m = ROUND_OFF_EDGES * mean_edge_m
+    reach_m = NEAR_EDGES * mean_edge_m
+    slightly_outside = (outside_m > least_m) & (outside_m < reach_m) & is_neighbour[:, None]
+    slightly_inside = (depth_m > least_m) & (depth_m < reach_m)
+    return GraspCheck(
+        name,
+        len(nodes),
+        tuple(low.tolist()),
+        tuple(high.tolist()),
+        len(nodes) / len(points_m),
+        int(slightly_outside.any(axis=1).sum()),
+        int(slightly_inside.any(axis=1).sum()),
+        grasp.axes,
+    )
+
+
+def grasp_sentence(grasp_check: GraspCheck) -> str:
+    """Return a description of the held nodes of a grasp."""
+    size = " × ".join(
+        f"{1e3 * (b - a):.4g}" for a, b in zip(grasp_check.low_m, grasp_check.high_m, strict=True)
+    )
+    low = ", ".join(f"{1e3 * x:.4g}" for x in grasp_check.low_m)
+    axes = (
+        "" if grasp_check.axes == "xyz" else f", held along {' and '.join(grasp_check.axes)} only"
+    )
+    nodes = f"{grasp_check.nodes} nodes, {grasp_check.share:.0%} of all"
+    return f"{nodes}, in a box of {size} mm at ({low}) mm{axes}"
+
+
+def grasp_concerns(grasp_check: GraspCheck) -> list[Concern]:
+    """Return a concern if rounding decides which nodes are held."""
+    by_chance = bool(grasp_check.nearly_held or grasp_check.nearly_free)
+    counts = {
+        "nodes": grasp_check.nodes,
+        "nearly_held": grasp_check.nearly_held,
+        "nearly_free": grasp_check.nearly_free,
+    }
+    return concern_if(
+        by_chance, False, "description/grasp", experiment=grasp_check.experiment, **counts
+    )

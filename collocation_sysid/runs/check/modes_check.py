@@ -1,0 +1,272 @@
+"""Check of natural modes: oscillation of the body in its grasps, and its resolution by the time
+grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...array_types import Array
+from ...errors import SimulationError
+from ...model.forces import Forces
+from ...model.numerical_damping import PERIOD_ERROR, numerical_mode, substeps_needed
+from ...model.schemes import Scheme
+from ...program.initial_equilibrium import equilibrium
+from ...program.natural_modes import Modes, natural_modes
+from ...program.newton_solver import NewtonSolver
+from ...recording.experiment import Experiment
+from ...statistics.concerns import Concern, concern_if
+
+# Number of modes.
+MODE_COUNT = 6
+# Largest numerical damping ratio, as a share of the material's.
+DAMPING_SHARE = 0.1
+# Largest numerical damping ratio of a mode with little damping.
+LEAST_DAMPING_LIMIT = 0.005
+# Fewest grid steps per period with which the motion of a mode is computed well.
+FEW_STEPS = 8
+# Fewest samples per period with which the motion of a mode is measured well.
+FEW_SAMPLES = 3
+# Scheme without numerical damping.
+UNDAMPED = "midpoint"
+# Decimals of numerical damping ratios: further ones are rounding.
+ROUNDING = 12
+
+
+@dataclass(frozen=True)
+class ModeCheck:
+    """One natural mode.
+
+    Attributes
+    ----------
+    frequency_hz : float
+    samples_per_period, steps_per_period : float
+        Samples of the recording, and steps of the time grid.
+    damping_ratio : float
+        Of the material.
+    numerical_damping_ratio : float
+        Damping ratio that the scheme adds; negative where it takes some away.
+    period_error : float
+        Relative lengthening of the undamped period by the scheme.
+    """
+
+    frequency_hz: float
+    samples_per_period: float
+    steps_per_period: float
+    damping_ratio: float
+    numerical_damping_ratio: float
+    period_error: float
+
+
+@dataclass(frozen=True)
+class ModesCheck:
+    """Natural modes of the body in one experiment, and errors of the time scheme.
+
+    Attributes
+    ----------
+    experiment : str
+    about : str
+        State about which the body oscillates: "rest state" or "undeformed shape".
+    modes : tuple of ModeCheck, by frequency
+    scheme : str
+    timestep_s : float
+        Step of the time grid.
+    duration_s : float
+    substeps_needed : int or None
+        The fewest with which the scheme damps and slows the first mode little; None if too many.
+    not_oscillating : int
+        Number of rigid modes that were left out.
+    """
+
+    experiment: str
+    about: str
+    modes: tuple[ModeCheck, ...]
+    scheme: str
+    timestep_s: float
+    duration_s: float
+    substeps_needed: int | None
+    not_oscillating: int
+
+    @property
+    def first_mode(self) -> ModeCheck | None:
+        """Mode of the lowest frequency; None if there is none."""
+        return self.modes[0] if self.modes else None
+
+
+def check_modes(experiment: Experiment, scheme: Scheme, step_s: float, theta: Array) -> ModesCheck:
+    """Return the natural modes of an experiment when fewest dofs are held, and errors of the
+    scheme.
+
+    Of several such samples the last counts, when all point masses have joined.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    scheme : Scheme
+    step_s : float
+        Step of the time grid.
+    theta : array
+        Constants θ of the body.
+    """
+    is_held = experiment.is_prescribed(experiment.t_s)
+    count = is_held.sum(axis=(1, 2))
+    least = int(np.flatnonzero(count == count.min())[-1])
+    time_s = float(experiment.t_s[least])
+    x, about = _reference_state(experiment, is_held[least], time_s, theta)
+    free = np.flatnonzero(~is_held[least])
+    modes = natural_modes(Forces.from_experiment(experiment, time_s, theta), x, free, MODE_COUNT)
+    findings = _mode_findings(modes, experiment, scheme, step_s)
+    needed = None
+    if findings:
+        omega = float(modes.angular_frequencies_rad_s[0])
+        limit = _damping_limit(findings[0])
+        ratio = _oscillating_damping_ratio(findings[0].damping_ratio)
+        needed = substeps_needed(scheme, omega, experiment.timestep_s, limit, damping_ratio=ratio)
+    return ModesCheck(
+        experiment.name,
+        about,
+        findings,
+        scheme.name,
+        step_s,
+        experiment.duration_s,
+        needed,
+        modes.omitted_count,
+    )
+
+
+def _reference_state(
+    experiment: Experiment, held: NDArray[np.bool_], time_s: float, theta: Array
+) -> tuple[Array, str]:
+    """Return node positions (n, 3) [m] about which the body oscillates, and the name of this state.
+
+    The equilibrium if it can be found, else the undeformed shape.
+    """
+    if held.any():
+        try:
+            solver = NewtonSolver(experiment, prescribed=held)
+            return equilibrium(experiment, theta, time_s, solver=solver), "rest state"
+        except SimulationError:
+            pass
+    return experiment.rigid_positions([time_s])[0], "undeformed shape"
+
+
+def _mode_findings(
+    modes: Modes, experiment: Experiment, scheme: Scheme, step_s: float
+) -> tuple[ModeCheck, ...]:
+    """Return the findings of each mode."""
+    findings = []
+    for frequency, ratio in zip(modes.frequencies_hz, modes.damping_ratios, strict=True):
+        omega = 2 * np.pi * frequency
+        undamped = numerical_mode(scheme, omega, step_s)
+        damped = numerical_mode(scheme, omega, step_s, _oscillating_damping_ratio(float(ratio)))
+        findings.append(
+            ModeCheck(
+                float(frequency),
+                float(1 / frequency / experiment.timestep_s),
+                float(1 / frequency / step_s),
+                float(ratio),
+                round(damped.damping_ratio, ROUNDING) + 0.0,  # no −0
+                undamped.period_error,
+            )
+        )
+    return tuple(findings)
+
+
+def _oscillating_damping_ratio(damping_ratio: float) -> float:
+    """Return the damping ratio of an oscillating mode; 0 for an overdamped one.
+
+    The scheme's change of the damping of an overdamped mode does not matter.
+    """
+    return damping_ratio if damping_ratio < 1 else 0.0
+
+
+def _damping_limit(mode: ModeCheck) -> float:
+    """Return the largest numerical damping ratio that is accepted for a mode."""
+    return max(DAMPING_SHARE * mode.damping_ratio, LEAST_DAMPING_LIMIT)
+
+
+def mode_concerns(motion: ModesCheck) -> list[Concern]:
+    """Return concerns about too few steps, too few samples or a recording shorter than a period."""
+    mode = motion.first_mode
+    if mode is None:
+        return []
+    first = _first_mode_data(motion, mode)
+    samples = mode.samples_per_period
+    rate_data = {"samples": samples, "needed_hz": FEW_STEPS * mode.frequency_hz}
+    is_short = motion.duration_s * mode.frequency_hz < 1
+    duration_data = {"duration_s": motion.duration_s}
+    return [
+        *_grid_concerns(motion, mode),
+        *concern_if(samples < FEW_SAMPLES, False, "information/rate", **first, **rate_data),
+        *concern_if(is_short, False, "information/short", **first, **duration_data),
+    ]
+
+
+def _grid_concerns(motion: ModesCheck, mode: ModeCheck) -> list[Concern]:
+    """Return a concern if the scheme changes the damping too much, or has too few steps per
+    period.
+    """
+    first = _first_mode_data(motion, mode)
+    added = mode.numerical_damping_ratio
+    if abs(added) > _damping_limit(mode):
+        remedy = _step_remedy(motion)
+        if motion.scheme != UNDAMPED:
+            or_finer = "" if motion.substeps_needed is None else f", or {_substeps_setting(motion)}"
+            remedy = f'set transcription.scheme = "{UNDAMPED}"{or_finer}'
+        grid = {"scheme": motion.scheme, "step_ms": 1e3 * motion.timestep_s, "ratio": abs(added)}
+        code = "scheme/adds" if added > 0 else "scheme/takes"
+        return [Concern(code, data=first | grid | {"remedy": remedy})]
+    steps = {
+        "steps": mode.steps_per_period,
+        "error": mode.period_error,
+        "remedy": _step_remedy(motion),
+    }
+    few = mode.steps_per_period < FEW_STEPS
+    return concern_if(few, False, "scheme/coarse", **first, **steps)
+
+
+def _first_mode_data(motion: ModesCheck, mode: ModeCheck) -> dict[str, Any]:
+    """Return experiment and frequency of the first mode, as data of a concern."""
+    return {"experiment": motion.experiment, "frequency_hz": mode.frequency_hz}
+
+
+def mode_notes(motion: ModesCheck) -> list[str]:
+    """Return notes on rigid modes, overdamped modes and the lengthening of the first period."""
+    notes = []
+    mode = motion.first_mode
+    name = motion.experiment
+    if motion.not_oscillating:
+        notes.append(
+            f"{motion.not_oscillating} modes of '{name}' do not oscillate (rigid motions that no "
+            "grasp holds) and are left out"
+        )
+    if mode is None:
+        return notes
+    if mode.damping_ratio >= 1:
+        notes.append(
+            f"the first mode of '{name}' creeps at the guess (damping ratio "
+            f"{mode.damping_ratio:.2g}): if the recording swings, guess less damping"
+        )
+    if mode.period_error > PERIOD_ERROR and not _grid_concerns(motion, mode):
+        notes.append(
+            f"{motion.scheme} lengthens the first period of '{name}' by {mode.period_error:.1%}, "
+            f"and the stiffness found will be about {2 * mode.period_error:.1%} too high: "
+            f"{_step_remedy(motion)}"
+        )
+    return notes
+
+
+def _step_remedy(motion: ModesCheck) -> str:
+    """Return the remedy for too few steps: a setting, or a higher rate."""
+    if motion.substeps_needed is None:
+        return "record at a higher rate"
+    return f"set transcription.{_substeps_setting(motion)}"
+
+
+def _substeps_setting(motion: ModesCheck) -> str:
+    """Return the setting of the substeps without its table."""
+    return f"substeps = {motion.substeps_needed}"

@@ -1,0 +1,165 @@
+"""Numerical errors of a solution, from solves with half the step and on a mesh twice as fine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+from ..errors import InputError
+from ..fem.refinement import refine_body
+from ..methods.reduced_space import ReducedSpace
+from ..methods.solution import Solution
+from ..model.schemes import as_scheme
+from ..problem import Problem
+from ..recording import experiment_refinement
+from ..statistics.discretisation_error import Refinement, RefinementLevel, discretisation_errors
+from ..statistics.estimates import Estimate
+from .solved_problem import SolvedProblem
+from .solving import solve
+from .warm_start import WarmStart
+
+A = TypeVar("A", bound=SolvedProblem)
+# Most discretisations of each kind: three show the order of convergence, and a fourth is too large.
+MOST_LEVELS = 3
+# Last step of the parameters' logarithms at convergence: far below any error bar.
+TOLERANCE = 1e-6
+
+
+def finer_step(problem: Problem) -> Problem:
+    """Return the problem with half the time step."""
+    return replace(problem, substeps=2 * problem.first_substeps)
+
+
+def finer_mesh(problem: Problem) -> Problem:
+    """Return the problem with every tetrahedron split into eight."""
+    bodies = {id(body): refine_body(body) for body in problem.bodies}
+    experiments = [
+        experiment_refinement.refined_experiment(e, bodies[id(e.body)]) for e in problem.experiments
+    ]
+    return replace(problem, experiments=experiments)
+
+
+REFINEMENTS = {"step": finer_step, "mesh": finer_mesh}
+
+
+def refine(run: A, levels: int = 2, report_progress: Callable[[str], None] | None = None) -> A:
+    """Return a converged run with its numerical error, see `solve_refined`."""
+    answer = WarmStart.of(run.solution)
+    problem = replace(run.problem, substeps=run.solution.collocation.substeps)
+    estimates = run.optimum
+    return replace(
+        run, refinement=solve_refined(problem, answer, estimates, levels, report_progress)
+    )
+
+
+def solve_refined(
+    problem: Problem,
+    solution: WarmStart,
+    estimates: Mapping[str, Estimate],
+    levels: int = 2,
+    report_progress: Callable[[str], None] | None = None,
+    solved_levels: Sequence[RefinementLevel] = (),
+    save_progress: Callable[[Refinement], object] | None = None,
+) -> Refinement:
+    """Solve again at finer discretisations, each from the previous solution.
+
+    The step and the mesh are refined separately: their errors add up to first order. Finer problems
+    are solved by the reduced space, whatever method found the answer.
+
+    Parameters
+    ----------
+    problem : Problem
+    solution : WarmStart
+        The solution of the problem.
+    estimates : mapping of name to Estimate
+        Estimates of that solution, with their statistical intervals.
+    levels : int
+        2 discretisations of each kind, or 3 to observe the orders of convergence.
+    report_progress : callable, optional
+        Called with a progress message.
+    solved_levels : sequence of RefinementLevel
+        Levels that were solved before.
+    save_progress : callable, optional
+        Called after each level with the refinement so far.
+
+    Raises
+    ------
+    InputError
+        For another number of levels, or where a finer problem is not solved.
+    KeyboardInterrupt
+        If a solve was interrupted; the levels passed to `save_progress` are complete.
+    """
+    if not 2 <= levels <= MOST_LEVELS:
+        raise InputError(f"levels = {levels}; expected 2 or {MOST_LEVELS}")
+    fitted = [experiment for experiment in problem.experiments if not experiment.validation]
+    coarse = replace(problem, experiments=fitted, notes=())
+    moving = any(not experiment.is_static for experiment in fitted)
+    solved = {(each.refined, each.halvings): each for each in solved_levels}
+    reached: list[RefinementLevel] = []
+    for kind, finer in REFINEMENTS.items():
+        at = coarse
+        start = solution
+        for level in range(1, levels if moving or kind == "mesh" else 1):  # equilibria have no step
+            at = finer(at)
+            if (kind, level) in solved:
+                reached.append(solved[kind, level])
+                start = replace(solution, values={**solution.values, **reached[-1].values})
+                continue
+            if report_progress is not None:
+                report_progress(f"solving again: {kind} halved {level}×")
+            refined = _solve_refined_problem(at, start, f"{kind} halved {level}×")
+            start = WarmStart.of(refined)
+            reached.append(_level_summary(kind, level, refined))
+            if save_progress is not None:
+                save_progress(_errors_from_levels(reached, problem, estimates))
+    return _errors_from_levels(reached, problem, estimates)
+
+
+def _errors_from_levels(
+    levels: Sequence[RefinementLevel], problem: Problem, estimates: Mapping[str, Estimate]
+) -> Refinement:
+    """Return the numerical errors from the levels solved so far."""
+    by_step, by_mesh = (
+        [each.values for each in levels if each.refined == kind] for kind in REFINEMENTS
+    )
+    order = as_scheme(problem.scheme).order
+    errors = discretisation_errors(
+        estimates, by_step, by_mesh, order, problem.parameters.linear_names
+    )
+    return Refinement(errors, tuple(levels))
+
+
+def _solve_refined_problem(problem: Problem, start: WarmStart, what: str) -> Solution:
+    """Solve a finer problem in reduced space; `what` names it in the message of the
+    `InputError`.
+    """
+    solution = solve(problem, ReducedSpace(ladder=(1.0,), tolerance=TOLERANCE), start=start)
+    if not solution.unless_interrupted().status.converged:
+        raise InputError(
+            f"the problem with the {what} was not solved ({solution.status.value}: "
+            f"{solution.message}); solve it by itself to see why"
+        )
+    return solution
+
+
+def _level_summary(kind: str, level: int, solution: Solution) -> RefinementLevel:
+    """Return the summary of a level from its solution.
+
+    Parameters
+    ----------
+    kind : {"step", "mesh"}
+    level : int
+        How often it was halved.
+    solution : Solution
+    """
+    segments = solution.collocation.transcriptions
+    return RefinementLevel(
+        refined=kind,
+        halvings=level,
+        timesteps=sum(segment.grid_times for segment in segments),
+        nodes=sum({id(s.body): len(s.body.nodes_m) for s in segments}.values()),
+        iterations=solution.iterations,
+        time_s=solution.timing.total,
+        values=dict(WarmStart.of(solution).values),
+    )

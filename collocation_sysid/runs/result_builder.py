@@ -1,0 +1,391 @@
+"""Conversion of an answer to `Result`, the content of ``result.json``."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
+
+import casadi
+import numpy as np
+
+from ..array_types import Array, root_mean
+from ..display import short
+from ..fem.constants import GAMMA_R, is_field_coefficient
+from ..files import SCHEMA
+from ..methods.solution import custom_sensor_rms, pooled_wrench_rms
+from ..model.schemes import as_scheme
+from ..problem import Problem
+from ..program.collocation import ExperimentIterate
+from ..program.contact_summary import friction_summaries
+from ..program.depth_comparison import DepthError
+from ..recording.experiment import Experiment
+from ..recording.nuisance import GAUGE, JOINING, PLACE, TARE, in_readable_unit
+from ..serialisation import alike
+from ..statistics.field_estimates import FieldEstimate
+from ..statistics.identifiability import identifiability_sentences
+from ..statistics.scale_identifiability import relative_scale_note
+from ..statistics.uncertainty import MarkerPlace
+from .forward_simulation import ForwardSimulation
+from .prediction import CopyError
+from .result_content import (
+    DynamicsResult,
+    FieldResult,
+    FitResult,
+    FittedExperiment,
+    ForwardResult,
+    NuisanceResult,
+    ProfileResult,
+    ProgramSize,
+    Provenance,
+    RecordingsAgreement,
+    Result,
+    ScanResult,
+    SimulatedExperiment,
+    UncertaintyResult,
+)
+from .solved_problem import SolvedProblem
+from .verdict import depth_errors
+
+
+def build_result(answer: SolvedProblem) -> Result:
+    """Return the content of ``result.json`` for an answer."""
+    solution = answer.solution
+    problem = answer.problem
+    collocation = solution.collocation
+    values = answer.estimates
+    return Result(
+        schema=SCHEMA,
+        status=solution.status.value,
+        converged=solution.status.converged,
+        message=solution.message,
+        missing=answer.omitted_checks,
+        trust=answer.trust,
+        method=solution.method,
+        title=problem.title,
+        parameters={item.name: values[item.name] for item in answer.start_parameters.items},
+        derived={name: values[name] for name in answer.derived},
+        basis=tuple(_reference_sentences(problem)),
+        budget={name: line.shares for name, line in answer.budget.items()},
+        probes=answer.probes,
+        places=answer.places,
+        nuisance=_nuisance(answer),
+        fields={name: _field_result(field) for name, field in answer.fields.items()},
+        uncertainty=_uncertainty_result(answer),
+        scan=None if solution.scan is None else alike(ScanResult, solution.scan),
+        fit=_fit_result(answer),
+        residuals=answer.diagnoses,
+        dynamics=DynamicsResult(
+            solution.max_violation_n,
+            solution.max_violation_relative,
+            tuple(map(str, solution.largest_violations)),
+        ),
+        rollout=_forward_results(answer),
+        iterations=solution.iterations,
+        evaluations=solution.evaluations,
+        timing_s=solution.timing,
+        elapsed_s=answer.elapsed_s,
+        problem=ProgramSize(
+            sum(len(body.nodes_m) for body in problem.bodies),
+            sum(len(body.cells) for body in problem.bodies),
+            collocation.substeps,
+            sum(segment.grid_times for segment in collocation.transcriptions),
+            collocation.variable_count,
+            collocation.constraint_count,
+            as_scheme(collocation.scheme).name,
+        ),
+        notes=tuple(dict.fromkeys([*problem.notes, *solution.notes, *answer.all_notes])),
+        history=tuple(solution.history),
+        provenance=_provenance(problem),
+    )
+
+
+def _provenance(problem: Problem) -> Provenance:
+    """Return versions, platform and hashes of the problem's files."""
+    origin = problem.origin
+    text = None if origin is None else origin.text.encode()
+    return Provenance(
+        version=version("collocation-sysid"),
+        casadi=casadi.CasadiMeta.version(),
+        numpy=np.__version__,
+        python=platform.python_version(),
+        platform=platform.platform(),
+        problem_file=None if origin is None else str(origin.path),
+        problem_sha256=None if text is None else hashlib.sha256(text).hexdigest(),
+        mesh_sha256=tuple(body.mesh.sha256 for body in problem.bodies),
+    )
+
+
+def _reference_sentences(problem: Problem) -> Iterator[str]:
+    """Yield what the values refer to: the damping law of γ_r, and how moduli are scaled without a
+    force.
+    """
+    parts = [part for body in problem.bodies for part in body.parts]
+    laws = dict.fromkeys(part.damping.name for part in parts if GAMMA_R in part.damping.constants)
+    law_names = [
+        law + (", which also brakes rotation" if law == "rayleigh" else "") for law in laws
+    ]
+    if law_names:
+        yield f"{GAMMA_R.symbol} refers to the damping law {' and '.join(law_names)}"
+    if (relative := relative_scale_note(problem.experiments, problem.parameters)) is not None:
+        yield relative
+
+
+def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
+    """Return the statistics behind the error bars; None without error bars.
+
+    Coefficients of fields are left out of the matrices.
+    """
+    known = answer.uncertainty
+    if known is None:
+        return None
+    reported = [k for k, name in enumerate(known.names) if not is_field_coefficient(name)]
+    return alike(
+        UncertaintyResult,
+        known,
+        names=tuple(known.names[k] for k in reported),
+        correlation=known.correlation[np.ix_(reported, reported)],
+        covariance=known.covariance[np.ix_(reported, reported)],
+        quantiles=known.quantiles[reported],
+        noise_factors=known.level.factors,
+        autocorrelation=known.dependence.lag1,
+        verdicts=tuple(identifiability_sentences(known)),
+        recordings=_recordings_agreement(answer),
+        profiles={
+            profile.parameter: alike(
+                ProfileResult,
+                profile,
+                rises=profile.losses - profile.losses.min(),
+                sentence=profile.message,
+            )
+            for profile in answer.profiles
+        },
+    )
+
+
+def _field_result(estimate: FieldEstimate) -> FieldResult:
+    """Return the summary of a field; its intervals are None if the covariance is not finite."""
+    modes = estimate.modes
+    volumes_m3 = estimate.modes.volumes_m3
+    ends = (float(estimate.value.min()), float(estimate.value.max()))
+    is_determined = estimate.is_informed
+    if not np.isfinite(estimate.deviation).all():
+        return FieldResult(modes.resolution, ends, None, None, {}, estimate.phases)
+    share = float(volumes_m3[is_determined].sum() / volumes_m3.sum())
+    likelier = {f"{each:g}": estimate.log_evidence_ratio(each) for each in modes.field.lengths_m}
+    return FieldResult(
+        modes.resolution, ends, share, estimate.identified_modes, likelier, estimate.phases
+    )
+
+
+def _recordings_agreement(answer: SolvedProblem) -> dict[str, RecordingsAgreement] | None:
+    """Return the agreement of the recordings, by parameter; None if it was not evaluated."""
+    if answer.uncertainty is None or (scatter := answer.uncertainty.scatter) is None:
+        return None
+    q = answer.solution.q
+    agreements = {}
+    for k, item in enumerate(answer.solution.collocation.parameters.free):
+        if is_field_coefficient(item.name):
+            continue
+        away = q[k] + scatter.differences[:, k]
+        values = [item.from_coordinate(float(x)) if np.isfinite(x) else np.nan for x in away]
+        deviations = scatter.deviations[:, k].tolist()
+        agreements[item.name] = RecordingsAgreement(
+            dict(zip(scatter.recordings, values, strict=True)),
+            dict(zip(scatter.recordings, deviations, strict=True)),
+            float(scatter.chi_squared[k]),
+            int(scatter.degrees_of_freedom[k]),
+            bool(scatter.is_disagreeing[k]),
+        )
+    return agreements
+
+
+def _fit_result(answer: SolvedProblem) -> FitResult:
+    """Return the residuals of the fit of each experiment."""
+    solution = answer.solution
+    experiments = {}
+    depths: dict[str, dict[str, DepthError]] = {}
+    for (recording, camera), error in depth_errors(solution).items():
+        depths.setdefault(recording, {})[camera] = error
+    for part in solution.parts:
+        experiment = part.segment.experiment
+        name = experiment.name
+        markers = experiment.markers
+        sensors = part.segment.sensors
+        wrenches = [sensor.wrench for sensor in sensors]
+        sigmas = [
+            (wrench.symmetry * wrench.sigmas) ** 2
+            * np.where(wrench.measured_components, 1.0, np.nan)
+            for wrench in wrenches
+        ]
+        both = np.array(sigmas).reshape(-1, 2, 3).swapaxes(0, 1)
+        experiments[name] = FittedExperiment(
+            solution.rms_by_experiment_m[name],
+            markers.sample_count,
+            int(markers.missing_counts.sum()),
+            experiment.is_static,
+            (*_place_sentences(answer.places[name]), *_nuisance_sentences(part, answer)),
+            *solution.wrench_rms.get(name, (None, None)),
+            custom_sensor_rms(experiment, solution.readings[name]) or None,
+            *(root_mean(each[np.isfinite(each)]) or None for each in both),
+            reading_sigma={gauge.name: gauge.sigma for gauge in experiment.readings} or None,
+            reading_unit=_sensor_units(experiment),
+            depth=depths.get(name),
+            friction=friction_summaries(experiment, part.equations.dynamics, part.x) or None,
+            air_density_kg_m3=experiment.air_density_kg_m3,
+        )
+    pooled = pooled_wrench_rms(solution)
+    parts = {
+        experiment.name: experiment.symmetry
+        for experiment in answer.problem.experiments
+        if experiment.symmetry > 1
+    }
+    symmetry = parts or None
+    return FitResult(solution.rms_m, answer.noise_rms_m, experiments, *pooled, symmetry=symmetry)
+
+
+def _forward_results(answer: SolvedProblem) -> ForwardResult:
+    """Return the errors of the forward simulations of all experiments."""
+    experiments = {}
+    squares = []
+    largest = []
+    for experiment in answer.problem.experiments:
+        experiments[experiment.name] = compared = _forward_result(answer, experiment)
+        if compared.fitted and compared.rms_m is not None and compared.max_m is not None:
+            squares.append(experiment.markers.sample_count * np.array([compared.rms_m**2, 1.0]))
+            largest.append(compared.max_m)
+    if not largest:
+        return ForwardResult(None, None, experiments)
+    total, count = np.sum(squares, axis=0)
+    return ForwardResult(float(np.sqrt(total / max(1, count))), max(largest), experiments)
+
+
+def _sensor_units(experiment: Experiment) -> dict[str, str] | None:
+    """Units of the readings that state one, by name; None where none does."""
+    return {gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit} or None
+
+
+def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedExperiment:
+    """Return the errors of the forward simulation of an experiment."""
+    fitted = experiment.name in answer.solution.rms_by_experiment_m
+    simulated = answer.rollouts[experiment.name]
+    if not isinstance(simulated, ForwardSimulation):
+        return SimulatedExperiment(fitted, failed=simulated)
+    force, torque = simulated.wrench_rms
+    return alike(
+        SimulatedExperiment,
+        simulated,
+        fitted=fitted,
+        failed=None,
+        wrench_rms_n=force,
+        wrench_rms_nm=torque,
+        reading_rms=simulated.reading_rms or None,
+        reading_unit=_sensor_units(experiment),
+        depth=simulated.depth or None,
+        blind=simulated.blind_error,
+        copied=simulated.copy_error if isinstance(simulated.copy_error, CopyError) else None,
+        not_copied=simulated.copy_error if isinstance(simulated.copy_error, str) else None,
+    )
+
+
+# What was estimated of a recording alone ----------------------------------------------------------
+
+
+def _nuisance(answer: SolvedProblem) -> dict[str, dict[str, NuisanceResult]]:
+    """Return the nuisance parameters, without the places of markers, by experiment and label."""
+    deviations = answer.uncertainty.nuisance if answer.uncertainty is not None else {}
+    named: dict[str, dict[str, NuisanceResult]] = {}
+    for part in answer.solution.parts:
+        for entry, name, value in part.segment.nuisance.iterate_values(part.phi):
+            error = deviations[name] * entry.sigma if name in deviations else None
+            here = named.setdefault(part.segment.experiment.name, {})
+            here[entry.label] = NuisanceResult(value, entry.sigma, error)
+    return named
+
+
+def _place_sentences(places: Mapping[str, MarkerPlace]) -> Iterator[str]:
+    """Yield sentences on how far places differ from the given ones, and on the accuracy of unknown
+    ones.
+    """
+    moved = {
+        n: place.displacement_m or 0.0
+        for n, place in places.items()
+        if place.prior_m and place.given
+    }
+    if moved:
+        worst = max(moved, key=moved.__getitem__)
+        yield (
+            f"markers sit off their places by up to {short(1e3 * moved[worst])} mm ({worst}; "
+            f"prior {short(1e3 * places[worst].prior_m)})"
+        )
+    if unknown := [place for place in places.values() if not place.given]:
+        count = f"{len(unknown)} marker" + ("s" if len(unknown) > 1 else "")
+        errors = [float(p.std_error_m.max()) for p in unknown if p.std_error_m is not None]
+        known = f", found to ±{short(1e3 * max(errors))} mm" if len(errors) == len(unknown) else ""
+        yield f"{count} without a place{known} (prior {short(1e3 * unknown[0].prior_m)})"
+
+
+def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Iterator[str]:
+    """Yield a sentence on each kind of nuisance parameter but the places, with the estimate and its
+    prior.
+    """
+    nuisance = part.segment.nuisance
+    values = part.phi * nuisance.scales
+    for row in (*part.segment.experiment.nuisance.kinds, GAUGE):
+        here = nuisance.indices_of_rows(row).tolist()
+        if row == PLACE or not here:
+            continue
+        groups = [[k] for k in here]
+        if row.by == "length":
+            numbers = dict.fromkeys(nuisance.entries[k].number for k in here)
+            vectors = [
+                nuisance.indices_of_rows(row, component=number).tolist() for number in numbers
+            ]
+            # Several markers have one each: the longest counts.
+            groups = [max(vectors, key=lambda own: float(np.linalg.norm(values[own])))]
+        elif row.by == "worst":
+            groups = [[max(here, key=lambda k: abs(part.phi[k]))]]
+        for own in groups:
+            yield _nuisance_sentence(part, own, values[own], answer)
+
+
+def _nuisance_sentence(
+    part: ExperimentIterate, components: Sequence[int], values: Array, answer: SolvedProblem
+) -> str:
+    """Return the sentence on a vector, or a number, of nuisance parameters.
+
+    Parameters
+    ----------
+    part : ExperimentIterate
+        Experiment at the solution.
+    components : sequence of int
+        Indices of its components in φ.
+    values : (k,) array
+        Their values in the unit of the row.
+    answer : SolvedProblem
+    """
+    nuisance = part.segment.nuisance
+    k = components[0]
+    entry = nuisance.entries[k]
+    name = nuisance.names[k]
+    known = answer.uncertainty.nuisance if answer.uncertainty else {}
+    low, high = (limit[k] for limit in nuisance.bounds(part.segment.association.clock_samples))
+    factor, unit = in_readable_unit(1.0, entry.unit)
+    if entry.row == TARE:  # of the sensor, on which the whole specimen acts
+        factor *= part.segment.experiment.symmetry
+    size = float(np.linalg.norm(values))
+    error = entry.sigma * known.get(name, np.nan)
+    allowed = low + 1e-3 < part.phi[k] < high - 1e-3
+    sentence = (entry.row.told or "{which} {signed}").format(
+        size=f"{short(factor * size)}{unit}",
+        signed=f"{short(factor * float(values[0]))}{unit}",
+        number=short(factor * size),
+        unit=unit,
+        error="" if np.isnan(error) else f" ± {short(factor * error)}",
+        way="later" if values[0] > 0 else "earlier",
+        which=entry.label.rpartition(" [")[0],
+        limit="" if allowed else ", the most that is allowed",
+        stated=f"{nuisance.timed_loads[entry.number].stated_s:g} s" if entry.row == JOINING else "",
+    )
+    return f"{sentence} (prior {short(factor * entry.sigma)})"

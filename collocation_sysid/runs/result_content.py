@@ -1,0 +1,562 @@
+"""Content of ``result.json``: one tree of plain values, from which pages and pictures are made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ..array_types import Array
+from ..display import short
+from ..errors import InputError
+from ..fem.constants import is_field_coefficient, symbol_of, unit_of
+from ..fem.spatial_field import FieldResolution
+from ..fem.two_phase import PhaseSummary
+from ..files import RESULT_FILE, damage_refused, read_json
+from ..methods.solution import Iteration, Timing
+from ..program.contact_summary import FrictionSummary
+from ..program.depth_comparison import DepthError
+from ..serialisation import optional, read
+from ..statistics.assessment import Assessment
+from ..statistics.discretisation_error import DiscretisationError, known_kinds
+from ..statistics.estimates import Estimate, IntervalCoordinate
+from ..statistics.relaxed_assumptions import Probe
+from ..statistics.residual_diagnostics import MarkerDiagnosis
+from ..statistics.uncertainty import MarkerPlace
+from .prediction import CopyError, PredictionErrors
+
+
+@dataclass(frozen=True)
+class ReportedEstimate(Estimate):
+    """A parameter or derived modulus as it is reported; derived moduli have no `guess`.
+
+    `value` is corrected for the known discretisation error, and `statistical95` is centred on it.
+
+    Attributes
+    ----------
+    combined_std_error : float or None
+        Standard uncertainty due to noise, discretisation and systematic effects; None if the
+        quantity was not estimated or is at a bound, or if systematic effects were not evaluated.
+    combined95 : (lower, upper) or None
+        95 % interval due to the same, the one to publish; None as above.
+    optimum : float or None
+        The optimum of the discretised problem, without the correction; None in a study's summary.
+    systematic : float or None
+        Standard deviation of the systematic effects in the coordinate of the estimate, see
+        `statistics.uncertainty_budget`.
+    known_effect : float or None
+        Correction for known effects, such as the compliance of a machine, in the coordinate of the
+        estimate; None if there is none.
+    known_correction : float or None
+        The same correction as part of `value`; None if there is none.
+    numerical_error : DiscretisationError or None
+        Discretisation error as far as it is known.
+    guess : float or None
+        Initial guess.
+    fixed, tied : bool or None
+        Whether the parameter was not estimated, or followed another one.
+    """
+
+    combined_std_error: float | None = None
+    combined95: tuple[float, float] | None = None
+    optimum: float | None = None
+    systematic: float | None = None
+    known_effect: float | None = optional()
+    known_correction: float | None = optional()
+    numerical_error: DiscretisationError | None = None
+    guess: float | None = optional()
+    fixed: bool | None = optional()
+    tied: bool | None = optional()
+
+    def at_optimum(self, name: str, *, linear: bool) -> Estimate:
+        """Return the estimate before the correction of the discretisation error.
+
+        Parameters
+        ----------
+        name : str
+        linear : bool
+            Whether the parameter is its own coordinate, see `IntervalCoordinate`.
+        """
+        if self.optimum is None or self.statistical95 is None or self.optimum == self.value:
+            optimum = self.value if self.optimum is None else self.optimum
+            return replace(self._statistical, value=optimum)
+        at = IntervalCoordinate.for_estimate(
+            name, (self.value, self.optimum, *self.statistical95), linear
+        )
+        correction = at.from_value(self.value) - at.from_value(self.optimum)
+        low, high = (at.to_value(at.from_value(end) - correction) for end in self.statistical95)
+        spread = self.statistical_std_error
+        if spread is not None:
+            spread *= at.derivative(self.value) / at.derivative(self.optimum)
+        return Estimate(self.optimum, spread, (low, high), self.at_bound, self.reason)
+
+    @property
+    def _statistical(self) -> Estimate:
+        """The estimate with its statistical uncertainty alone."""
+        return Estimate(
+            self.value,
+            self.statistical_std_error,
+            self.statistical95,
+            self.at_bound,
+            self.reason,
+        )
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the combined interval is not wider than the value; false if there is none."""
+        if self.combined95 is None:
+            return False
+        low, high = self.combined95
+        return high - low <= abs(self.value)
+
+    @property
+    def systematic_std_error(self) -> float | None:
+        """Part of the combined standard uncertainty that is not statistical; None if unknown."""
+        if self.combined_std_error is None or self.statistical_std_error is None:
+            return None
+        difference = self.combined_std_error**2 - self.statistical_std_error**2
+        return max(0.0, difference) ** 0.5
+
+
+@dataclass(frozen=True)
+class NuisanceResult:
+    """A nuisance parameter.
+
+    Attributes
+    ----------
+    value : float
+        In its unit.
+    prior : float
+        Standard deviation of its prior.
+    std_error : float or None
+        Statistical standard error; None without error bars.
+    """
+
+    value: float
+    prior: float
+    std_error: float | None
+
+
+@dataclass(frozen=True)
+class FieldResult:
+    """A constant that varies in space; its arrays are in ``trajectory.npz``.
+
+    Attributes
+    ----------
+    shapes : FieldResolution
+    range : (least, most)
+        Range of its values in the elements.
+    share_told : float or None
+        Share of the volume where the interval is less than half as wide as the prior's; None
+        without intervals.
+    identified : int or None
+        Number of independent shapes that the data determine; None without intervals.
+    likelier : mapping of length in metres to float
+        Logarithm of the evidence of other correlation lengths, relative to the chosen one.
+    phases : PhaseSummary or None
+        Contrast and volume of the inclusion of a two-phase field; None for a smooth field.
+    """
+
+    shapes: FieldResolution
+    range: tuple[float, float]
+    share_told: float | None
+    identified: int | None
+    likelier: Mapping[str, float]
+    phases: PhaseSummary | None = None
+
+    def sentence(self, name: str) -> str:
+        """Return a one-line summary of the field; `name` is the name of its constant."""
+        least, most = self.range
+        sentence = f"{symbol_of(name)} from {least:.3g} to {most:.3g} {unit_of(name)}".strip()
+        if self.identified is None or self.share_told is None:
+            return sentence
+        if self.phases is not None:
+            lower, contrast, upper = self.phases.contrast
+            least_m3, volume_m3, most_m3 = self.phases.volume_m3
+            return (
+                f"{sentence}: two phases, contrast {contrast:.3g} ({lower:.3g} to {upper:.3g}), "
+                f"inclusion {1e6 * volume_m3:.3g} cm³ ({1e6 * least_m3:.3g} to "
+                f"{1e6 * most_m3:.3g}); the phase of {self.share_told:.0%} of the volume is known"
+            )
+        shapes = f"{self.identified} of {self.shapes.modes} shapes of its field"
+        share = f"{self.share_told:.0%} of the volume better than the prior by half"
+        details = [f"details above {short(1e3 * self.shapes.detail_m)} mm"]
+        if len(self.likelier) > 1:
+            each = ", ".join(f"{length} m {gain:+.1f}" for length, gain in self.likelier.items())
+            details.append(f"length {self.shapes.length_m:g} m, ln evidence of {each}")
+        return f"{sentence}: the data tell {shapes}, and {share} ({'; '.join(details)})"
+
+
+@dataclass(frozen=True)
+class RecordingsAgreement:
+    """Estimates of a parameter from single recordings, to first order, and their agreement.
+
+    Attributes
+    ----------
+    values : mapping of recording to float
+        Estimates from single recordings; NaN where a recording does not determine the parameter.
+    deviations : mapping of recording to float
+        Their standard deviations, in the coordinate of the estimate.
+    chi_squared : float
+        χ² of their differences.
+    degrees_of_freedom : int
+    disagree : bool
+        Whether the differences are significant.
+    """
+
+    values: Mapping[str, float]
+    deviations: Mapping[str, float]
+    chi_squared: float
+    degrees_of_freedom: int
+    disagree: bool
+
+
+@dataclass(frozen=True)
+class ProfileResult:
+    """A profile likelihood.
+
+    Attributes
+    ----------
+    interval : (lower, upper)
+        Interval by the threshold; None for an end that was not reached.
+    values : (k,) array
+        Values of the parameter.
+    rises : (k,) array
+        Loss minus its least value.
+    threshold : float
+        Rise of the loss at the ends of the interval.
+    sentence : str
+    """
+
+    interval: tuple[float | None, float | None]
+    values: Array
+    rises: Array
+    threshold: float
+    sentence: str
+
+
+@dataclass(frozen=True, eq=False)
+class UncertaintyResult:
+    """Statistics behind the error bars.
+
+    Matrices refer to the logarithms (or other coordinates) of the parameters in `names`.
+    """
+
+    noise: str
+    errors: str
+    reduced_chi_squared: float
+    noise_factors: Mapping[str, float]
+    autocorrelation: float
+    names: tuple[str, ...]
+    correlation: Array
+    covariance: Array
+    quantiles: Array
+    verdicts: tuple[str, ...]
+    recordings: Mapping[str, RecordingsAgreement] | None
+    profiles: Mapping[str, ProfileResult]
+
+
+@dataclass(frozen=True, eq=False)
+class ScanResult:
+    """The scan over stiffnesses that gave the start of the search.
+
+    Attributes
+    ----------
+    reason : str
+        Why a scan was needed.
+    young_pa, misfit : (k,) arrays
+        Young's moduli and their misfits.
+    best : int
+        Index of the chosen one.
+    samples : int
+        Number of samples that were simulated.
+    time_s : float
+    sentence : str
+    """
+
+    reason: str
+    young_pa: Array
+    misfit: Array
+    best: int
+    samples: int
+    time_s: float
+    sentence: str
+
+
+@dataclass(frozen=True)
+class FittedExperiment:
+    """Residuals of the fit of an experiment.
+
+    Attributes
+    ----------
+    rms_m : float
+        RMS distance of the markers from the fit.
+    samples, missing : int
+        Numbers of marker samples that are present, and that are missing.
+    static : bool
+    beside : tuple of str
+        Sentences on the nuisance parameters of this recording.
+    wrench_rms_n, wrench_rms_nm, reading_rms
+        RMS differences of forces, torques and custom sensors; None if not measured.
+    wrench_sigma_n, wrench_sigma_nm, reading_sigma
+        Stated standard deviations of their noise.
+    reading_unit : mapping of name to str, optional
+        Units of the custom sensors that state one.
+    friction : mapping of obstacle to FrictionSummary
+        Of the obstacles with friction.
+    depth : mapping of depth camera to DepthError
+        Distances of its points from the fitted surface.
+    air_density_kg_m3 : float
+        Density of the air around the body in the model; zero in a vacuum.
+    """
+
+    rms_m: float
+    samples: int
+    missing: int
+    static: bool
+    beside: tuple[str, ...]
+    wrench_rms_n: float | None = optional()
+    wrench_rms_nm: float | None = optional()
+    reading_rms: Mapping[str, float] | None = optional()
+    wrench_sigma_n: float | None = optional()
+    wrench_sigma_nm: float | None = optional()
+    reading_sigma: Mapping[str, float] | None = optional()
+    reading_unit: Mapping[str, str] | None = optional()
+    friction: Mapping[str, FrictionSummary] | None = optional()
+    depth: Mapping[str, DepthError] | None = optional()
+    air_density_kg_m3: float = 0.0
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """Residuals of the fit of all experiments.
+
+    Attributes
+    ----------
+    rms_m, noise_rms_m : float
+        RMS distance of all markers, and that expected from the stated noise.
+    experiments : mapping of name to FittedExperiment
+    wrench_rms_n, wrench_rms_nm : float or None
+        RMS differences of all forces and torques.
+    symmetry : mapping of experiment to int, optional
+        Of experiments whose loads are reported for the whole specimen: ratio of these to the loads
+        of the modelled part. Energies of friction and nuisance parameters are those of the modelled
+        part.
+    """
+
+    rms_m: float
+    noise_rms_m: float
+    experiments: Mapping[str, FittedExperiment]
+    wrench_rms_n: float | None = optional()
+    wrench_rms_nm: float | None = optional()
+    symmetry: Mapping[str, int] | None = optional()
+
+
+@dataclass(frozen=True)
+class SimulatedExperiment:
+    """Errors of the forward simulation of an experiment; if `failed` is set, all else is missing.
+
+    Attributes
+    ----------
+    fitted : bool
+        Whether the experiment was fitted, not only predicted.
+    failed : str, optional
+        Why there is no simulation.
+    rms_m, max_m : float, optional
+        RMS and largest distance of the markers.
+    nuisance, places_m : mapping, optional
+        Nuisance parameters and marker places that were fitted to a recording for validation.
+    depth : mapping of depth camera to DepthError
+        Distances of its points from the simulated surface.
+    blind : PredictionErrors, optional
+        Of an experiment for validation, with the nuisance parameters of the fitted recordings in
+        place of its own.
+    copied : CopyError, optional
+        Of an experiment for validation, with the measurements of the nearest fitted recording as
+        the prediction.
+    not_copied : str, optional
+        Why there is no such copy.
+    """
+
+    fitted: bool
+    failed: str | None = optional()
+    rms_m: float | None = optional()
+    max_m: float | None = optional()
+    reading_unit: Mapping[str, str] | None = optional()
+    nuisance: Mapping[str, float] | None = optional()
+    places_m: Mapping[str, tuple[float, ...]] | None = optional()
+    wrench_rms_n: float | None = optional()
+    wrench_rms_nm: float | None = optional()
+    reading_rms: Mapping[str, float] | None = optional()
+    depth: Mapping[str, DepthError] | None = optional()
+    blind: PredictionErrors | None = optional()  # noqa: RUF009, it returns a field
+    copied: CopyError | None = optional()  # noqa: RUF009, it returns a field
+    not_copied: str | None = optional()
+
+
+@dataclass(frozen=True)
+class ForwardResult:
+    """Forward simulations with the estimates; RMS and largest distance of the fitted experiments'
+    markers.
+    """
+
+    rms_m: float | None
+    max_m: float | None
+    experiments: Mapping[str, SimulatedExperiment]
+
+
+@dataclass(frozen=True)
+class DynamicsResult:
+    """Residuals of the equations of motion: largest force [N], relative to other forces, and
+    where.
+    """
+
+    max_violation_n: float
+    max_violation_relative: float
+    largest: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ProgramSize:
+    """Size of the discretised problem and its scheme."""
+
+    nodes: int
+    elements: int
+    substeps: int
+    timesteps: int
+    variables: int
+    constraints: int
+    scheme: str
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Software, platform and problem files from which the result was made."""
+
+    version: str
+    casadi: str
+    numpy: str
+    python: str
+    platform: str
+    problem_file: str | None
+    problem_sha256: str | None
+    mesh_sha256: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Elapsed:
+    """Wall-clock time of the parts of a run [s].
+
+    Attributes
+    ----------
+    search : float
+        From the problem to the optimum: finding a start, and every search that led to the answer,
+        also with finer steps.
+    checks : float
+        Forward simulations, uncertainties, budget, probes and likely causes.
+    pictures : float or None
+        Drawing and writing the pictures; None if they have not been drawn.
+    """
+
+    search: float = 0.0
+    checks: float = 0.0
+    pictures: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """The content of ``result.json``; the attributes are its keys.
+
+    `timing_s` is about the iterations of the method alone, `elapsed_s` about the whole run. `basis`
+    names what the values refer to: the damping law, and what sets the scale; `budget` has each
+    source's share of an estimate's variance; `deep_probes` are refits with an assumption relaxed
+    and,
+    where requested, of parts of the data.
+    """
+
+    schema: int
+    status: str
+    converged: bool
+    message: str
+    missing: str
+    trust: Assessment
+    method: str
+    title: str
+    parameters: Mapping[str, ReportedEstimate]
+    derived: Mapping[str, ReportedEstimate]
+    basis: tuple[str, ...]
+    budget: Mapping[str, Mapping[str, float]]
+    probes: tuple[Probe, ...]
+    places: Mapping[str, Mapping[str, MarkerPlace]]
+    nuisance: Mapping[str, Mapping[str, NuisanceResult]]
+    fields: Mapping[str, FieldResult]
+    uncertainty: UncertaintyResult | None
+    scan: ScanResult | None
+    fit: FitResult
+    residuals: tuple[MarkerDiagnosis, ...]
+    dynamics: DynamicsResult
+    rollout: ForwardResult
+    iterations: int
+    evaluations: int
+    timing_s: Timing
+    elapsed_s: Elapsed
+    problem: ProgramSize
+    notes: tuple[str, ...]
+    history: tuple[Iteration, ...]
+    provenance: Provenance
+
+    @classmethod
+    def read(cls, run: str | Path, expected: str = "a run folder") -> Result:
+        """Read the result in a run folder.
+
+        Parameters
+        ----------
+        run : str or Path
+        expected : str
+            What is expected, for the message if the folder has no result.
+
+        Raises
+        ------
+        InputError
+            If it is no run folder, or damaged.
+        """
+        folder = Path(run)
+        content = read_json(folder / RESULT_FILE, expected)
+        with damage_refused(folder, RESULT_FILE, "solve the problem again"):
+            return read(cls, content)
+
+    @property
+    def values(self) -> dict[str, ReportedEstimate]:
+        """Parameters, then derived moduli, by name, without the coefficients of fields."""
+        both = {**self.parameters, **self.derived}
+        return {name: each for name, each in both.items() if not is_field_coefficient(name)}
+
+    @property
+    def discretisation_kinds(self) -> tuple[str, ...]:
+        """Kinds of discretisation error that the combined intervals contain: "step", "mesh"."""
+        return known_kinds(self.numerical_errors.values())
+
+    @property
+    def numerical_errors(self) -> dict[str, DiscretisationError]:
+        """Known discretisation errors, by name of the estimate."""
+        errors = ((name, each.numerical_error) for name, each in self.values.items())
+        return {name: error for name, error in errors if error is not None}
+
+    def problem_folder(self, run: str | Path, purpose: str) -> Path:
+        """Return the folder of the problem file.
+
+        Parameters
+        ----------
+        run : str or Path
+            The run folder, for the message.
+        purpose : str
+            Who needs the file, for the message, such as "which refine needs".
+
+        Raises
+        ------
+        InputError
+            If the run was not made from a problem file.
+        """
+        if self.provenance.problem_file is None:
+            raise InputError(f"the run is of no problem file, {purpose}", run)
+        return Path(self.provenance.problem_file).parent

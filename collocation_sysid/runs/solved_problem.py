@@ -1,0 +1,337 @@
+"""A solved problem with its checks: estimates, uncertainties and verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError, hint_at
+from ..fem.constants import is_field_coefficient, unit_of
+from ..methods.solution import Solution
+from ..model.parameters import Parameters
+from ..problem import Problem
+from ..statistics.assessment import Assessment, cause_concerns, numerical_concerns, probe_concerns
+from ..statistics.combined_intervals import combine
+from ..statistics.concerns import Concern
+from ..statistics.discretisation_error import DiscretisationError, Refinement
+from ..statistics.estimates import Estimate
+from ..statistics.field_estimates import FieldEstimate, field_estimates
+from ..statistics.identifiability import identifiability_sentences
+from ..statistics.linearised import DerivedModuli
+from ..statistics.misspecification_hypothesis import Hypothesis
+from ..statistics.profile_likelihood import Profile
+from ..statistics.relaxed_assumptions import Probe
+from ..statistics.residual_diagnostics import MarkerDiagnosis
+from ..statistics.uncertainty import MarkerPlace, Uncertainty, marker_places
+from ..statistics.uncertainty_budget import BudgetLine, VarianceSources, budget
+from .check.modes_check import ModesCheck
+from .forward_simulation import ForwardSimulation
+from .result_content import Elapsed, ReportedEstimate
+from .verdict import combined_concerns, expected_rms_m, modes_by_experiment, solution_concerns
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedProblem:
+    """A solved problem with its checks.
+
+    Attributes
+    ----------
+    problem : Problem
+    solution : Solution
+    rollouts : mapping of experiment name to ForwardSimulation or str
+        Forward simulations, or the reason why there is none.
+    uncertainty : Uncertainty or None
+        None if the solve did not converge.
+    diagnoses : tuple of MarkerDiagnosis
+        Findings in the residuals.
+    profiles : tuple of Profile
+        Profile likelihoods that were requested.
+    notes : tuple of str
+        Problems after the solve.
+    causes : tuple of Hypothesis
+        Likely errors in the description of the problem, likeliest first.
+    refinement : Refinement or None
+        Discretisation errors: from solves at finer discretisations if requested, else the
+        first-order effect of the step from finer forward simulations; None where these are missing.
+    omitted_checks : str
+        Checks that were left out after Ctrl-C; empty if all were done.
+    systematic_effects : VarianceSources or None
+        Systematic effects on the estimates; None without error bars.
+    probes : tuple of Probe
+        Refits with an assumption relaxed: the two of every solve, see `routine_probes`; or all, and
+        of parts of the data, where these were requested. Empty without error bars.
+    elapsed_s : Elapsed
+        Durations of search and checks.
+    """
+
+    problem: Problem
+    solution: Solution
+    rollouts: Mapping[str, ForwardSimulation | str]
+    uncertainty: Uncertainty | None
+    diagnoses: tuple[MarkerDiagnosis, ...] = ()
+    profiles: tuple[Profile, ...] = ()
+    notes: tuple[str, ...] = ()
+    causes: tuple[Hypothesis, ...] = ()
+    refinement: Refinement | None = None
+    omitted_checks: str = ""
+    systematic_effects: VarianceSources | None = None
+    probes: tuple[Probe, ...] = ()
+    elapsed_s: Elapsed = field(default_factory=Elapsed)
+
+    def __repr__(self) -> str:
+        solution = self.solution
+        free = [item.name for item in self.problem.parameters.free]
+        values = ", ".join(f"{name} = {_estimate_text(self.estimates[name])}" for name in free)
+        rms = f"{1e3 * solution.rms_m:.3g} mm RMS"
+        summary = f"{solution.method}, {solution.status.value}, {self.trust.verdict}"
+        return f"Run({summary}: {values}; {rms})"
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Every parameter by name, corrected for the known discretisation error."""
+        return {name: self.estimates[name].value for name in self.solution.parameters}
+
+    @property
+    def start_parameters(self) -> Parameters:
+        """The parameters with the guesses that the search started from."""
+        return self.solution.collocation.parameters
+
+    @cached_property
+    def derived(self) -> dict[str, float]:
+        """Moduli that follow from the parameters at the optimum, by name."""
+        constants = (segment.constants for segment in self.solution.collocation.transcriptions)
+        return dict(DerivedModuli.from_bodies(constants, self.solution.q).values)
+
+    @cached_property
+    def estimates(self) -> dict[str, ReportedEstimate]:
+        """Parameters and derived moduli with their combined and statistical intervals, by name."""
+        return {name: self._report_estimate(name, each) for name, each in self.optimum.items()}
+
+    def _report_estimate(self, name: str, optimum: Estimate) -> ReportedEstimate:
+        """Correct an estimate at the optimum and combine its uncertainties."""
+        item = next((each for each in self.start_parameters.items if each.name == name), None)
+        line = self.budget.get(name)
+        error = None if is_field_coefficient(name) else self.discretisation_errors.get(name)
+        linear, bounds = self.start_parameters.scale_and_bounds(name)
+        systematic = None if line is None else line.systematic
+        known_effect = 0.0 if line is None else line.known_effect
+        combined = combine(
+            name,
+            optimum,
+            error,
+            systematic,
+            known_effect=known_effect,
+            linear=linear,
+            bounds=bounds,
+        )
+        guess = None if item is None else item.guess
+        tied = item is not None and item.tied is not None
+        return ReportedEstimate(
+            **vars(combined),
+            at_bound=optimum.at_bound,
+            reason=optimum.reason,
+            optimum=optimum.value,
+            systematic=systematic,
+            known_effect=known_effect or None,
+            numerical_error=error,
+            guess=np.nan if item is not None and guess is None else guess,
+            fixed=None if item is None else item.is_fixed or tied,
+            tied=tied or None,
+        )
+
+    @cached_property
+    def budget(self) -> dict[str, BudgetLine]:
+        """The uncertainty budget of each estimate, by name; empty without error bars."""
+        if self.uncertainty is None or self.systematic_effects is None:
+            return {}
+        return budget(
+            self.systematic_effects,
+            self.uncertainty,
+            self.discretisation_errors,
+            self.start_parameters,
+        )
+
+    @property
+    def discretisation_errors(self) -> Mapping[str, DiscretisationError]:
+        """Known discretisation errors, by name of the estimate; empty without `refinement`."""
+        return {} if self.refinement is None else self.refinement.errors
+
+    @cached_property
+    def optimum(self) -> dict[str, Estimate]:
+        """Estimates at the optimum of the discretised problem, with statistical intervals."""
+        bars = self.uncertainty
+        known = {} if bars is None else {**bars.estimates, **bars.derived}
+        values = self.solution.parameters | self.derived
+        return {name: known.get(name, Estimate(value)) for name, value in values.items()}
+
+    @cached_property
+    def places(self) -> dict[str, dict[str, MarkerPlace]]:
+        """Estimated places of the markers on the undeformed body, by fitted experiment and by
+        marker.
+        """
+        named = ((part.segment.experiment.name, part) for part in self.solution.parts)
+        return {name: marker_places(part, self.uncertainty) for name, part in named}
+
+    @cached_property
+    def trust(self) -> Assessment:
+        """Verdict (good, check or doubtful) with its concerns."""
+        of_fit = solution_concerns(
+            self.solution,
+            self.rollouts,
+            self.modes_by_experiment.values(),
+            self.uncertainty,
+            self.diagnoses,
+        )
+        uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}
+        numerical = numerical_concerns(self.optimum, uncertainties, self.refinement)
+        shares = {name: line.shares for name, line in self.budget.items()}
+        vague = combined_concerns(self.start_parameters, self.estimates, shares)
+        of_fields = [concern for field in self.fields.values() for concern in field.concerns]
+        if not self.omitted_checks:
+            probed = probe_concerns(self.probes, self._discretisation_corrections)
+            causes = cause_concerns(self.causes)
+            return Assessment.from_concerns(
+                (*causes, *of_fit, *of_fields, *probed, *numerical, *vague)
+            )
+        interrupted = Concern("solve/interrupted", "doubtful", {"left_out": self.omitted_checks})
+        return Assessment.from_concerns(
+            (interrupted, *(of_fit if self.uncertainty is not None else ()))
+        )
+
+    @property
+    def _discretisation_corrections(self) -> dict[str, float]:
+        """Factors from optimum to reported value of the estimated parameters, without fields."""
+        return {
+            item.name: each.value / each.optimum if each.optimum else 1.0
+            for item in self.start_parameters.free
+            if not is_field_coefficient(item.name) and (each := self.estimates[item.name])
+        }
+
+    @cached_property
+    def modes_by_experiment(self) -> dict[str, ModesCheck]:
+        """Natural modes of the body at the estimates, by experiment; only motions, empty if not
+        converged.
+        """
+        return modes_by_experiment(self.problem, self.solution)
+
+    @cached_property
+    def fields(self) -> dict[str, FieldEstimate]:
+        """Estimated fields (spatially varying constants), by name."""
+        collocation = self.solution.collocation
+        q = self.solution.q
+        bodies = dict.fromkeys(segment.body for segment in collocation.transcriptions)
+        known = (field_estimates(b, collocation.parameters, q, self.uncertainty) for b in bodies)
+        return {field.name: field for each in known for field in each}
+
+    @property
+    def noise_rms_m(self) -> float:
+        """RMS distance of the fitted markers that is expected from noise with the stated
+        sigma_m.
+        """
+        return expected_rms_m(self.solution, self.uncertainty)
+
+    def interval(self, name: str) -> tuple[float, float]:
+        """Return the combined 95 % interval of a parameter or derived modulus, the one to publish.
+
+        Both ends are NaN if there is none: the solve has not converged, or the parameter was not
+        estimated, is at a bound or has no error bar, see `ReportedEstimate`.
+
+        Raises
+        ------
+        InputError
+            For an unknown name.
+        """
+        return self._estimate(name).combined95 or (np.nan, np.nan)
+
+    def std_error(self, name: str) -> float:
+        """Return the combined standard uncertainty of a parameter or derived modulus.
+
+        NaN under the same conditions as `interval`.
+
+        Raises
+        ------
+        InputError
+            For an unknown name.
+        """
+        return _or_nan(self._estimate(name).combined_std_error)
+
+    def nuisance(self, name: str) -> float:
+        """Return the value of a nuisance parameter of a recording, see `Solution.nuisance`.
+
+        Raises
+        ------
+        InputError
+            If no parameter, or several with different values, have this name.
+        """
+        return self.solution.nuisance(name)
+
+    def to_frame(self) -> Any:
+        """Return the estimates as a pandas DataFrame, one row each.
+
+        Columns: value, combined_std_error, combined_lower, combined_upper, statistical_std_error,
+        statistical_lower, statistical_upper, verdict, guess, unit. NaN stands for what is unknown.
+
+        Raises
+        ------
+        InputError
+            Without pandas.
+        """
+        try:
+            pandas = import_module("pandas")
+        except ImportError as error:
+            raise InputError("a data frame needs pandas: pip install pandas") from error
+        rows = {name: self._row(name) for name in self.estimates}
+        return pandas.DataFrame.from_dict(rows, orient="index")
+
+    def _row(self, name: str) -> dict[str, float | str]:
+        """Return the row of a data frame."""
+        each = self.estimates[name]
+        combined = each.combined95 or (np.nan, np.nan)
+        statistical = each.statistical95 or (np.nan, np.nan)
+        return {
+            "value": each.value,
+            "combined_std_error": _or_nan(each.combined_std_error),
+            "combined_lower": combined[0],
+            "combined_upper": combined[1],
+            "statistical_std_error": _or_nan(each.statistical_std_error),
+            "statistical_lower": statistical[0],
+            "statistical_upper": statistical[1],
+            "verdict": self.trust.verdict,
+            "guess": np.nan if each.tied else _or_nan(each.guess),
+            "unit": unit_of(name),
+        }
+
+    def _estimate(self, name: str) -> ReportedEstimate:
+        """Return an estimate by name; an `InputError` for an unknown name."""
+        if name not in self.estimates:
+            known = list(self.estimates)
+            expected = f"expected one of {', '.join(known)}{hint_at(name, known)}"
+            raise InputError(f"no parameter {name!r}; {expected}")
+        return self.estimates[name]
+
+    @property
+    def all_notes(self) -> tuple[str, ...]:
+        """Notes on the solve and its uncertainty, and statements on what the data determine."""
+        if self.uncertainty is None:
+            return self.notes
+        notes = (*self.notes, *self.uncertainty.notes, *identifiability_sentences(self.uncertainty))
+        return (*dict.fromkeys(notes), *(profile.message for profile in self.profiles))
+
+
+def _or_nan(value: float | None) -> float:
+    """Return the value; NaN for None."""
+    return np.nan if value is None else value
+
+
+def _estimate_text(estimate: ReportedEstimate) -> str:
+    """Return value, standard uncertainty and combined interval as text."""
+    error = "" if estimate.combined_std_error is None else f" ± {estimate.combined_std_error:.2g}"
+    interval = (
+        "" if estimate.combined95 is None else " [{:.5g}, {:.5g}]".format(*estimate.combined95)
+    )
+    return f"{estimate.value:.5g}{error}{interval}"

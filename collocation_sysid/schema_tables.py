@@ -1,0 +1,166 @@
+"""Building blocks of the tables of a problem file: vectors, alternatives, and sections."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Annotated, Any, Literal, Union, get_args, get_type_hints
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    GetCoreSchemaHandler,
+    Tag,
+    create_model,
+    model_validator,
+)
+
+from .declarations import Key, attributes, documented, keys_of
+from .errors import located
+from .validated_types import Boundless, Finite
+
+Vector = tuple[Finite, Finite, Finite]
+Corner = tuple[Boundless, Boundless, Boundless]
+Unit = Literal["m", "cm", "mm", "in"]
+
+
+@dataclass(frozen=True)
+class ByForm:
+    """Annotation of a key with two alternative forms; values of the types `first` have the first
+    form.
+
+    A tag in <> distinguishes the forms in pydantic's error locations; messages omit it.
+    """
+
+    first: type | tuple[type, ...]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        first, second = get_args(source)
+        forms = Union[Annotated[first, Tag("<first>")], Annotated[second, Tag("<second>")]]  # noqa: UP007
+        return handler.generate_schema(Annotated[forms, Discriminator(self._tag)])
+
+    def _tag(self, value: Any) -> str:
+        return "<first>" if isinstance(value, self.first) else "<second>"
+
+
+@dataclass(frozen=True)
+class Among:
+    """Annotation of a key whose value is one of the given words."""
+
+    words: tuple[str, ...]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        return handler.generate_schema(Literal[self.words])
+
+
+class Section(BaseModel):
+    """Base class of the tables of a problem file.
+
+    The class docstring and its Attributes become the descriptions in the schema and in messages.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        for name, (_, said) in attributes(cls).items():
+            if name in cls.model_fields:
+                cls.model_fields[name].description = said
+        cls.__doc__ = inspect.cleandoc(cls.__doc__ or "").partition("\n\nAttributes\n")[0]
+
+
+def section_of(kind: type, title: str, base: type[Section] = Section) -> Any:
+    """Return the pydantic model of a table that states an instance of a class.
+
+    Parameters
+    ----------
+    kind : type
+        A class decorated with `stated`, whose keys are used, or a dataclass of options, all of
+        whose
+        fields become keys. Its docstring provides the descriptions.
+    title : str
+        Name of the model.
+    base : type
+        Base model with further keys of the table.
+    """
+    stated = [key for _, key in keys_of(kind)]
+    keys: dict[str, Any] = {
+        key.name: (key.form, Field(key.default, description=key.said)) for key in stated
+    }
+    checks: dict[str, Any] = {
+        f"_{key.name}_or": model_validator(mode="after")(_either(key.constant, key.name))
+        for key in stated
+        if key.constant is not None
+    }
+    doc = inspect.cleandoc(kind.__doc__ or "").partition("\n")[0]
+    made = keys or _options(kind)
+    return create_model(title, __base__=base, __doc__=doc, __validators__=checks, **made)
+
+
+def tables(name: str, kind: type) -> Key:
+    """Return the key of an array of tables [[name]], each of which states an instance of `kind`."""
+    form = list[section_of(kind, f"{kind.__name__}Section")]
+    return Key(name, form, default=[], tables=kind)
+
+
+def _options(kind: Any) -> dict[str, Any]:
+    types = get_type_hints(kind, include_extras=True)
+    descriptions = documented(kind)
+    keys: dict[str, Any] = {}
+    for each in fields(kind):
+        form = types[each.name]
+        default = each.default
+        if isinstance(form, type) and is_dataclass(form):
+            form = section_of(form, f"{form.__name__}Section")
+            default = form()
+        keys[each.name] = (form, Field(default, description=descriptions.get(each.name)))
+    return keys
+
+
+def stated_in(section: Section, kind: type, where: str) -> dict[str, Any]:
+    """Return the fields of a class that a table states, by name; tables in files are not read yet.
+
+    Parameters
+    ----------
+    section : Section
+    kind : type
+        Class decorated with `stated`.
+    where : str
+        Location of the table, for messages.
+
+    Raises
+    ------
+    InputError
+        For an invalid value; the message names its key.
+    """
+    fields: dict[str, Any] = {}
+    for name, key in keys_of(kind):
+        value = getattr(section, key.name)
+        if value is not None and key.constant is None and key.tables is None:
+            with located(where=f"{where}.{key.name}"):
+                fields[name] = key.read(value) if key.read else value
+    return fields
+
+
+def _either(*names: str) -> Callable[[Any], Any]:
+    def check(section: Any) -> Any:
+        require_one(section, *names)
+        return section
+
+    return check
+
+
+def given_keys(section: Section, *names: str) -> list[str]:
+    """Return those of the keys that the file states."""
+    return [name for name in names if getattr(section, name) is not None]
+
+
+def require_one(section: Section, *names: str) -> None:
+    """Raise ValueError unless the section states exactly one of the keys."""
+    there = given_keys(section, *names)
+    if len(there) != 1:
+        which = " and ".join(there) or f"no {' or '.join(names)}"
+        raise ValueError(f"found {which}; expected exactly one of {', '.join(names)}")

@@ -1,0 +1,610 @@
+"""Verdict on a fit: "good", "check" or "doubtful", with its reasons.
+
+Each function whose name ends in "concerns" examines one thing and returns a list of concerns, empty
+if there are none. Levels of significance are strict: at least 95 % of fits to faultless data are to
+be "good", however many markers and nuisance parameters there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal, get_args
+
+import numpy as np
+
+from ..array_types import Array
+from ..display import short
+from ..errors import listed
+from ..fem.constants import symbol_of, unit_of
+from ..program.contact_summary import ContactSummary
+from ..program.stability import Instability
+from ..recording.experiment import Experiment
+from ..recording.grasp_rotation import WARNING_ANGLE_RAD, fastest_rotation
+from .concerns import Concern, concern_if
+from .discretisation_error import Refinement
+from .distributions import chi2_sf, normal_isf
+from .estimates import Estimate, display_name
+from .misspecification_hypothesis import Hypothesis
+from .noise_level import NoiseLevel
+from .relaxed_assumptions import Probe
+from .residual_diagnostics import MOST_WILD, MarkerDiagnosis
+from .routine_probes import is_alarming
+from .uncertainty import Uncertainty
+from .uncertainty_budget import source_label
+
+Verdict = Literal["good", "check", "doubtful"]
+
+# Factor of the misfit from which on a hypothesis is as good as certain.
+CERTAIN = 2.0
+# Probability of a false alarm of each test.
+RARE = 1e-4
+# Residuals over sigma, or sigma over residuals: from here on "check". The noise of
+# cameras is known to about this factor.
+MISFIT = 1.5
+# Residuals over sigma: from here on "doubtful" if they are not white, or are those of a prediction.
+# The only threshold for doubtful residuals; docs/howto/verdict.md states its value.
+GROSS_MISFIT = 3.0
+# Factor by which one marker may be noisier than the others.
+MARKER_MISFIT = 2.0
+# Autocorrelation from which on errors matter.
+PERSISTENT = 0.2
+# Additional distance of a forward simulation, over the RMS distance of the fit or of noise:
+# "check".
+ROLLOUT = 0.35
+# The same for "doubtful".
+GROSS_ROLLOUT = 2.0
+# Distance of a prediction over that of the fit: "check".
+PREDICTION = 3.0
+# The same for "doubtful".
+GROSS_PREDICTION = 10.0
+# Nuisance parameters in standard deviations of their priors: "check".
+FAR = 3.0
+# The same for "doubtful".
+ABSURD = 6.0
+# Pose of a depth camera in standard deviations of its prior: "check", because it compensates wrong
+# shapes.
+CAMERA_FAR = 2.0
+# Distance of outline points from the edge [pixels] that needs an explanation: edges of pixels
+# scatter by 0.3, lenses and wrong depths at edges by one.
+OUTLINE_FAR_PX = 3.0
+# Share of outline points that may be farther.
+OUTLINE_SHARE = 0.1
+# Time shift in standard deviations of its prior: "check".
+LATE = 1.8
+# Share of the samples beyond Huber's threshold: "check".
+WILD = MOST_WILD
+# The same for "doubtful".
+HARDLY_TAME = 0.2
+# Damping ratio that a scheme adds, over that of the mode: "check".
+DAMPING_SHARE = 0.2
+# The same for "doubtful".
+GROSS_DAMPING_SHARE = 1.0
+# Added damping ratio that never matters.
+LITTLE_DAMPING = 0.005
+# Relative change of a period by the scheme: "check".
+PERIOD_ERROR = 0.02
+# The same for "doubtful".
+GROSS_PERIOD_ERROR = 0.1
+# Powers of e by which a disturbance may grow in a recording: "check".
+E_FOLDINGS = 1.0
+# The same for "doubtful".
+GROSS_E_FOLDINGS = 7.0
+# Number of faces below which the mesh determines the width of a contact.
+FEWEST_FACES = 4.0
+# Combined standard uncertainties by which step and mesh may change a parameter: the half width of
+# its 95 % interval.
+MOVED = 2.0
+# Codes of the concern about an estimated, and about a measured discretisation error.
+NUMERICAL = "scheme/step", "mesh/refined"
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """Concerns, the gravest first, and the resulting verdict.
+
+    Attributes
+    ----------
+    concerns : tuple of Concern
+        Empty if the verdict is "good".
+    """
+
+    concerns: tuple[Concern, ...] = ()
+    SERIALISED_PROPERTIES: ClassVar = ("verdict", "reasons")
+
+    @classmethod
+    def from_concerns(cls, concerns: Iterable[Concern]) -> Assessment:
+        """Build from concerns; duplicates are removed and the gravest come first."""
+        by_message = {concern.message: concern for concern in reversed([*concerns])}
+        gravest = sorted(reversed(by_message.values()), key=lambda each: each.grade == "check")
+        return cls(tuple(gravest))
+
+    @property
+    def verdict(self) -> Verdict:
+        """Verdict in one word.
+
+        "good": nothing speaks against the answer and its error bars. "check": usable, after a look
+        at the reasons. "doubtful": something is wrong with data, model or solve.
+        """
+        return self.concerns[0].grade if self.concerns else "good"
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Messages of the concerns, in the order of `solution_concerns`."""
+        return tuple(concern.message for concern in self.concerns)
+
+    def combined_with(self, other: Assessment) -> Assessment:
+        """Return the graver of two verdicts, with the reasons of both."""
+        light, grave = sorted((other, self), key=lambda t: get_args(Verdict).index(t.verdict))
+        return Assessment.from_concerns((*grave.concerns, *light.concerns))
+
+
+def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
+    """Return concerns about likely misspecifications, "doubtful" if the misfit decreases by
+    more than a factor of two without one.
+    """
+    return [
+        replace(cause, subject=f"likely: {cause.subject}").concern(
+            "doubtful" if cause.strength > CERTAIN else "check"
+        )
+        for cause in causes
+    ]
+
+
+def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
+    """Return concerns about the residuals: their size compared with σ, correlation,
+    outliers and disagreement of recordings.
+    """
+    level = uncertainty.level
+    dependence = uncertainty.dependence
+    factor = float(np.sqrt(level.pooled))
+    limit = float(normal_isf(RARE / 2)) * dependence.lag1_deviation
+    persistent = abs(dependence.lag1) > max(PERSISTENT, limit)
+    shared = dependence.shared_p < RARE
+    is_used = uncertainty.errors == "autocorrelated" and (persistent or shared)
+    larger = factor > MISFIT and level.larger_p < RARE
+    # Of single samples nothing tells that it is noise.
+    no_noise = persistent or shared or not np.isfinite(dependence.lag1_deviation)
+    # Residuals of exactly zero are those of no measurement at all.
+    smaller = not larger and 0 < factor < 1 / MISFIT and level.smaller_p < RARE and not is_used
+    stated = level.sigma_key
+    return [
+        *(outlier.concern for outlier in uncertainty.outliers),
+        *concern_if(
+            is_used and persistent,
+            factor > GROSS_MISFIT,
+            "residuals/persist",
+            autocorrelation=dependence.lag1,
+        ),
+        *concern_if(is_used and not persistent, False, "residuals/shared"),
+        *concern_if(
+            larger, factor > GROSS_MISFIT and no_noise, "noise/larger", factor=factor, stated=stated
+        ),
+        *concern_if(smaller, False, "noise/smaller", factor=1 / (factor or 1.0), stated=stated),
+        *_noisy_marker_concerns(level),
+        *_disagreement_concerns(uncertainty),
+    ]
+
+
+def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:
+    """Return a concern if recordings disagree on shared parameters."""
+    scatter = uncertainty.scatter
+    disagreeing = [] if scatter is None else np.flatnonzero(scatter.is_disagreeing).tolist()
+    names = [display_name(uncertainty.names[k]) for k in disagreeing]
+    return concern_if(bool(names), False, "residuals/recordings", names=names)
+
+
+def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
+    """Return a concern if markers are much noisier than the others."""
+    if not level.unequal_p < RARE:
+        return []
+    usual = float(np.median([*level.factors.values()]))
+    noisy = [n for n, f in level.factors.items() if f > MARKER_MISFIT * max(1.0, usual)]
+    if not noisy:
+        return []
+    worst = max(noisy, key=level.factors.__getitem__)
+    code = "noise/marker" if len(noisy) == 1 else "noise/markers"
+    data = {"marker": worst, "factor": level.factors[worst], "count": len(noisy)}
+    return [Concern(code, data=data)]
+
+
+def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
+    """Return concerns about parameters at their bounds, and about those that the data do
+    not determine.
+    """
+    known = uncertainty.estimates
+    estimates = {name: known[name] for name in uncertainty.names if name in known}
+    bounded = [name for name, estimate in estimates.items() if estimate.at_bound]
+    undetermined = [
+        name
+        for name, estimate in estimates.items()
+        if not estimate.at_bound and estimate.statistical_std_error is None
+    ]
+    several = len(bounded) > 1
+    code = "information/bounds" if several else "information/bound"
+    return [
+        *concern_if(bool(bounded), several, code, names=bounded),
+        *concern_if(
+            bool(undetermined),
+            len(undetermined) == len(estimates),
+            "information/none",
+            names=undetermined,
+        ),
+    ]
+
+
+def numerical_concerns(
+    optimum: Mapping[str, Estimate],
+    combined_std_errors: Mapping[str, float | None],
+    refinement: Refinement | None,
+) -> list[Concern]:
+    """Return a concern if step or mesh dominate the uncertainty of a parameter.
+
+    Parameters
+    ----------
+    optimum : mapping of name to Estimate
+        Estimates before the correction of the discretisation error.
+    combined_std_errors : mapping of name to float or None
+        Combined standard uncertainties; None if unknown.
+    refinement : Refinement or None
+        Discretisation errors; None if they are unknown, which is no concern.
+    """
+    if refinement is None:
+        return []
+    worst, largest = refinement.largest_correction(optimum, combined_std_errors)
+    if largest <= MOVED:
+        return []
+    value = optimum[worst].value
+    percent = 100 * (refinement.errors[worst].extrapolated - value) / abs(value)
+    code = NUMERICAL[1] if refinement.levels else NUMERICAL[0]
+    return [Concern(code, data={"name": worst, "percent": percent, "errors": largest})]
+
+
+# What is assumed, by the name of the relaxed assumption, for messages.
+RELAXED = {
+    "stiffness_drift": "the stiffness is constant during a recording",
+    "clock_rate": "the clocks of cameras and robot run at the same rate",
+    "time_scale": "all clocks run at the right rate",
+}
+
+
+def probe_concerns(probes: Iterable[Probe], corrections: Mapping[str, float]) -> list[Concern]:
+    """Return a concern about the assumption that the data contradict most, with the estimates
+    without it.
+
+    Other assumptions that would explain the data less well are named in the same concern, because
+    relaxing one is mostly a substitute for relaxing another.
+
+    Parameters
+    ----------
+    probes : iterable of Probe
+        Relaxed assumptions.
+    corrections : mapping of str to float
+        The estimated parameters in the order in which they are reported, each with the factor that
+        corrects its optimum for the known discretisation error.
+    """
+    alarming = sorted(filter(is_alarming, probes), key=lambda each: -each.chi_squared)
+    if not alarming:
+        return []
+    worst, *others = alarming
+    instead = listed(f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in others)
+    data = {
+        "assumption": RELAXED.get(worst.name, f"{source_label(worst.name)} is as stated"),
+        "name": source_label(worst.name),
+        "size": short(worst.size or 0.0),
+        "size_error": short(worst.size_error or 0.0),
+        "chi_squared": worst.chi_squared,
+        "estimates": [_relaxed_estimate(worst, *each) for each in corrections.items()],
+        "instead": f"; less well also by {instead}" if others else "",
+    }
+    return [Concern("assumption/contradicted", data=data)]
+
+
+def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
+    """Return the estimate of a parameter with an assumption relaxed, as text."""
+    move = probe.moves.get(name)
+    if move is None:
+        return f"{symbol_of(name)} not determined"
+    value = correction * move.value
+    return f"{symbol_of(name)} = {value:.4g} ± {move.std_error:.2g} {unit_of(name)}".strip()
+
+
+def outlier_share_concerns(diagnoses: Iterable[MarkerDiagnosis]) -> list[Concern]:
+    """Return a concern if too many samples are beyond Huber's threshold."""
+    diagnoses_list = tuple(diagnoses)
+    share = sum(d.wild for d in diagnoses_list) / max(1, sum(d.samples for d in diagnoses_list))
+    return concern_if(share > WILD, share > HARDLY_TAME, "residuals/wild", percent=100 * share)
+
+
+def nuisance_concerns(
+    names: Iterable[str], deviations: Iterable[float], low: Iterable[float], high: Iterable[float]
+) -> list[Concern]:
+    """Return concerns about nuisance parameters far from their priors or at their limits.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Labels.
+    deviations : iterable of float
+        Estimates φ in standard deviations of their priors.
+    low, high : iterables of float
+        Limits of the estimates, likewise.
+    """
+    items = [*zip(names, deviations, low, high, strict=True)]
+    limit = max(FAR, float(normal_isf(RARE / 2 / max(1, len(items))))) if items else FAR
+    concerns: list[Concern] = []
+    for name, phi, lowest, highest in items:
+        deviation = abs(float(phi))
+        limited = not lowest + 1e-3 < phi < highest - 1e-3
+        concerns += concern_if(limited, True, "nuisance/limit", name=name)
+        concerns += concern_if(
+            deviation > limit and not limited,
+            deviation > ABSURD,
+            "nuisance/far",
+            name=name,
+            deviations=deviation,
+        )
+    return concerns
+
+
+def camera_pose_concerns(names: Sequence[str], deviations: Sequence[float]) -> list[Concern]:
+    """Return a concern if a depth camera is farther from its stated pose than expected.
+
+    A wrong shape of the body often fits with a camera that is rotated and translated to match.
+
+    Parameters
+    ----------
+    names : (k,) sequence of str
+        Labels of the rotation and translation errors of one camera.
+    deviations : (k,) sequence of float
+        Their values in standard deviations of their priors.
+    """
+    if not len(names):
+        return []
+    worst = int(np.argmax(np.abs(deviations)))
+    deviation = abs(float(deviations[worst]))
+    return concern_if(
+        deviation > CAMERA_FAR, False, "nuisance/camera", name=names[worst], deviations=deviation
+    )
+
+
+def outline_concerns(camera: str, distances_px: Array) -> list[Concern]:
+    """Return a concern if the outline of the body differs from the edges in a camera's images.
+
+    Parameters
+    ----------
+    camera : str
+        Name of the depth camera and of its experiment, for the message.
+    distances_px : (n,) array
+        Distances of outline points from the edges in the images [pixels].
+    """
+    share = float(np.mean(np.abs(distances_px) > OUTLINE_FAR_PX)) if len(distances_px) else 0.0
+    return concern_if(
+        share > OUTLINE_SHARE,
+        False,
+        "residuals/outline",
+        camera=camera,
+        pixels=OUTLINE_FAR_PX,
+        percent=100 * share,
+    )
+
+
+def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
+    """Return a concern if a time shift is large for its prior, although it is estimated.
+
+    Parameters
+    ----------
+    name : str
+        Name of the experiment.
+    shift_s : float
+        Estimated shift; positive if the markers were measured later than their times state [s].
+    prior_s : float
+        Standard deviation of its prior [s].
+    """
+    return concern_if(
+        abs(shift_s) > LATE * prior_s,
+        False,
+        "nuisance/clock",
+        experiment=name,
+        shift_ms=1e3 * abs(shift_s),
+        when="later" if shift_s > 0 else "earlier",
+    )
+
+
+def forward_simulation_concerns(
+    name: str, rms_m: float, fit_rms_m: float, noise_rms_m: float, is_fitted: bool
+) -> list[Concern]:
+    """Return a concern if the forward simulation of an experiment is much worse than the fit.
+
+    Parameters
+    ----------
+    name : str
+        Name of the experiment.
+    rms_m : float
+        Root mean square distance of the simulated markers from the measurements [m].
+    fit_rms_m : float
+        The same distance of the fit, or for a prediction of the fits of other experiments [m].
+    noise_rms_m : float
+        Distance that noise alone would give [m]; without both there is no concern.
+    is_fitted : bool
+        Whether the experiment was fitted; if not, the simulation is a prediction.
+    """
+    yardstick_m = max(fit_rms_m, noise_rms_m)
+    if not yardstick_m:  # nothing of the kind is measured
+        return []
+    if not is_fitted:
+        times = rms_m / yardstick_m
+        gross = times > GROSS_PREDICTION
+        return concern_if(
+            times > PREDICTION, gross, "roll-out/predicted", experiment=name, times=times
+        )
+    missed = float(np.sqrt(max(0.0, rms_m**2 - fit_rms_m**2))) / yardstick_m
+    return concern_if(
+        missed > ROLLOUT,
+        missed > GROSS_ROLLOUT,
+        "roll-out/misses",
+        experiment=name,
+        rms_mm=1e3 * rms_m,
+        fit_mm=1e3 * fit_rms_m,
+    )
+
+
+def prediction_concerns(
+    name: str,
+    what: str,
+    sigma_key: str,
+    sigmas: float,
+    robust_sigmas: float,
+    count: int,
+    size: str = "",
+) -> list[Concern]:
+    """Return a concern if a prediction, for which nothing was fitted, differs from the
+    measurements.
+
+    Parameters
+    ----------
+    name : str
+        Name of the experiment.
+    what : str
+        Name of the measured quantity.
+    sigma_key : str
+        Key of its σ in the problem.
+    sigmas : float
+        Root mean square difference over σ.
+    robust_sigmas : float
+        Root mean square difference over σ with outliers shortened, which decides.
+    count : int
+        Number of measured values.
+    size : str
+        Root mean square difference with its unit, for the message.
+    """
+    is_chance = float(chi2_sf(count * robust_sigmas**2, count)) > RARE
+    return concern_if(
+        robust_sigmas > MISFIT and not is_chance,
+        robust_sigmas > GROSS_MISFIT,
+        "prediction/misses",
+        experiment=name,
+        what=what,
+        stated=sigma_key,
+        sigmas=sigmas,
+        size=f"{size}, " if size else "",
+    )
+
+
+def stability_concerns(instabilities: Iterable[Instability]) -> list[Concern]:
+    """Return concerns about states of the answer in which disturbances grow."""
+    concerns: list[Concern] = []
+    for each in instabilities:
+        grows = each.e_foldings > E_FOLDINGS
+        grossly = each.e_foldings > GROSS_E_FOLDINGS
+        concerns += concern_if(grows, grossly, "stability/grows", **vars(each))
+    return concerns
+
+
+def contact_concerns(summaries: Iterable[ContactSummary], guess: str = "") -> list[Concern]:
+    """Return concerns about obstacles that are never touched, or by too few faces to resolve the
+    contact.
+
+    For a simulation at the guess, also about obstacles that lose contact, or are in contact at the
+    first sample. A concern that several experiments share is returned once, for the worst of them.
+
+    Parameters
+    ----------
+    summaries : iterable of ContactSummary
+        Contact summaries.
+    guess : str
+        Text that refers to the guess, such as " at the guess"; empty for an answer.
+    """
+    concerns: dict[tuple[str, str], list[Concern]] = {}
+    for each in sorted(summaries, key=lambda touch: touch.face_count):
+        data = {"experiment": each.experiment, "obstacle": each.obstacle, "guess": guess}
+        coarse = 0 < each.face_count < FEWEST_FACES
+        numbers = {"faces": each.face_count, "face_mm": each.face_mm}
+        for one in (
+            *concern_if(
+                not each.face_count, not guess, "contact/never", mm=1e3 * each.gap_m, **data
+            ),
+            *concern_if(coarse, False, "contact/coarse", **numbers, **data),
+            *concern_if(
+                bool(guess) and each.is_initially_in_contact, False, "contact/pressed", **data
+            ),
+            *concern_if(
+                bool(guess and each.separation_s),
+                False,
+                "contact/lost",
+                t_s=each.separation_s,
+                **data,
+            ),
+        ):
+            concerns.setdefault((one.code, each.obstacle), []).append(one)
+    return [
+        replace(first, data={**first.data, "more": f" and {len(others)} more" if others else ""})
+        for first, *others in concerns.values()
+    ]
+
+
+def rotation_step_concerns(
+    experiment: Experiment,
+    substeps: int,
+    limit_rad: float = WARNING_ANGLE_RAD,
+    code: str = "scheme/turns",
+) -> list[Concern]:
+    """Return a concern if a grasp rotates by more than `limit_rad` [rad] within a step of the
+    grid.
+    """
+    turn = fastest_rotation(experiment, substeps)
+    numbers = {"step_ms": 1e3 * turn.step_s, "rate_rad_s": turn.rate_rad_s}
+    return concern_if(turn.angle_rad > limit_rad, False, code, **vars(turn), **numbers)
+
+
+def scheme_concerns(
+    name: str, damping_ratio: float, added_ratio: float, period_error: float
+) -> list[Concern]:
+    """Return concerns about the effect of the scheme on the first mode of an experiment.
+
+    Parameters
+    ----------
+    name : str
+        Name of the experiment.
+    damping_ratio : float
+        Damping ratio of the mode at the answer.
+    added_ratio : float
+        Damping ratio that the scheme adds.
+    period_error : float
+        Relative change of the period by the scheme.
+    """
+    return [
+        *concern_if(
+            added_ratio > max(DAMPING_SHARE * damping_ratio, LITTLE_DAMPING),
+            added_ratio > GROSS_DAMPING_SHARE * damping_ratio,
+            "scheme/damping",
+            experiment=name,
+            added=added_ratio,
+            damping=damping_ratio,
+        ),
+        *concern_if(
+            abs(period_error) > PERIOD_ERROR,
+            abs(period_error) > GROSS_PERIOD_ERROR,
+            "scheme/period",
+            experiment=name,
+            change=period_error,
+        ),
+    ]
+
+
+def rms_expected_from_noise_m(sigma_m: Array, samples: Array, parameter_count: float) -> float:
+    """Return the RMS distance of markers that noise alone would leave, √(3 (1 − p/N)) σ, pooled
+    [m].
+
+    Parameters
+    ----------
+    sigma_m, samples : (M,) arrays
+        Stated σ and number of samples of the markers of all experiments.
+    parameter_count : float
+        Number p of parameters that the data determine, of N = 3 Σ samples measurements.
+    """
+    if not samples.sum():
+        return 0.0
+    total = float(samples.sum())
+    remaining = max(0.0, 1 - parameter_count / (3 * total))
+    return float(np.sqrt(3 * remaining * (samples @ sigma_m**2) / total))

@@ -1,0 +1,195 @@
+"""Deeper checks of a fit: refits of parts of the data, and with assumptions relaxed.
+
+Windows of time and recordings are fitted alone by one Gauss–Newton step from the answer, as for
+`scatter`. An assumption that is relaxed joins the linearised fit as one more nuisance parameter,
+with the deviation of the budget as its prior and the changes of the residuals as its derivative,
+see `changes_of_nuisances`. Where its amplitude is significant, the effect is computed again at the
+parameters
+that the step leads to, and a step is taken from there, until parameters settle; the remaining error
+is of second order in the amplitude. Error bars are those of any fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from ..array_types import Array
+from ..methods.initial_trajectories import simulate_trajectories
+from .distributions import normal_isf
+from .linearised import (
+    LinearisedFit,
+    ResidualBlock,
+    gauss_newton_step,
+    least_squares_of_fit,
+    linearise_fit,
+)
+from .recording_scatter import blocks_by_recording, fit_part, single_fits
+from .relaxed_assumptions import (
+    Kind,
+    Probe,
+    SolvedFit,
+    assumption_name,
+    probed_changes,
+    relaxed_probe,
+    with_relaxed_assumption,
+)
+from .routine_probes import ROUTINE, WIDENING, is_alarming, routine_probes, significance_limit
+from .systematic_effects import CORRELATION_KEY
+
+# Into so many windows of time the data are cut.
+WINDOWS = ("first third", "middle third", "last third")
+# Probability that a faultless run has any significant probe, beside those of every solve.
+CHANCE = 0.01
+# Most linear steps of a significant assumption: each is a simulation.
+STEPS = 4
+# Change of a parameter's logarithm in a step that is the last.
+SETTLED = 0.02
+
+
+def routine_probes_with_steps(answered: SolvedFit) -> tuple[Probe, ...]:
+    """Relax the routine assumptions by one linear step, and iterate the one that gives concern.
+
+    A linear step suffices to find that an assumption is wrong, but not for estimates that change by
+    much of their value. The most significant assumption that gives concern therefore takes a few
+    further steps, each with a simulation.
+    """
+    probes_found = routine_probes(answered)
+    alarming = [probe for probe in probes_found if is_alarming(probe)]
+    if not alarming:
+        return probes_found
+    worst = max(alarming, key=lambda probe: probe.chi_squared)
+    followed = replace(
+        _iterate_probe(answered, worst, significance_limit(answered.changes)), routine=True
+    )
+    return tuple(followed if probe is worst else probe for probe in probes_found)
+
+
+def deep_probes(answered: SolvedFit) -> tuple[Probe, ...]:
+    """Refit windows of time, recordings where there are several, and with assumptions relaxed.
+
+    Routine assumptions have the same prior and level of significance as in `routine_probes`.
+    """
+    parts = [*_window_probes(answered), *_recording_probes(answered)]
+    relaxed = [*_relaxed_probes(answered)]
+    tests = sum(len(probe.moves) for probe in parts) + len(relaxed)
+    limit = float(normal_isf(CHANCE / 2 / max(1, tests)))
+    limits = dict.fromkeys(ROUTINE, significance_limit(answered.changes))
+    return (
+        *(_with_significant_moves(each, limit) for each in parts),
+        *(_iterate_probe(answered, probe, limits.get(probe.name, limit)) for probe in relaxed),
+    )
+
+
+def _window_probes(at: SolvedFit) -> Iterator[Probe]:
+    """Yield the refits of a third of every recording's time."""
+    for k, name in enumerate(WINDOWS):
+        cuts = [_third(block, k) for block in at.fit.blocks]
+        blocks = [_restrict(block, cut) for block, cut in zip(at.fit.blocks, cuts, strict=True)]
+        alone = fit_part(at.fit, blocks, np.arange(len(at.fit.names)))
+        yield from _part_probe(at, "window", name, *alone)
+
+
+def _third(block: ResidualBlock, k: int) -> slice:
+    """Return the slice of the samples in third k (an index) of a block's time."""
+    ends = np.round(np.linspace(0, len(block.t_s), len(WINDOWS) + 1)).astype(int)
+    return slice(int(ends[k]), int(ends[k + 1]))
+
+
+def _restrict(block: ResidualBlock, cut: slice) -> ResidualBlock:
+    """Return the block with some samples only."""
+    own = ("t_s", "is_present", "residual", "jacobian", "misfit", "components")
+    there = {name: each[cut] for name in own if (each := getattr(block, name)) is not None}
+    shaken = block.disturbances
+    return replace(block, **there, disturbances=None if shaken is None else shaken[:, cut])
+
+
+def _recording_probes(at: SolvedFit) -> Iterator[Probe]:
+    """Yield the refits of single recordings; none if there is only one."""
+    if len(blocks_by_recording(at.fit)) < 2:
+        return
+    for alone, step in single_fits(at.fit):
+        yield from _part_probe(at, "recording", alone.blocks[0].name, alone, step)
+
+
+def _part_probe(
+    at: SolvedFit, kind: Kind, name: str, alone: LinearisedFit, step: Array
+) -> Iterator[Probe]:
+    """Yield the probe of a part of the data, unless it has fewer measurements than parameters."""
+    if alone.measurement_count <= len(alone.names):
+        return
+    uncertainty = at.uncertainty_of_refit(
+        alone, at.parameters[: alone.shared_count] + step[: alone.shared_count]
+    )
+    remaining = least_squares_of_fit(alone)
+    falls = remaining.loss(-step) - remaining.loss(np.zeros(len(step)))
+    yield Probe(kind, name, falls, at.changes_of_estimates(uncertainty))
+
+
+def _with_significant_moves(probe: Probe, limit: float) -> Probe:
+    """Return the probe with the estimates in `report` that differ more than by chance.
+
+    A part differs from the whole with less than its own error bar (Hausman 1978).
+    """
+    significant = (
+        n for n, move in probe.moves.items() if abs(move.change) > limit * move.std_error
+    )
+    return replace(probe, told=tuple(significant))
+
+
+# Freed assumptions --------------------------------------------------------------------------------
+
+
+def _relaxed_probes(at: SolvedFit) -> Iterator[Probe]:
+    """Relax each assumption that changes anything, by one linear step."""
+    for name in dict.fromkeys(at.changes.names):
+        wide = with_relaxed_assumption(at.fit, at.changes, name, _widening(name))
+        if any(block.jacobian[..., len(at.fit.names) :].any() for block in wide.blocks):
+            yield relaxed_probe(at, name, wide, at.parameters)
+
+
+def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
+    """Iterate a significant probe by further steps, from where its first step leads.
+
+    Parameters
+    ----------
+    at : SolvedFit
+        The fit.
+    probe : Probe
+        Probe of an assumption after one linear step; it is returned unchanged if it is not
+        significant.
+    limit : float
+        Least significant size, in its standard errors.
+    """
+    if not probe.is_beyond(limit):
+        return probe
+    first = len(at.fit.names)
+    collocation = at.collocation
+    kept_names = assumption_name(probe.name), CORRELATION_KEY
+    alone = {name: size if name in kept_names else None for name, size in at.deviations.items()}
+    wide = with_relaxed_assumption(at.fit, at.changes, probe.name, _widening(probe.name))
+    p = at.parameters
+    _, positions = collocation.unpack(at.z)
+    for _ in range(STEPS):
+        step = gauss_newton_step(wide)[:first]
+        p = p + step
+        positions, failure = simulate_trajectories(collocation, p, guess=positions)
+        if failure is not None:
+            break
+        z = collocation.pack(p, positions)
+        changes = probed_changes(collocation, z, alone)
+        there = linearise_fit(collocation, z).with_disturbances(
+            b.disturbances for b in at.fit.blocks
+        )
+        wide = with_relaxed_assumption(there, changes, probe.name, _widening(probe.name))
+        probe = relaxed_probe(at, probe.name, wide, p)
+        if np.abs(step[: wide.shared_count]).max(initial=0.0) < SETTLED:
+            break
+    return replace(probe, told=(probe.name,) if probe.is_beyond(limit) else ())
+
+
+def _widening(name: str) -> float:
+    """Return the deviation of an assumption's prior, in deviations of the budget."""
+    return WIDENING if name in ROUTINE else 1.0

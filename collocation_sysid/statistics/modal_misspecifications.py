@@ -1,0 +1,355 @@
+"""Misspecification hypotheses tested before any solve, by natural modes for many stiffnesses.
+
+The markers of bodies of many stiffnesses (`program.modal_prediction`) are compared with the
+measured tracks, for the description as stated and with each common mistake corrected. A correction
+that fits far better is reported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse.linalg import ArpackError
+from scipy.spatial.transform import Rotation
+
+from ..array_types import Array, Index
+from ..errors import SimulationError
+from ..program.modal_prediction import ModalResponse, StatedMotion, delayed_tracks
+from ..recording.experiment import Experiment
+from .axes import OTHER_AXES
+from .misspecification_hypothesis import Hypothesis, HypothesisTest, clock_hypothesis, rank
+from .plausibility import (
+    load_sign_hypotheses,
+    name_exchange_hypotheses,
+    step_hypotheses,
+    undriven_motion,
+)
+
+# Factor by which the misfit must decrease.
+FAR_BETTER = 2.0
+# Additional factor for hypotheses with fitted numbers.
+FITTED = 1.5
+# Accuracy of small strains and a few modes, over the size of the body.
+ROUGHLY = 0.005
+# Share of the samples that are used, the best ones; others may be exchanged labels or reflections.
+USED = 0.9
+# Clock lags that are tried [s].
+LAGS_S = np.concatenate([-np.arange(15, 0, -1), np.arange(1, 16)]) * 0.01
+# Longest lag over the length of the recording.
+LONGEST_LAG = 0.3
+# Alternations between the best stiffness and the best rigid motion.
+REFITS = 3
+# Additional factor for each of many variants of one mistake.
+ONE_OF_MANY = 1.05
+# Deformation of an equilibrium over the body's diagonal that needs no explanation.
+DEFORMED = 0.1
+# Distance of the tracks over the body's diagonal from which on no stiffness explains them.
+FAR_OFF = 0.3
+
+
+def find_misspecifications_by_modes(
+    experiment: Experiment, constants: Mapping[str, float], huber: float | None = None
+) -> tuple[Hypothesis, ...]:
+    """Return hypotheses about a recording's description, likeliest first; mostly empty.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The recording.
+    constants : mapping of str to float
+        Constants of the body; only ratios of stiffness within it matter.
+    huber : float, optional
+        Threshold of Huber's loss; None means a quadratic loss.
+    """
+    if not experiment.markers.names:
+        return rank(load_sign_hypotheses(experiment))
+    if experiment.is_static:
+        return rank([*load_sign_hypotheses(experiment), *_rigid_axes(experiment)])
+    comparison = ModalComparison.from_experiment(experiment, constants)
+    tried = _rigid_axes(experiment) if comparison is None else comparison.hypotheses()
+    found = [*tried, *name_exchange_hypotheses(experiment, huber), *step_hypotheses(experiment)]
+    found += undriven_motion(experiment)
+    if comparison is not None and not found and not experiment.obstacles:
+        found += comparison.unlike()
+    return rank(found)
+
+
+def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Yield hypotheses of other axes of the tracks that bring them far nearer to the
+    undeformed body.
+    """
+    markers = experiment.markers
+    body = experiment.body
+    places_m = markers.predict_positions(experiment.rigid_positions(experiment.t_s))
+    size_m = float(np.linalg.norm(np.ptp(body.mesh.bounds_m, axis=0)))
+
+    def left(tracks_m: Array) -> float:
+        apart_m = np.linalg.norm(tracks_m - places_m, axis=2)
+        return float(np.hypot(np.nanmedian(apart_m), DEFORMED * size_m))
+
+    if markers.sample_count:
+        trial = HypothesisTest(left(markers.positions_m), left, FAR_BETTER)
+        yield from trial.accepted(_axes(f"'{experiment.name}'", markers.positions_m))
+
+
+def _axes(name: str, tracks_m: Array) -> Iterator[Hypothesis]:
+    """Yield the tracks (T, M, 3) with their axes in every other order and of either sign,
+    as hypotheses.
+    """
+    for axes, (order, signs) in OTHER_AXES.items():
+        turned = np.array(signs) * tracks_m[..., list(order)]
+        yield Hypothesis("markers-axes", name, {"axes": axes}, turned, ONE_OF_MANY)
+
+
+@dataclass(frozen=True, eq=False)
+class ModalComparison:
+    """Comparison of descriptions of one experiment with its tracks.
+
+    Attributes
+    ----------
+    stated : StatedMotion
+        Description as stated.
+    names : (M,) tuple of str
+        Names of the markers.
+    response : ModalResponse
+        Natural modes at the markers.
+    floor_m : float
+        Smallest misfit that can be expected [m].
+    """
+
+    stated: StatedMotion
+    names: tuple[str, ...]
+    response: ModalResponse
+    floor_m: float
+
+    @classmethod
+    def from_experiment(
+        cls, experiment: Experiment, constants: Mapping[str, float]
+    ) -> ModalComparison | None:
+        """Build the comparison for an experiment, see `hypotheses`.
+
+        None if the body has no modes, no single grasp carries it, there are too few tracks, or
+        tendons or pressures drive it.
+        """
+        given = None if experiment.actuators else StatedMotion.from_experiment(experiment)
+        if given is None or np.isfinite(given.tracks_m[..., 0]).sum() < 3:
+            return None
+        try:
+            sway = ModalResponse.from_experiment(experiment, constants)
+        except (SimulationError, np.linalg.LinAlgError, ArpackError):
+            return None
+        markers = experiment.markers
+        noise_m = np.sqrt(3) * np.median(markers.sigma_m)
+        return cls(given, markers.names, sway, float(np.hypot(noise_m, ROUGHLY * sway.size_m)))
+
+    def misfit_m(self, stated: StatedMotion) -> float:
+        """Return the misfit of the best stiffness [m]."""
+        return float(self._misfits_m(stated, self.response.predict(stated)).min())
+
+    def best_prediction(self, stated: StatedMotion) -> Array:
+        """Return the markers (T, M, 3) of the best stiffness [m]."""
+        predicted = self.response.predict(stated)
+        return predicted[int(self._misfits_m(stated, predicted).argmin())]
+
+    def hypotheses(self) -> Iterator[Hypothesis]:
+        """Iterate over the hypotheses that fit far better than the description as stated."""
+        trial = HypothesisTest(self.misfit_m(self.stated), self.misfit_m, FAR_BETTER)
+        yield from trial.accepted(
+            [*simple_hypotheses(self.stated), *self._frame_hypotheses(), *self._clock_hypotheses()]
+        )
+        yield from self._name_hypotheses()
+        yield from self._other_axes()
+
+    def unlike(self) -> Iterator[Hypothesis]:
+        """Yield the hypothesis that no stiffness explains the tracks, if they are far from
+        all predictions.
+        """
+        misfit_m = self.misfit_m(self.stated)
+        size_m = self.response.size_m
+        strength = misfit_m / (FAR_OFF * size_m)
+        if strength > 1:
+            data = {"by_mm": 1e3 * misfit_m, "size_mm": 1e3 * size_m}
+            yield Hypothesis("unlike", self.stated.name, data, strength=strength)
+
+    def _other_axes(self) -> Iterator[Hypothesis]:
+        """Yield hypotheses of other axes of the tracks, tested by the modes."""
+        predicted = self.response.predict(self.stated)
+
+        def left(tracks_m: Array) -> float:
+            turned = replace(self.stated, tracks_m=tracks_m)
+            return float(self._misfits_m(turned, predicted).min())
+
+        given_m = self.stated.tracks_m
+        yield from HypothesisTest(left(given_m), left, FAR_BETTER).accepted(
+            _axes(self.stated.name, given_m)
+        )
+
+    def _misfits_m(self, stated: StatedMotion, predicted: Array) -> Array:
+        """Return the misfit (S,) of each prediction: root mean square distance of the best
+        90 % of the samples, and the floor [m].
+        """
+        present = np.isfinite(stated.tracks_m[..., 0]) & np.isfinite(predicted[0, ..., 0])
+        distance = np.linalg.norm(predicted - stated.tracks_m, axis=3)[:, present]
+        squares = np.sort(distance**2, axis=1)
+        used = max(1, int(np.ceil(USED * squares.shape[1])))
+        return np.sqrt(squares[:, :used].mean(axis=1) + self.floor_m**2)
+
+    def _frame_hypotheses(self) -> Iterator[Hypothesis]:
+        """Yield hypotheses of a rigid motion before the poses, and of a rigid motion of the
+        tracks.
+        """
+        given = self.stated
+        places_m = self.response.places_m
+        if not _determines_rotation(places_m):
+            return
+        moved_poses = moved_tracks = given
+        for k in range(REFITS):
+            best = (
+                moved_poses.to_grasp_frame(self.best_prediction(moved_poses))
+                if k
+                else np.broadcast_to(places_m, given.tracks_m.shape)
+            )
+            moved_poses = moved_poses.with_prior_motion(
+                *_fit_rigid_motion(best, moved_poses.to_grasp_frame(moved_poses.tracks_m))
+            )
+            turn, shift_m = _fit_rigid_motion(
+                moved_tracks.tracks_m, self.best_prediction(moved_tracks)
+            )
+            moved_tracks = replace(moved_tracks, tracks_m=moved_tracks.tracks_m @ turn.T + shift_m)
+        yield Hypothesis("gripper-frame", given.name, corrected=moved_poses, handicap=FITTED)
+        yield Hypothesis("camera-frame", given.name, corrected=moved_tracks, handicap=FITTED)
+
+    def _clock_hypotheses(self) -> Iterator[Hypothesis]:
+        """Yield the hypothesis of the clock lag that fits best."""
+        given = self.stated
+        predicted = self.response.predict(given)
+        allowed = LAGS_S[np.abs(LAGS_S) < LONGEST_LAG * np.ptp(given.t_s)].tolist()
+        delayed = (delayed_tracks(predicted, given.t_s, lag_s) for lag_s in allowed)
+        misfits = [self._misfits_m(given, each).min() for each in delayed]
+        if misfits:
+            lag_s = allowed[int(np.argmin(misfits))]
+            yield clock_hypothesis(given.name, lag_s, replace(given, lag_s=lag_s), FITTED)
+
+    def _name_hypotheses(self) -> Iterator[Hypothesis]:
+        """Yield the hypothesis that markers have each other's names, tested on these markers."""
+        given = self.stated
+        squares = np.sum(
+            (given.tracks_m[:, :, None] - self.best_prediction(given)[:, None]) ** 2, axis=3
+        )
+        is_complete = np.isfinite(squares).any(axis=0).all()
+        if not is_complete or len(self.names) < 2:
+            return
+        _, chosen = linear_sum_assignment(np.nanmean(squares, axis=0))
+        exchanged = np.flatnonzero(chosen != np.arange(len(chosen)))
+        if not len(exchanged):
+            return
+        few, renamed = (
+            _with_markers(given, given.tracks_m[:, order], exchanged)
+            for order in (np.arange(len(chosen)), np.argsort(chosen))
+        )
+        listed = ", ".join(f"{self.names[k]} is {self.names[chosen[k]]}" for k in exchanged)
+        hypothesis = Hypothesis("markers-exchanged", given.name, {"names": listed}, renamed)
+        yield from HypothesisTest(self.misfit_m(few), self.misfit_m, FAR_BETTER).accepted(
+            [hypothesis]
+        )
+
+
+def _with_markers(stated: StatedMotion, tracks_m: Array, markers: Index) -> StatedMotion:
+    """Return the description with the tracks of some markers only."""
+    few_m = np.full_like(tracks_m, np.nan)
+    few_m[:, markers] = tracks_m[:, markers]
+    return replace(stated, tracks_m=few_m)
+
+
+def _fit_rigid_motion(from_m: Array, to_m: Array) -> tuple[Array, Array]:
+    """Return rotation (3, 3) and translation (3,) that map points to others, both (T, M,
+    3), by least squares.
+    """
+    both = np.isfinite(from_m[..., 0]) & np.isfinite(to_m[..., 0])
+    a = from_m[both]
+    b = to_m[both]
+    rotation = Rotation.align_vectors(b - b.mean(axis=0), a - a.mean(axis=0))[0].as_matrix()
+    return rotation, b.mean(axis=0) - rotation @ a.mean(axis=0)
+
+
+def _determines_rotation(places_m: Array) -> bool:
+    """Whether places (M, 3) are not collinear, so that they determine a rotation."""
+    if len(places_m) < 3:
+        return False
+    extents = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)
+    return bool(extents[1] > 0.1 * extents[0])
+
+
+# Factors of lengths in a wrong unit, with the unit to state; empty where none is certain.
+UNITS = {1e-3: "mm", 1e-2: "cm", 0.0254: "in", 1e3: "", 1e2: ""}
+# Cosine of some 20 degrees, above which a direction is not another axis.
+SAME_DIRECTION = 0.94
+
+
+def simple_hypotheses(stated: StatedMotion) -> Iterator[Hypothesis]:
+    """Iterate over the hypotheses without fitted numbers, each with the mistake corrected."""
+    moving = np.ptp(stated.rotations, axis=0).any() or np.ptp(stated.translations_m, axis=0).any()
+    if moving or np.abs(stated.translations_m).any():
+        yield from _pose_hypotheses(stated)
+        yield from _unit_hypotheses(
+            stated, "translations_m", "the poses would fit if they", "grasp"
+        )
+    yield from _unit_hypotheses(stated, "tracks_m", "the markers would fit if they", "markers")
+    yield from _unit_hypotheses(stated, "mesh_scale", "the mesh would fit if it", "object")
+    yield from gravity_hypotheses(stated)
+
+
+def _pose_hypotheses(stated: StatedMotion) -> Iterator[Hypothesis]:
+    """Yield hypotheses of inverted poses, inverted rotations and other quaternion orders."""
+    inverse = stated.rotations.transpose(0, 2, 1)
+    shift = -np.einsum("tij,tj->ti", inverse, stated.translations_m)
+    inverted = replace(stated, rotations=inverse, translations_m=shift)
+    yield Hypothesis("poses-inverted", stated.name, corrected=inverted)
+    yield Hypothesis("rotation-inverted", stated.name, corrected=replace(stated, rotations=inverse))
+    quaternions = Rotation.from_matrix(stated.rotations).as_quat()
+    # Signs are free; neighbours of one sign keep the reordered ones continuous.
+    flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
+    quaternions *= np.cumprod(np.r_[1.0, np.where(flips, -1.0, 1.0)])[:, None]
+    for order, turn in (("wxyz", -1), ("xyzw", 1)):
+        reordered = Rotation.from_quat(np.roll(quaternions, turn, axis=1)).as_matrix()
+        without = replace(stated, rotations=reordered)
+        yield Hypothesis("quaternion-order", stated.name, {"order": order}, without)
+
+
+def _unit_hypotheses(
+    stated: StatedMotion, what: str, who: str, section: str
+) -> Iterator[Hypothesis]:
+    """Yield hypotheses that an attribute of the description is in another unit of length.
+
+    Parameters
+    ----------
+    stated : StatedMotion
+        Description as stated.
+    what : str
+        Attribute of the description.
+    who : str
+        Beginning of the message.
+    section : str
+        Section of the problem file.
+    """
+    key = f"{section}.length_unit"
+    for factor, unit in UNITS.items():
+        remedy = f'set {key} = "{unit}"' if unit else f"check {key}"
+        data = {"who": who, "factor": factor, "remedy": remedy}
+        without = replace(stated, **{what: factor * getattr(stated, what)})
+        yield Hypothesis("length-unit", stated.name, data, without)
+
+
+def gravity_hypotheses(stated: StatedMotion) -> Iterator[Hypothesis]:
+    """Iterate over the hypotheses of gravity along the other axes, and with the other sign."""
+    size = float(np.linalg.norm(stated.gravity_m_s2))
+    for axis, name in enumerate("xyz"):
+        for sign, plus in ((1.0, "+"), (-1.0, "−")):
+            other: Array = np.where(np.arange(3) == axis, sign * size, 0.0)
+            if size and other @ stated.gravity_m_s2 <= SAME_DIRECTION * size**2:
+                data = {"axis": plus + name, "vector": ", ".join(f"{x:g}" for x in other)}
+                without = replace(stated, gravity_m_s2=other)
+                yield Hypothesis("gravity", stated.name, data, without)

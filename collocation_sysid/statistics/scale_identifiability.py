@@ -1,0 +1,166 @@
+"""Quantities that no recording can determine, whatever its noise: a common scale of stiffness and
+mass, and damping without motion.
+
+If all moduli and all densities are multiplied by one number, the equations of motion are the same
+unless a force or mass is known. Slow or static experiments determine stiffness but no damping.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from ..array_types import Array
+from ..errors import listed
+from ..fem.body import Body
+from ..fem.constants import DENSITY, is_damping, is_density, is_modulus, symbol_of, without_region
+from ..methods.stiffness_scan import SOFT_PA, typical_parameters
+from ..model.parameters import Parameters, ThetaMap
+from ..recording.experiment import Experiment
+from .concerns import Concern, Grade
+from .distributions import chi2_isf
+
+# Relative error up to which parameters can multiply all constants by a common factor.
+LEFT = 1e-8
+
+
+def parameters_of_open_scale(
+    experiments: Iterable[Experiment], parameters: Parameters
+) -> tuple[str, ...]:
+    """Return the parameters of which only ratios can be determined, densities among them;
+    mostly empty.
+    """
+    if not any(is_density(item.name) for item in parameters.free):
+        return ()
+    return _scaled_parameters(experiments, parameters, includes_stated=False)
+
+
+def relative_moduli(experiments: Iterable[Experiment], parameters: Parameters) -> tuple[str, ...]:
+    """Return the parameters that are determined relative to the stated densities only."""
+    return _scaled_parameters(experiments, parameters, includes_stated=True)
+
+
+def scale_concerns(
+    experiments: Iterable[Experiment], parameters: Parameters, grade: Grade = "check"
+) -> list[Concern]:
+    """Return a concern if the scale is not determined."""
+    names = parameters_of_open_scale(experiments, parameters)
+    return [Concern("scale/unknown", grade, {"names": names})] if names else []
+
+
+def relative_scale_note(experiments: Iterable[Experiment], parameters: Parameters) -> str | None:
+    """Return the note that moduli are relative to the stated density; None if a force sets
+    the scale, or the scale is open.
+    """
+    names = relative_moduli(experiments, parameters)
+    if not names or parameters_of_open_scale(experiments, parameters):
+        return None
+    verb = "is" if len(names) == 1 else "are"
+    symbols = [symbol_of(name) for name in names]
+    return f"no known force sets the scale: {listed(symbols)} {verb} relative to the stated density"
+
+
+def _scaled_parameters(
+    experiments: Iterable[Experiment], parameters: Parameters, includes_stated: bool
+) -> tuple[str, ...]:
+    """Return the free parameters that multiply all moduli and densities by a common factor; empty
+    if data or priors determine the factor.
+
+    Parameters
+    ----------
+    experiments : iterable of Experiment
+        Experiments; those for validation are ignored.
+    parameters : Parameters
+        Shared parameters.
+    includes_stated : bool
+        Whether densities that are not estimated count as multiplied too.
+    """
+    fitted = [experiment for experiment in experiments if not experiment.validation]
+    bodies = {id(e.body): e.body for e in fitted}
+    with_known_force = {id(e.body) for e in fitted if e.has_known_force}
+    if len(with_known_force) == len(bodies):
+        return ()
+    usual = typical_parameters(parameters, SOFT_PA)
+    slopes = []
+    changes = []
+    for key, body in bodies.items():
+        constants = ThetaMap(usual, body)
+        theta = constants.theta(usual.guess_q)
+        slope = constants.jacobian(usual.guess_q)
+        change = _common_scaling(body, theta, slope, includes_stated)
+        if key in with_known_force or change is None:
+            change = np.zeros(len(slope))
+        size = np.where(theta == 0, 1.0, np.abs(theta))
+        slopes.append(slope / size[:, None])
+        changes.append(change / size)
+    matrix = np.concatenate(slopes)
+    scaling = np.concatenate(changes)
+    if not scaling.any():
+        return ()
+    solution = np.linalg.lstsq(matrix, scaling, rcond=None)[0]
+    moves = np.abs(solution) > LEFT * np.abs(solution).max(initial=0.0)
+    priors = np.array([item.prior is not None for item in usual.free], dtype=bool)
+    if np.abs(matrix @ solution - scaling).max() > LEFT or (moves & priors).any():
+        return ()
+    return tuple(item.name for item, is_moved in zip(usual.free, moves, strict=True) if is_moved)
+
+
+def _common_scaling(body: Body, theta: Array, slope: Array, is_stated: bool) -> Array | None:
+    """Return the change of θ (k,) if all moduli and densities change by a common factor;
+    None if a density cannot.
+    """
+    if not is_stated and not all(part.has_free_density for part in body.parts):
+        return None
+    scaled = [
+        is_modulus(name)
+        or (without_region(name) == DENSITY.name and not (is_stated and not slope[place].any()))
+        for place, name in enumerate(body.constants)
+    ]
+    return np.where(scaled, theta, 0.0)
+
+
+# Probability that noise of a motionless marker is taken for motion.
+RARE = 1e-3
+# Displacement of grasped nodes up to which they count as motionless, over sigma_m.
+HELD = 2.0
+
+
+def is_motionless(experiment: Experiment) -> bool:
+    """Whether neither grasps, loads nor markers change, except for noise."""
+    markers = experiment.markers
+    t_s = experiment.t_s
+    sigma_m = float(np.median(markers.sigma_m)) if markers.names else 0.0
+    is_prescribed, positions_m = experiment.prescribed_displacements(t_s)
+    lasting = is_prescribed.all(axis=0)
+    if (is_prescribed.any(axis=0) != lasting).any():
+        return False
+    displacement_m = np.ptp(positions_m[:, lasting], axis=0)
+    if displacement_m.size and displacement_m.max() > HELD * sigma_m:
+        return False
+    if np.ptp(experiment.point_mass_at_nodes_kg(t_s), axis=0).any():
+        return False
+    if np.ptp(experiment.stated_node_forces_n(t_s), axis=0).any():
+        return False
+    present = markers.is_present[..., None]
+    counts = np.maximum(present.sum(axis=0), 1)
+    mean = np.where(present, markers.positions_m, 0.0).sum(axis=0) / counts
+    deviations = np.where(present, markers.positions_m - mean, 0.0) / markers.sigma_m[:, None]
+    # Of a mean of n samples, the deviations have n − 1 degrees of freedom.
+    freedom = 3 * float(np.maximum(present.sum(axis=0) - 1, 0).sum())
+    return bool(np.sum(deviations**2) <= chi2_isf(RARE, max(freedom, 1.0)))
+
+
+def static_concerns(experiments: Iterable[Experiment], parameters: Parameters) -> list[Concern]:
+    """Return a concern if nothing moves in the fitted recordings, so that damping cannot be
+    determined.
+    """
+    fitted = [experiment for experiment in experiments if not experiment.validation]
+    damping = [item.name for item in parameters.free if is_damping(item.name)]
+    if not fitted or not damping or not all(e.is_static or is_motionless(e) for e in fitted):
+        return []
+    code = "static" if all(experiment.is_static for experiment in fitted) else "still"
+    names = [f"'{e.name}'" for e in fitted]
+    verb = "is" if len(fitted) == 1 else "are"
+    data = {"names": names, "verb": verb, "damping": damping}
+    return [Concern(f"information/{code}", data=data)]

@@ -1,0 +1,790 @@
+"""Systematic effects (type B): assumptions that are not estimated, and what changes if they are
+wrong.
+
+An assumption is a row of `ASSUMPTIONS`: its standard deviation, and its effect on the equations of
+motion, c = Σ w F − M a, or on the prescribed displacements; `changes_of_nuisances` propagates
+effects to the
+residuals. Assumptions that change only the measurements (cameras, clocks) are nuisance parameters,
+see `recording.nuisance`. `Assumptions` is the table of the problem file in which users state
+standard deviations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, make_dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..array_types import Array, Index
+from ..fem.body import Body
+from ..fem.constants import GAMMA_R, without_region
+from ..fem.materials import DAMPINGS, MATERIALS
+from ..fem.moduli import engineering_constants
+from ..fem.rest_shape import RestShape
+from ..model.contact import Contact, contact_terms
+from ..model.dynamics import Dynamics
+from ..model.force_term import States
+from ..model.parameters import Parameters
+from ..program.collocation import ExperimentIterate
+from ..program.contact_summary import surface_gaps_and_pressures
+from ..program.reaction_forces import forces_on_dofs, reaction_forces
+from ..recording.grasp import free_rigid_motions
+from ..recording.nuisance import KINDS
+from ..schema_tables import ByForm, Section
+from ..validated_types import Options, Positive
+from .shape_error import (
+    CORRELATION,
+    SURFACE_MODES,
+    sag_m,
+    standing_nodes,
+    surface_modes,
+    thickness_m,
+)
+from .size_effect import obstacle_shifts_m
+
+# Differences by a scale.
+SMALL = 1e-4
+# Relative standard deviation of the density of the air: weather and room temperature, at the stated
+# altitude. At 2000 m the density is 18 % lower, and has to be stated.
+AIR_DENSITY_DEVIATION = 0.03
+# Relative standard deviation of the added mass and of the drag coefficient of a given body: they
+# depend on its shape, on edges, on amplitude and on frequency.
+AIR_COEFFICIENT_DEVIATION = 0.4
+_AXES = "xyz"
+# Laws of damping that a real material may obey: Rayleigh's resists rotation, as no material does.
+OBJECTIVE_DAMPINGS = ("kelvin-voigt", "material")
+# Differences by a displacement: its largest entry over the length of an edge.
+SMALL_STRAIN = 1e-4
+_MODES = " ".join(str(number) for number in range(1, SURFACE_MODES + 1))
+# Beside the deviations: the correlation length of the error of the surface.
+CORRELATION_KEY = "surface_correlation"
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """Change of the equations of motion if an assumption is off by one unit.
+
+    Attributes
+    ----------
+    force_n : (N, 3n) array or None
+        Change of the forces at the evaluations [N]; None means no change.
+    mass_kg : (3n,) array or None
+        Change of the inertial masses, whose weight is not in `force_n` [kg]; None means no change.
+    time_stretch : float
+        Relative change of the times in the inertia.
+    displacement_m : (N, g) array or None
+        Change of the prescribed positions of the grasped dofs [m]; None means no change.
+    """
+
+    force_n: Array | None = None
+    mass_kg: Array | None = None
+    time_stretch: float = 0.0
+    displacement_m: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ExperimentAtAnswer:
+    """One experiment at the answer, as the effects of assumptions need it.
+
+    Attributes
+    ----------
+    iterate : ExperimentIterate
+        The experiment at the answer.
+    parameters : Parameters
+        Shared parameters.
+    surface_correlation : float
+        Correlation length of the surface's error over the longest extent of the body.
+    """
+
+    iterate: ExperimentIterate
+    parameters: Parameters
+    surface_correlation: float = CORRELATION
+
+    @property
+    def body(self) -> Body:
+        """Body of the experiment."""
+        return self.iterate.segment.body
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """Equations of motion at the answer."""
+        return self.iterate.equations.dynamics
+
+    @property
+    def theta(self) -> Array:
+        """Constants θ of the body (k,)."""
+        return self.dynamics.theta
+
+    @property
+    def gravity(self) -> Array:
+        """Gravity at each dof (3n,) [m/s²]."""
+        return self.dynamics.forces.weight.gravity
+
+    @cached_property
+    def own_mass_kg(self) -> Array:
+        """Masses (3n,) of the body without point masses [kg]."""
+        return self.body.mass_of_dofs(self.theta)
+
+    @cached_property
+    def acceleration(self) -> Array:
+        """Accelerations (N, 3n) of the rows [m/s²]."""
+        return self.dynamics.acceleration(self.iterate.x)
+
+    @cached_property
+    def states(self) -> tuple[Array, Array]:
+        """States ξ [m] and velocities ν [m/s] at the evaluations, each (N, 3n); zero before
+        the first.
+        """
+        xi, nu = self.dynamics.evaluation_states(self.iterate.x)
+        return self.pad_rows(xi), self.pad_rows(nu)
+
+    def pad_rows(self, evaluated: Array) -> Array:
+        """Return values (N, 3n) of all rows from those of the evaluations, zero before the
+        first.
+        """
+        return np.concatenate([np.zeros((self.dynamics.first_row, evaluated.shape[1])), evaluated])
+
+    def internal_n(
+        self,
+        length_factor: float = 1.0,
+        time_factor: float = 1.0,
+        theta: Array | None = None,
+        body: Body | None = None,
+    ) -> Array:
+        """Return the material's forces (N, 3n) at scaled lengths or times, without γ_m [N].
+
+        Parameters
+        ----------
+        length_factor : float
+            Factor of lengths: positions and velocities are divided by it.
+        time_factor : float
+            Factor of times: velocities are divided by it.
+        theta : (k,) array, optional
+            Constants of the body; those of the answer by default.
+        body : Body, optional
+            Body with another stress-free shape.
+        """
+        undamped = (self.theta if theta is None else theta).copy()
+        undamped[list(self.body.tied_shares)] = 0.0
+        dynamics = self.dynamics.with_theta(undamped)
+        histories = dynamics.forces_with_histories(dynamics.histories(self.iterate.x)).memory_state
+        xi, nu = dynamics.evaluation_states(self.iterate.x)
+        evaluated = self.body if body is None else body
+        return self.pad_rows(
+            evaluated.force(
+                xi / length_factor,
+                nu / (length_factor * time_factor),
+                undamped,
+                memory_input=histories,
+            )
+        )
+
+    @cached_property
+    def internal_force_n(self) -> Array:
+        """Forces (N, 3n) of the material at the answer, without γ_m [N]."""
+        return self.internal_n(body=self.body.with_stress_free(self.stress_free_m))
+
+    @cached_property
+    def stress_free_m(self) -> Array:
+        """Stress-free positions (n, 3) of the nodes, without nodes of obstacle frames [m]."""
+        body = self.body
+        return (
+            body.nodes.points_m
+            if body.inverse_equilibrium is None
+            else self._rest_shape.positions_m
+        )
+
+    @cached_property
+    def _rest_shape(self) -> RestShape:
+        """Stress-free shape that follows from a mesh made under gravity."""
+        assert self.body.inverse_equilibrium is not None
+        return self.body.inverse_equilibrium.solve(self.theta)
+
+    def force_change_by_reference(self, moved_m: Array) -> Array:
+        """Return the first-order change (N, 3n) of the material's forces if the stress-free
+        positions change by (n, 3) [m].
+        """
+        largest = float(np.abs(moved_m).max(initial=0.0))
+        if not largest:
+            return np.zeros_like(self.iterate.x)
+        step = SMALL_STRAIN * self.iterate.segment.length_m / largest
+        own = self.stress_free_m + step * moved_m[: len(self.stress_free_m)]
+        other = self.body.with_stress_free(own)
+        return (self.internal_n(body=other) - self.internal_force_n) / step
+
+    def force_change_by_scan_weight(self) -> Array:
+        """Return the change (N, 3n) of forces per relative change of the weight during the
+        scan; zero unless the mesh was made under gravity.
+        """
+        if self.body.inverse_equilibrium is None:
+            return np.zeros_like(self.iterate.x)
+        return self.force_change_by_reference(
+            self.body.inverse_equilibrium.weight_sensitivity(self.theta)
+        )
+
+    @cached_property
+    def surface_modes_m(self) -> Array:
+        """Displacements (modes, n, 3) of the nodes if the surface is off by the thickness
+        of the body, for each mode [m].
+        """
+        segment = self.iterate.segment
+        gaps_m = surface_gaps_and_pressures(segment.experiment, self.theta, self.iterate.x)[0]
+        nearest = np.fmin.reduce(gaps_m, axis=0)
+        is_touched = np.nan_to_num(nearest, nan=np.inf) < segment.length_m
+        known = np.unique(self.body.mesh.surface[is_touched])
+        modes = surface_modes(self.body, known, self.surface_correlation)
+        return thickness_m(self.body) * modes
+
+    @cached_property
+    def likely_support_dofs(self) -> Index:
+        """Dofs that were probably supported while the mesh was made: those prescribed in
+        the recording, or else the lowest nodes.
+        """
+        prescribed = self.iterate.equations.prescribed.dofs
+        own = prescribed[prescribed < self.body.nodes.points_m.size]
+        points_m = self.body.nodes.points_m
+        if len(free_rigid_motions(points_m, _dof_mask(own, len(points_m)))):
+            gravity = self.iterate.segment.experiment.gravity_m_s2
+            nodes = standing_nodes(self.body, gravity)
+            return (3 * nodes[:, None] + np.arange(3)).ravel()
+        return own
+
+    def weight_and_drag(self, mass_kg: Array) -> Array:
+        """Return weight and γ_m damping (N, 3n) of masses (3n,) [N]."""
+        return mass_kg * (self.gravity - self.body.tied_damping_rate(self.theta) * self.states[1])
+
+    @property
+    def buoyancy_n(self) -> Array:
+        """Buoyancy (N, 3n) in the model [N]; zero in a vacuum."""
+        lifted = -self.dynamics.mass.displaced_kg * self.gravity
+        return np.broadcast_to(lifted, self.iterate.x.shape)
+
+    @property
+    def added_mass_kg(self) -> Array:
+        """Added mass (3n,) of the air in the model [kg]; zero in a vacuum."""
+        return self.dynamics.mass.added_kg
+
+    @cached_property
+    def air_drag_n(self) -> Array:
+        """Drag of the air (N, 3n) in the model [N]; zero in a vacuum and where nothing moves."""
+        term = self.dynamics.forces.air_drag
+        if term is None:
+            return np.zeros_like(self.states[1])
+        drag = term.force(States(*self.states, self.theta))
+        drag[: self.dynamics.first_row] = 0.0
+        return drag
+
+    @cached_property
+    def grasp_force_n(self) -> Array:
+        """Reaction forces (N, g) on the grasped dofs [N]; zero while they are not prescribed."""
+        dofs = self.iterate.equations.prescribed.dofs
+        x = self.iterate.x
+        force = forces_on_dofs(self.dynamics, x, dofs)
+        mass = self.dynamics.mass.inertia_kg[:, dofs]
+        reaction_n = reaction_forces(self.dynamics, mass, force, self.acceleration[:, dofs])
+        return np.where(np.isnan(self.iterate.equations.prescribed.positions_m), 0.0, reaction_n)
+
+    @cached_property
+    def contacts(self) -> dict[int, Contact]:
+        """Contact forces derived from an energy, by their index among the further forces."""
+        further = enumerate(self.dynamics.forces.external_terms)
+        return {
+            k: each
+            for k, each in further
+            if isinstance(each, Contact) and not each.is_complementarity
+        }
+
+    def contact_n(self, index: int) -> Array:
+        """Return the forces (N, 3n) of one of `contact_terms` at the evaluations [N]."""
+        xi, nu = self.dynamics.evaluation_states(self.iterate.x)
+        forces = self.dynamics.evaluated_forces
+        term = forces.external_terms[index]
+        return self.pad_rows(term.force(forces.states_of_terms(xi, nu)(term)))
+
+    @cached_property
+    def proportional_s(self) -> Array:
+        """Damping times γ_r (E,) of elements with Rayleigh damping γ_r K(x) v [s], zero of
+        others.
+        """
+        gamma_r_s = np.zeros(len(self.body.cells))
+        for part, start in zip(self.body.parts, self.body.starts, strict=False):
+            if GAMMA_R in part.damping.constants and part.damping.stress is None:
+                gamma_r_s[part.cells] = self.theta[start + part.constants.index(GAMMA_R)]
+        return gamma_r_s
+
+    @cached_property
+    def young_pa(self) -> float:
+        """Young's modulus of the softest part at small strain [Pa]."""
+        return min(
+            engineering_constants(*moduli)[0] for moduli in self.body.lame(self.theta).values()
+        )
+
+
+def _dof_mask(dofs: Index, nodes: int) -> NDArray[np.bool_]:
+    """Return the mask (n, 3) of the coordinates of n nodes that are among the dofs."""
+    mask = np.zeros(3 * nodes, dtype=bool)
+    mask[dofs] = True
+    return mask.reshape(nodes, 3)
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """Quantity that is taken as stated instead of being estimated.
+
+    Attributes
+    ----------
+    name : str
+        Name, as in problem files and budgets.
+    unit : str
+        Unit of its deviation.
+    sigma : float or None
+        Default standard deviation, as in a careful laboratory; None if the effect counts only where
+        a problem states its deviation.
+    description : str
+        Description.
+    effect : callable
+        Returns the effect of one unit, from an experiment at the answer and the index of the
+        component; None if there is no effect in this experiment.
+    component_names : str
+        Names of components with independent errors, separated by spaces; empty if there is one.
+    """
+
+    name: str
+    unit: str
+    sigma: float | None
+    description: str
+    effect: Callable[[ExperimentAtAnswer, int], Effect | None]
+    component_names: str = ""
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Names of the components, each after that of the assumption."""
+        return tuple(f"{self.name} {a}" for a in self.component_names.split()) or (self.name,)
+
+
+# What each changes ------------------------------------------------------------------------------
+
+
+def _size(at: ExperimentAtAnswer, _: int) -> Effect:
+    """Return the effect of a body that is larger by a share: f = s² f(x/s, v/s).
+
+    From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths. Goals of grasped nodes scale
+    about the middle of the grasps; obstacles keep their size and are moved so that they first touch
+    the body as before, see `size_effect.obstacle_shifts_m`. Contact areas grow by s², and a contact
+    stiffness that is not stated falls by s, as it follows the edges of the mesh.
+    """
+    larger = 1 + SMALL
+    smaller = 1 - SMALL
+    force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(smaller)
+    force = force / (2 * SMALL)
+    # Of a body made under gravity the deflection over the size grows with the weight over s².
+    heavier = at.force_change_by_scan_weight() * (-2.0 if at.body.has_stated_mass else 1.0)
+    mass = (0.0 if at.body.has_stated_mass else 3.0) * at.own_mass_kg
+    for number, contact in at.contacts.items():
+        stated = contact.law_of_contact.obstacle.stiffness_pa_m is not None
+        force += (2.0 if stated else 1.0) * at.contact_n(number)
+    segment = at.iterate.segment
+    turns: Array = np.nan_to_num(segment.prescribed_motion.pose_rows[0])
+    arms_m = (
+        segment.prescribed_motion.displaced_nodes(at.iterate.phi)[0]
+        - segment.nuisance.grasp_pivot_m
+    )
+    displacement_m = np.einsum("tgj,gj->tg", turns, arms_m)
+    for obstacle, shift_m in obstacle_shifts_m(at.iterate):
+        obstacle_dofs = np.searchsorted(segment.prescribed_motion.dofs, obstacle.prescribed_dofs)
+        displacement_m[:, obstacle_dofs] = np.tile(shift_m, len(obstacle.nodes))
+    air = 3.0 * at.buoyancy_n + 2.0 * at.air_drag_n
+    return Effect(
+        force + heavier + at.weight_and_drag(mass) + air,
+        mass + 3.0 * at.added_mass_kg,
+        displacement_m=displacement_m,
+    )
+
+
+def _mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of a body that is heavier by a share; None if a density is estimated."""
+    if any(part.has_free_density for part in at.body.parts):
+        return None
+    return Effect(
+        at.weight_and_drag(at.own_mass_kg) + at.force_change_by_scan_weight(), at.own_mass_kg
+    )
+
+
+def _density_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
+    """Effect of a density that is higher at one end of the body and lower at the other, by
+    a share.
+    """
+    place = at.body.nodes_m[:, axis]
+    middle = np.average(place, weights=at.own_mass_kg[::3])
+    mass = at.own_mass_kg * np.repeat((place - middle) / np.abs(place - middle).max(), 3)
+    return Effect(at.weight_and_drag(mass), mass)
+
+
+def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
+    """Effect of a stiffness that is higher along one axis by a share of E: the energy ½ E e² of the
+    strain e along it.
+
+    Rayleigh damping K(x) v follows by its time derivative.
+    """
+    body = at.body
+    xi, nu = at.states
+    count, points = body.geometry.shape[:2]
+    geometry = body.stress_free_geometry(at.theta)
+    slopes = geometry[..., :-1].reshape(count, points, -1, 3)[..., axis]
+    weight = at.young_pa * geometry[..., -1]
+    force = np.zeros_like(xi)
+    gamma = at.proportional_s[:, None, None]
+    for x, v, own in zip(xi, nu, force, strict=True):
+        stretch, rate = (
+            np.einsum("eqa,eaj->eqj", slopes, each.reshape(-1, 3)[body.cells]) for each in (x, v)
+        )
+        strain = 0.5 * (np.sum(stretch**2, axis=2, keepdims=True) - 1)
+        pull = (strain + gamma * np.sum(stretch * rate, axis=2, keepdims=True)) * stretch
+        pull = weight[..., None] * (pull + gamma * strain * rate)
+        np.subtract.at(own.reshape(-1, 3), body.cells, np.einsum("eqa,eqj->eaj", slopes, pull))
+    force[: at.dynamics.first_row] = 0.0
+    return Effect(force)
+
+
+def _drift(at: ExperimentAtAnswer, _: int) -> Effect:
+    """Effect of a stiffness that is higher at the end than at the beginning, by a share."""
+    t_s = at.dynamics.evaluated_s
+    since = (t_s - t_s.mean()) / max(np.ptp(t_s), 1e-300)
+    return Effect(at.internal_n() * since[:, None])
+
+
+def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of clocks that are fast by a share, so that less time passes than they show;
+    None for a static experiment.
+    """
+    if at.iterate.segment.experiment.is_static:
+        return None
+    slower = at.internal_n(time_factor=1 + SMALL)
+    faster = at.internal_n(time_factor=1 - SMALL)
+    drag = at.body.tied_damping_rate(at.theta) * at.dynamics.mass.damped_kg * at.states[1]
+    air = 2.0 * at.air_drag_n
+    return Effect((faster - slower) / (2 * SMALL) - drag + air, time_stretch=-1.0)
+
+
+def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of a larger Poisson's ratio where it is stated; None where it is estimated."""
+    items = {item.name: item for item in at.parameters.items}
+    stated = {
+        name
+        for name, item in items.items()
+        if without_region(name) == "poisson"
+        and (items[item.tied.to] if item.tied else item).is_fixed
+    }
+    if not stated:
+        return None
+    values = at.parameters.values(at.iterate.q)
+    larger, smaller = (
+        at.internal_n(
+            theta=at.body.theta_from_values({n: v + way * (n in stated) for n, v in values.items()})
+        )
+        for way in (SMALL, -SMALL)
+    )
+    return Effect((larger - smaller) / (2 * SMALL))
+
+
+def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of a compliant layer of the body's own material in the grips; None without a grip.
+
+    A grasp that prescribes some axes only is a platen or a plane of symmetry, not a grip.
+    """
+    prescribed = at.iterate.equations.prescribed
+    holding = at.iterate.segment.experiment.body_grasps
+    gripped = [grasp.prescribed_dofs for grasp in holding if len(grasp.axes) == len(_AXES)]
+    if not gripped:
+        return None
+    area_m2 = at.body.dof_volume_m3[prescribed.dofs] ** (2 / 3)
+    is_gripped = np.isin(prescribed.dofs, np.concatenate(gripped))
+    displacement_m = np.zeros_like(at.grasp_force_n)
+    displacement_m[:, is_gripped] = -at.grasp_force_n[:, is_gripped] / (
+        at.young_pa * area_m2[is_gripped]
+    )
+    return Effect(displacement_m=displacement_m)
+
+
+def _is_driven(at: ExperimentAtAnswer) -> NDArray[np.bool_]:
+    """Return the mask (g,) of grasped dofs whose prescribed position changes."""
+    goals = at.iterate.equations.prescribed.positions_m
+    return np.asarray(np.nanmax(goals, axis=0) > np.nanmin(goals, axis=0))
+
+
+def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of the compliance of a test bench: displacements are measured behind its
+    frame. None for dynamic experiments.
+    """
+    experiment = at.iterate.segment.experiment
+    prescribed = at.iterate.equations.prescribed
+    if not experiment.is_static or not (driven := _is_driven(at)).any():
+        return None
+    displacement_m = np.zeros_like(at.grasp_force_n)
+    for grasp in experiment.grasps:
+        for axis in range(3):
+            here = np.flatnonzero(
+                np.isin(prescribed.dofs, grasp.prescribed_dofs) & (prescribed.dofs % 3 == axis)
+            )
+            if driven[here].any():
+                displacement_m[:, here] = -at.grasp_force_n[:, here].sum(axis=1, keepdims=True)
+    return Effect(displacement_m=displacement_m)
+
+
+def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of friction on nodes that slide along platens, perpendicular to the loading axis; None
+    without platens.
+
+    Planes of symmetry have no normal force in the loading direction, and no friction.
+    """
+    experiment = at.iterate.segment.experiment
+    prescribed = at.iterate.equations.prescribed
+    if not experiment.is_static:
+        return None
+    pressed = {_AXES[k] for k in np.unique(prescribed.dofs[_is_driven(at)] % 3)}
+    platens = [g for g in experiment.grasps if len(g.axes) < 3 and pressed & set(g.axes)]
+    force = np.zeros_like(at.iterate.x)
+    x = at.iterate.x
+    start = at.body.nodes_m.ravel()
+    for grasp in platens:
+        across = [k for k, name in enumerate(_AXES) if name not in grasp.axes]
+        for node in grasp.nodes:
+            normal = np.isin(prescribed.dofs, [3 * node + _AXES.index(a) for a in grasp.axes])
+            press = np.linalg.norm(at.grasp_force_n[:, normal], axis=1)
+            dofs = [3 * node + k for k in across]
+            way = x[:, dofs] - start[dofs]
+            length = np.linalg.norm(way, axis=1, keepdims=True)
+            force[:, dofs] -= press[:, None] * way / np.maximum(length, 1e-9)
+    return Effect(force) if platens else None
+
+
+def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of rigid contact in place of the pressure law, to first order."""
+    if not at.contacts:
+        return None
+    xi, nu = at.dynamics.evaluation_states(at.iterate.x)
+    forces = at.dynamics.evaluated_forces
+    change_n = np.zeros_like(xi)
+    for contact in contact_terms(at.iterate.segment.experiment):
+        if not contact.is_complementarity:
+            change_n += contact.rigid_limit_n(forces.states_of_terms(xi, nu)(contact))
+    return Effect(at.pad_rows(change_n))
+
+
+def _buoyancy(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of more buoyancy, as a share of that in the model; None in a vacuum."""
+    return Effect(at.buoyancy_n) if at.added_mass_kg.any() else None
+
+
+def _added_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of more added mass, as a share of that in the model; None in a vacuum."""
+    if at.iterate.segment.experiment.is_static or not at.added_mass_kg.any():
+        return None
+    return Effect(mass_kg=at.added_mass_kg)
+
+
+def _air_drag(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of more drag, as a share of that in the model; None in a vacuum."""
+    return Effect(at.air_drag_n) if at.iterate.segment.experiment.has_air_drag else None
+
+
+def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
+    """Effect of replacing the stated damping law by another with the same γ_r.
+
+    Parts with a custom law keep it, and so do parts of linear material, for which all laws agree.
+    None if there is no difference, or the experiment is static.
+    """
+    body = at.body
+    names = body.constants.items()
+    is_damped = any(
+        constant is GAMMA_R and value for (_, constant), value in zip(names, at.theta, strict=False)
+    )
+    if at.iterate.segment.experiment.is_static or not is_damped:
+        return None
+    parts = tuple(
+        replace(part, damping=DAMPINGS[law])
+        if part.damping in DAMPINGS.values() and part.material is not MATERIALS["linear"]
+        else part
+        for part in body.parts
+    )
+    if all(own.damping is other.damping for own, other in zip(body.parts, parts, strict=True)):
+        return None
+    xi, nu = at.dynamics.evaluation_states(at.iterate.x)
+    histories = at.dynamics.forces_with_histories(at.dynamics.histories(at.iterate.x)).memory_state
+    forces_n = (
+        each.force(xi, nu, at.theta, memory_input=histories)
+        for each in (body.with_parts(parts), body)
+    )
+    return Effect(at.pad_rows(next(forces_n) - next(forces_n)))
+
+
+def _objective_damping(at: ExperimentAtAnswer, index: int) -> Effect | None:
+    """Effect of another objective damping law, by its index in `OBJECTIVE_DAMPINGS`."""
+    return _other_damping(at, OBJECTIVE_DAMPINGS[index])
+
+
+def _rayleigh_damping(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of Rayleigh damping, which is not objective, instead of the stated law."""
+    return _other_damping(at, "rayleigh")
+
+
+def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
+    """Effect of a mesh that was made under the body's own weight along one of its axes.
+
+    None if the problem states the stress-free shape.
+    """
+    if at.body.rest_shape is not None:
+        return None
+    return Effect(
+        at.force_change_by_reference(sag_m(at.body, at.theta, at.likely_support_dofs, axis))
+    )
+
+
+def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
+    """Effect of an error of the surface along its normal, by one mode of a smooth random field."""
+    moved_m = at.surface_modes_m[mode]
+    grasping = at.iterate.segment.prescribed_motion
+    turns: Array = np.nan_to_num(grasping.pose_rows[0])
+    offsets_m = moved_m.ravel()[
+        3 * (at.iterate.equations.prescribed.dofs // 3)[:, None] + np.arange(3)
+    ]
+    return Effect(
+        at.force_change_by_reference(moved_m),
+        displacement_m=np.einsum("tgj,gj->tg", turns, offsets_m),
+    )
+
+
+# fmt: off
+ASSUMPTIONS = (
+    Assumption("body_scale", "1", 0.01, "size of the mesh", _size),
+    Assumption("rest_shape", "1", 0.58,
+        "weight under which a mesh hung that nothing is stated of, along each axis", _rest_shape,
+        "x y z"),
+    Assumption("surface", "1", 0.005,
+        "place of the surface along its normal over the thickness", _surface, _MODES),
+    Assumption("mass", "1", 0.01, "mass of the body, where it is not estimated", _mass),
+    Assumption("density_gradient", "1", 0.05,
+        "density at one end of the body over that in its middle", _density_gradient, "x y z"),
+    Assumption("anisotropy", "1", 0.05,
+        "stiffness along one axis over that across", _anisotropy, "x y z"),
+    Assumption("stiffness_drift", "1", 0.02,
+        "stiffness at the end over that at the beginning", _drift),
+    Assumption("time_scale", "1", 1e-4, "pace of all clocks", _time_scale),
+    Assumption("poisson", "", 0.02, "Poisson's ratio, where it is stated", _poisson),
+    Assumption("damping_law", "1", 1.0,
+        "damping force of another objective law, in its difference from the stated one",
+        _objective_damping, " ".join(OBJECTIVE_DAMPINGS)),
+    Assumption("rayleigh_damping", "1", None,
+        "damping force of Rayleigh's law, in its difference from the stated one",
+        _rayleigh_damping),
+    Assumption("grip_layer_m", "m", 2e-4,
+        "what grip and skin give way, as thickness of the body's own material", _grip),
+    Assumption("machine_compliance_m_n", "m/N", 1e-6, "what a test bench gives way", _machine),
+    Assumption("platen_friction", "", 0.1,
+        "friction of what holds nodes across and lets them slide", _platen_friction),
+    Assumption("contact_stiffness", "1", 1.0,
+        "softness of contact with obstacles, in that of the pressure law", _contact_stiffness),
+    Assumption("buoyancy", "1", AIR_DENSITY_DEVIATION,
+        "buoyancy over that in the model, by the density of the air", _buoyancy),
+    Assumption("added_mass", "1", AIR_COEFFICIENT_DEVIATION,
+        "air that moves with the body over that in the model", _added_mass),
+    Assumption("air_drag", "1", AIR_COEFFICIENT_DEVIATION,
+        "drag of the air over that in the model", _air_drag),
+)
+# fmt: on
+
+
+class KnownEffect(Section):
+    """Systematic effect of known sign and size, for which estimates are corrected to first order.
+
+    Attributes
+    ----------
+    mean : float
+        Its size.
+    deviation : float
+        Standard deviation of its size.
+    """
+
+    mean: Positive
+    deviation: Positive
+
+
+Deviation = Annotated[Literal["none"] | Positive, ByForm(str)]
+KnownDeviation = Annotated[KnownEffect | Deviation, ByForm((dict, KnownEffect))]
+# Rows that are never negative, of which a mean may be stated: what gives way does not push.
+OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n")
+_SAID = """How far off what is assumed may be: standard deviations, or "none" of what is exact.
+
+Of what is known to be there, such as the compliance of a machine, a table of mean and deviation.
+Nuisance parameters of recordings, by their names, count where they are not estimated.
+
+Attributes
+----------
+"""
+_FIELDS = [(row.name, row.sigma, f"{row.description} [{row.unit or 1}]") for row in ASSUMPTIONS]
+_FIELDS += [(row.name, row.considered, f"{row.said} [{row.unit}]") for row in KINDS]
+
+
+class _AssumptionsBase(Options):
+    """Methods of the table of standard deviations."""
+
+    @classmethod
+    def exact(cls) -> Assumptions:
+        """Return the table with all assumptions exactly true, as for a simulated recording."""
+        exact: dict[str, Literal["none"]] = dict.fromkeys(vars(Assumptions()), "none")
+        return Assumptions(**exact)
+
+    @property
+    def deviations(self) -> dict[str, float | None]:
+        """Standard deviations by name; None for what is exact."""
+        by_name: dict[str, float | None] = {}
+        for name, stated in vars(self).items():
+            known = stated.deviation if isinstance(stated, KnownEffect) else stated
+            by_name[name] = None if known == "none" else known
+        return by_name
+
+    @property
+    def means(self) -> dict[str, float]:
+        """Known effects by name, each over its standard deviation."""
+        return {
+            name: stated.mean / stated.deviation
+            for name, stated in vars(self).items()
+            if isinstance(stated, KnownEffect)
+        }
+
+
+if TYPE_CHECKING:
+
+    @dataclass(frozen=True, init=False)
+    class Assumptions(_AssumptionsBase):
+        """Standard deviations of all assumptions and nuisance parameters, one field per row
+        of `ASSUMPTIONS` and of `recording.nuisance.ROWS`.
+        """
+
+        def __init__(
+            self, **deviations: float | Literal["none"] | KnownEffect | Mapping[str, float]
+        ) -> None: ...
+
+else:
+    Assumptions = make_dataclass(
+        "Assumptions",
+        [
+            (
+                name,
+                KnownDeviation if name in OF_KNOWN_SIGN else Deviation,
+                field(default=sigma or "none"),
+            )
+            for name, sigma, _ in _FIELDS
+        ],
+        bases=(_AssumptionsBase,),
+        frozen=True,
+        kw_only=True,
+        namespace={
+            "__module__": __name__,
+            "__doc__": _SAID + "\n".join(f"{name}\n    {said}." for name, _, said in _FIELDS),
+        },
+    )
