@@ -1,8 +1,8 @@
 """Declaration of classes that users state in Python or in a problem file.
 
-`stated` makes a frozen dataclass whose fields are converted and checked on construction; `key`
-declares the conversion of a field and the form that it has in a problem file. A field without a
-converter is checked against that form.
+`stated` makes a frozen dataclass whose fields are converted and checked on construction;
+`legend_handles` declares the conversion of a field and the form that it has in a problem file. A
+field without a converter is checked against that form.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ def printable(text: str) -> str:
 
 
 def excerpt(text: str, longest: int = LONGEST_EXCERPT) -> str:
-    """Return the text, cut to `longest` letters."""
+    """Return the text, cut to `longest_displacement_m` letters."""
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 

@@ -55,9 +55,9 @@ class Run(SolvedProblem):
     """
 
     def __str__(self) -> str:
-        from .result.run_sections import summary  # how it looks is no part of a run
+        from .result.run_sections import run_summary  # how it looks is no part of a run
 
-        return plain_text(summary(self.result))
+        return plain_text(run_summary(self.result))
 
     @cached_property
     def result(self) -> Result:
@@ -68,9 +68,9 @@ class Run(SolvedProblem):
         """Return parameters, combined intervals, their sources and the verdict, as printed in the
         terminal.
         """
-        from .result.run_sections import answer  # how it looks is no part of a run
+        from .result.run_sections import estimate_sections  # how it looks is no part of a run
 
-        return plain_text(answer(self.result))
+        return plain_text(estimate_sections(self.result))
 
     def plot(
         self, experiment: str | None = None, field: str | None = "von_mises_pa", count: int = 6
@@ -100,12 +100,12 @@ class Run(SolvedProblem):
             For an unknown experiment or field, an invalid count, or a run without motion.
         """
         from .result.animation import chosen  # how it looks is no part of a run
-        from .result.pictures.shapes import portrait
+        from .result.pictures.shapes import field_shapes
         from .result.run_record import replays
 
         replay = chosen(replays(self), experiment)
         bodies = {each.name: each.body for each in self.problem.experiments}
-        return portrait(replay, bodies[replay.name], self.parameters, field, count)
+        return field_shapes(replay, bodies[replay.name], self.parameters, field, count)
 
     def save(self, folder: str | Path, frames: bool = True, pictures: bool = True) -> Path:
         """Write the run folder, completely or not at all, and return it.

@@ -60,7 +60,7 @@ from collocation_sysid.recording import read_markers, read_poses
 from collocation_sysid.recording.formats import topics  # noqa: F401
 from collocation_sysid.result import run_record
 from collocation_sysid.result.export import TARGETS
-from collocation_sysid.result.pictures import album  # noqa: F401
+from collocation_sysid.result.pictures import all_pictures  # noqa: F401
 from collocation_sysid.runs import check  # noqa: F401
 
 Rng = np.random.Generator

@@ -30,7 +30,7 @@ def _runs_without_pictures() -> Iterator[None]:
 def _no_lines_of_slow_machines() -> Iterator[None]:
     """What runs leave on stderr does not depend on how busy the machine is."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(solve_progress, "FIRST_S", 1e6)
+        patch.setattr(solve_progress, "FIRST_LINE_S", 1e6)
         yield
 
 

@@ -23,16 +23,16 @@ from collocation_sysid.display import escape
 from collocation_sysid.errors import InputError
 from collocation_sysid.result import animation
 from collocation_sysid.result.animation import (
-    FOOT_MM,
-    HEAD_MM,
-    WIDTH_MM,
-    Film,
+    FILM_WIDTH_MM,
+    FOOT_HEIGHT_MM,
+    HEAD_HEIGHT_MM,
+    FilmFigure,
     animate,
     film_samples,
 )
 from collocation_sysid.result.figure_style import GREEN
-from collocation_sysid.result.interactive_view import frame_files, view
-from collocation_sysid.result.replay import headline, read_run
+from collocation_sysid.result.interactive_view import frame_files, view_run
+from collocation_sysid.result.replay import read_run, run_headline
 from collocation_sysid.result.web_page import Colouring, surface_strain, write_page
 from collocation_sysid.statistics.assessment import Assessment
 from collocation_sysid.statistics.concerns import Concern
@@ -82,7 +82,7 @@ def test_a_run_stores_what_is_needed_to_look_at_it(run):
 
 
 def test_a_film_has_its_length_and_moves(run, tmp_path):
-    file = animate(run, tmp_path / "deep" / "film.gif", fps=20, slow=2)
+    file = animate(run, tmp_path / "deep" / "film.gif", fps=20, slowdown=2)
     frames = frames_in(file)
     assert len(frames) == 4  # 0.08 s, twice as long, 20 a second
     assert np.abs(frames[-1] - frames[0]).max() > 100
@@ -100,49 +100,49 @@ def test_a_film_is_a_gif_in_the_run_folder_by_default(run, tmp_path):
 
 def test_the_simulation_is_drawn_as_edges_over_the_fit(run):
     _, (swing, nod) = read_run(run)
-    film = Film(swing)
-    assert [name for name, *_ in film.panels] == ["fitted", "simulated"]
-    film.show(3)
-    (*_, fitted, _), (*_, simulated, title) = film.panels
-    assert len(fitted.skin.get_facecolor()) > 1
-    assert len(simulated.skin.get_facecolor()) == 0
-    assert simulated.skin.get_paths()
-    assert to_hex(simulated.skin.get_edgecolor()[0]) == to_hex(title.get_color()) == to_hex(GREEN)
-    (alone,) = Film(nod).panels
+    film = FilmFigure(swing)
+    assert [name for name, *_ in film.drawings] == ["fitted", "simulated"]
+    film.show_sample(3)
+    (*_, fitted, _), (*_, simulated, title) = film.drawings
+    assert len(fitted.faces.get_facecolor()) > 1
+    assert len(simulated.faces.get_facecolor()) == 0
+    assert simulated.faces.get_paths()
+    assert to_hex(simulated.faces.get_edgecolor()[0]) == to_hex(title.get_color()) == to_hex(GREEN)
+    (alone,) = FilmFigure(nod).drawings
     assert alone[0] == "simulated"
     assert alone[3].wire is None
 
 
 def test_a_film_has_the_errors_of_both_beside_the_body_and_a_line_at_its_time(run):
     _, (swing, _) = read_run(run)
-    film = Film(swing)
-    film.show(4)
+    film = FilmFigure(swing)
+    film.show_sample(4)
     _, errors = film.figure.axes
     assert [line.get_label() for line in errors.lines[:2]] == ["fitted", "simulated"]
     assert film.cursor is not None
     assert film.cursor.get_xdata()[0] == pytest.approx(swing.t_s[4] - swing.t_s[0])
     unmarked = replace(swing, measured_m=np.full_like(swing.measured_m, np.nan))
-    assert Film(unmarked).cursor is None
+    assert FilmFigure(unmarked).cursor is None
 
 
 def test_the_body_fills_a_large_part_of_the_frame(run):
     """It stood in a half of the frame beside its double."""
     _, (swing, _) = read_run(run)
-    film = Film(swing)
-    film.show(3)
-    corners = np.concatenate([path.vertices for path in film.panels[0][3].skin.get_paths()])
+    film = FilmFigure(swing)
+    film.show_sample(3)
+    corners = np.concatenate([path.vertices for path in film.drawings[0][3].faces.get_paths()])
     width, height = np.ptp(corners, axis=0)
-    room = film.figure.axes[0].get_ylim()[1] - HEAD_MM - FOOT_MM
-    assert max(height / room, width / WIDTH_MM) > 0.6
+    room = film.figure.axes[0].get_ylim()[1] - HEAD_HEIGHT_MM - FOOT_HEIGHT_MM
+    assert max(height / room, width / FILM_WIDTH_MM) > 0.6
 
 
 def test_the_film_says_how_far_the_markers_are_off(run):
     _, (swing, _) = read_run(run)
-    film = Film(swing)
-    film.show(8)
-    *_, title = film.panels[0]
+    film = FilmFigure(swing)
+    film.show_sample(8)
+    *_, title = film.drawings[0]
     assert title.get_text() == "fitted: 0.00 mm"
-    assert film.clock.get_text() == "0.08 s"
+    assert film.time_label.get_text() == "0.08 s"
 
 
 def test_frames_show_the_nearest_samples():
@@ -223,7 +223,7 @@ def test_the_page_needs_nothing_else_and_holds_the_motion(run, tmp_path):
 def test_names_are_shown_on_the_page_and_fill_no_place_of_it(run, tmp_path):
     _, (swing, _) = read_run(run)
     name = "@DATA@ @HEADLINE@ </title><script><!-- \x1b"
-    quantity = Colouring.field("<!--<script>", surface_strain(swing, swing.positions_m))
+    quantity = Colouring.by_field("<!--<script>", surface_strain(swing, swing.positions_m))
     page = write_page(replace(swing, name=name), tmp_path / "a.html", colouring=quantity)
     text = page.read_text(encoding="utf-8")
     assert re.findall(r"<title>(.*)</title>", text) == [escape(name)]
@@ -254,18 +254,19 @@ def test_a_page_is_coloured_by_the_field_asked_for(run, tmp_path):
 
 def test_page_and_film_say_what_was_found(run, tmp_path):
     result, (swing, _) = read_run(run)
-    assert headline(result).startswith("E = ")
-    assert headline(result).endswith(f"verdict: {result.trust.verdict}")
+    assert run_headline(result).startswith("E = ")
+    assert run_headline(result).endswith(f"verdict: {result.trust.verdict}")
     one = a_result(
         {"core.young_pa": value(1543.21, 123.4)}, trust=Assessment((Concern("solve/moves"),))
     )
-    assert headline(one) == "E core = 1543.2 ± 120 Pa; verdict: check"
+    assert run_headline(one) == "E core = 1543.2 ± 120 Pa; verdict: check"
     run_command("view", run, "--html", tmp_path / "page.html")
-    assert headline(result) in (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert run_headline(result) in (tmp_path / "page.html").read_text(encoding="utf-8")
     texts = [
-        text.get_text() for text in Film(swing, headline=headline(result)).figure.axes[0].texts
+        text.get_text()
+        for text in FilmFigure(swing, headline=run_headline(result)).figure.axes[0].texts
     ]
-    assert headline(result) in texts
+    assert run_headline(result) in texts
 
 
 def test_turning_is_no_strain_and_stretching_is(run):
@@ -305,8 +306,8 @@ def test_the_view_finds_the_frames(run):
 @pytest.mark.slow  # starting VTK takes longer than everything else here
 def test_the_view_colours_the_body_by_a_field(run, tmp_path):
     pytest.importorskip("pyvista")
-    view(run, "det_f", screenshot=tmp_path / "view.png")
+    view_run(run, "det_f", screenshot=tmp_path / "view.png")
     (picture,) = frames_in(tmp_path / "view.png")
     assert picture.std() > 5
     with pytest.raises(InputError, match="expected one of det_f, energy_density_j_m3"):
-        view(run, "colour", screenshot=tmp_path / "view.png")
+        view_run(run, "colour", screenshot=tmp_path / "view.png")

@@ -23,7 +23,7 @@ from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import displaced_axes, read_displacement, read_wrench
 from collocation_sysid.recording.formats.units import si_factor
 from collocation_sysid.recording.time_tables import read_pressure
-from collocation_sysid.result.run_sections import run_report, summary
+from collocation_sysid.result.run_sections import run_report, run_summary
 from collocation_sysid.result.synthesis import write_data
 from collocation_sysid.statistics.modal_misspecifications import find_misspecifications_by_modes
 
@@ -265,12 +265,12 @@ def test_loads_of_a_part_are_reported_for_the_whole_specimen(tmp_path):
         arrays.append(np.load(tmp_path / name / "trajectory.npz")["second/wrench_1"])
     np.testing.assert_allclose(arrays[0][:, 3], [0, -2.5, -6, -9])  # as in the file
     np.testing.assert_allclose(arrays[0][:, 1:], 4 * arrays[1][:, 1:], rtol=1e-6)
-    said = plain_text(summary(found.result, tmp_path / "whole"))
+    said = plain_text(run_summary(found.result, tmp_path / "whole"))
     words = (
         "loads of 'first' and 'second': of the whole specimen, 4 times those of the modelled part"
     )
     assert words in said
-    assert "specimen" not in plain_text(summary(alone.result, tmp_path / "part"))
+    assert "specimen" not in plain_text(run_summary(alone.result, tmp_path / "part"))
     priors_n = [
         float(re.search(r"tare up to \S+ N \(prior (\S+)\)", said)[1])
         for each in (found.result, alone.result)

@@ -30,7 +30,7 @@ from collocation_sysid import (
 from collocation_sysid.display import plain_text
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.recording.nuisance import KINDS
-from collocation_sysid.result.run_sections import summary
+from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.combined_intervals import combine
 from collocation_sysid.statistics.consider_analysis import (
@@ -213,7 +213,7 @@ def test_terminal_page_and_pictures_show_the_budget(finished, tmp_path):
     assert (folder / "budget.png").exists()
     told = Result.read(folder)
     assert set(told.budget["mu_pa"]) == set(finished.budget["mu_pa"].shares)
-    short, whole = (plain_text(summary(told, folder, budget=b)) for b in (False, True))
+    short, whole = (plain_text(run_summary(told, folder, budget=b)) for b in (False, True))
     assert "± syst" in short
     assert "% of the variance" not in short
     assert "% of the variance" in whole

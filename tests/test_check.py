@@ -24,7 +24,7 @@ from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.numerical_damping import numerical_mode
 from collocation_sysid.model.schemes import SCHEMES, as_scheme
 from collocation_sysid.problem import Problem
-from collocation_sysid.result.check_sections import closer_table, glance_table
+from collocation_sysid.result.check_sections import full_check_tables, quick_check_tables
 from collocation_sysid.runs.check import CheckResult, check_problem, quick_check
 from collocation_sysid.runs.check.body_check import element_concerns, slenderness, worst_elements
 from collocation_sysid.runs.check.cost import MethodCost, cost_concerns, cost_notes
@@ -364,7 +364,7 @@ def test_the_command_shows_it_before_anything_is_simulated(tiny: Path, monkeypat
 
 
 def test_every_grasp_of_an_experiment_is_shown():
-    shown = plain_text(glance_table(quick_check(Problem([bar_in_two_hands()], TRUTH))))
+    shown = plain_text(quick_check_tables(quick_check(Problem([bar_in_two_hands()], TRUTH))))
     (first,) = re.findall(r"grasp 1 of 'bar in two hands' .* at \((.*?)\) mm", shown)
     (second,) = re.findall(r"grasp 2 of 'bar in two hands' .* at \((.*?)\) mm", shown)
     assert (first, second) == ("0, 0, 0", "150, 0, 0")
@@ -377,12 +377,12 @@ def test_a_long_simulation_is_left_out_and_told_unless_asked_for(tiny: Path, mon
     short = check_problem(problem, told.append)
     assert short.rms_at_guess_m is None
     assert any("but for their first samples" in n and "check --full" in n for n in short.notes)
-    assert "markers are missed by" not in plain_text(closer_table(short))
+    assert "markers are missed by" not in plain_text(full_check_tables(short))
     assert short.derivatives_agree
     assert not any("simulating the recordings" in each for each in told)
     whole = check_problem(problem, told.append, full=True)
     assert (whole.rms_at_guess_m or 0) > 0
-    assert "markers are missed by" in plain_text(closer_table(whole))
+    assert "markers are missed by" in plain_text(full_check_tables(whole))
     assert any("simulating the recordings at the guess" in each for each in told)
     assert short.jacobian_nonzeros == whole.jacobian_nonzeros
 

@@ -313,12 +313,12 @@ def test_another_result_in_the_folder_is_left_alone_when_the_pictures_are_drawn(
 
 
 def test_an_interrupted_run_writes_its_best_iterate(tiny, monkeypatch):
-    def interrupt(self: progress_shown.Progress, line: Iteration) -> None:
+    def interrupt(self: progress_shown.SolveProgress, line: Iteration) -> None:
         if line.number == 1:
             signal.raise_signal(signal.SIGINT)
             time.sleep(0.5)  # until it is heard, on the main thread
 
-    monkeypatch.setattr(progress_shown.Progress, "iteration", interrupt)
+    monkeypatch.setattr(progress_shown.SolveProgress, "iteration", interrupt)
     monkeypatch.setattr(
         pipeline, "find_misspecifications", lambda _: pytest.fail("nobody waits for this")
     )
@@ -407,7 +407,7 @@ def test_a_real_process_keeps_its_streams_apart(tiny):
 def test_a_terminal_shows_iterations_as_they_come(tiny):
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=100)
-    with progress_shown.Progress(console, cs.Problem.read("problem.toml")) as progress:
+    with progress_shown.SolveProgress(console, cs.Problem.read("problem.toml")) as progress:
         progress.iteration(Iteration(3, 1.0, 2.5e-3, 1e-4, TRUTH, 0.5))
         progress.say("checking")
     assert "violation N" in screen.getvalue()
@@ -416,7 +416,7 @@ def test_a_terminal_shows_iterations_as_they_come(tiny):
 
 
 def test_elsewhere_long_work_leaves_a_line_now_and_then(monkeypatch):
-    monkeypatch.setattr("collocation_sysid.result.solve_progress.FIRST_S", 0.01)
+    monkeypatch.setattr("collocation_sysid.result.solve_progress.FIRST_LINE_S", 0.01)
     told, lines = threading.Event(), []
 
     class Log(io.StringIO):
@@ -425,12 +425,12 @@ def test_elsewhere_long_work_leaves_a_line_now_and_then(monkeypatch):
             told.set()
             return len(text)
 
-    with progress_shown.Progress(Console(file=Log())) as progress:
+    with progress_shown.SolveProgress(Console(file=Log())) as progress:
         progress.say("simulating the first samples")
         assert told.wait(30.0)
     assert "finding a start" in lines[0] or "simulating the first samples" in lines[0]
     assert "s so far)" in lines[0]
-    with progress_shown.Progress(Console(file=Log()), quiet=True) as progress:
+    with progress_shown.SolveProgress(Console(file=Log()), quiet=True) as progress:
         assert progress._heartbeat is None
     assert not any(thread.name == Heartbeat.NAME for thread in threading.enumerate())
 
@@ -725,10 +725,10 @@ def test_a_terminal_is_told_what_is_waited_for_before_anything_heavy(monkeypatch
     screen = io.StringIO()
     terminal = PlainConsole(file=screen, force_terminal=True, width=100)
     for module in (cli, command_options):
-        monkeypatch.setattr(module, "errors", terminal)
-    assert cli.Commands().get_command(None, "check") is not None
+        monkeypatch.setattr(module, "error_console", terminal)
+    assert cli.LazyCommands().get_command(None, "check") is not None
     assert "starting" in screen.getvalue()
-    command_options.OfProblem(problem=Path("problem.toml")).read()
+    command_options.ProblemOptions(problem=Path("problem.toml")).read_problem()
     assert "reading" in screen.getvalue()
 
 
@@ -738,7 +738,7 @@ def test_a_terminal_gets_lines_that_break_between_words(monkeypatch):
         file = io.StringIO()
         shown = Console(file=file, force_terminal=live, width=40, color_system=None)
         monkeypatch.setattr(common, "PlainConsole", lambda shown=shown, **_: shown)
-        common.show(words)
+        common.print_result(words)
         found = file.getvalue().splitlines()
         assert len(found) == lines
         assert {word for line in found for word in line.split()} == {"misfit"}

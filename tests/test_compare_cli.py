@@ -191,7 +191,7 @@ def test_an_interrupted_study_says_how_to_resume(tiny, stand_in, monkeypatch):
 def test_progress_is_one_line_on_a_terminal(tiny, stand_in, monkeypatch):
     shown = io.StringIO()
     monkeypatch.setattr(
-        study_commands, "errors", Console(force_terminal=True, width=80, file=shown)
+        study_commands, "error_console", Console(force_terminal=True, width=80, file=shown)
     )
     monkeypatch.setenv("TERM", "xterm")
     assert compare().code == 0

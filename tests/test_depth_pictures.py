@@ -30,11 +30,11 @@ from collocation_sysid.program.depth_comparison import SurfaceComparison
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.program.visible_surface import VisibleSurface
 from collocation_sysid.recording.depth_camera import points_from_image
-from collocation_sysid.result.animation import Film
-from collocation_sysid.result.depth_overlays import compared_rows, save_overlays, seen_before
-from collocation_sysid.result.pictures.album import album
+from collocation_sysid.result.animation import FilmFigure
+from collocation_sysid.result.depth_overlays import save_overlays, surface_rows, undeformed_rows
+from collocation_sysid.result.pictures.album import all_pictures
 from collocation_sysid.result.pictures.depth_comparison_picture import depth_picture
-from collocation_sysid.result.replay import Replay
+from collocation_sysid.result.replay import MotionRecord
 from collocation_sysid.statistics.camera_misspecifications import camera_hypotheses
 
 UPWARD, INVERTED = np.diag([1.0, -1, -1, 1]), np.linalg.inv(POSE)
@@ -103,7 +103,7 @@ def test_a_camera_that_is_20_mm_and_10_degrees_off_is_none_that_sees_nothing():
 
 
 def test_outlines_before_a_fit_are_where_the_stated_camera_sees_the_body():
-    (rows,) = seen_before(seeing(POSE)).values()
+    (rows,) = undeformed_rows(seeing(POSE)).values()
     points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
     assert np.isnan(points[:, 4]).all()
     # The undeformed bar is drawn by hand.
@@ -117,14 +117,14 @@ def test_outlines_before_a_fit_are_where_the_stated_camera_sees_the_body():
 
 
 def test_what_is_not_in_view_is_said_in_the_picture():
-    (rows,) = seen_before(seeing(INVERTED)).values()
+    (rows,) = undeformed_rows(seeing(INVERTED)).values()
     said = [text.get_text() for text in depth_picture(rows).axes[0].texts]
     assert said == ["the body is not in view"]
 
 
 def test_a_cloud_is_drawn_with_the_body_from_its_broad_side():
     cloud = points_from_image(image_m(), cs.DepthCamera(MATRIX)) @ POSE[:3, :3].T + POSE[:3, 3]
-    (rows,) = seen_before(hanging((cs.Depth("scan", [0.0], [cloud], 1e-3),))).values()
+    (rows,) = undeformed_rows(hanging((cs.Depth("scan", [0.0], [cloud], 1e-3),))).values()
     points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
     wide, high = np.nanmax(lines[:, 1:3], axis=0) - np.nanmin(lines[:, 1:3], axis=0)
     assert 100 < wide < 135
@@ -155,7 +155,7 @@ def test_check_draws_the_image_of_a_camera_that_looks_away_and_says_that_it_does
     assert checked.code == 1
     assert (tmp_path / "seen" / "depth_hanging_front.png").is_file()
     assert "points of 'front'" in checked.out
-    (rows,) = seen_before(seeing(AWAY)).values()
+    (rows,) = undeformed_rows(seeing(AWAY)).values()
     said = [text.get_text() for text in depth_picture(rows).axes[0].texts]
     assert said == ["the body is not in view"]
 
@@ -177,7 +177,7 @@ def test_a_solve_in_which_no_point_of_a_camera_counts_is_saved_with_its_pictures
 
 
 def test_cameras_whose_names_meet_in_one_file_name_have_a_picture_each(tmp_path):
-    (rows,) = seen_before(seeing(POSE)).values()
+    (rows,) = undeformed_rows(seeing(POSE)).values()
     named = [("a_b", "c"), ("a", "b_c")]
     twins = [
         replace(seeing(POSE), name=name, depths=(replace(seeing(POSE).depths[0], name=camera),))
@@ -186,8 +186,11 @@ def test_cameras_whose_names_meet_in_one_file_name_have_a_picture_each(tmp_path)
     drawn = save_overlays(twins, tmp_path)
     assert [file.name for file in drawn] == ["depth_a_b_c.png", "depth_a_b_c_2.png"]
     shape_m = bar().nodes_m[None], np.zeros((1, 0, 3))
-    shown = [replace(Replay.of(each, shape_m), seen={each.depths[0].name: rows}) for each in twins]
-    assert {"depth_a_b_c", "depth_a_b_c_2"} <= album(shown, a_result()).keys()
+    shown = [
+        replace(MotionRecord.from_experiment(each, shape_m), seen={each.depths[0].name: rows})
+        for each in twins
+    ]
+    assert {"depth_a_b_c", "depth_a_b_c_2"} <= all_pictures(shown, a_result()).keys()
 
 
 def test_models_are_not_compared_by_what_only_a_depth_camera_sees(tmp_path):
@@ -208,7 +211,7 @@ def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(f
     (part,) = found.collocation.iterates(found.z)
     ((reading, looked),) = part.depth_residuals
     surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
-    rows = compared_rows(surface, part.segment.experiment.upward_direction)
+    rows = surface_rows(surface, part.segment.experiment.upward_direction)
     points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
     used = np.isfinite(points[:, 4])
     assert used.sum() == reading.correspondences.is_compared.sum()
@@ -232,10 +235,10 @@ def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(found)
     (part,) = found.collocation.iterates(found.z)
     ((reading, looked),) = part.depth_residuals
     surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
-    rows = compared_rows(surface, part.segment.experiment.upward_direction)
+    rows = surface_rows(surface, part.segment.experiment.upward_direction)
     experiment = part.segment.experiment
     x = np.repeat(part.x.reshape(1, -1, 3), 3, axis=0)
-    replay = Replay.of(experiment, (x[:1], np.zeros((1, 0, 3))))
+    replay = MotionRecord.from_experiment(experiment, (x[:1], np.zeros((1, 0, 3))))
     # As if the camera had seen it twice, before and after a dropout.
     later = rows + np.eye(8)[0] * 0.2
     replay = replace(
@@ -248,15 +251,15 @@ def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(found)
         seen={"front": np.vstack([rows, later])},
     )
     count = reading.correspondences.is_compared.sum()
-    assert [len(replay.seen_m(t)) for t in range(3)] == [count, 0, count]
+    assert [len(replay.depth_points_m(t)) for t in range(3)] == [count, 0, count]
     sparse = replace(replay, seen={"front": rows})
-    assert [len(sparse.seen_m(t)) > 0 for t in range(3)] == [True, False, False]
-    film = Film(sparse)
-    ((_, _, _, drawn, _),) = film.panels
-    film.show(0)
-    u, _ = drawn.seen.get_data()
+    assert [len(sparse.depth_points_m(t)) > 0 for t in range(3)] == [True, False, False]
+    film = FilmFigure(sparse)
+    ((_, _, _, drawn, _),) = film.drawings
+    film.show_sample(0)
+    u, _ = drawn.depth_points.get_data()
     assert 0 < len(u) <= reading.correspondences.is_compared.sum()
-    shown = drawn.view.places(sparse.seen_m(0))
+    shown = drawn.view.places(sparse.depth_points_m(0))
     assert np.isin(np.round(u, 6), np.round(shown[:, 0], 6)).all()
-    film.show(2)
-    assert len(drawn.seen.get_data()[0]) == 0
+    film.show_sample(2)
+    assert len(drawn.depth_points.get_data()[0]) == 0

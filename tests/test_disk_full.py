@@ -15,7 +15,7 @@ import pytest
 from problem_files import Outcome, contents, run_command, settings, write_problem
 
 from collocation_sysid.files import whole_file, write_whole
-from collocation_sysid.result.run_writers import run_folder
+from collocation_sysid.result.run_writers import replaced_folder
 
 resource = pytest.importorskip("resource", reason="limits of POSIX")
 
@@ -133,7 +133,7 @@ def test_the_message_names_the_folder_and_not_the_passing_one(tmp_path: Path):
     with (
         room_for(10),
         pytest.raises(ValueError, match="run: cannot be written") as caught,
-        run_folder(tmp_path / "run") as place,
+        replaced_folder(tmp_path / "run") as place,
     ):
         write_whole(place / "table.csv", 100 * "x")
     assert ".partial" not in str(caught.value)

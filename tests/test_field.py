@@ -19,7 +19,7 @@ from collocation_sysid.fem.constants import MU
 from collocation_sysid.fem.refinement import refine_body
 from collocation_sysid.fem.spatial_field import FieldModes, Laplacian
 from collocation_sysid.result.pictures.field_intervals import field_picture
-from collocation_sysid.result.replay import GROUPS, LAYOUT, WRENCH, read_run
+from collocation_sysid.result.replay import ARRAY_LAYOUT, GROUP_PREFIXES, WRENCH_PREFIX, read_run
 from collocation_sysid.runs.check.body_check import check_body
 from collocation_sysid.runs.forward_simulation import simulate_experiment
 from collocation_sysid.statistics.consider_analysis import changes_of_assumptions
@@ -432,11 +432,18 @@ def documented_arrays() -> set[str]:
 
 def test_the_documented_arrays_are_those_that_a_run_may_have():
     documented = documented_arrays()
-    missing = {*LAYOUT, "residuals_m", "part_names", "marker_names", "static"} - documented
+    missing = {*ARRAY_LAYOUT, "residuals_m", "part_names", "marker_names", "static"} - documented
     assert not missing
-    fronts = {f"{front}NAME" for front in GROUPS.values()} | {f"{WRENCH}K"}
+    fronts = {f"{front}NAME" for front in GROUP_PREFIXES.values()} | {f"{WRENCH_PREFIX}K"}
     assert fronts <= documented
-    assert documented <= {*LAYOUT, "residuals_m", "part_names", "marker_names", "static", *fronts}
+    assert documented <= {
+        *ARRAY_LAYOUT,
+        "residuals_m",
+        "part_names",
+        "marker_names",
+        "static",
+        *fronts,
+    }
 
 
 def _brightness(figure: Figure) -> float:

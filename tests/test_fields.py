@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.result.element_fields import NAMES, ElementFields
+from collocation_sysid.result.element_fields import FIELD_NAMES, ElementFields
 
 LAMBDA_PA, MU_PA = 200.0, 300.0
 BOTH = pytest.mark.parametrize("element", ["tet4", "tet10"])
@@ -25,13 +25,13 @@ def bar(element: str = "tet4", material: str = "neo-hookean", evaluator: str = "
 
 @cache
 def fields_of(body: Body) -> ElementFields:
-    return ElementFields.of(body, np.array([LAMBDA_PA, MU_PA, 0.0, 0.0]))
+    return ElementFields.from_body(body, np.array([LAMBDA_PA, MU_PA, 0.0, 0.0]))
 
 
 def deformed(body: Body, gradient) -> dict[str, np.ndarray]:
     """Fields, (E,) each, of a body whose deformation gradient is the same everywhere."""
-    found = fields_of(body).at(body.nodes_m @ np.transpose(gradient))
-    assert tuple(found) == NAMES
+    found = fields_of(body).evaluate_at(body.nodes_m @ np.transpose(gradient))
+    assert tuple(found) == FIELD_NAMES
     return {name: values[0] for name, values in found.items()}
 
 
@@ -74,7 +74,7 @@ def test_small_shear_has_the_stress_of_linear_elasticity():
 def test_energy_densities_add_up_to_the_energy(element):
     body = bar(element)
     bent = body.nodes_m + 0.5 * body.nodes_m[:, :1] ** 2 * [0.0, 0.0, 1.0]
-    densities = fields_of(body).at(bent)["energy_density_j_m3"][0]
+    densities = fields_of(body).evaluate_at(bent)["energy_density_j_m3"][0]
     total = body.energy(bent, lambda_pa=LAMBDA_PA, mu_pa=MU_PA)
     assert densities @ body.mesh.volumes_m3 == pytest.approx(total)
 
@@ -83,8 +83,8 @@ def test_energy_densities_add_up_to_the_energy(element):
 def test_both_evaluators_agree_over_several_states(element, rng):
     simd, casadi = bar(element), bar(element, evaluator="casadi")
     states = simd.nodes_m + 0.004 * rng.normal(size=(3, *simd.nodes_m.shape))
-    found = [fields_of(body).at(states) for body in (simd, casadi)]
-    for name in NAMES:
+    found = [fields_of(body).evaluate_at(states) for body in (simd, casadi)]
+    for name in FIELD_NAMES:
         assert found[0][name].shape == (3, len(simd.cells))
         np.testing.assert_allclose(found[0][name], found[1][name], rtol=1e-9)
 

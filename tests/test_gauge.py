@@ -22,8 +22,8 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_readings
 from collocation_sysid.recording import Experiment, Gauge, Look, Markers, Wrench
-from collocation_sysid.result.pictures.album import _of_experiment as album_pictures
-from collocation_sysid.result.pictures.over_time import readings_picture
+from collocation_sysid.result.pictures.album import _experiment_pictures as album_pictures
+from collocation_sysid.result.pictures.over_time import sensor_picture
 from collocation_sysid.result.replay import read_run
 
 LOW_M = [[0.05, 0.05, 0.01]]
@@ -307,8 +307,8 @@ def test_readings_in_a_file_are_simulated_and_identified_from(worn: Path):
     assert "also estimated for 'swing': bias of chip" in " ".join(done.out.split())
     with np.load(worn / "found" / "trajectory.npz") as arrays:
         drawn = (
-            readings_picture(arrays["reading_chip"], "xyz"),
-            readings_picture(arrays["reading_cell"], ["cell"]),
+            sensor_picture(arrays["reading_chip"], "xyz"),
+            sensor_picture(arrays["reading_cell"], ["cell"]),
         )
     _, (replay,) = read_run(worn / "found")
     assert replay.reading_units == {"chip": "m/s²"}

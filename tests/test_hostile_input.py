@@ -527,7 +527,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next(
     going_on = tmp_path / f".run.{host}-{os.getpid()}-0a1b2c3d.partial"
     for folder in (stale, others, going_on):
         folder.mkdir()
-    with run_writers.run_folder(tmp_path / "run") as place:
+    with run_writers.replaced_folder(tmp_path / "run") as place:
         (place / "result.json").write_text("{}")
     assert not stale.exists()
     assert others.exists()

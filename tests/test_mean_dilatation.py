@@ -195,7 +195,7 @@ def test_the_fields_are_those_that_the_material_feels(rng):
     body = small_body()
     x = deformed(body, rng)[0]
     _, _, V, mean = kinematics(body, x)
-    fields = ElementFields.of(body, theta_for(body)).at(x)
+    fields = ElementFields.from_body(body, theta_for(body)).evaluate_at(x)
     np.testing.assert_allclose(fields["det_f"][0], mean[:, 0], rtol=1e-12)
     energy = (fields["energy_density_j_m3"][0] * V.sum(1)).sum()
     assert energy == pytest.approx(body.energy(x, **elastic(body)), rel=1e-12)

@@ -19,8 +19,8 @@ from collocation_sysid.model.contact import contact_terms
 from collocation_sysid.model.force_term import States
 from collocation_sysid.program.contact_summary import surface_gaps_and_pressures
 from collocation_sysid.recording import write_markers_csv, write_poses_csv, write_wrench_csv
-from collocation_sysid.result.pictures.shapes import contact_shapes
-from collocation_sysid.result.replay import Replay
+from collocation_sysid.result.pictures.shapes import contact_pictures
+from collocation_sysid.result.replay import MotionRecord
 from collocation_sysid.result.web_page import write_page
 
 PROBLEM = """
@@ -171,16 +171,16 @@ def test_an_outline_is_on_the_surface(name: str):
 
 def test_pictures_have_outlines_where_obstacles_are_and_keep_them():
     cube = pressed_cube(4)
-    seen = Replay.of(cube)
+    seen = MotionRecord.from_experiment(cube)
     assert seen.obstacles_m is not None
     ball = cube.obstacles[0]
     circles = seen.obstacles_m[:, : 3 * 34]
     centres = ball.poses.at(cube.t_s)[1] + ball.shape.centre_m
     distance_m = np.linalg.norm(circles - centres[:, None], axis=2)
     np.testing.assert_allclose(distance_m[np.isfinite(distance_m)], ball.shape.radius_m)
-    kept = Replay.from_arrays(cube.name, seen.arrays())
+    kept = MotionRecord.from_arrays(cube.name, seen.to_arrays())
     np.testing.assert_array_equal(kept.obstacles_m, seen.obstacles_m)
-    assert Replay.of(replace(cube, grasps=cube.body_grasps)).obstacles_m is None
+    assert MotionRecord.from_experiment(replace(cube, grasps=cube.body_grasps)).obstacles_m is None
 
 
 def test_pictures_show_where_something_presses_and_how_far_the_rest_is(tmp_path: Path):
@@ -201,10 +201,12 @@ def test_pictures_show_where_something_presses_and_how_far_the_rest_is(tmp_path:
     assert given_n[-1] > 0
     np.testing.assert_allclose(pressures_pa @ areas_m2 / 2, given_n, rtol=1e-9)
     assert np.all(gaps_m[pressures_pa == 0] >= term.law_of_contact.largest_width_m)
-    seen = Replay.of(cube, (motion.positions_m, motion.markers_m), touched=touched)
-    kept = Replay.from_arrays(cube.name, seen.arrays())
-    assert set(contact_shapes(kept)) == {"pressure", "gap"}
-    assert contact_shapes(Replay.of(cube)) == {}
+    seen = MotionRecord.from_experiment(
+        cube, (motion.positions_m, motion.markers_m), contact=touched
+    )
+    kept = MotionRecord.from_arrays(cube.name, seen.to_arrays())
+    assert set(contact_pictures(kept)) == {"pressure", "gap"}
+    assert contact_pictures(MotionRecord.from_experiment(cube)) == {}
     page = write_page(kept, tmp_path / "page.html").read_text()
     (packed,) = re.findall('"outlines": "([^"]*)"', page)
     drawn = np.frombuffer(base64.b64decode(packed), dtype="<f4").reshape(seen.obstacles_m.shape)
@@ -214,6 +216,6 @@ def test_pictures_show_where_something_presses_and_how_far_the_rest_is(tmp_path:
 def test_recordings_with_other_obstacles_are_of_one_body():
     cube = pressed_cube(4)
     fewer = replace(cube, grasps=cube.grasps[:2], name="fewer")
-    both = [Replay.of(each).arrays(f"{each.name}/") for each in (cube, fewer)]
+    both = [MotionRecord.from_experiment(each).to_arrays(f"{each.name}/") for each in (cube, fewer)]
     stored = both[0] | both[1]
-    assert Replay.from_arrays("fewer", stored).held.shape[1] == len(cube.body.mesh.points_m)
+    assert MotionRecord.from_arrays("fewer", stored).held.shape[1] == len(cube.body.mesh.points_m)

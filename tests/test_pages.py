@@ -14,7 +14,7 @@ from collocation_sysid.cli.markdown import TerminalPage
 from collocation_sysid.console import PlainConsole
 from collocation_sysid.display import plain_text
 from collocation_sysid.pages import page_files, page_text, page_url
-from collocation_sysid.result.run_sections import _cures, how_to
+from collocation_sysid.result.run_sections import _remedy_lines, remedy_command
 from collocation_sysid.statistics.concerns import TOPICS, Concern
 
 ROOT = Path(__file__).parents[1]
@@ -56,7 +56,7 @@ def test_code_of_a_page_can_be_copied_from_a_narrow_terminal():
 
 
 def test_what_to_do_is_a_command_that_works():
-    (line,) = how_to(CONCERNS)
+    (line,) = remedy_command(CONCERNS)
     said = plain_text(line)
     assert said == "what to do: collocation-sysid explain trust scheme"
     shown = run_command(*said.removeprefix("what to do: ").split()[1:])
@@ -78,7 +78,7 @@ def test_reports_link_to_the_documentation_that_the_project_states(
     if base is not None:
         stated["Project-URL"] = f"Documentation, {base}"
     monkeypatch.setattr(metadata, "metadata", lambda name: stated)
-    links = [span.to for cure in _cures(CONCERNS) for span in cure.spans if span.to]
+    links = [span.to for cure in _remedy_lines(CONCERNS) for span in cure.spans if span.to]
     if base is None:
         assert page_url("theory") is None
         assert links == []

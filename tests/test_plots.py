@@ -31,30 +31,30 @@ from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.result.figure_style import COLUMN_MM, CYCLE, RESOLUTION_DPI, SMALL_PT
+from collocation_sysid.result.figure_style import COLOUR_CYCLE, COLUMN_MM, RESOLUTION_DPI, SMALL_PT
 from collocation_sysid.result.pictures import (
     Confidence,
-    album,
+    all_pictures,
     confidence_ellipses,
     convergence,
     correlation_matrix,
     elements_picture,
-    error_over_time,
     jacobian_sparsity,
+    marker_errors,
+    marker_tracks,
     mesh_picture,
     save_pictures,
-    shapes,
-    spectrum,
-    tracks,
+    shapes_picture,
+    spectrum_picture,
 )
-from collocation_sysid.result.pictures.confidence import GREY, budget_picture, ellipse
-from collocation_sysid.result.pictures.jacobian import RASTER, SHOWN_STEPS
-from collocation_sysid.result.pictures.mesh_pictures import apart
-from collocation_sysid.result.pictures.projection import Camera
-from collocation_sysid.result.pictures.scene import Drawn, View, sheet
-from collocation_sysid.result.pictures.shapes import COLOURS, Coloured
+from collocation_sysid.result.pictures.confidence import GREY, budget_picture, ellipse_outline
+from collocation_sysid.result.pictures.jacobian import RASTER_SIZE, SHOWN_STEPS
+from collocation_sysid.result.pictures.mesh_pictures import spread_levels
+from collocation_sysid.result.pictures.projection import ParallelCamera
+from collocation_sysid.result.pictures.scene import BodyDrawing, SheetView, sheet
+from collocation_sysid.result.pictures.shapes import FIELD_COLOURS, SurfaceField
 from collocation_sysid.result.pictures.spectrum import spectral_density
-from collocation_sysid.result.replay import Replay
+from collocation_sysid.result.replay import MotionRecord
 from collocation_sysid.runs.result_content import Result
 
 THETA = np.array([*TRUTH.values()])
@@ -152,7 +152,7 @@ def test_nothing_to_draw_is_no_error(names, tmp_path):
 
 def test_tracks_show_each_coordinate_with_its_error_below():
     measured_m, fitted = noisy_tracks()
-    figure = tracks(TIMES, ["tip", "side"], measured_m, fitted, 1.1 * fitted)
+    figure = marker_tracks(TIMES, ["tip", "side"], measured_m, fitted, 1.1 * fitted)
     assert len(figure.axes) == 2 * 3 * 2
     upper, lower = figure.axes[2:4]  # y of the tip
     dots, fit, rolled_out = (line.get_ydata() for line in upper.lines)
@@ -167,14 +167,14 @@ def test_tracks_show_each_coordinate_with_its_error_below():
 def test_missing_samples_leave_gaps():
     measured_m, fitted = noisy_tracks()
     measured_m[5:8, 1] = np.nan
-    figure = tracks(TIMES, ["tip", "side"], measured_m, fitted)
+    figure = marker_tracks(TIMES, ["tip", "side"], measured_m, fitted)
     side = figure.axes[6].lines[0].get_ydata()
     assert np.flatnonzero(np.isnan(side)).tolist() == [5, 6, 7]
 
 
 def test_tracks_keep_to_a_page_on_which_they_are_legible():
     measured_m, fitted = noisy_tracks(markers=9)
-    figure = tracks(TIMES, [f"m{k}" for k in range(9)], measured_m, fitted)
+    figure = marker_tracks(TIMES, [f"m{k}" for k in range(9)], measured_m, fitted)
     assert len(figure.axes) == 2 * 3 * 3
     assert figure.get_figheight() < 0.75 * figure.get_figwidth()
 
@@ -190,7 +190,7 @@ def test_a_budget_has_its_whole_legend_and_colours_that_differ():
     assert inside.x1 <= whole.width
     assert inside.y0 >= figure.axes[0].get_window_extent().y1
     drawn = [to_hex(bars[0].get_facecolor()).upper() for bars in figure.axes[0].containers]
-    assert drawn == [*CYCLE, GREY]  # for any colour vision, each once
+    assert drawn == [*COLOUR_CYCLE, GREY]  # for any colour vision, each once
     ends = [bars[-1].get_x() + bars[-1].get_width() for bars in figure.axes[0].containers]
     assert ends[-1] == pytest.approx(1.0)
 
@@ -199,7 +199,7 @@ def test_of_many_markers_the_worst_are_shown():
     measured_m, fitted = noisy_tracks(markers=9)
     fitted[:, 4] += 0.1
     fitted[:, 7] += 0.1
-    figure = tracks(TIMES, [f"m{k}" for k in range(9)], measured_m, fitted, max_markers=2)
+    figure = marker_tracks(TIMES, [f"m{k}" for k in range(9)], measured_m, fitted, max_markers=2)
     titles = [axes.get_title(loc="left").partition(",")[0] for axes in figure.axes]
     assert list(dict.fromkeys(title for title in titles if title)) == ["m4", "m7"]
     assert "2 of 9" in figure.legends[0].get_title().get_text()
@@ -207,15 +207,15 @@ def test_of_many_markers_the_worst_are_shown():
 
 def test_validation_has_no_fitted_track():
     measured_m, fitted = noisy_tracks()
-    assert len(tracks(TIMES, ["tip", "side"], measured_m, None, fitted).axes[0].lines) == 2
-    assert len(error_over_time(TIMES, measured_m, None, fitted).axes[0].lines) == 1
+    assert len(marker_tracks(TIMES, ["tip", "side"], measured_m, None, fitted).axes[0].lines) == 2
+    assert len(marker_errors(TIMES, measured_m, None, fitted).axes[0].lines) == 1
 
 
 def test_error_over_time_is_the_rms_distance_of_the_markers_seen():
     measured_m, fitted = np.zeros((len(TIMES), 2, 3)), np.zeros((len(TIMES), 2, 3))
     fitted[:, 0, 0], fitted[:, 1, 1] = 3e-3, 4e-3
     measured_m[3, 0] = measured_m[4] = np.nan
-    error = error_over_time(TIMES, measured_m, fitted).axes[0].lines[0].get_ydata()
+    error = marker_errors(TIMES, measured_m, fitted).axes[0].lines[0].get_ydata()
     assert error[0] == pytest.approx(np.sqrt((9 + 16) / 2))
     assert error[3] == pytest.approx(4.0)
     assert np.isnan(error[4])
@@ -223,8 +223,8 @@ def test_error_over_time_is_the_rms_distance_of_the_markers_seen():
 
 def test_errors_far_apart_get_a_logarithmic_axis():
     measured_m, fitted = noisy_tracks()
-    near = error_over_time(TIMES, measured_m, fitted, fitted)
-    far = error_over_time(TIMES, measured_m, fitted, fitted + 0.1)
+    near = marker_errors(TIMES, measured_m, fitted, fitted)
+    far = marker_errors(TIMES, measured_m, fitted, fitted + 0.1)
     assert (near.axes[0].get_yscale(), far.axes[0].get_yscale()) == ("linear", "log")
 
 
@@ -278,7 +278,7 @@ def test_sparsity_is_drawn_for_every_start_and_scheme(make, scheme):
     figure = jacobian_sparsity(solution.collocation, solution.z)
     shown = rasters(figure)
     assert len(shown) == 3
-    assert max(max(raster.shape) for raster in shown) <= RASTER
+    assert max(max(raster.shape) for raster in shown) <= RASTER_SIZE
 
 
 def test_curves_tell_where_the_horizon_grows():
@@ -295,24 +295,24 @@ def test_curves_tell_where_the_horizon_grows():
 
 
 @cache
-def replay(make=hung_cube) -> Replay:
+def replay(make=hung_cube) -> MotionRecord:
     """An experiment seen as it is simulated, with the same for a fit."""
     experiment = measured(make())
     x = simulate(experiment, TRUTH, "midpoint", substeps=1)
     seen = (x.positions_m, x.markers_m)
-    return Replay.of(experiment, seen, seen, np.array([3.0, 7.0]))
+    return MotionRecord.from_experiment(experiment, seen, seen, np.array([3.0, 7.0]))
 
 
 def test_a_camera_sees_right_and_up_as_they_are():
-    camera = Camera.looking((0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
+    camera = ParallelCamera.from_direction((0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
     np.testing.assert_allclose(camera.project(np.eye(3)), [[1, 0], [0, 0], [0, 1]], atol=1e-15)
-    np.testing.assert_allclose(camera.nearness(np.eye(3)), [0, -1, 0], atol=1e-15)
+    np.testing.assert_allclose(camera.depths_m(np.eye(3)), [0, -1, 0], atol=1e-15)
 
 
 def test_a_camera_faces_the_plane_of_motion():
     swing = np.zeros((20, 4, 3)) + np.eye(4, 3) * 0.01
     swing[:, :, 1] += np.sin(np.linspace(0, 6, 20))[:, None]
-    right, top, near = Camera.facing(swing, (0.0, 0.0, 1.0)).axes
+    right, top, near = ParallelCamera.facing_motion(swing, (0.0, 0.0, 1.0)).axes
     assert abs(right[1]) > 0.85
     assert top[2] > 0.9
     assert near[0] > 0.8
@@ -320,7 +320,7 @@ def test_a_camera_faces_the_plane_of_motion():
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (0.6, 0.0, -0.8)])
 def test_up_is_up_in_the_picture(up):
-    camera = Camera.facing(replay().positions_m, up)
+    camera = ParallelCamera.facing_motion(replay().positions_m, up)
     np.testing.assert_allclose(camera.axes @ camera.axes.T, np.eye(3), atol=1e-12)
     across, along = camera.project(np.array(up))
     assert across == pytest.approx(0.0, abs=1e-12)
@@ -329,20 +329,20 @@ def test_up_is_up_in_the_picture(up):
 
 def test_only_faces_towards_the_viewer_are_drawn_the_nearest_last():
     mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1))
-    camera = Camera.looking((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
-    polygons, brightness, chosen = camera.faces(mesh.points_m, mesh.surface)
+    camera = ParallelCamera.from_direction((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
+    polygons, brightness, chosen = camera.visible_faces(mesh.points_m, mesh.surface)
     assert polygons.shape == (2, 3, 2)
     assert (mesh.points_m[mesh.surface[chosen], 2] == 1.0).all()  # of the top
     assert ((brightness > 0.5) & (brightness <= 1.0)).all()
-    oblique = Camera.looking((1.0, 2.0, 3.0), (0.0, 0.0, 1.0))
-    assert len(oblique.faces(mesh.points_m, mesh.surface)[0]) == 6
+    oblique = ParallelCamera.from_direction((1.0, 2.0, 3.0), (0.0, 0.0, 1.0))
+    assert len(oblique.visible_faces(mesh.points_m, mesh.surface)[0]) == 6
 
 
 def test_what_lies_behind_the_body_is_hidden():
     mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1))
-    camera = Camera.looking((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
+    camera = ParallelCamera.from_direction((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
     points = np.array([[0.4, 0.3, 1.0], [0.4, 0.3, 0.0], [2.0, 0.3, 0.0], [np.nan] * 3])
-    found = camera.hidden(points, mesh.points_m, mesh.surface)
+    found = camera.are_hidden(points, mesh.points_m, mesh.surface)
     assert found.tolist() == [False, True, False, False]
 
 
@@ -356,7 +356,7 @@ def test_every_marker_is_named_once_on_the_mesh():
 
 def test_names_keep_their_order_and_a_distance():
     levels = np.array([0.0, 0.1, 0.2, 5.0])
-    moved = apart(levels, 1.0)
+    moved = spread_levels(levels, 1.0)
     assert (np.diff(moved) > 1.0 - 1e-12).all()
     assert moved[-1] == 5.0
     assert moved[:3].mean() == pytest.approx(levels[:3].mean())
@@ -364,7 +364,7 @@ def test_names_keep_their_order_and_a_distance():
 
 def test_shapes_stand_side_by_side_in_one_scale():
     seen = replay()
-    figure = shapes(seen, 3)
+    figure = shapes_picture(seen, 3)
     skins = [c for c in figure.axes[0].collections if isinstance(c, PolyCollection)]
     boxes = [np.vstack([path.vertices for path in skin.get_paths()]) for skin in skins]
     assert len(boxes) == 3
@@ -382,15 +382,15 @@ def test_a_field_colours_each_shape_by_its_values_there():
     seen = replay()
     count = len(seen.surface)
     values = np.arange(1.0, 2 * count + 1).reshape(2, count)
-    pressure = Coloured("pressure [Pa]", lambda samples: values[: len(samples)])
-    figure = shapes(seen, 2, pressure)
+    pressure = SurfaceField("pressure [Pa]", lambda samples: values[: len(samples)])
+    figure = shapes_picture(seen, 2, pressure)
     sheet_axes = figure.axes[0]
     assert any(text.get_text() == "pressure [Pa]" for text in sheet_axes.texts)
     (bar,) = sheet_axes.child_axes
     assert bar.get_ylim() == (0.0, 2 * count)
     skins = [c for c in sheet_axes.collections if isinstance(c, PolyCollection)]
     for skin, own in zip(skins, values, strict=True):
-        expected = hues(COLOURS(own / values.max()))
+        expected = hues(FIELD_COLOURS(own / values.max()))
         for hue in hues(skin.get_facecolor()):
             assert np.abs(expected - hue).max(axis=1).min() < 1e-6
 
@@ -398,7 +398,7 @@ def test_a_field_colours_each_shape_by_its_values_there():
 def test_quadratic_bodies_are_drawn_by_their_corners(tmp_path):
     seen = replay(quadratic_bar)
     assert seen.surface.max() < len(seen.undeformed_m)
-    files = save_pictures(tmp_path, album([seen], told()))
+    files = save_pictures(tmp_path, all_pictures([seen], told()))
     assert all(imread(file)[..., :3].std() > 0.01 for file in files)
 
 
@@ -437,7 +437,7 @@ def told(covariance: np.ndarray | None = None) -> Result:
 @pytest.mark.parametrize("rho", [-0.95, 0.0, 0.8])
 def test_an_ellipse_holds_95_per_cent_of_the_pairs(rho):
     found = two_parameters(rho)
-    outline = ellipse(found, 0, 1)
+    outline = ellipse_outline(found, 0, 1)
     inverse = np.linalg.inv(found.covariance)
     squares = np.einsum("ki,ij,kj->k", outline, inverse, outline)
     np.testing.assert_allclose(squares, -2 * np.log(0.05), rtol=1e-3)
@@ -464,11 +464,11 @@ def test_wide_intervals_are_read_as_factors(tmp_path):
 
 def test_what_is_not_determined_is_left_out():
     covariance = np.array([[np.nan, np.nan], [np.nan, 0.01]])
-    found = Confidence.of(told(covariance))
+    found = Confidence.from_result(told(covariance))
     assert found is not None
     assert found.names == ["mu_pa"]
     assert found.covariance.tolist() == [[0.01]]
-    assert Confidence.of(a_result()) is None
+    assert Confidence.from_result(a_result()) is None
 
 
 def test_a_tone_stands_out_at_its_frequency():
@@ -492,7 +492,7 @@ def test_gaps_hardly_change_a_spectrum_and_unseen_markers_do_not_count():
 def test_modes_are_numbered_and_near_ones_together():
     t = 0.01 * np.arange(100)
     track = np.random.default_rng(0).normal(size=(100, 2, 3))
-    figure = spectrum(t, track, None, np.array([3.0, 3.1, 20.0, 80.0]))
+    figure = spectrum_picture(t, track, None, np.array([3.0, 3.1, 20.0, 80.0]))
     assert [text.get_text() for text in figure.axes[0].texts] == ["1–2", "3"]
 
 
@@ -501,7 +501,7 @@ def test_modes_are_numbered_and_near_ones_together():
 
 def test_a_run_has_all_its_pictures(tmp_path):
     seen = replay()
-    pictures = album([seen], told())
+    pictures = all_pictures([seen], told())
     files = save_pictures(tmp_path, pictures)
     assert {file.stem for file in files} == {
         "confidence",
@@ -521,7 +521,7 @@ def test_a_run_has_all_its_pictures(tmp_path):
 
 def test_type_can_be_read_in_a_column():
     seen = replay()
-    pictures = album([seen], told())
+    pictures = all_pictures([seen], told())
     for name, figure in pictures.items():
         assert figure.get_size_inches()[0] * 25.4 <= 2.1 * COLUMN_MM
         sizes = [t.get_fontsize() for t in figure.findobj(Text) if t.get_text()]
@@ -530,7 +530,7 @@ def test_type_can_be_read_in_a_column():
 
 def test_validation_is_drawn_by_its_simulation():
     seen = replace(replay(), positions_m=None, markers_m=None)
-    pictures = album([seen], a_result())
+    pictures = all_pictures([seen], a_result())
     assert "shapes_hung_cube" in pictures
     assert len(pictures["error_hung_cube"].axes[0].lines) == 1
 
@@ -540,16 +540,16 @@ def test_what_went_astray_leaves_gaps(tmp_path, wrong, first):
     seen = replay()
     positions, markers = seen.positions_m.copy(), seen.markers_m.copy()
     positions[first:], markers[first:] = wrong, wrong
-    pictures = album([replace(seen, positions_m=positions, markers_m=markers)], a_result())
+    pictures = all_pictures([replace(seen, positions_m=positions, markers_m=markers)], a_result())
     assert ("shapes_hung_cube" in pictures) == (first > 0)
     save_pictures(tmp_path, pictures)
 
 
 def test_an_experiment_can_be_read_back_from_its_arrays():
     seen = replay()
-    arrays = seen.arrays("hung cube/")
+    arrays = seen.to_arrays("hung cube/")
     assert arrays["hung cube/rolled_out_positions_m"].dtype == np.float32
-    again = Replay.from_arrays("hung cube", arrays)
+    again = MotionRecord.from_arrays("hung cube", arrays)
     np.testing.assert_array_equal(again.positions_m, seen.positions_m)
     np.testing.assert_array_equal(again.held, seen.held)
     assert again.marker_names == list(seen.marker_names)
@@ -569,7 +569,9 @@ def test_drawing_needs_no_display_and_leaves_pyplot_alone():
 def test_grasped_nodes_on_the_sides_are_marked():
     experiment = quadratic_bar()
     body = experiment.body
-    seen = Replay.of(experiment, (np.tile(body.nodes_m, (len(experiment.t_s), 1, 1)), None))
+    seen = MotionRecord.from_experiment(
+        experiment, (np.tile(body.nodes_m, (len(experiment.t_s), 1, 1)), None)
+    )
     assert seen.surface_nodes.shape == (len(seen.surface), 6)
     corners, sides = body.nodes_m[seen.surface], body.nodes_m[seen.surface_nodes[:, 3:]]
     middles = (corners + np.roll(corners, -1, axis=1)) / 2
@@ -577,12 +579,12 @@ def test_grasped_nodes_on_the_sides_are_marked():
         distances = np.linalg.norm(found[:, None] - expected, axis=2)
         np.testing.assert_allclose(distances.min(axis=1), 0.0, atol=1e-12)
     _, axes = sheet(80, 60)
-    camera = Camera.facing(body.nodes_m[None], seen.up)
-    view = View.fitting(camera, body.nodes_m, (70, 50), (5, 5))
-    drawn = Drawn(axes, view, seen.surface, nodes=seen.surface_nodes)
-    drawn.show(body.nodes_m, np.ones(len(body.nodes_m), bool), np.empty((0, 3)))
+    camera = ParallelCamera.facing_motion(body.nodes_m[None], seen.up)
+    view = SheetView.fit_points(camera, body.nodes_m, (70, 50), (5, 5))
+    drawn = BodyDrawing(axes, view, seen.surface, nodes=seen.surface_nodes)
+    drawn.update(body.nodes_m, np.ones(len(body.nodes_m), bool), np.empty((0, 3)))
     marked = len(drawn.grasped.get_xdata())
-    faces = camera.faces(body.nodes_m, seen.surface)[2]
+    faces = camera.visible_faces(body.nodes_m, seen.surface)[2]
     assert marked == len(np.unique(seen.surface_nodes[faces])) > len(np.unique(seen.surface[faces]))
 
 

@@ -17,7 +17,7 @@ from collocation_sysid.display import plain_text
 from collocation_sysid.program.depth_comparison import DepthError
 from collocation_sysid.program.visible_surface import VisibleSurface
 from collocation_sysid.result.run_record import replays
-from collocation_sysid.result.run_sections import summary
+from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.runs.prediction import CopyError, nearest_recording_error
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.serialisation import as_json, read
@@ -27,7 +27,7 @@ NOISE_M = 1e-3
 
 
 def shown(finished: cs.Run) -> str:
-    return plain_text(summary(finished.result, Path("runs")))
+    return plain_text(run_summary(finished.result, Path("runs")))
 
 
 def stored(finished: cs.Run) -> dict:

@@ -27,7 +27,7 @@ from collocation_sysid import (
 )
 from collocation_sysid.display import plain_text
 from collocation_sysid.model.parameters import Parameters
-from collocation_sysid.result.run_sections import summary
+from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.deep_probes import WINDOWS, Probe
 from collocation_sysid.statistics.systematic_effects import Assumptions
@@ -148,7 +148,7 @@ def test_terminal_page_and_file_have_the_probes(tmp_path):
     folder = solved.save(tmp_path / "run", frames=False)
     result = Result.read(folder)
     assert {p.name for p in result.probes} == {p.name for p in solved.probes}
-    said = plain_text(summary(result, folder))
+    said = plain_text(run_summary(result, folder))
     assert "the data determine density gradient z: -0.1" in said
     assert "−Δχ²" in said
     assert run_command("report", folder).code == 0

@@ -214,9 +214,9 @@ def test_a_notebook_shows_the_body_of_a_run_once():
 def test_a_drawn_body_is_coloured_by_what_its_material_feels(field):
     run = identified()
     (positions_m,), body = run.solution.positions_m, run.problem.bodies[0]
-    felt = ElementFields.of(body, body.theta_from_values(run.parameters)).at(positions_m[[0, -1]])[
-        field
-    ]
+    felt = ElementFields.from_body(body, body.theta_from_values(run.parameters)).evaluate_at(
+        positions_m[[0, -1]]
+    )[field]
     (bar,) = run.plot(field=field, count=2).axes[0].child_axes
     low, high = bar.get_ylim()
     outer = felt[:, body.mesh.surface_cells]

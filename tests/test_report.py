@@ -15,7 +15,7 @@ from problem_files import TRUTH, pictures_drawn, run_command, settings, write_pr
 from results_small import ROLLOUT, a_result
 
 from collocation_sysid.display import plain_text
-from collocation_sysid.result.run_sections import summary
+from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.runs.result_content import Result, SimulatedExperiment
 from collocation_sysid.serialisation import as_json
 from collocation_sysid.statistics.assessment import Assessment
@@ -120,7 +120,7 @@ def test_text_is_escaped(run_folder: Path, tmp_path: Path):
 
 
 def test_what_a_terminal_shows_is_on_the_page(page: str, run_folder: Path):
-    shown = plain_text(summary(Result.read(run_folder), run_folder)).splitlines()
+    shown = plain_text(run_summary(Result.read(run_folder), run_folder)).splitlines()
     text = Elements(page).text
     assert sum("forward simulation 'swing': " in line for line in shown) == 1
     for line in shown[:-1]:  # which names the folder
@@ -135,7 +135,7 @@ def test_a_result_read_back_is_shown_as_it_was(run_folder: Path):
     elapsed_s = result.elapsed_s
     before = replace(result, elapsed_s=replace(elapsed_s, pictures=None))
     shown = plain_text(
-        [*summary(before, run_folder), f"pictures drawn in {elapsed_s.pictures:.1f} s"]
+        [*run_summary(before, run_folder), f"pictures drawn in {elapsed_s.pictures:.1f} s"]
     )
     assert shown.split() == printed.split()
 
@@ -146,7 +146,7 @@ def test_failures_and_predictions_are_told():
         "b": SimulatedExperiment(False, rms_m=3e-3, max_m=4e-3),
     }
     told = a_result(rollout=replace(ROLLOUT, experiments=experiments))
-    said = plain_text(summary(told, Path("run"))).splitlines()
+    said = plain_text(run_summary(told, Path("run"))).splitlines()
     assert "forward simulation 'a': failed: no step" in said
     assert "validation 'b': 3.000 mm RMS, at most 4.00 mm" in said
 

@@ -148,12 +148,12 @@ def test_a_stiff_body_is_as_scanned():
 def test_element_fields_refer_to_the_stress_free_shape():
     body = scanned_body()
     theta = body.theta_from_values(SOFT)
-    fields = ElementFields.of(body, theta)
+    fields = ElementFields.from_body(body, theta)
     stress_free = body.inverse_equilibrium.solve(theta).positions_m
-    at_rest = fields.at(stress_free[None])
+    at_rest = fields.evaluate_at(stress_free[None])
     np.testing.assert_allclose(at_rest["det_f"], 1.0, atol=1e-9)
     assert at_rest["von_mises_pa"].max() < 1e-5 * SOFT["young_pa"]
-    assert fields.at(body.nodes_m[None])["von_mises_pa"].max() > 1e-2 * SOFT["young_pa"]
+    assert fields.evaluate_at(body.nodes_m[None])["von_mises_pa"].max() > 1e-2 * SOFT["young_pa"]
 
 
 # Fits --------------------------------------------------------------------------------------------

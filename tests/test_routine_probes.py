@@ -35,8 +35,8 @@ from collocation_sysid.display import plain_text
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.result.probe_sections import DEEPER, is_deeper_check_worthwhile
-from collocation_sysid.result.run_sections import summary
+from collocation_sysid.result.probe_sections import DEEPER_CHECK_ADVICE, is_deeper_check_worthwhile
+from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.statistics.assessment import Assessment, probe_concerns
 from collocation_sysid.statistics.linearised import gauss_newton_step, linearise_fit
 from collocation_sysid.statistics.relaxed_assumptions import (
@@ -115,7 +115,7 @@ def test_a_faultless_solve_has_both_probes_and_no_alarm():
     assert not any(probe.told for probe in faultless.probes)
     assert faultless.trust.verdict == "good"
     assert not is_deeper_check_worthwhile(faultless.result)
-    assert "solve --probe" not in plain_text(summary(faultless.result, Path("runs")))
+    assert "solve --probe" not in plain_text(run_summary(faultless.result, Path("runs")))
 
 
 @pytest.mark.long
@@ -136,7 +136,7 @@ def test_a_drift_and_a_wrong_clock_rate_mean_check_with_corrected_estimates(faul
         if name in TRUTH:  # the corrected estimates are right
             assert abs(move.value - TRUTH[name]) < 3.5 * move.std_error
     assert is_deeper_check_worthwhile(wrongly.result)
-    assert DEEPER in plain_text(summary(wrongly.result, Path("runs")))
+    assert DEEPER_CHECK_ADVICE in plain_text(run_summary(wrongly.result, Path("runs")))
 
 
 # Level of significance ----------------------------------------------------------------------------

@@ -46,8 +46,8 @@ from collocation_sysid.recording import (
     displaced_axes,
     read_displacement,
 )
-from collocation_sysid.result.check_sections import closer_table
-from collocation_sysid.result.run_sections import summary
+from collocation_sysid.result.check_sections import full_check_tables
+from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.check.derivatives import derivative_errors
 from collocation_sysid.runs.forward_simulation import ForwardSimulation
@@ -457,14 +457,14 @@ def test_a_test_bench_without_markers_is_checked(tmp_path):
     assert findings.derivatives_agree
     assert findings.samples == 0
     assert not findings.motions
-    said = plain_text(closer_table(findings))
+    said = plain_text(full_check_tables(findings))
     assert "Modes" not in said
     assert "markers are missed" not in said
 
 
 def test_a_run_without_markers_speaks_of_forces(tmp_path):
     found = run(cs.Problem.read(bench(tmp_path)), seek_causes=False)
-    said = plain_text(summary(found.result, tmp_path))
+    said = plain_text(run_summary(found.result, tmp_path))
     assert " mm RMS" not in said
     assert re.search(r"wrench of 'press': \S+ N RMS \(sigma 0.01 N\)", said)
     assert re.search(r"forward simulation 'press': \S+ N RMS", said)

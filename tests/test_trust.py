@@ -18,7 +18,7 @@ from collocation_sysid import Run, UncertaintyOptions, run
 from collocation_sysid.display import plain_text
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.problem import Problem
-from collocation_sysid.result.run_sections import summary
+from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.serialisation import as_json, content, read
 from collocation_sysid.statistics.assessment import (
     GROSS_MISFIT,
@@ -265,7 +265,7 @@ def test_the_verdict_is_shown_stored_and_fed():
     found = judged("none")
     assert ", good: " in repr(found)
     assert content(found.result)["trust"] == {"verdict": "good", "reasons": [], "concerns": []}
-    lines = plain_text(summary(found.result, Path("runs"))).splitlines()
+    lines = plain_text(run_summary(found.result, Path("runs"))).splitlines()
     assert lines[1] == "Verdict: good"
     assert "γ_r refers to the damping law rayleigh, which also brakes rotation" in lines
     (markers,) = [line for line in lines if line.startswith("markers: ")]

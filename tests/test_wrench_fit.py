@@ -151,16 +151,16 @@ def test_a_run_tells_of_the_wrench(tmp_path: Path):
     with np.load(folder / "trajectory.npz") as stored:
         assert stored["wrench_1"].shape == (21, 19)
     from collocation_sysid.display import plain_text
-    from collocation_sysid.result.pictures.album import redraw
-    from collocation_sysid.result.report import as_page
-    from collocation_sysid.result.run_sections import run_report, summary
+    from collocation_sysid.result.pictures.album import redraw_pictures
+    from collocation_sysid.result.report import report_html
+    from collocation_sysid.result.run_sections import run_report, run_summary
 
-    said = plain_text(summary(run.result, folder))
+    said = plain_text(run_summary(run.result, folder))
     assert "wrench of 'hung cube'" in said
     assert "tare up to" in said
     assert "sensor late by" in said
-    assert folder / "wrench_hung_cube.png" in redraw(folder, folder)
-    assert "Wrench of a grasp" in as_page(run_report(folder))
+    assert folder / "wrench_hung_cube.png" in redraw_pictures(folder, folder)
+    assert "Wrench of a grasp" in report_html(run_report(folder))
 
 
 def test_methods_that_need_second_derivatives_in_the_parameters_refuse_wrenches():

@@ -15,7 +15,7 @@ from collocation_sysid.fem.elements import element_named
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.files import write_whole
 from collocation_sysid.result.element_fields import ElementFields
-from collocation_sysid.result.run_writers import run_folder, write_frames, write_pvd, write_vtu
+from collocation_sysid.result.run_writers import replaced_folder, write_frames, write_pvd, write_vtu
 from collocation_sysid.written_files import LIST_FILE, list_files
 
 MESH = box_mesh((0.1, 0.2, 0.3), (1, 2, 1))
@@ -108,7 +108,7 @@ def test_long_trajectories_are_thinned_evenly(tmp_path):
 
 def test_frames_hold_what_the_material_feels(tmp_path):
     body = Body(MESH, density_kg_m3=30.0)
-    fields = ElementFields.of(body, np.array([200.0, 300.0, 0.0, 0.0]))
+    fields = ElementFields.from_body(body, np.array([200.0, 300.0, 0.0, 0.0]))
     stretch = np.linspace(1.0, 1.2, 3)[:, None, None]
     listing = write_frames(
         tmp_path, [0, 1, 2], stretch * MESH.points_m, body.cells, TET4, MESH.points_m, fields=fields
@@ -151,7 +151,7 @@ def listing(folder: Path) -> list[str]:
 
 def test_a_run_appears_whole_at_the_end(tmp_path):
     target = tmp_path / "runs" / "swing"
-    with run_folder(target) as folder:
+    with replaced_folder(target) as folder:
         (folder / "result.json").write_text("new")
         assert folder.parent == target.parent
         assert not target.exists()
@@ -160,14 +160,14 @@ def test_a_run_appears_whole_at_the_end(tmp_path):
 
 def test_the_folder_has_ordinary_permissions(tmp_path):
     (tmp_path / "ordinary").mkdir()
-    with run_folder(tmp_path / "run"):
+    with replaced_folder(tmp_path / "run"):
         pass
     assert (tmp_path / "run").stat().st_mode == (tmp_path / "ordinary").stat().st_mode
 
 
 def test_an_earlier_run_is_replaced_whole(tmp_path):
     target = earlier_run(tmp_path / "run")
-    with run_folder(target) as folder:
+    with replaced_folder(target) as folder:
         (folder / "result.json").write_text("new")
         assert (target / "result.json").read_text() == "old"
     assert listing(tmp_path) == ["run", "run/result.json"]
@@ -176,7 +176,7 @@ def test_an_earlier_run_is_replaced_whole(tmp_path):
 
 def test_an_empty_folder_is_used(tmp_path):
     (tmp_path / "run").mkdir()
-    with run_folder(tmp_path / "run") as folder:
+    with replaced_folder(tmp_path / "run") as folder:
         (folder / "result.json").write_text("new")
     assert listing(tmp_path) == ["run", "run/result.json"]
 
@@ -187,7 +187,7 @@ def test_a_failure_leaves_everything_as_it_was(tmp_path, failure):
     before = listing(tmp_path)
 
     def write_half():
-        with run_folder(target) as folder:
+        with replaced_folder(target) as folder:
             (folder / "half.txt").write_text("half")
             raise failure
 
@@ -203,7 +203,7 @@ def test_somebody_elses_folder_is_left_alone(tmp_path):
     before = listing(tmp_path)
     with (
         pytest.raises(InputError, match=r"thesis.*not an earlier run"),
-        run_folder(tmp_path / "thesis"),
+        replaced_folder(tmp_path / "thesis"),
     ):
         pytest.fail("the work was started")
     assert listing(tmp_path) == before
@@ -215,7 +215,10 @@ def test_an_earlier_run_with_a_foreign_file_is_left_alone(tmp_path, foreign):
     (target / foreign).parent.mkdir(exist_ok=True)
     (target / foreign).write_text("precious")
     before = listing(tmp_path)
-    with pytest.raises(InputError, match=rf"run: {foreign} .* not written"), run_folder(target):
+    with (
+        pytest.raises(InputError, match=rf"run: {foreign} .* not written"),
+        replaced_folder(target),
+    ):
         pytest.fail("the work was started")
     assert listing(tmp_path) == before
 
@@ -224,14 +227,14 @@ def test_a_result_file_alone_does_not_make_a_run(tmp_path):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "result.json").write_text("{}")
     (tmp_path / "thesis" / "chapter.tex").write_text("precious")
-    with pytest.raises(InputError, match=r"chapter\.tex"), run_folder(tmp_path / "thesis"):
+    with pytest.raises(InputError, match=r"chapter\.tex"), replaced_folder(tmp_path / "thesis"):
         pytest.fail("the work was started")
 
 
 def test_an_edited_file_keeps_an_earlier_run_from_being_replaced(tmp_path):
     target = earlier_run(tmp_path / "run")
     (target / "old.png").write_text("edited")
-    with pytest.raises(InputError, match=r"old\.png .* changed since"), run_folder(target):
+    with pytest.raises(InputError, match=r"old\.png .* changed since"), replaced_folder(target):
         pytest.fail("the work was started")
 
 
@@ -239,10 +242,10 @@ def test_what_is_written_into_a_run_later_may_be_replaced_with_it(tmp_path):
     target = earlier_run(tmp_path / "run")
     write_whole(target / "report.html", "a page")
     write_whole(target / "old.png", "drawn again")
-    with run_folder(target / "export-json", mark="identified.json") as folder:
+    with replaced_folder(target / "export-json", marker_file="identified.json") as folder:
         (folder / "identified.json").write_text("{}")
     (target / ".DS_Store").write_text("of a file manager")
-    with run_folder(target) as folder:
+    with replaced_folder(target) as folder:
         (folder / "result.json").write_text("new")
     assert listing(target) == ["result.json"]
 
@@ -255,7 +258,7 @@ def test_nothing_is_written_through_a_link(tmp_path):
     before = listing(tmp_path)
     for name, where in (("run", "precious"), ("later", "missing")):
         with pytest.raises(InputError, match=f"{name}: is a link to {where}"):  # noqa: SIM117
-            with run_folder(tmp_path / name):
+            with replaced_folder(tmp_path / name):
                 pytest.fail("the work was started")
     assert listing(tmp_path) == before
 
@@ -265,7 +268,7 @@ def test_a_link_in_an_earlier_run_keeps_it_from_being_replaced(tmp_path):
     target = earlier_run(tmp_path / "run")
     (target / "old.png").rename(tmp_path / "old.png")
     (target / "old.png").symlink_to(tmp_path / "old.png")
-    with pytest.raises(InputError, match=r"old\.png in it is a link"), run_folder(target):
+    with pytest.raises(InputError, match=r"old\.png in it is a link"), replaced_folder(target):
         pytest.fail("the work was started")
 
 
@@ -273,20 +276,20 @@ def test_a_run_may_be_moved_and_copied_before_it_is_replaced(tmp_path):
     earlier_run(tmp_path / "run").rename(tmp_path / "moved")
     shutil.copytree(tmp_path / "moved", tmp_path / "copied")
     for name in ("moved", "copied"):
-        with run_folder(tmp_path / name) as folder:
+        with replaced_folder(tmp_path / name) as folder:
             (folder / "result.json").write_text("new")
 
 
 def test_a_file_is_left_alone(tmp_path):
     (tmp_path / "run").write_text("precious")
-    with pytest.raises(InputError, match="is a file"), run_folder(tmp_path / "run"):
+    with pytest.raises(InputError, match="is a file"), replaced_folder(tmp_path / "run"):
         pytest.fail("the work was started")
     assert (tmp_path / "run").read_text() == "precious"
 
 
 def test_an_earlier_run_is_kept_on_request(tmp_path):
     target = earlier_run(tmp_path / "run")
-    with pytest.raises(InputError, match="earlier run"), run_folder(target, overwrite=False):
+    with pytest.raises(InputError, match="earlier run"), replaced_folder(target, overwrite=False):
         pytest.fail("the work was started")
 
 
@@ -294,7 +297,7 @@ def test_a_finished_run_is_not_lost_when_its_place_is_taken_meanwhile(tmp_path):
     target = tmp_path / "run"
 
     def write_too_late():
-        with run_folder(target) as folder:
+        with replaced_folder(target) as folder:
             (folder / "result.json").write_text("new")
             target.mkdir()
             (target / "chapter.tex").write_text("precious")

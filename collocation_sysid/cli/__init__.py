@@ -28,7 +28,7 @@ from typer.main import get_command, get_command_from_info
 
 from ..errors import InputError, SimulationError, hint_at
 from ..signal_handling import heed_interrupts, leave
-from .common import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, errors
+from .common import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, error_console
 
 FAMILIES = (
     "problem_commands",
@@ -41,7 +41,7 @@ FAMILIES = (
 
 
 @cache
-def _written() -> dict[str, tuple[str, str]]:
+def _command_sources() -> dict[str, tuple[str, str]]:
     """Return the module and the first help line of each command, read from the source without
     importing.
     """
@@ -55,7 +55,7 @@ def _written() -> dict[str, tuple[str, str]]:
     return commands
 
 
-class Commands(TyperGroup):
+class LazyCommands(TyperGroup):
     """Group of commands that imports only the module of the requested command.
 
     Importing all of them would take seconds.
@@ -63,14 +63,14 @@ class Commands(TyperGroup):
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the names of all commands."""
-        return [*_written()]
+        return [*_command_sources()]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return the command called `cmd_name`, or None if there is none; imports its module."""
-        if cmd_name not in _written():
+        if cmd_name not in _command_sources():
             return None
-        with errors.status("starting"):  # on a terminal only; it takes a second
-            family = import_module(_written()[cmd_name][0]).commands.registered_commands
+        with error_console.status("starting"):  # on a terminal only; it takes a second
+            family = import_module(_command_sources()[cmd_name][0]).commands.registered_commands
         info = next(each for each in family if each.callback.__name__ == cmd_name)
         how = {"pretty_exceptions_short": False, "rich_markup_mode": None}
         return get_command_from_info(info, **how)
@@ -80,19 +80,21 @@ class Commands(TyperGroup):
 
         An unknown name ends the program with a message that suggests a similar command.
         """
-        if args and args[0] not in _written() and not ctx.resilient_parsing:
-            ctx.fail(f"No such command {args[0]!r}{hint_at(args[0], _written()) or '.'}")
+        if args and args[0] not in _command_sources() and not ctx.resilient_parsing:
+            ctx.fail(f"No such command {args[0]!r}{hint_at(args[0], _command_sources()) or '.'}")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write a line on each command into the help."""
         with formatter.section("Commands"):
-            formatter.write_dl([(name, summary) for name, (_, summary) in _written().items()])
+            formatter.write_dl(
+                [(name, summary) for name, (_, summary) in _command_sources().items()]
+            )
 
 
 app = typer.Typer(
     name="collocation-sysid",
-    cls=Commands,
+    cls=LazyCommands,
     help="Identify the material parameters of a soft object from motion capture.\n\n"
     "\b\nStart with\n"
     "  collocation-sysid new my_object                    a commented problem file\n"
@@ -106,9 +108,9 @@ app = typer.Typer(
 )
 
 
-def _version(wanted: bool) -> None:
+def _print_version(is_requested: bool) -> None:
     """Print the version and exit, if the option was given."""
-    if wanted:
+    if is_requested:
         from importlib.metadata import version
 
         typer.echo(version("collocation-sysid"))
@@ -118,14 +120,17 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def _root(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
 ) -> None:
     pass
 
 
 @cache
-def _commands() -> Callable[..., Any]:
+def _root_command() -> Callable[..., Any]:
     """Return the callable that parses the arguments and runs a command; made when first needed."""
     return get_command(app)
 
@@ -133,32 +138,34 @@ def _commands() -> Callable[..., Any]:
 def main() -> None:
     """Run the command line: errors become one message and an exit code."""
     try:
-        _run()
+        _run_command()
     except KeyboardInterrupt:  # before or after the command itself
         leave(EXIT_INTERRUPTED)
     except SystemExit as ended:
         leave(ended.code or 0)
 
 
-def _run() -> None:
+def _run_command() -> None:
     """Run the command of the arguments; exit with a message for bad input or a failure."""
     restore = heed_interrupts()
     # That it builds its cache of fonts, or where, is no news to who solves a problem.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
-        _commands()(prog_name="collocation-sysid")
+        _root_command()(prog_name="collocation-sysid")
     except InputError as error:
-        _refuse("error", error, EXIT_BAD_INPUT)
+        _exit_with_error("error", error, EXIT_BAD_INPUT)
     except OSError as error:
         where = error.filename or "standard output, or a temporary file"
-        _refuse("error", InputError(error.strerror or str(error), where), EXIT_BAD_INPUT)
+        _exit_with_error("error", InputError(error.strerror or str(error), where), EXIT_BAD_INPUT)
     except SimulationError as error:
-        _refuse("simulation failed", error, EXIT_NOT_CONVERGED)
+        _exit_with_error("simulation failed", error, EXIT_NOT_CONVERGED)
     finally:
         restore()
 
 
-def _refuse(kind: str, error: Exception, code: int) -> NoReturn:
+def _exit_with_error(kind: str, error: Exception, code: int) -> NoReturn:
     """Print an error after the word `kind`, and exit with `code`."""
-    errors.print(Text(f"{kind}: ", style="red").append(str(error), style="default"), soft_wrap=True)
+    error_console.print(
+        Text(f"{kind}: ", style="red").append(str(error), style="default"), soft_wrap=True
+    )
     sys.exit(code)

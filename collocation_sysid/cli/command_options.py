@@ -37,7 +37,7 @@ from ..display import Shown
 from ..errors import InputError
 from ..serialisation import as_json
 from ..validated_types import Options
-from .common import errors, show
+from .common import error_console, print_result
 
 if TYPE_CHECKING:
     from ..problem import Problem  # which takes a second to import
@@ -58,12 +58,12 @@ OneExperiment = Annotated[
     str | None,
     typer.Option("--experiment", metavar="NAME", help="Experiment; by default the first."),
 ]
-Out = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Where to write.")]
+OutputFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Where to write.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 
 
-def command(group: typer.Typer, *shown: str) -> Callable[[Callable[[Any], None]], Any]:
+def command(group: typer.Typer, *examples: str) -> Callable[[Callable[[Any], None]], Any]:
     """Return a decorator that registers a function of a dataclass of options as a command.
 
     Parameters
@@ -77,23 +77,23 @@ def command(group: typer.Typer, *shown: str) -> Callable[[Callable[[Any], None]]
     def registered(function: Callable[[Any], None]) -> Callable[[Any], None]:
         """Register the function in `group`, and return it unchanged."""
         (kind,) = (each for name, each in get_type_hints(function).items() if name != "return")
-        parameters = [*_parameters(kind)]
+        parameters = [*_typer_parameters(kind)]
 
         def called(**values: Any) -> None:
-            function(_built(kind, values))
+            function(_options_from_values(kind, values))
 
         called.__name__ = function.__name__
         called.__doc__ = function.__doc__
         called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         called.__annotations__ = {each.name: each.annotation for each in parameters}
-        lines = "".join(f"\n  collocation-sysid {each}" for each in shown)
+        lines = "".join(f"\n  collocation-sysid {each}" for each in examples)
         group.command(epilog=f"\b\nExamples:{lines}")(called)  # kept as they are
         return function
 
     return registered
 
 
-def _parameters(kind: type) -> Iterator[inspect.Parameter]:
+def _typer_parameters(kind: type) -> Iterator[inspect.Parameter]:
     """Yield the parameters of a command, from which typer makes its options.
 
     A field that is itself a dataclass of options yields one parameter for each of its fields.
@@ -101,7 +101,7 @@ def _parameters(kind: type) -> Iterator[inspect.Parameter]:
     documented = attributes(kind)
     for name, default, hint, marks in _typed_fields(kind):
         if is_dataclass(hint):
-            yield from _parameters(hint)  # type: ignore[arg-type]
+            yield from _typer_parameters(hint)  # type: ignore[arg-type]
             continue
         infos = (copy(mark) for mark in marks if isinstance(mark, ParameterInfo))
         info = next(infos, None) or typer.Option()
@@ -111,7 +111,7 @@ def _parameters(kind: type) -> Iterator[inspect.Parameter]:
                 (w for w in written.split() if w[0].isupper() or w[0].isdigit()), None
             )
             if isinstance(info, OptionInfo):
-                info.param_decls = _names(name, default, written)
+                info.param_decls = _option_names(name, default, written)
         yield inspect.Parameter(
             name,
             inspect.Parameter.KEYWORD_ONLY,
@@ -120,7 +120,7 @@ def _parameters(kind: type) -> Iterator[inspect.Parameter]:
         )
 
 
-def _names(field: str, default: Any, written: str) -> list[str]:
+def _option_names(field: str, default: Any, type_text: str) -> list[str]:
     """Return the names of an option on the command line.
 
     Parameters
@@ -129,17 +129,17 @@ def _names(field: str, default: Any, written: str) -> list[str]:
         Name of the field.
     default : object
         Default value; an option that is on by default gets a name to switch it off.
-    written : str
+    type_text : str
         Type of the field in the docstring, which may contain names that begin with "-".
     """
     option = field.strip("_").replace("_", "-")
-    names = [word for word in written.split() if word.startswith("-")]
+    names = [word for word in type_text.split() if word.startswith("-")]
     if not any(word.startswith("--") for word in names):
         names.insert(0, f"--{option}" + (default is True) * f"/--no-{option}")
     return names
 
 
-def _built(kind: type[T], values: Mapping[str, Any]) -> T:
+def _options_from_values(kind: type[T], values: Mapping[str, Any]) -> T:
     """Return the options of a command from their values by name.
 
     Parameters
@@ -154,7 +154,7 @@ def _built(kind: type[T], values: Mapping[str, Any]) -> T:
         Naming the option as it is written on the command line.
     """
     content = {
-        name: _built(hint, values) if is_dataclass(hint) else values[name]  # type: ignore[arg-type]
+        name: _options_from_values(hint, values) if is_dataclass(hint) else values[name]  # type: ignore[arg-type]
         for name, _, hint, _ in _typed_fields(kind)
     }
     try:
@@ -164,7 +164,7 @@ def _built(kind: type[T], values: Mapping[str, Any]) -> T:
         if error.where not in fields_:
             raise
         written = attributes(kind).get(error.where, ("", ""))[0]
-        names = _names(error.where, fields_[error.where], written)
+        names = _option_names(error.where, fields_[error.where], written)
         raise InputError(error.message, None, names[0]) from error
 
 
@@ -191,26 +191,26 @@ def _typed_fields(kind: type) -> list[tuple[str, Any, Any, tuple[Any, ...]]]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfProblem:
+class ProblemOptions:
     """Options that name a problem file and change its keys."""
 
     problem: ProblemPath
     set_: Overrides = None
     allow_code: AllowCode = False
 
-    def read(self, simulation: bool = False) -> Problem:
+    def read_problem(self, simulation: bool = False) -> Problem:
         """Read the problem file with the changes of the command line.
 
         Notes are printed on stderr unless the command is quiet. With `simulation`, measurements may
         be
         missing.
         """
-        with errors.status(f"reading {self.problem}"):
+        with error_console.status(f"reading {self.problem}"):
             from ..problem import Problem
 
             def say(sentence: str) -> None:
                 if not getattr(self, "quiet", False):
-                    errors.print(Text(sentence, style="dim"), soft_wrap=True)
+                    error_console.print(Text(sentence, style="dim"), soft_wrap=True)
 
             return Problem.read(
                 self.problem, self.set_ or (), self.allow_code, simulation=simulation, say=say
@@ -218,7 +218,7 @@ class OfProblem:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfRun:
+class RunFolderOptions:
     """Options that name a run folder.
 
     Attributes
@@ -231,15 +231,15 @@ class OfRun:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Told(Options):
+class OutputOptions(Options):
     """Options for the form of the result and of the progress."""
 
     as_json: AsJson = False
     quiet: Quiet = False
 
-    def tell(self, answer: Any, shown: Shown | Iterable[Shown]) -> None:
-        """Print the result as JSON if requested, or else its tables and lines `shown`."""
+    def print_result(self, answer: Any, content: Shown | Iterable[Shown]) -> None:
+        """Print the result as JSON if requested, or else its tables and lines `content`."""
         if self.as_json:
             typer.echo(as_json(answer))
         else:
-            show(shown)
+            print_result(content)

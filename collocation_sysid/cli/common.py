@@ -12,31 +12,31 @@ from rich.text import Text
 from ..console import PlainConsole
 from ..display import Shown, on_terminal, plain_text
 
-errors = PlainConsole(stderr=True)
+error_console = PlainConsole(stderr=True)
 
 EXIT_NOT_CONVERGED = 1
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 # Width of the output in columns if it is not a terminal: no line is longer.
-UNBROKEN = 100_000
+UNBROKEN_WIDTH = 100_000
 EXIT_DOUBTFUL = EXIT_NOT_CONVERGED
 
 
-def interrupted(kept: str) -> typer.Exit:
+def interruption_exit(kept_results: str) -> typer.Exit:
     """Print what is kept after an interrupt and the command that continues; return the exit to
     raise.
     """
     again = shlex.join(["collocation-sysid", *sys.argv[1:]])
-    errors.print(Text(f"interrupted: {kept}; go on with: {again}"), soft_wrap=True)
+    error_console.print(Text(f"interrupted: {kept_results}; go on with: {again}"), soft_wrap=True)
     return typer.Exit(EXIT_INTERRUPTED)
 
 
-def show(content: Shown | Iterable[Shown]) -> None:
+def print_result(content: Shown | Iterable[Shown]) -> None:
     """Print on stdout: wrapped between words on a terminal, elsewhere each line and table row
     unbroken.
     """
     console = PlainConsole()
     if console.is_terminal:
         console.print(on_terminal(content), crop=False)
-    elif text := plain_text(content, width=UNBROKEN):
+    elif text := plain_text(content, width=UNBROKEN_WIDTH):
         console.print(Text(text), soft_wrap=True)

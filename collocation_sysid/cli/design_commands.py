@@ -14,14 +14,14 @@ from ..plan.design import DesignCriterion, DesignOptions, Limits
 from ..plan.design import design_motion as designed
 from ..plan.design.predicted_information import Kind, Over
 from ..result.run_writers import require_replaceable
-from .command_options import OfProblem, OneExperiment, Out, Told, command
-from .common import EXIT_INTERRUPTED, errors
+from .command_options import OneExperiment, OutputFolder, OutputOptions, ProblemOptions, command
+from .common import EXIT_INTERRUPTED, error_console
 
 commands = typer.Typer()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Design(OfProblem, Told):
+class DesignCommand(ProblemOptions, OutputOptions):
     """Options of `design_motion`.
 
     Attributes
@@ -51,7 +51,7 @@ class Design(OfProblem, Told):
     search: DesignOptions
     add: bool = False
     experiment: OneExperiment = None
-    out: Out = None
+    out: OutputFolder = None
     film: bool = True
 
 
@@ -61,7 +61,7 @@ class Design(OfProblem, Told):
     "design problem.toml --duration 2 --limits limits.toml --for poisson",
     "design problem.toml --duration 2 --limits limits.toml --add",
 )
-def design(options: Design) -> None:
+def design(options: DesignCommand) -> None:
     """Find the motion of the grasp that makes the error bars smallest.
 
     It begins and ends at rest in the first pose, keeps to the limits, and is judged over a prior
@@ -76,10 +76,10 @@ def design(options: Design) -> None:
     names = () if options.for_ is None else tuple(n.strip() for n in options.for_.split(","))
     criterion = DesignCriterion(cast("Kind", options.criterion), names, cast("Over", options.over))
     limits = Limits.read(options.limits)
-    problem = options.read(simulation=not options.add)
+    problem = options.read_problem(simulation=not options.add)
     require_possible(folder)
-    require_replaceable(folder, mark=DESIGN_FILE, what="design")
-    with DesignProgress(errors, options.search.evaluations, options.quiet) as progress:
+    require_replaceable(folder, marker_file=DESIGN_FILE, content_word="design")
+    with DesignProgress(error_console, options.search.evaluations, options.quiet) as progress:
         try:
             answer = designed(
                 problem,
@@ -96,5 +96,5 @@ def design(options: Design) -> None:
             key = error.where in Limits.model_fields and error.source is None
             raise (error.located(options.limits) if key else error) from error
         write_design(answer, folder, options.film, progress.show_activity)
-    options.tell(design_json(answer), design_summary(answer, folder))
+    options.print_result(design_json(answer), design_summary(answer, folder))
     raise typer.Exit(EXIT_INTERRUPTED if answer.best.is_interrupted else 0)

@@ -24,8 +24,8 @@ from ..runs.check import check_problem, quick_check
 from ..runs.result_content import Result
 from ..serialisation import as_json
 from ..signal_handling import INTERRUPTS
-from .command_options import OfProblem, Out, Told, command
-from .common import EXIT_DOUBTFUL, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, errors, show
+from .command_options import OutputFolder, OutputOptions, ProblemOptions, command
+from .common import EXIT_DOUBTFUL, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, error_console, print_result
 
 if TYPE_CHECKING:
     from ..problem import Problem
@@ -34,7 +34,7 @@ commands = typer.Typer()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Solve(OfProblem, Told):
+class SolveCommand(ProblemOptions, OutputOptions):
     """Options of `solve`.
 
     Attributes
@@ -58,7 +58,7 @@ class Solve(OfProblem, Told):
     """
 
     method: str | None = None
-    out: Out = None
+    out: OutputFolder = None
     start: Path | None = None
     scheduler: str | None = None
     verbose: bool = False
@@ -75,7 +75,7 @@ class Solve(OfProblem, Told):
     "solve problem.toml --set parameters.mu_pa.guess=200",
     "solve finer.toml --start runs/coarse",
 )
-def solve(options: Solve) -> None:
+def solve(options: SolveCommand) -> None:
     """Identify the parameters and write a run folder.
 
     Parameters need no guess: a scan of the stiffness finds where to start. --start takes an earlier
@@ -86,17 +86,17 @@ def solve(options: Solve) -> None:
     Set a method's options in its table of the file, [solver.reduced-space] and so on, or with
     --set, as in --set solver.reduced-space.tolerance=1e-6; the command methods lists them.
     """
-    from ..result.run_sections import summary
-    from ..result.solve_progress import Progress
+    from ..result.run_sections import run_summary
+    from ..result.solve_progress import SolveProgress
 
     if options.method is not None:
         require_method(options.method, "--method")
     folder = options.out or Path("runs") / run_name(options.problem)
-    problem = options.read()
+    problem = options.read_problem()
     require_possible(folder)
     require_replaceable(folder)
     with ExitStack() as until_shown:
-        with Progress(errors, problem, options.verbose, options.quiet) as progress:
+        with SolveProgress(error_console, problem, options.verbose, options.quiet) as progress:
             finished = run(
                 problem,
                 options.method,
@@ -110,12 +110,12 @@ def solve(options: Solve) -> None:
             progress.say("writing the run folder")
             finished.save(folder, pictures=False)
         if not options.as_json:
-            show(summary(finished.result, folder, options.budget))
-    result = _drawn(finished, folder, options) if options.pictures else finished.result
+            print_result(run_summary(finished.result, folder, options.budget))
+    result = _draw_pictures(finished, folder, options) if options.pictures else finished.result
     if options.as_json:
         typer.echo(as_json(result))
     elif result.elapsed_s.pictures is not None:
-        show(f"pictures drawn in {result.elapsed_s.pictures:.1f} s")
+        print_result(f"pictures drawn in {result.elapsed_s.pictures:.1f} s")
     status = finished.solution.status
     if options.pictures and result.elapsed_s.pictures is None:
         raise typer.Exit(EXIT_INTERRUPTED)
@@ -126,25 +126,25 @@ def solve(options: Solve) -> None:
     raise typer.Exit(0 if status.converged else EXIT_NOT_CONVERGED)
 
 
-def _drawn(finished: Run, folder: Path, options: Solve) -> Result:
+def _draw_pictures(finished: Run, folder: Path, options: SolveCommand) -> Result:
     """Draw the pictures of a run, and return its result with the time that they took.
 
     After an interrupt the result without that time is returned, and a message says how to go on.
     """
-    from ..result.solve_progress import Progress
+    from ..result.solve_progress import SolveProgress
 
     try:
-        with Progress(errors, verbose=options.verbose, quiet=options.quiet) as progress:
+        with SolveProgress(error_console, verbose=options.verbose, quiet=options.quiet) as progress:
             return draw_run(finished, folder, progress.say)
     except KeyboardInterrupt:
         again = shlex.join(["collocation-sysid", "plot", str(folder)])
         kept = f"interrupted: the answer is kept in {folder}, without all pictures"
-        errors.print(Text(f"{kept}; draw them with: {again}"), soft_wrap=True)
+        error_console.print(Text(f"{kept}; draw them with: {again}"), soft_wrap=True)
         return finished.result
 
 
 @dataclass(frozen=True, kw_only=True)
-class Simulate(OfProblem, Told):
+class SimulateCommand(ProblemOptions, OutputOptions):
     """Options of `simulate`.
 
     Attributes
@@ -162,17 +162,17 @@ class Simulate(OfProblem, Told):
     "simulate problem.toml --out data --noise-m 0.001 --seed 1",
     "simulate problem.toml --out data --set parameters.mu_pa.guess=300",
 )
-def simulate(options: Simulate) -> None:
+def simulate(options: SimulateCommand) -> None:
     """Simulate at the guesses and write markers and poses as CSV.
 
     The markers' places are their reference_m, or follow from their file. The parameters are the
     guesses or fixed values: set others with --set.
     """
-    from ..result.solve_progress import Progress
+    from ..result.solve_progress import SolveProgress
 
-    problem = options.read(simulation=True)
+    problem = options.read_problem(simulation=True)
     require_possible(options.out)
-    with Progress(errors, problem, quiet=options.quiet) as progress:
+    with SolveProgress(error_console, problem, quiet=options.quiet) as progress:
         try:
             written = write_data(problem, options.out, options.recipe, progress.share)
         except SimulationError as error:
@@ -198,11 +198,11 @@ def _draw_instability(error: SimulationError, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with whole_file(file) as draft:
         instability_picture(error.lost_stability).savefig(draft, dpi=RESOLUTION_DPI)
-    errors.print(f"the mode is drawn in {file}")
+    error_console.print(f"the mode is drawn in {file}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check(OfProblem, Told):
+class CheckCommand(ProblemOptions, OutputOptions):
     """Options of `check`.
 
     Attributes
@@ -224,7 +224,7 @@ class Check(OfProblem, Told):
     "check problem.toml --out pictures",
     "check problem.toml --set transcription.scheme=backward-euler",
 )
-def check(options: Check) -> None:
+def check(options: CheckCommand) -> None:
     """Check a problem before solving it, and say what will go wrong.
 
     Bodies, recordings and grasps are shown at once. Derivatives, costs and the simulation at the
@@ -232,21 +232,23 @@ def check(options: Check) -> None:
 
     Of each depth camera a picture shows the first image and the undeformed body over it.
     """
-    from ..result.check_sections import closer_table, glance_table
-    from ..result.solve_progress import Progress
+    from ..result.check_sections import full_check_tables, quick_check_tables
+    from ..result.solve_progress import SolveProgress
 
-    problem = options.read()
+    problem = options.read_problem()
     if not options.as_json:
-        show(glance_table(quick_check(problem)))
-        _overlay(problem, options.out or Path("runs") / f"{run_name(options.problem)}_check")
-    with Progress(errors, quiet=options.quiet) as progress:
+        print_result(quick_check_tables(quick_check(problem)))
+        _write_depth_overlays(
+            problem, options.out or Path("runs") / f"{run_name(options.problem)}_check"
+        )
+    with SolveProgress(error_console, quiet=options.quiet) as progress:
         findings = check_problem(problem, progress.say, options.full)
-    options.tell(findings.as_dict(), closer_table(findings))
+    options.print_result(findings.as_dict(), full_check_tables(findings))
     good = findings.derivatives_agree and not findings.causes
     raise typer.Exit(0 if good else EXIT_NOT_CONVERGED)
 
 
-def _overlay(problem: Problem, folder: Path) -> None:
+def _write_depth_overlays(problem: Problem, folder: Path) -> None:
     """Write a picture of each depth camera's first image with the undeformed body into the folder.
 
     Nothing is written without depth cameras.

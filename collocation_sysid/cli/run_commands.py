@@ -12,14 +12,23 @@ from rich.text import Text
 
 from ..files import require_possible, write_whole
 from ..serialisation import as_json, content
-from .command_options import AllowCode, AsJson, OfRun, OneExperiment, Out, Quiet, Told, command
-from .common import errors, interrupted, show
+from .command_options import (
+    AllowCode,
+    AsJson,
+    OneExperiment,
+    OutputFolder,
+    OutputOptions,
+    Quiet,
+    RunFolderOptions,
+    command,
+)
+from .common import error_console, interruption_exit, print_result
 
 commands = typer.Typer()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Refine(OfRun, Told):
+class RefineCommand(RunFolderOptions, OutputOptions):
     """Options of `refine`.
 
     Attributes
@@ -33,7 +42,7 @@ class Refine(OfRun, Told):
 
 
 @command(commands, "refine runs/swing", "refine runs/swing --levels 3")
-def refine(options: Refine) -> None:
+def refine(options: RefineCommand) -> None:
     """Solve again with half the step and a finer mesh, to measure the discretisation error.
 
     Each solve starts from the run's answer. The folder gets refinement.json, and result.json gets
@@ -42,23 +51,23 @@ def refine(options: Refine) -> None:
     interruption the same command continues where it stopped.
     """
     from ..result.run_refinement import refine_run
-    from ..result.run_sections import refinement_table, verdict_of
+    from ..result.run_sections import refinement_table, verdict_section
 
     def say(what: str) -> None:
         """Print what is being done on stderr unless the command is quiet."""
         if not options.quiet:
-            errors.print(Text(what, style="dim"), soft_wrap=True)
+            error_console.print(Text(what, style="dim"), soft_wrap=True)
 
     try:
         refinement, result = refine_run(options.run_folder, options.levels, options.allow_code, say)
     except KeyboardInterrupt:
-        raise interrupted(f"what was solved is kept in {options.run_folder}") from None
+        raise interruption_exit(f"what was solved is kept in {options.run_folder}") from None
     report = {**content(refinement), "trust": result.trust}
-    options.tell(report, [refinement_table(result), verdict_of(result.trust)])
+    options.print_result(report, [refinement_table(result), verdict_section(result.trust)])
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(OfRun):
+class ExportCommand(RunFolderOptions):
     """Options of `export`.
 
     Attributes
@@ -70,7 +79,7 @@ class Export(OfRun):
     """
 
     to: str
-    out: Out = None
+    out: OutputFolder = None
     experiment: OneExperiment = None
     verify: bool = False
     allow_code: AllowCode = False
@@ -80,65 +89,67 @@ class Export(OfRun):
 @command(
     commands, "export runs/swing --to mujoco", "export runs/swing --to calculix --out deck --verify"
 )
-def export(options: Export) -> None:
+def export(options: ExportCommand) -> None:
     """Write the identified body for another simulator: mesh, material, damping, grasp.
 
     What the target cannot express is printed. The files go to export-TARGET in the run folder.
     """
     from ..result.export import (
-        Identified,
+        IdentifiedBody,
         comparison_table,
-        export_run,
         target_named,
         verify_export,
+        write_export,
     )
 
     target = target_named(options.to)
     folder = options.out or options.run_folder / f"export-{options.to}"
     require_possible(folder)
-    body = Identified.read(options.run_folder, options.experiment, options.allow_code)
-    exported = export_run(body, options.to, folder)
+    body = IdentifiedBody.read(options.run_folder, options.experiment, options.allow_code)
+    exported = write_export(body, options.to, folder)
     compared = verify_export(body, options.to, folder) if options.verify else []
     if options.as_json:
         report = {
             "folder": str(folder),
             "warnings": body.warnings,
-            "not_expressed": exported.limits,
-            "verified": [{**asdict(each), "relative": each.relative} for each in compared],
+            "not_expressed": exported.limitations,
+            "verified": [
+                {**asdict(each), "relative": each.relative_difference} for each in compared
+            ],
         }
         typer.echo(as_json(report))
         return
-    show(f"warning: {each}" for each in body.warnings)
-    show(f"not expressed: {each}" for each in exported.limits)
+    print_result(f"warning: {each}" for each in body.warnings)
+    print_result(f"not expressed: {each}" for each in exported.limitations)
     if options.verify:
-        show(comparison_table(target.name, compared))
+        print_result(comparison_table(target.name, compared))
     typer.echo(folder)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plot(OfRun):
+class PlotCommand(RunFolderOptions):
     """Options of `plot`, all of which are shared."""
 
-    out: Out = None
+    out: OutputFolder = None
     quiet: Quiet = False
 
 
 @command(commands, "plot runs/swing")
-def plot(options: Plot) -> None:
+def plot(options: PlotCommand) -> None:
     """Draw the pictures of a run again, from its files."""
-    from ..result.pictures.album import redraw
-    from ..result.solve_progress import Progress
+    from ..result.pictures.album import redraw_pictures
+    from ..result.solve_progress import SolveProgress
 
     folder = options.out or options.run_folder
     require_possible(folder)
-    with Progress(errors, quiet=options.quiet) as progress:
-        files = redraw(options.run_folder, folder, progress.say)
+    with SolveProgress(error_console, quiet=options.quiet) as progress:
+        files = redraw_pictures(options.run_folder, folder, progress.say)
     for file in files:
         typer.echo(file)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report:
+class ReportCommand:
     """Options of `report`.
 
     Attributes
@@ -154,12 +165,12 @@ class Report:
 
 
 @command(commands, "report runs/swing", "report runs/compare --to comparison.html")
-def report(options: Report) -> None:
+def report(options: ReportCommand) -> None:
     """Write one HTML page about a run or a study, or a Markdown file.
 
     It has all results and the pictures; Markdown links to them.
     """
-    from ..result.report import as_file, comparison_report
+    from ..result.report import comparison_report, report_text
     from ..result.run_sections import run_report
 
     folder = options.folder
@@ -167,12 +178,12 @@ def report(options: Report) -> None:
     study = (folder / "summary.json").is_file()
     page = comparison_report(folder) if study else run_report(folder)
     require_possible(file.parent)
-    write_whole(file, as_file(page, file))
+    write_whole(file, report_text(page, file))
     typer.echo(file)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Animate(OfRun):
+class AnimateCommand(RunFolderOptions):
     """Options of `animate`.
 
     Attributes
@@ -193,21 +204,21 @@ class Animate(OfRun):
 
 
 @command(commands, "animate runs/swing --to swing.mp4", "animate runs/swing --slow 4")
-def animate(options: Animate) -> None:
+def animate(options: AnimateCommand) -> None:
     """Film a run: the body as fitted beside its forward simulation."""
     from rich.progress import Progress
 
     from ..result.animation import animate as film
 
     require_possible(options.run_folder if options.to is None else options.to.parent)
-    bar = Progress(console=errors, transient=True)
+    bar = Progress(console=error_console, transient=True)
     task = bar.add_task("filming", total=1.0)
-    with bar if errors.is_terminal and not options.quiet else nullcontext():
+    with bar if error_console.is_terminal and not options.quiet else nullcontext():
         file = film(
             options.run_folder,
             options.to,
             fps=options.fps,
-            slow=options.slow,
+            slowdown=options.slow,
             experiment=options.experiment,
             progress=lambda share: bar.update(task, completed=share),
         )
@@ -215,8 +226,8 @@ def animate(options: Animate) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(OfRun):
-    """Options of `view`.
+class ViewCommand(RunFolderOptions):
+    """Options of `view_run`.
 
     Attributes
     ----------
@@ -232,19 +243,19 @@ class View(OfRun):
 
 
 @command(commands, "view runs/swing", "view runs/swing --html swing.html")
-def view(options: View) -> None:
+def view(options: ViewCommand) -> None:
     """Show a run in 3-D.
 
     It opens a window, which needs pyvista, or writes a web page, which needs nothing.
     """
-    from ..result.interactive_view import FIELD, export_page
-    from ..result.interactive_view import view as opened
+    from ..result.interactive_view import DEFAULT_FIELD, export_page
+    from ..result.interactive_view import view_run as opened
 
     run = options.run_folder
     html = options.html
     field = options.field
     if html is None:
-        opened(run, field or FIELD, options.experiment)
+        opened(run, field or DEFAULT_FIELD, options.experiment)
         return
     require_possible(html.parent)
     typer.echo(export_page(run, html, options.experiment, field))

@@ -16,14 +16,14 @@ from ..files import require_possible
 from ..live import LiveEstimator, LiveOptions
 from ..live.sources import read_problem
 from ..validated_types import NotNegative, Options, Positive
-from .command_options import AllowCode, Overrides, ProblemPath, Told, command
-from .common import EXIT_BAD_INPUT, errors, show
+from .command_options import AllowCode, OutputOptions, Overrides, ProblemPath, command
+from .common import EXIT_BAD_INPUT, error_console, print_result
 
 commands = typer.Typer()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Estimating(Options):
+class LiveEstimationOptions(Options):
     """Options of commands that estimate from frames as they come.
 
     Attributes
@@ -39,7 +39,7 @@ class Estimating(Options):
     set_: Overrides = None
     allow_code: AllowCode = False
 
-    def estimator(self, recording: Path) -> LiveEstimator:
+    def make_estimator(self, recording: Path) -> LiveEstimator:
         """Return the estimator for a problem file or a run folder, with these options."""
         budget_s = None if self.budget_ms is None else 1e-3 * self.budget_ms
         problem = read_problem(recording, self.set_ or (), self.allow_code)
@@ -47,7 +47,7 @@ class Estimating(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Live(Estimating):
+class LiveCommand(LiveEstimationOptions):
     """Options of `live`.
 
     Attributes
@@ -63,7 +63,7 @@ class Live(Estimating):
 @command(
     commands, "live problem.toml < frames.jsonl", "live problem.toml --udp 9870 > estimates.jsonl"
 )
-def live(options: Live) -> None:
+def live(options: LiveCommand) -> None:
     """Identify while the recording is made: frames in, a line of JSON for each out, one at the end.
 
     A frame is a line: {"t_s": 0.01, "pose": {"position_m": [x, y, z], "quaternion_xyzw": [x, y, z,
@@ -84,11 +84,11 @@ def live(options: Live) -> None:
             "is closed; expected frames, as in live problem.toml < frames.jsonl, or --udp PORT",
             "standard input",
         )
-    estimator = options.estimator(options.problem)
+    estimator = options.make_estimator(options.problem)
 
     def opened(port: int) -> None:
         """Print on stderr that the port is open."""
-        errors.print(f"listening on UDP port {port} of this machine")
+        error_console.print(f"listening on UDP port {port} of this machine")
 
     if options.udp is None:
         lines = decode_lines(sys.stdin.buffer)
@@ -110,7 +110,7 @@ def live(options: Live) -> None:
                 frame = reader.read(line)
             except InputError as error:
                 bad += 1
-                errors.print(Text(f"error: {error}"), soft_wrap=True)
+                error_console.print(Text(f"error: {error}"), soft_wrap=True)
                 continue
             if frame is not None:
                 typer.echo(update_as_json(estimator.process_frame(frame)))
@@ -121,7 +121,7 @@ def live(options: Live) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Replay(Estimating, Told):
+class ReplayCommand(LiveEstimationOptions, OutputOptions):
     """Options of `replay`.
 
     Attributes
@@ -145,7 +145,7 @@ class Replay(Estimating, Told):
     "replay runs/swing --film swing.gif",
     "replay problem.toml --json --rate 0",
 )
-def replay(options: Replay) -> None:
+def replay(options: ReplayCommand) -> None:
     """Stream a recording as if it were made now, and estimate from it live."""
     from rich.live import Live
 
@@ -159,13 +159,13 @@ def replay(options: Replay) -> None:
     if film is not None:
         require_possible(film.parent)
         live_display.require_gif(film)
-    estimator = options.estimator(options.recording)
+    estimator = options.make_estimator(options.recording)
     experiment = estimator.model.experiment
     frames = frames_of_recording(experiment, estimator.model)
     pace = 1.0 / experiment.timestep_s if rate is None else rate
     updates = []
-    watched = errors.is_terminal and not options.quiet and not options.as_json
-    shown = Live(console=errors, refresh_per_second=10)
+    watched = error_console.is_terminal and not options.quiet and not options.as_json
+    shown = Live(console=error_console, refresh_per_second=10)
     with without_garbage_of_startup(), shown if watched else nullcontext():
         for frame in paced_frames(frames, pace) if pace else frames:
             updates.append(estimator.process_frame(frame))
@@ -177,6 +177,6 @@ def replay(options: Replay) -> None:
     if options.as_json:
         typer.echo(json_line(settled))
     else:
-        show(live_display.final_display(updates, settled))
+        print_result(live_display.final_display(updates, settled))
     if film is not None:
         typer.echo(live_display.write_film(updates, film))

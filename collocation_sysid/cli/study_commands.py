@@ -26,14 +26,14 @@ from ..plan.study_arguments import parse_methods, parse_swept_keys, read_truth
 from ..plan.study_rows import SuccessCriterion
 from ..problem import Problem
 from ..validated_types import Positive
-from .command_options import OfProblem, Out, Told, command
-from .common import errors, interrupted, show
+from .command_options import OutputFolder, OutputOptions, ProblemOptions, command
+from .common import error_console, interruption_exit, print_result
 
 commands = typer.Typer()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Many(OfProblem, Told):
+class StudyOptions(ProblemOptions, OutputOptions):
     """Options of commands with many runs.
 
     Attributes
@@ -43,12 +43,12 @@ class Many(OfProblem, Told):
     """
 
     limits: RunOptions
-    out: Out = None
+    out: OutputFolder = None
     dry_run: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compare(Many):
+class CompareCommand(StudyOptions):
     """Options of `compare`.
 
     Attributes
@@ -90,7 +90,7 @@ class Compare(Many):
     "compare problem.toml --materials neo-hookean,yeoh",
     "compare problem.toml --damping kelvin-voigt,material,rayleigh",
 )
-def compare(options: Compare) -> None:
+def compare(options: CompareCommand) -> None:
     """Compare methods from many starts, or fit several models and say which to use.
 
     With --materials, --damping, --prony or --with each model is fitted to all recordings, and to
@@ -101,9 +101,9 @@ def compare(options: Compare) -> None:
     Finished runs are kept in the output folder: the same command resumes.
     """
     methods = parse_methods(options.methods) if options.methods is not None else ()
-    problem = options.read()
+    problem = options.read_problem()
     if options.with_ or {options.materials, options.damping, options.prony} != {None}:
-        _study("models", options, _planned_models(options, problem, methods))
+        _run_study("models", options, _planned_models(options, problem, methods))
         return
     if not methods:
         raise InputError(
@@ -120,11 +120,11 @@ def compare(options: Compare) -> None:
         truth,
         options.allow_code,
     )
-    _study("compare", options, planned, yardstick)
+    _run_study("compare", options, planned, yardstick)
 
 
 def _planned_models(
-    options: Compare, problem: Problem, methods: Sequence[str]
+    options: CompareCommand, problem: Problem, methods: Sequence[str]
 ) -> Sequence[PlannedRun]:
     """Return the runs that compare models: materials, damping laws, branches, or other problem
     files.
@@ -141,7 +141,7 @@ def _planned_models(
             None,
             "--methods",
         )
-    others = [replace(options, problem=file).read() for file in options.with_ or ()]
+    others = [replace(options, problem=file).read_problem() for file in options.with_ or ()]
     materials = parse_materials(options.materials) if options.materials is not None else ()
     dampings = parse_dampings(options.damping) if options.damping is not None else ()
     branches = parse_branches(options.prony) if options.prony is not None else ()
@@ -159,7 +159,7 @@ def _planned_models(
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepOptions(Many):
+class SweepCommand(StudyOptions):
     """Options of `sweep`.
 
     Attributes
@@ -179,7 +179,7 @@ class SweepOptions(Many):
     "sweep problem.toml --over transcription.substeps=1,2,4",
     "sweep problem.toml --over parameters.mu_pa.guess=50:5000:log:9",
 )
-def sweep(options: SweepOptions) -> None:
+def sweep(options: SweepCommand) -> None:
     """Solve for every combination of values of some keys."""
     method = parse_methods(options.method, "--method")[0] if options.method else None
     over = parse_swept_keys(options.over)
@@ -187,12 +187,12 @@ def sweep(options: SweepOptions) -> None:
     planned = plan_sweep(options.problem, over, overrides, method, options.allow_code)
     # A missing file would fail every run.
     Problem.read(options.problem, planned[0].overrides, options.allow_code)
-    _study("sweep", options, planned)
+    _run_study("sweep", options, planned)
 
 
-def _study(
+def _run_study(
     kind: str,
-    options: Many,
+    options: StudyOptions,
     planned: Sequence[PlannedRun],
     yardstick: SuccessCriterion | None = None,
 ) -> None:
@@ -202,7 +202,7 @@ def _study(
     ----------
     kind : str
         Name of the study, for its folder and title.
-    options : Many
+    options : StudyOptions
     planned : sequence of PlannedRun
     yardstick : SuccessCriterion, optional
         True parameters and tolerance for the success of a run.
@@ -231,13 +231,13 @@ def _study(
             listed = [{**run.as_dict(), "finished": run.key in finished} for run in planned]
             typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
         else:
-            show(plan_table(planned, finished))
+            print_result(plan_table(planned, finished))
         return
     require_possible(folder)
     remaining = [run for run in planned if run.key not in finished]
     is_complete = True
     try:
-        with StudyProgress(errors, remaining, len(planned), options.quiet) as progress:
+        with StudyProgress(error_console, remaining, len(planned), options.quiet) as progress:
             run_all(remaining, store, limits, progress.count_run)
     except KeyboardInterrupt:
         is_complete = False
@@ -245,5 +245,7 @@ def _study(
     if report.records:
         write_report(report, folder)
     if not is_complete:
-        raise interrupted(f"{len(report.records)} of {len(planned)} runs are kept in {folder}")
-    options.tell(report_json(report), study_tables(report, folder))
+        raise interruption_exit(
+            f"{len(report.records)} of {len(planned)} runs are kept in {folder}"
+        )
+    options.print_result(report_json(report), study_tables(report, folder))

@@ -18,14 +18,14 @@ from ..errors import located, require_among
 from ..pages import page_files, page_text, page_title
 from ..serialisation import as_json
 from .command_options import AsJson, command
-from .common import errors, show
+from .common import error_console, print_result
 
 commands = typer.Typer()
 
-KINDS = {"number": "number", "integer": "whole number", "string": "text", "object": "table"}
+TYPE_WORDS = {"number": "number", "integer": "whole number", "string": "text", "object": "table"}
 
 
-class Kind(StrEnum):
+class NewProblemKind(StrEnum):
     """Kinds of a new problem's simulated recording."""
 
     COMPRESSION = "compression"
@@ -34,7 +34,7 @@ class Kind(StrEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Methods:
+class MethodsCommand:
     """Options of `methods`.
 
     Attributes
@@ -48,7 +48,7 @@ class Methods:
 
 
 @command(commands, "methods", "methods interior-point")
-def methods(options: Methods) -> None:
+def methods(options: MethodsCommand) -> None:
     """List the methods, or the options of one: defaults, values, and what they do."""
     from ..methods import METHODS, method_options_schema, method_summary, require_method
 
@@ -64,7 +64,7 @@ def methods(options: Methods) -> None:
         typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
     else:
         parts = _options_table(name) if name else _methods_table()
-        show(parts)
+        print_result(parts)
 
 
 @commands.command()
@@ -76,7 +76,7 @@ def schema() -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explain:
+class ExplainCommand:
     """Options of `explain_validation_error`.
 
     Attributes
@@ -89,13 +89,13 @@ class Explain:
 
 
 @command(commands, "explain", "explain verdict", "explain trust scheme", "explain theory | less")
-def explain(options: Explain) -> None:
+def explain(options: ExplainCommand) -> None:
     """Show pages of the documentation, or list their topics.
 
     Pages are part of the installation; no network is needed. In a pipe they are Markdown.
     """
     if not options.topics:
-        show(
+        print_result(
             Table(
                 "", ("topic", ""), tuple((each, page_title(each)) for each in page_files()), texts=1
             )
@@ -114,7 +114,7 @@ def explain(options: Explain) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Topics:
+class TopicsCommand:
     """Options of `topics`.
 
     Attributes
@@ -128,7 +128,7 @@ class Topics:
 
 
 @command(commands, "topics run.mcap", "topics bags/2026-05-04 --json")
-def topics(options: Topics) -> None:
+def topics(options: TopicsCommand) -> None:
     """List what is in a robot's log, what it can serve as, and what to write for it."""
     from ..recording.formats.topics import list_topics
 
@@ -150,11 +150,11 @@ def topics(options: Topics) -> None:
     heads = ("topic", "type", "messages", "Hz", "serves as")
     addresses = [f"  {address}" for each in listed for address in each.write]
     what = ["", "In place of a file write:", *addresses] if addresses else []
-    show([Table("", heads, rows, names=2, texts=1), *what])
+    print_result([Table("", heads, rows, names=2, texts=1), *what])
 
 
 @dataclass(frozen=True, kw_only=True)
-class New:
+class NewCommand:
     """Options of `new`.
 
     Attributes
@@ -166,13 +166,13 @@ class New:
     """
 
     name: Annotated[str, typer.Argument()]
-    kind: Kind | None = None
+    kind: NewProblemKind | None = None
 
 
 @command(
     commands, "new my_object", "new silicone --kind compression", "check silicone/problem.toml"
 )
-def new(options: New) -> None:
+def new(options: NewCommand) -> None:
     """Write a commented problem file to start from."""
     from ..problem.new_problem import create_problem
 
@@ -184,9 +184,9 @@ def new(options: New) -> None:
         typer.echo(each)
     yours = "put your mesh, poses and marker tracks beside it and name them in it"
     example = "it runs as it is, on simulated data; then put your own in their place"
-    errors.print(f"Next: {yours if kind is None else example}.", soft_wrap=True)
+    error_console.print(f"Next: {yours if kind is None else example}.", soft_wrap=True)
     for next_ in ("check", "solve"):
-        errors.print(f"  collocation-sysid {next_} {shlex.quote(str(file))}", soft_wrap=True)
+        error_console.print(f"  collocation-sysid {next_} {shlex.quote(str(file))}", soft_wrap=True)
 
 
 def _methods_table() -> Table:
@@ -205,7 +205,13 @@ def _options_table(method: str) -> list[Shown]:
 
     rows = []
     for name, option in method_options_schema(method)["properties"].items():
-        rows.append((name, _default(option), f"{_values(option)}\n{option['description']}"))
+        rows.append(
+            (
+                name,
+                _default_text(option),
+                f"{_allowed_values_text(option)}\n{option['description']}",
+            )
+        )
     table = Table("", ("option", "default", ""), tuple(rows), names=2, texts=1)
     return [
         method_summary(method),
@@ -216,7 +222,7 @@ def _options_table(method: str) -> list[Shown]:
     ]
 
 
-def _default(option: Mapping[str, Any]) -> str:
+def _default_text(option: Mapping[str, Any]) -> str:
     """Return the default of an option as text."""
     default = option["default"]
     items = default if isinstance(default, tuple) else [default]
@@ -224,12 +230,12 @@ def _default(option: Mapping[str, Any]) -> str:
     return f"[{text}]" if isinstance(default, tuple) else text
 
 
-def _values(option: Mapping[str, Any]) -> str:
+def _allowed_values_text(option: Mapping[str, Any]) -> str:
     """Return the allowed values of an option in words, from its JSON schema."""
     if "enum" in option:
         return ", ".join(option["enum"])
     if option["type"] == "array":
-        return f"list, each a {_values(option['items'])}"
+        return f"list, each a {_allowed_values_text(option['items'])}"
     limits = {"exclusiveMinimum": "above", "minimum": "of at least"}
     ranges = [f" {word} {option[key]:g}" for key, word in limits.items() if key in option]
-    return KINDS[option["type"]] + "".join(ranges)
+    return TYPE_WORDS[option["type"]] + "".join(ranges)

@@ -134,7 +134,7 @@ class FrameBuffer:
             Positions (G, 3) and quaternions (G, 4) of the grasps that move; None if missing.
         tracks_m : (M, 3)
             Marker positions, NaN where missing.
-        instrument_samples : sequence of Told
+        instrument_samples : sequence of OutputOptions
             Samples of instruments.
         """
         sample_s = self.interval_s

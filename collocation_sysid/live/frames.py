@@ -54,7 +54,7 @@ class Frame:
         Marker positions; NaN where missing.
     has_wrench : bool
         Whether the frame contains a wrench, even if the problem has no sensor for it.
-    instrument_samples : tuple of Told
+    instrument_samples : tuple of OutputOptions
         Samples of instruments, at their own times.
     """
 

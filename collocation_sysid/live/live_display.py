@@ -14,8 +14,8 @@ from ..display import Shown, Table, millimetres
 from ..errors import InputError
 from ..fem.constants import unit_of
 from ..files import whole_file
-from ..result.figure_style import BLUE, ORANGE, dress, mathematical, new_figure
-from ..result.run_sections import verdict_of
+from ..result.figure_style import BLUE, ORANGE, new_figure, style_axes, symbol_as_mathtext
+from ..result.run_sections import verdict_section
 from .estimator import LiveUpdate
 
 # Characters of increasing height.
@@ -56,7 +56,7 @@ def display_of(updates: Sequence[LiveUpdate]) -> list[Shown]:
         f"t = {last.t_s:.2f} s   markers missed by {millimetres(last.marker_rms_m)}   "
         f"{1e3 * last.latency_s:.1f} ms",
         Table("", ("", "estimate", "±", "unit", "so far"), tuple(rows), names=5),
-        verdict_of(last.trust, most=SHOWN_REASONS),
+        verdict_section(last.trust, max_reasons=SHOWN_REASONS),
     ]
 
 
@@ -126,8 +126,8 @@ def _draw_parameter(
     axes.set_xlim(t_s[0], max(t_s[-1], t_s[0] + 1e-9))
     axes.set_ylim(low - margin, high + margin)
     unit = unit_of(name)
-    label = mathematical(name) + (f" [{unit}]" if unit else "")
-    dress(axes, "", "t [s]" if k == count - 1 else "", label)
+    label = symbol_as_mathtext(name) + (f" [{unit}]" if unit else "")
+    style_axes(axes, "", "t [s]" if k == count - 1 else "", label)
     styles = ((BLUE, "-"), (ORANGE, "--"), (ORANGE, "--"))
     lines = [axes.plot([], [], style, color=colour)[0] for colour, style in styles]
     return lines, [value, ends[:, 0], ends[:, 1]]

@@ -16,19 +16,19 @@ from ..fem.constants import unit_of
 from ..result.figure_style import (
     BLACK,
     BLUE,
-    CYCLE,
+    COLOUR_CYCLE,
     LINE_PT,
     PAGE_MM,
     SMALL_PT,
     TEXT_PT,
     VERMILION,
-    dress,
-    legend_above,
-    legend_of_all,
-    log_axis,
-    mathematical,
+    add_figure_legend,
+    add_legend_above,
+    format_plain_numbers,
+    make_log_axis,
     new_figure,
-    plain_numbers,
+    style_axes,
+    symbol_as_mathtext,
 )
 from ..runs.result_content import Result
 from ..serialisation import read
@@ -77,7 +77,10 @@ def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
     """Return colour and rows of each method."""
     methods = dict.fromkeys(row["method"] for row in rows)
     return {
-        method: (CYCLE[k % len(CYCLE)], [row for row in rows if row["method"] == method])
+        method: (
+            COLOUR_CYCLE[k % len(COLOUR_CYCLE)],
+            [row for row in rows if row["method"] == method],
+        )
         for k, method in enumerate(methods)
     }
 
@@ -98,14 +101,14 @@ def convergence_in_time(rows: Sequence[Row], records: Mapping[str, Record]) -> F
                 values[~(values > 0)] = np.nan
                 label = None if k else method
                 axes.plot(times, values, label=label, alpha=max(0.2, len(runs) ** -0.5), **style)
-    dress(panels[0], "Loss", "time [s]", "Σ (residual / σ)²")
-    dress(panels[1], "Violated dynamics", "time [s]", "largest residual [N]")
+    style_axes(panels[0], "Loss", "time [s]", "Σ (residual / σ)²")
+    style_axes(panels[1], "Violated dynamics", "time [s]", "largest residual [N]")
     for axes in panels:
-        log_axis(axes)
+        make_log_axis(axes)
         axes.set_xscale("log", nonpositive="mask")
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
-        plain_numbers(axes.xaxis)
-    legend_above(panels[0], 3, 1.1)
+        format_plain_numbers(axes.xaxis)
+    add_legend_above(panels[0], 3, 1.1)
     return figure
 
 
@@ -142,12 +145,12 @@ def success_by_distance(
             places, rates, np.abs(np.array(bars)).T, color=colour, label=method, **style
         )  # fmt: skip
     title = f"Success by distance from the {'truth' if known_rows else 'best answer'}"
-    dress(axes, title, "factor of the guess that is farthest off", "success [%]")
+    style_axes(axes, title, "factor of the guess that is farthest off", "success [%]")
     axes.set_xscale("log")
     axes.set_xticks(edges, [f"{edge:.2g}" for edge in edges])
     axes.xaxis.set_minor_locator(NullLocator())
     axes.set_ylim(-4, 104)
-    legend_above(axes, 2, 1.1)
+    add_legend_above(axes, 2, 1.1)
     return figure
 
 
@@ -172,12 +175,12 @@ def basins(rows: Sequence[Row], centre: Mapping[str, float], known_rows: bool) -
                     label="success" if success else "failure",
                 )  # fmt: skip
             axes.plot(1, 1, "+", color=BLACK, ms=6, label="truth" if known_rows else "best answer")
-            dress(axes, method if axes is line[0] else "", "", mathematical(second))
+            style_axes(axes, method if axes is line[0] else "", "", symbol_as_mathtext(second))
     for axes, (first, _) in zip(panels[-1], pairs, strict=True):
-        axes.set_xlabel(mathematical(first), fontsize=TEXT_PT)
+        axes.set_xlabel(symbol_as_mathtext(first), fontsize=TEXT_PT)
     _ratio_axes(panels[0, 0], max(guess_distance(row, centre) for row in rows))
     title = f"guesses over the {'truth' if known_rows else 'best answer'}"
-    legend_of_all(
+    add_figure_legend(
         figure, 3, loc="outside upper right", fontsize=SMALL_PT, title=title,
         title_fontsize=SMALL_PT, alignment="right",
     )  # fmt: skip
@@ -192,7 +195,7 @@ def _ratio_axes(axes: Axes, factor: float) -> None:
     for axis, limit in ((axes.xaxis, axes.set_xlim), (axes.yaxis, axes.set_ylim)):
         limit(0.8 / factor, 1.25 * factor)
         axis.set_major_locator(FixedLocator([1 / tick, 1, tick]))
-        plain_numbers(axis, ".2g")
+        format_plain_numbers(axis, ".2g")
 
 
 # Answers ------------------------------------------------------------------------------------------
@@ -210,7 +213,7 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
     for axis, (axes, letter) in enumerate(zip(panels, "xyz", strict=True)):
         axes.plot(tip["t_s"], measured[:, axis], ".", label="measured", **dots)
         title = f"Tip: marker {tip['marker']} of {tip['experiment']}" if axis == 0 else ""
-        dress(axes, title, "time [s]", f"{letter} [mm]")
+        style_axes(axes, title, "time [s]", f"{letter} [mm]")
         axes.yaxis.set_major_locator(MaxNLocator(5))
     for method, (colour, runs) in _by_method(rows).items():
         best = best_run(runs)
@@ -221,7 +224,7 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
         off = f", off by at most {1e3 * track['max_m']:.2g} mm" if track["max_m"] else ""
         for axis, axes in enumerate(panels):
             axes.plot(track["t_s"], rolled[:, axis], color=colour, lw=LINE_PT, label=method + off)
-    legend_of_all(figure, 2)
+    add_figure_legend(figure, 2)
     return figure
 
 
@@ -248,17 +251,17 @@ def estimates_against(rows: Sequence[Row], swept: Sequence[str]) -> Figure:
             for label, colour, shift, chosen in _groups(rows, swept, key, shorts):
                 _draw_estimates(line[column], rows, places + shift, name, chosen, colour, label)
             unit = f" [{unit_of(name)}]" if unit_of(name) else ""
-            dress(line[column], "", "", "" if column else mathematical(name) + unit)
+            style_axes(line[column], "", "", "" if column else symbol_as_mathtext(name) + unit)
         bottom = panels[-1, column]
         bottom.set_xlabel(shorts[key], fontsize=TEXT_PT)
         shown = list(texts)[:: -(-len(texts) // MOST_TICKS)]
         bottom.set_xticks(shown, [texts[place] for place in shown])
         if len(swept) > 1:
-            legend_above(panels[0, column], 2)
+            add_legend_above(panels[0, column], 2)
     for line in panels:
         drawn = np.concatenate([c.get_segments() for c in line[0].collections])[..., 1].ravel()
         if drawn.size and drawn.min() > 0 and drawn.max() > WIDE * drawn.min():
-            log_axis(line[0])
+            make_log_axis(line[0])
     return figure
 
 
@@ -283,14 +286,14 @@ def _groups(
     """Return label, colour, offset and mask of the rows that share a value of another key."""
     other = next((name for name in swept if name != key), None)
     if other is None:
-        yield None, CYCLE[0], 0.0, np.ones(len(rows), dtype=bool)
+        yield None, COLOUR_CYCLE[0], 0.0, np.ones(len(rows), dtype=bool)
         return
     values = list(dict.fromkeys(row[other] for row in rows))
     for k, value in enumerate(values):
         label = f"{shorts[other]} = {_shortened(value)}"
         shift = 0.5 * ((k + 0.5) / len(values) - 0.5)
         chosen = np.array([row[other] == value for row in rows])
-        yield label, CYCLE[k % len(CYCLE)], shift, chosen
+        yield label, COLOUR_CYCLE[k % len(COLOUR_CYCLE)], shift, chosen
 
 
 def _draw_estimates(

@@ -74,7 +74,7 @@ class LiftedWrench(LiftedVariables):
 
     @cached_property
     def _row_unit(self) -> Array:
-        """Unit (6,) of the equations [N, N m], between `_unit` and that of R for good
+        """Unit (6,) of the equations [N, N m], between `_unit_text` and that of R for good
         conditioning.
         """
         return self._reaction_unit**0.75 * self._unit**0.25

@@ -2,7 +2,7 @@
 
 Beside the body a panel shows the distance of the markers from their measurements over time.
 `animate`
-works from a run folder, `write_film` from a `Replay`.
+works from a run folder, `write_film` from a `ReplayCommand`.
 """
 
 from __future__ import annotations
@@ -23,51 +23,51 @@ from numpy.typing import NDArray
 from ..array_types import Array
 from ..errors import InputError, require_among
 from ..files import safe_name, whole_file
-from .figure_style import BLACK, BLUE, GREEN, LINE_PT, TEXT_PT, dress, legend_above
+from .figure_style import BLACK, BLUE, GREEN, LINE_PT, TEXT_PT, add_legend_above, style_axes
 from .pictures.over_time import rms_over_markers
-from .pictures.projection import Camera
+from .pictures.projection import ParallelCamera
 from .pictures.scene import (
-    Drawn,
-    View,
+    BodyDrawing,
+    SheetView,
+    aspect_ratio,
     draw_directions,
-    draw_key,
+    draw_legend,
     draw_scale,
-    key,
+    legend_handles,
     sheet,
-    width_over_height,
-    with_outlines,
+    with_near_outlines,
 )
-from .replay import Replay, headline, read_run, reading_run
+from .replay import MotionRecord, damaged_run_refused, read_run, run_headline
 
-WIDTH_MM = 160.0
-TALLEST_MM = 110.0
-LOWEST_MM = 30.0
+FILM_WIDTH_MM = 160.0
+MAX_BODY_HEIGHT_MM = 110.0
+MIN_BODY_HEIGHT_MM = 30.0
 # Width of a film in pixels, even for H.264 (see `_stiffening_of_interval`); smaller for GIF, which
 # compresses badly.
 PIXELS_WIDE = {".mp4": 1280, ".gif": 800}
-HEAD_MM = 12.0
-FOOT_MM = 12.0
-LINE_MM = 5.0
+HEAD_HEIGHT_MM = 12.0
+FOOT_HEIGHT_MM = 12.0
+HEADLINE_HEIGHT_MM = 5.0
 # Width of the panel of marker errors beside the body.
-ERRORS_MM = 60.0
+ERROR_PANEL_WIDTH_MM = 60.0
 # Colour of the paths of measured markers.
-PATH = "#C4CBD4"
+MARKER_PATH_COLOUR = "#C4CBD4"
 # Frames of a film: more take minutes and hundreds of megabytes.
-MOST_FRAMES = 3000
+MAX_FILM_FRAMES = 3000
 # Samples per second of a static experiment, whose recording may have taken a second or a day.
-STATES_A_SECOND = 8
-NAMES = ("fitted", "simulated")
+STATIC_SAMPLES_PER_SECOND = 8
+TRAJECTORY_NAMES = ("fitted", "simulated")
 
-Progress = Callable[[float], None]
+ProgressCallback = Callable[[float], None]
 
 
 def animate(
     run: str | Path,
-    to: str | Path | None = None,
+    file: str | Path | None = None,
     fps: float = 25.0,
-    slow: float = 1.0,
+    slowdown: float = 1.0,
     experiment: str | None = None,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Path:
     """Film an experiment of a run folder, and return the film's file.
 
@@ -75,12 +75,12 @@ def animate(
     ----------
     run : str or Path
         A run folder.
-    to : str or Path, optional
+    file : str or Path, optional
         A file ending in .mp4, which needs ffmpeg, or .gif; by default <experiment>.gif in the run
         folder.
     fps : float
         Frames per second.
-    slow : float
+    slowdown : float
         How many times slower than the recording the film is.
     experiment : str, optional
         Name of the experiment; the first by default.
@@ -94,35 +94,35 @@ def animate(
         is
         missing, and for numbers out of range.
     """
-    for name, value in (("--fps", fps), ("--slow", slow)):
+    for name, value in (("--fps", fps), ("--slow", slowdown)):
         if not 0 < value < np.inf:
             raise InputError(f"found {value:g}; expected a number above 0", None, name)
     result, replays = read_run(run)
-    replay = chosen(replays, experiment, run)
-    with reading_run(Path(run)):
-        text = headline(result)
-    file = Path(to) if to is not None else Path(run) / f"{safe_name(replay.name)}.gif"
+    replay = experiment_named(replays, experiment, run)
+    with damaged_run_refused(Path(run)):
+        text = run_headline(result)
+    file = Path(file) if file is not None else Path(run) / f"{safe_name(replay.name)}.gif"
     if file.suffix.lower() not in PIXELS_WIDE:
         raise InputError(
             f"found '{file.suffix}'; expected {' or '.join(PIXELS_WIDE)}", file, "--to"
         )
-    return film(replay, file, fps, slow, progress, headline=text)
+    return film(replay, file, fps, slowdown, progress, headline=text)
 
 
 def film(
-    replay: Replay,
+    replay: MotionRecord,
     file: Path,
     fps: float = 25.0,
-    slow: float = 1.0,
-    progress: Progress | None = None,
-    names: tuple[str, str] = NAMES,
+    slowdown: float = 1.0,
+    progress: ProgressCallback | None = None,
+    names: tuple[str, str] = TRAJECTORY_NAMES,
     headline: str = "",
 ) -> Path:
     """Film one experiment and return the file.
 
     Parameters
     ----------
-    replay : Replay
+    replay : ReplayCommand
         Experiment with at least one trajectory.
     file : Path
         Ends in .mp4 or .gif.
@@ -133,27 +133,27 @@ def film(
     headline : str
         Text above the body.
     """
-    picture = Film(replay, names, headline)
+    picture = FilmFigure(replay, names, headline)
     t_s = replay.t_s
     if replay.static:  # which may take a second or a day
-        t_s = np.arange(len(t_s)) / STATES_A_SECOND
-    shown = film_samples(t_s, fps, slow)
-    ffmpeg = _ffmpeg(file) if file.suffix.lower() == ".mp4" else None
-    dpi = PIXELS_WIDE[file.suffix.lower()] / (WIDTH_MM / 25.4)
+        t_s = np.arange(len(t_s)) / STATIC_SAMPLES_PER_SECOND
+    shown = film_samples(t_s, fps, slowdown)
+    ffmpeg = _find_ffmpeg(file) if file.suffix.lower() == ".mp4" else None
+    dpi = PIXELS_WIDE[file.suffix.lower()] / (FILM_WIDTH_MM / 25.4)
     with rc_context({"animation.ffmpeg_path": ffmpeg} if ffmpeg else {}):
-        writer = _writer(fps, ffmpeg)
+        writer = _frame_writer(fps, ffmpeg)
         with whole_file(file) as draft, writer.saving(picture.figure, str(draft), dpi):
             for number, t in enumerate(shown):
-                picture.show(int(t))
+                picture.show_sample(int(t))
                 writer.grab_frame()
                 if progress is not None:
                     progress((number + 1) / len(shown))
     return file
 
 
-def chosen(
-    replays: Sequence[Replay], experiment: str | None, run: str | Path | None = None
-) -> Replay:
+def experiment_named(
+    replays: Sequence[MotionRecord], experiment: str | None, run: str | Path | None = None
+) -> MotionRecord:
     """Return the experiment called `experiment`, or the first one if that is None.
 
     Experiments without a trajectory do not count. `run` is the run folder that errors name.
@@ -172,7 +172,7 @@ def chosen(
     return available[experiment]
 
 
-def film_samples(t_s: Array, fps: float, slow: float) -> NDArray[np.int64]:
+def film_samples(t_s: Array, fps: float, slowdown: float) -> NDArray[np.int64]:
     """Return the indices (k,) of the samples nearest to the times of a film's frames.
 
     Parameters
@@ -181,7 +181,7 @@ def film_samples(t_s: Array, fps: float, slow: float) -> NDArray[np.int64]:
         Times of the samples.
     fps : float
         Frames per second.
-    slow : float
+    slowdown : float
         How many times slower than the recording the film is.
 
     Raises
@@ -190,18 +190,18 @@ def film_samples(t_s: Array, fps: float, slow: float) -> NDArray[np.int64]:
         If the film would have more than `MOST_FRAMES` frames.
     """
     duration = float(t_s[-1] - t_s[0])
-    count = round(duration * slow * fps) + 1
-    if count > MOST_FRAMES:
+    count = round(duration * slowdown * fps) + 1
+    if count > MAX_FILM_FRAMES:
         raise InputError(
-            f"{duration:.3g} s, {slow:g} times slower, at {fps:g} frames a second make {count} "
-            f"frames, more than {MOST_FRAMES}; lower --fps or --slow"
+            f"{duration:.3g} s, {slowdown:g} times slower, at {fps:g} frames a second make {count} "
+            f"frames, more than {MAX_FILM_FRAMES}; lower --fps or --slow"
         )
-    times_s = np.arange(count) / (slow * fps)
+    times_s = np.arange(count) / (slowdown * fps)
     share = times_s / max(duration, np.finfo(float).tiny)
     return np.minimum(np.rint(share * (len(t_s) - 1)), len(t_s) - 1).astype(np.int64)
 
 
-class Film:
+class FilmFigure:
     """Figure that shows the samples of a film one after another.
 
     Attributes
@@ -211,7 +211,9 @@ class Film:
 
     figure: Figure
 
-    def __init__(self, replay: Replay, names: tuple[str, str] = NAMES, headline: str = "") -> None:
+    def __init__(
+        self, replay: MotionRecord, names: tuple[str, str] = TRAJECTORY_NAMES, headline: str = ""
+    ) -> None:
         self.replay = replay
         trajectories = (
             (names[0], replay.positions_m, replay.markers_m),
@@ -223,8 +225,8 @@ class Film:
         is_finite = np.isfinite(surface_m).all(axis=(1, 2))
         surface_m = surface_m[is_finite]
         outlines_m = replay.obstacles_m
-        camera = Camera.facing(surface_m, replay.up)
-        surroundings_m = with_outlines(
+        camera = ParallelCamera.facing_motion(surface_m, replay.up)
+        surroundings_m = with_near_outlines(
             surface_m, None if outlines_m is None else outlines_m[is_finite]
         )
         depth_points_m = [rows[np.isfinite(rows[:, 4]), 5:] for rows in replay.seen.values()]
@@ -234,101 +236,128 @@ class Film:
         compared = [
             (n, m) for n, _, m in shown if m.size and np.isfinite(m - replay.measured_m).any()
         ]
-        width = WIDTH_MM - (ERRORS_MM if compared else 0.0)
-        aspect = width_over_height(camera, everything)
-        height = float(np.clip((width - 8) / aspect, LOWEST_MM, TALLEST_MM))
-        head = HEAD_MM + (LINE_MM if headline else 0.0)
-        total = _even(head + height + FOOT_MM)
-        self.figure, axes = sheet(WIDTH_MM, total)
+        width = FILM_WIDTH_MM - (ERROR_PANEL_WIDTH_MM if compared else 0.0)
+        aspect = aspect_ratio(camera, everything)
+        height = float(np.clip((width - 8) / aspect, MIN_BODY_HEIGHT_MM, MAX_BODY_HEIGHT_MM))
+        head = HEAD_HEIGHT_MM + (HEADLINE_HEIGHT_MM if headline else 0.0)
+        total = _with_even_pixels(head + height + FOOT_HEIGHT_MM)
+        self.figure, axes = sheet(FILM_WIDTH_MM, total)
         self.figure.set_facecolor("white")
-        axes.text(WIDTH_MM / 2, total - 3, headline, ha="center", va="top", fontsize=TEXT_PT)
-        self.panels = []
-        view = View.fitting(camera, everything, (width - 8, height), (4, FOOT_MM))
+        axes.text(FILM_WIDTH_MM / 2, total - 3, headline, ha="center", va="top", fontsize=TEXT_PT)
+        self.drawings = []
+        view = SheetView.fit_points(camera, everything, (width - 8, height), (4, FOOT_HEIGHT_MM))
         for path_m in np.moveaxis(replay.measured_m, 1, 0):
-            axes.plot(*view.places(path_m).T, color=PATH, lw=0.6, zorder=0.2)
+            axes.plot(*view.to_sheet_mm(path_m).T, color=MARKER_PATH_COLOUR, lw=0.6, zorder=0.2)
         for k, (name, positions, markers) in enumerate(shown):
-            top = total - 3 - (head - HEAD_MM)
+            top = total - 3 - (head - HEAD_HEIGHT_MM)
             wire = GREEN if k else None
             title = axes.text(
-                4 + k * WIDTH_MM / 4, top, "", va="top", fontsize=TEXT_PT, zorder=6,
+                4 + k * FILM_WIDTH_MM / 4, top, "", va="top", fontsize=TEXT_PT, zorder=6,
                 color=wire or BLACK,
             )  # fmt: skip
-            body = Drawn(
+            body = BodyDrawing(
                 axes,
                 view,
                 replay.surface,
                 parts=replay.surface_parts,
                 nodes=replay.surface_nodes,
-                wire=wire,
+                edge_colour=wire,
             )
-            self.panels.append((name, positions, markers, body, title))
-        self._surround(axes, camera, view.mm_per_m, total)
+            self.drawings.append((name, positions, markers, body, title))
+        self._draw_annotations(axes, camera, view.mm_per_m, total)
         self.cursor = self._draw_errors(compared, width, height, total) if compared else None
-        self.clock = axes.text(WIDTH_MM - 4, 4.0, "", ha="right", va="center", fontsize=TEXT_PT)
+        self.time_label = axes.text(
+            FILM_WIDTH_MM - 4, 4.0, "", ha="right", va="center", fontsize=TEXT_PT
+        )
 
     def _draw_errors(
-        self, compared: Sequence[tuple[str, Array]], left_mm: float, height_mm: float, total: float
+        self,
+        trajectories: Sequence[tuple[str, Array]],
+        left_mm: float,
+        height_mm: float,
+        figure_height_mm: float,
     ) -> Line2D:
         """Draw the panel of marker errors over time, and return the vertical line that marks the
         current time.
 
         Parameters
         ----------
-        compared : sequence of (str, (T, M, 3))
+        trajectories : sequence of (str, (T, M, 3))
             Label and marker positions [m] of each trajectory.
-        left_mm, height_mm, total : float
+        left_mm, height_mm, figure_height_mm : float
             Left edge of the panel, height of the body's picture, and height of the figure [mm].
         """
         t_s = self.replay.t_s - self.replay.t_s[0]
-        place = left_mm + 12, FOOT_MM + 9, ERRORS_MM - 16, min(height_mm - 12, 45.0)
-        panel = self.figure.add_axes(
-            (place[0] / WIDTH_MM, place[1] / total, place[2] / WIDTH_MM, place[3] / total)
+        place = (
+            left_mm + 12,
+            FOOT_HEIGHT_MM + 9,
+            ERROR_PANEL_WIDTH_MM - 16,
+            min(height_mm - 12, 45.0),
         )
-        for (name, markers), colour in zip(compared, (BLUE, GREEN), strict=False):
+        panel = self.figure.add_axes(
+            (
+                place[0] / FILM_WIDTH_MM,
+                place[1] / figure_height_mm,
+                place[2] / FILM_WIDTH_MM,
+                place[3] / figure_height_mm,
+            )
+        )
+        for (name, markers), colour in zip(trajectories, (BLUE, GREEN), strict=False):
             squares = np.sum((markers - self.replay.measured_m) ** 2, axis=2)
             style = {"color": colour, "lw": LINE_PT, "ls": "-" if colour == BLUE else (0, (4, 2))}
             panel.plot(t_s, 1e3 * rms_over_markers(squares), label=name, **style)
-        dress(panel, "", "time [s]", "markers, RMS [mm]")
+        style_axes(panel, "", "time [s]", "markers, RMS [mm]")
         panel.set_ylim(bottom=0.0)
-        legend_above(panel, columns=1)
+        add_legend_above(panel, columns=1)
         return panel.axvline(0.0, color=BLACK, lw=0.8)
 
-    def _surround(self, axes: Axes, camera: Camera, mm_per_m: float, total: float) -> None:
+    def _draw_annotations(
+        self, axes: Axes, camera: ParallelCamera, mm_per_m: float, height_mm: float
+    ) -> None:
         """Draw the axis directions, the scale bar and the legend around the body."""
         draw_directions(axes, camera, (7.0, 4.0))
-        draw_scale(axes, mm_per_m, (WIDTH_MM * 0.17, 4.0))
+        draw_scale(axes, mm_per_m, (FILM_WIDTH_MM * 0.17, 4.0))
         named = ["grasped", "measured", "behind the body"]
         if self.replay.seen:
             markers = named[1:] if len(self.replay.marker_names) else []
             named = ["grasped", *markers, "seen in depth"]
-        draw_key(axes, key(*named), (WIDTH_MM * (0.42 if len(named) < 4 else 0.35), 5.5))
+        draw_legend(
+            axes, legend_handles(*named), (FILM_WIDTH_MM * (0.42 if len(named) < 4 else 0.35), 5.5)
+        )
 
-    def show(self, t: int) -> None:
-        """Show the sample with index `t`."""
+    def show_sample(self, sample: int) -> None:
+        """Show the sample with index `sample`."""
         replay = self.replay
-        measured = replay.measured_m[t]
-        for name, positions, markers, drawn, title in self.panels:
-            outlines_m = None if replay.obstacles_m is None else replay.obstacles_m[t]
-            drawn.show(positions[t], replay.held[t], measured, None, outlines_m, replay.seen_m(t))
-            distances = np.linalg.norm(markers[t] - measured, axis=1)
+        measured = replay.measured_m[sample]
+        for name, positions, markers, drawn, title in self.drawings:
+            outlines_m = None if replay.obstacles_m is None else replay.obstacles_m[sample]
+            drawn.update(
+                positions[sample],
+                replay.held[sample],
+                measured,
+                None,
+                outlines_m,
+                replay.depth_points_m(sample),
+            )
+            distances = np.linalg.norm(markers[sample] - measured, axis=1)
             present = distances[np.isfinite(distances)]
             off = f"{1e3 * np.sqrt(np.mean(present**2)):.2f} mm" if len(present) else "no markers"
             title.set_text(name if markers is replay.measured_m else f"{name}: {off}")
         if self.cursor is not None:
-            now_s = replay.t_s[t] - replay.t_s[0]
+            now_s = replay.t_s[sample] - replay.t_s[0]
             self.cursor.set_xdata([now_s, now_s])
-        self.clock.set_text(f"{replay.t_s[t] - replay.t_s[0]:.2f} s")
+        self.time_label.set_text(f"{replay.t_s[sample] - replay.t_s[0]:.2f} s")
 
 
-def _even(height_mm: float) -> float:
+def _with_even_pixels(height_mm: float) -> float:
     """Return the next larger height [mm] that is an even number of pixels in a film, as H.264
     needs.
     """
-    per_mm = PIXELS_WIDE[".mp4"] / WIDTH_MM
+    per_mm = PIXELS_WIDE[".mp4"] / FILM_WIDTH_MM
     return float(2 * np.ceil(height_mm * per_mm / 2) / per_mm)
 
 
-def _writer(fps: float, ffmpeg: str | None) -> AbstractMovieWriter:
+def _frame_writer(fps: float, ffmpeg: str | None) -> AbstractMovieWriter:
     """Return the writer of frames: for GIF if `ffmpeg` is None, else for H.264 by that program."""
     if ffmpeg is None:
         return PillowWriter(fps=fps)  # type: ignore[arg-type]
@@ -336,7 +365,7 @@ def _writer(fps: float, ffmpeg: str | None) -> AbstractMovieWriter:
     return FFMpegWriter(fps=fps, codec="h264", extra_args=["-pix_fmt", "yuv420p", "-crf", "18"])  # type: ignore[arg-type]
 
 
-def _ffmpeg(file: Path) -> str:
+def _find_ffmpeg(file: Path) -> str:
     """Return the path of ffmpeg, of the system or else of imageio-ffmpeg.
 
     Raises

@@ -1,6 +1,7 @@
 """Findings of a check as tables for the terminal.
 
-`glance_table` shows what is known at once; `closer_table` shows the findings that need simulations.
+`quick_check_tables` shows what is known at once; `full_check_tables` shows the findings that need
+simulations.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from ..display import Line, Shown, Table, duration, labelled
 from ..fem.constants import symbol_of, unit_of
 from ..runs.check import BodyCheck, CheckResult, GraspCheck, QuickCheck, RecordingCheck
 from ..runs.check.body_check import grasp_sentence
-from .run_sections import how_to
+from .run_sections import remedy_command
 
 # Natural modes in the table, lowest first.
 SHOWN_MODES = 3
@@ -21,12 +22,12 @@ SHOWN_MODES = 3
 SHOWN_RECORDINGS = 4
 
 
-def glance_table(seen: QuickCheck) -> list[Shown]:
+def quick_check_tables(quick_check: QuickCheck) -> list[Shown]:
     """Return tables of the bodies and of the measurements, which need no simulation."""
-    return [*map(_body_section, seen.bodies), _measurements_section(seen)]
+    return [*map(_body_section, quick_check.bodies), _measurements_section(quick_check)]
 
 
-def closer_table(findings: CheckResult) -> list[Shown]:
+def full_check_tables(findings: CheckResult) -> list[Shown]:
     """Return tables of modes, costs and derivatives, then notes, warnings, remedies and the
     conclusion.
     """
@@ -40,7 +41,7 @@ def closer_table(findings: CheckResult) -> list[Shown]:
             for kind, (sentences, style) in messages.items()
             if sentences
         ),
-        *how_to(findings.concerns),
+        *remedy_command(findings.concerns),
         _check_verdict(findings),
     ]
 
@@ -123,18 +124,18 @@ def _measurements_section(findings: QuickCheck) -> Table:
         when = f"{recording.duration_s:.3g} s at {recording.rate_hz:.4g} Hz"
         rows[f"'{recording.experiment}'"] = (
             f"{'static' if recording.static else when}: {recording.frames} × "
-            f"{_markers_seen(recording)}{kind}"
+            f"{_marker_summary(recording)}{kind}"
         )
     if len(findings.recordings) > SHOWN_RECORDINGS:
         rows["…"] = f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
     densities = {recording.air_density_kg_m3 for recording in findings.recordings}
-    rows["air"] = ", ".join(map(_air, sorted(densities)))
+    rows["air"] = ", ".join(map(_air_description, sorted(densities)))
     for recording in findings.recordings[:SHOWN_RECORDINGS]:
-        rows |= _grasps(recording.experiment, findings.holds)
+        rows |= _grasp_rows(recording.experiment, findings.holds)
     return labelled("Measurements", rows)
 
 
-def _grasps(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
+def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
     """Return a sentence on each grasp of an experiment; several grasps are numbered from 1."""
     own = [grasp_sentence(hold) for hold in holds if hold.experiment == experiment]
     if len(own) == 1:
@@ -142,14 +143,14 @@ def _grasps(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
     return {f"grasp {k} of '{experiment}'": sentence for k, sentence in enumerate(own, start=1)}
 
 
-def _air(density_kg_m3: float) -> str:
+def _air_description(density_kg_m3: float) -> str:
     """Return how the model contains the surrounding air, of a density of zero in a vacuum."""
     if not density_kg_m3:
         return "none (as in a vacuum)"
     return f"{density_kg_m3:.4g} kg/m³ (buoyancy, added mass and drag)"
 
 
-def _markers_seen(recording: RecordingCheck) -> str:
+def _marker_summary(recording: RecordingCheck) -> str:
     """Return how many markers a recording has, how many samples are missing, and the farthest
     marker.
     """

@@ -1,7 +1,7 @@
 """Points of depth cameras and outlines of the body's surface, as pictures and films need them.
 
-`compared_rows` is for a fitted or simulated surface, `seen_before` for the undeformed body before
-anything is fitted. Both give the rows of `Replay.fit_summary`.
+`surface_rows` is for a fitted or simulated surface, `undeformed_rows` for the undeformed body
+before anything is fitted. Both give the rows of `ReplayCommand.fit_summary`.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from ..program.depth_camera_model import DepthCameraModel
 from ..program.depth_comparison import SurfaceComparison
 from ..program.visible_surface import VisibleSurface
 from ..recording.experiment import Experiment
-from .pictures.album import of_different_names, save_pictures
+from .pictures.album import save_pictures, with_unique_names
 from .pictures.depth_comparison_picture import depth_picture
-from .pictures.projection import Camera
+from .pictures.projection import ParallelCamera
 
 # Number of samples whose outlines are drawn.
-OUTLINED = 4
+MAX_OUTLINED_SAMPLES = 4
 # Distance of the viewer from a point cloud, over the size of the body: nearly parallel rays.
-AWAY = 1e3
+VIEWER_DISTANCE_RATIO = 1e3
 
 
 @dataclass(frozen=True, eq=False)
-class Projection:
+class DepthProjection:
     """Projection into the image of a depth camera or, for a point cloud, onto the body's broad
     side.
 
@@ -41,19 +41,19 @@ class Projection:
         Visible surface of the body.
     phi : (k,)
         Nuisance parameters, of which those of the camera correct its pose, bias and scale.
-    scene : Camera
+    parallel_camera : ParallelCamera
         Parallel projection for point clouds, which have no image of their own.
     """
 
     view: DepthCameraModel
     skin: VisibleSurface
     phi: Array
-    scene: Camera
+    parallel_camera: ParallelCamera
 
     @classmethod
-    def of(
+    def facing_shape(
         cls, view: DepthCameraModel, skin: VisibleSurface, phi: Array, shape_m: Array, up: Array
-    ) -> Projection:
+    ) -> DepthProjection:
         """Return the projection whose parallel view faces the broad side of the body.
 
         Parameters
@@ -66,25 +66,25 @@ class Projection:
         up : (3,)
             Unit vector against gravity.
         """
-        return cls(view, skin, phi, Camera.facing(shape_m[None], up))
+        return cls(view, skin, phi, ParallelCamera.facing_motion(shape_m[None], up))
 
-    def points(self, own_m: Array, world_m: Array) -> Array:
+    def image_points(self, camera_m: Array, world_m: Array) -> Array:
         """Return image coordinates u, v [pixels] and depth [m] of points, as (P, 3).
 
         For a point cloud, u and v are millimetres in the parallel view.
 
         Parameters
         ----------
-        own_m : (P, 3)
+        camera_m : (P, 3)
             Points in the camera's frame.
         world_m : (P, 3)
             The same points in the world.
         """
         camera = self.view.depth.camera
         if camera.matrix is not None:
-            return np.column_stack([camera.undistorted_pixels(own_m), own_m[:, 2]])
-        right_top_mm = 1e3 * self.scene.project(world_m)
-        return np.column_stack([right_top_mm * [1, -1], -self.scene.nearness(world_m)])
+            return np.column_stack([camera.undistorted_pixels(camera_m), camera_m[:, 2]])
+        right_top_mm = 1e3 * self.parallel_camera.project(world_m)
+        return np.column_stack([right_top_mm * [1, -1], -self.parallel_camera.depths_m(world_m)])
 
     def outlines(self, shape_m: Array, sample: int) -> Array:
         """Return u and v (k, 2) of the faces that are turned to the camera; NaN in the row after
@@ -100,7 +100,9 @@ class Projection:
         eye_m = self.view.eye_m(self.phi, sample)
         if eye_m is None:
             size_m = float(np.linalg.norm(np.ptp(shape_m, axis=0)))
-            eye_m = shape_m.mean(axis=0) + AWAY * size_m * self.scene.axes[2]
+            eye_m = (
+                shape_m.mean(axis=0) + VIEWER_DISTANCE_RATIO * size_m * self.parallel_camera.axes[2]
+            )
         corners = shape_m[self.skin.flat_triangles[self.skin.is_facing(shape_m, eye_m)]]
         closed = corners[:, [0, 1, 2, 0]].reshape(-1, 3)
         own_m = self.view.to_camera_m(self.phi, closed, sample)
@@ -108,11 +110,11 @@ class Projection:
             is_in_front = np.repeat((own_m[:, 2].reshape(-1, 4) > 0).all(axis=1), 4)
             closed = closed[is_in_front]
             own_m = own_m[is_in_front]
-        image = self.points(own_m, closed)[:, :2].reshape(-1, 4, 2)
+        image = self.image_points(own_m, closed)[:, :2].reshape(-1, 4, 2)
         return np.pad(image, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 2)
 
-    def rows(self, sample: int, points_m: Array, rays: Array, apart_m: Array) -> Array:
-        """Return rows (P, 8) of `Replay.fit_summary` for the points of one sample.
+    def point_rows(self, sample: int, points_m: Array, rays: Array, distances_m: Array) -> Array:
+        """Return rows (P, 8) of `ReplayCommand.fit_summary` for the points of one sample.
 
         Parameters
         ----------
@@ -120,15 +122,15 @@ class Projection:
             Index of the camera's sample.
         points_m, rays : (P, 3)
             Points and viewing directions in the camera's frame.
-        apart_m : (P,)
+        distances_m : (P,)
             Distance behind the surface; NaN for points that do not count.
         """
         world = self.view.to_world(self.phi, points_m, rays, sample)
         t_s = np.full(len(points_m), self.view.depth.sample_times_s[sample])
-        return np.column_stack([t_s, self.points(points_m, world), apart_m, world])
+        return np.column_stack([t_s, self.image_points(points_m, world), distances_m, world])
 
     def outline_rows(self, sample: int, shape_m: Array) -> Array:
-        """Return rows (k, 8) of `Replay.fit_summary` with the outlines of a shape (n, 3).
+        """Return rows (k, 8) of `ReplayCommand.fit_summary` with the outlines of a shape (n, 3).
 
         The last row has the time alone, so that the sample is known also if no face is in view.
         """
@@ -139,7 +141,7 @@ class Projection:
         return rows
 
 
-def compared_rows(surface: SurfaceComparison, up: Array) -> Array:
+def surface_rows(surface: SurfaceComparison, up: Array) -> Array:
     """Return the points of all depth images with their distance from a fitted or simulated surface.
 
     Parameters
@@ -151,31 +153,31 @@ def compared_rows(surface: SurfaceComparison, up: Array) -> Array:
     Returns
     -------
     (k, 8) array
-        Rows of `Replay.fit_summary`, with outlines for at most `OUTLINED` samples.
+        Rows of `ReplayCommand.fit_summary`, with outlines for at most `OUTLINED` samples.
     """
     correspondences = surface.correspondences
     shapes_m = surface.shapes_m
     phi = surface.phi
-    shown = Projection.of(correspondences.camera, correspondences.surface, phi, shapes_m[0], up)
+    shown = DepthProjection.facing_shape(
+        correspondences.camera, correspondences.surface, phi, shapes_m[0], up
+    )
     samples = np.flatnonzero(correspondences.is_compared[: len(shapes_m)].any(axis=1)).tolist()
     rows = [np.zeros((0, 8))]
     for k in samples:
         within = correspondences.weights[k].any(axis=1)
         sights = correspondences.points[k], correspondences.rays[k], surface.signed_distances_m[k]
-        rows.append(shown.rows(k, *(each[within] for each in sights)))
-    few = np.unique(np.linspace(0, len(samples) - 1, OUTLINED).round().astype(int))
+        rows.append(shown.point_rows(k, *(each[within] for each in sights)))
+    few = np.unique(np.linspace(0, len(samples) - 1, MAX_OUTLINED_SAMPLES).round().astype(int))
     rows += [shown.outline_rows(samples[k], shapes_m[samples[k]]) for k in few if samples]
     return np.vstack(rows)
 
 
-def seen_before(experiment: Experiment) -> dict[str, Array]:
+def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
     """Return the first image of each depth camera with the undeformed body, before anything is
     fitted.
 
-    The arrays (k, 8) have the rows of `Replay.fit_summary`, by name of the camera; the body is
-    where the
-    grasps
-    carry it rigidly, and distances from it are NaN.
+    The arrays (k, 8) have the rows of `ReplayCommand.fit_summary`, by name of the camera; the body
+    is where the grasps carry it rigidly, and distances from it are NaN.
     """
     nuisance = NuisanceMap.from_experiment(experiment)
     by_camera = {}
@@ -183,11 +185,11 @@ def seen_before(experiment: Experiment) -> dict[str, Array]:
         view = DepthCameraModel.from_experiment(experiment, number, nuisance)
         skin = VisibleSurface.from_body(experiment.body, depth)
         shape_m = skin.initial_positions_m(experiment, depth)
-        shown = Projection.of(
+        shown = DepthProjection.facing_shape(
             view, skin, np.zeros(nuisance.size), shape_m, experiment.upward_direction
         )
         points_m = depth.points_m[depth.first_sample_with_points]
-        rows = shown.rows(
+        rows = shown.point_rows(
             depth.first_sample_with_points,
             points_m,
             view.rays[depth.first_sample_with_points],
@@ -200,12 +202,12 @@ def seen_before(experiment: Experiment) -> dict[str, Array]:
 
 
 def save_overlays(experiments: Iterable[Experiment], folder: Path) -> list[Path]:
-    """Draw `seen_before` of all experiments into a folder, and return the files."""
+    """Draw `undeformed_rows` of all experiments into a folder, and return the files."""
     return save_pictures(
         folder,
-        of_different_names(
+        with_unique_names(
             (f"depth_{experiment.name}_{name}", depth_picture(rows))
             for experiment in experiments
-            for name, rows in seen_before(experiment).items()
+            for name, rows in undeformed_rows(experiment).items()
         ),
     )

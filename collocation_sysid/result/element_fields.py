@@ -28,7 +28,7 @@ from ..fem.expressions import PointLaw, kernel_from_outputs, quadrature_point
 from ..fem.kernel import Derivative, ElementKernel
 from ..fem.kernels import Evaluator, KernelBatch
 
-NAMES = ("det_f", "energy_density_j_m3", "von_mises_pa")
+FIELD_NAMES = ("det_f", "energy_density_j_m3", "von_mises_pa")
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class ElementFields:
     _volumes: Array
 
     @classmethod
-    def of(cls, body: Body, theta: Array) -> ElementFields:
+    def from_body(cls, body: Body, theta: Array) -> ElementFields:
         """Return the evaluator of a body with the constants `theta` (k,); compiles its materials'
         kernels.
         """
@@ -56,8 +56,8 @@ class ElementFields:
         for number, part in enumerate(body.parts):
             kernel = field_kernel(body.element, body.law(number))
             # Every element has a place of its own, where its points add up.
-            places = len(NAMES) * part.cells[:, None] + np.arange(len(NAMES))
-            width = len(NAMES) * len(body.cells)
+            places = len(FIELD_NAMES) * part.cells[:, None] + np.arange(len(FIELD_NAMES))
+            width = len(FIELD_NAMES) * len(body.cells)
             cells = body.cells[part.cells]
             geometry = body.geometry[part.cells]
             histories = None
@@ -71,7 +71,7 @@ class ElementFields:
         volumes = body.stress_free_geometry(theta)[:, :, -1].sum(axis=1)
         return cls(body, theta, evaluators, volumes)
 
-    def at(self, positions_m: ArrayLike) -> dict[str, Array]:
+    def evaluate_at(self, positions_m: ArrayLike) -> dict[str, Array]:
         """Return the fields at node positions, by `NAMES`.
 
         Parameters
@@ -87,15 +87,15 @@ class ElementFields:
         """
         body = self.body
         x = np.ascontiguousarray(positions_m, dtype=float).reshape(-1, body.nodes_m.size)
-        sums = np.empty((len(x), len(NAMES) * len(self._volumes)))
+        sums = np.empty((len(x), len(FIELD_NAMES) * len(self._volumes)))
         shares = body.split_theta(self.theta)
         for k, (part, evaluate) in enumerate(zip(body.parts, self._evaluators, strict=True)):
             constants = np.array(shares[k][: part.law_constant_count], dtype=float)
             if body.inverse_equilibrium is not None:
                 constants = body.point_constants(k, self.theta)
             evaluate([x], constants, sums, body.threads, k > 0, body.point_data(k, self.theta))
-        means = sums.reshape(len(x), -1, len(NAMES)) / self._volumes[:, None]
-        return {name: means[:, :, k] for k, name in enumerate(NAMES)}
+        means = sums.reshape(len(x), -1, len(FIELD_NAMES)) / self._volumes[:, None]
+        return {name: means[:, :, k] for k, name in enumerate(FIELD_NAMES)}
 
 
 def field_kernel(element: Element, law: PointLaw) -> ElementKernel:
@@ -104,24 +104,24 @@ def field_kernel(element: Element, law: PointLaw) -> ElementKernel:
     """
     point = quadrature_point(element, law, "x")
     fields = ca.vertcat(*_point_fields(law, point.local_constants))
-    evaluated = ca.substitute(fields, _F, ca.vec(point.material_gradient))
+    evaluated = ca.substitute(fields, _DEFORMATION_GRADIENT, ca.vec(point.material_gradient))
     return kernel_from_outputs(
         "fields", point, {"fields": (Derivative(point.volume * evaluated, ()),)}
     )
 
 
-_F = ca.SX.sym("F", 9)
+_DEFORMATION_GRADIENT = ca.SX.sym("F", 9)
 
 
-def _point_fields(law: PointLaw, theta: ca.SX) -> tuple[ca.SX, ...]:
+def _point_fields(law: PointLaw, constants: ca.SX) -> tuple[ca.SX, ...]:
     """Return det F, the energy density and the von Mises stress as expressions in `_F`.
 
-    `_F` has the nine components of the deformation gradient column after column; `theta` are the
-    constants of the law.
+    `_F` has the nine components of the deformation gradient column after column; `constants` are
+    the constants of the law.
     """
-    f = ca.reshape(_F, 3, 3)
+    f = ca.reshape(_DEFORMATION_GRADIENT, 3, 3)
     j = ca.det(f)
-    psi = law.psi(f, theta)
-    cauchy = ca.reshape(ca.gradient(psi, _F), 3, 3) @ f.T / j
+    psi = law.psi(f, constants)
+    cauchy = ca.reshape(ca.gradient(psi, _DEFORMATION_GRADIENT), 3, 3) @ f.T / j
     deviator = cauchy - ca.trace(cauchy) / 3 * ca.SX.eye(3)
     return j, psi, ca.sqrt(1.5 * ca.sumsqr(deviator))

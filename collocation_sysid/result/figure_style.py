@@ -26,7 +26,7 @@ GREEN = "#009E73"
 BLUE = "#0072B2"
 VERMILION = "#D55E00"
 PURPLE = "#CC79A7"
-CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
+COLOUR_CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 
 # Sizes for a journal page, in whose column or width figures are printed without scaling.
 TEXT_PT = 8.0
@@ -40,7 +40,7 @@ RESOLUTION_DPI = 200
 _GREY = "#606060"
 
 
-class Picture(Figure):
+class NotebookFigure(Figure):
     """Figure that a notebook shows, with or without pyplot."""
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
@@ -58,7 +58,7 @@ class Picture(Figure):
             super().draw(renderer)
 
 
-def mathematical(name: str) -> str:
+def symbol_as_mathtext(name: str) -> str:
     """Return the symbol of a parameter for matplotlib, followed by the name of its region."""
     symbol, _, region = symbol_of(name).partition(" ")
     letter, _, index = symbol.partition("_")
@@ -68,7 +68,7 @@ def mathematical(name: str) -> str:
 
 def new_figure(width_mm: float, height_mm: float) -> Figure:
     """Return an empty figure that arranges its axes automatically."""
-    figure = Picture(figsize=(width_mm / 25.4, height_mm / 25.4), layout="constrained")
+    figure = NotebookFigure(figsize=(width_mm / 25.4, height_mm / 25.4), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03)  # type: ignore[union-attr]
     return figure
 
@@ -90,7 +90,7 @@ def framed_figure(
     left_mm, right_mm, foot_mm, top_mm : float
         Margins around the axes.
     """
-    figure = Picture(figsize=(width_mm / 25.4, height_mm / 25.4))
+    figure = NotebookFigure(figsize=(width_mm / 25.4, height_mm / 25.4))
     figure.subplots_adjust(
         left_mm / width_mm,
         foot_mm / height_mm,
@@ -100,7 +100,7 @@ def framed_figure(
     return figure
 
 
-def dress(axes: Axes, title: str = "", xlabel: str = "", ylabel: str = "") -> None:
+def style_axes(axes: Axes, title: str = "", xlabel: str = "", ylabel: str = "") -> None:
     """Give axes a title, labels, the type sizes of this module, and a light frame and grid."""
     axes.set_title(title, fontsize=TEXT_PT, loc="left")
     axes.set_xlabel(xlabel, fontsize=TEXT_PT)
@@ -116,13 +116,13 @@ def dress(axes: Axes, title: str = "", xlabel: str = "", ylabel: str = "") -> No
         spine.set(linewidth=0.6, color=_GREY)
 
 
-def legend(axes: Axes, title: str = "") -> None:
+def add_legend(axes: Axes, title: str = "") -> None:
     """Add a small legend with a white background, readable over lines."""
     box = axes.legend(title=title, fontsize=SMALL_PT, title_fontsize=SMALL_PT, framealpha=0.85)
     box.get_frame().set(edgecolor="none", facecolor="white")
 
 
-def legend_above(axes: Axes, columns: int, height: float = 1.0) -> None:
+def add_legend_above(axes: Axes, columns: int, height: float = 1.0) -> None:
     """Add a legend above the axes, where it hides nothing.
 
     Parameters
@@ -140,7 +140,7 @@ def legend_above(axes: Axes, columns: int, height: float = 1.0) -> None:
     )  # fmt: skip
 
 
-def legend_of_all(figure: Figure, columns: int, **how: Any) -> None:
+def add_figure_legend(figure: Figure, columns: int, **how: Any) -> None:
     """Add a legend above all axes of a figure, with the lines of its first axes.
 
     Parameters
@@ -149,14 +149,14 @@ def legend_of_all(figure: Figure, columns: int, **how: Any) -> None:
     columns : int
         Number of entries in a row.
     **how
-        Further arguments of `Figure.legend`.
+        Further arguments of `Figure.add_legend`.
     """
     handles, labels = figure.axes[0].get_legend_handles_labels() if figure.axes else ([], [])
     place = {"loc": "outside upper left", "fontsize": TEXT_PT, "frameon": False}
     figure.legend(handles, labels, ncols=columns, **place | how)
 
 
-def plain_numbers(axis: Axis, form: str = "g") -> None:
+def format_plain_numbers(axis: Axis, form: str = "g") -> None:
     """Write the numbers of a logarithmic axis without powers of ten, and remove ticks between them.
 
     `form` is the format of a number.
@@ -165,7 +165,7 @@ def plain_numbers(axis: Axis, form: str = "g") -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
+def make_log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
     """Make the y axis logarithmic, with plain numbers where these are short.
 
     The limits are widened to span at least the ratio `least_ratio`, so that at least two numbers
@@ -182,6 +182,6 @@ def log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
     axes.yaxis.set_major_locator(LogLocator(subs=subs if few else (1.0,), numticks=7))
     axes.yaxis.set_minor_locator(NullLocator())
     if few and plain:
-        plain_numbers(axes.yaxis)
+        format_plain_numbers(axes.yaxis)
     else:
         axes.yaxis.set_major_formatter(LogFormatterSciNotation(minor_thresholds=(inf, inf)))

@@ -1,7 +1,7 @@
 """Interactive 3-D view of a run through pyvista, and its web page with a chosen field.
 
-`view` opens a window in which the body can be turned, stepped through time and coloured by a field
-of the run's ParaView frames. `export_page` needs no pyvista.
+`view_run` opens a window in which the body can be turned, stepped through time and coloured by a
+field of the run's ParaView frames. `export_page` needs no pyvista.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ import numpy as np
 from ..array_types import Array
 from ..errors import InputError, require_among
 from ..files import damage_refused, is_own
-from .animation import chosen
+from .animation import experiment_named
 from .figure_style import BLACK, VERMILION
-from .pictures.projection import Camera
-from .replay import Replay, headline, read_run, reading_run
+from .pictures.projection import ParallelCamera
+from .replay import MotionRecord, damaged_run_refused, read_run, run_headline
 from .run_writers import FRAMES_FILE
-from .web_page import Colouring, cells_of_faces, write_page
+from .web_page import Colouring, cells_below_faces, write_page
 
 # Width and height of the window in pixels.
-WINDOW = (1100, 800)
-FIELD = "von_mises_pa"
+WINDOW_SIZE_PIXELS = (1100, 800)
+DEFAULT_FIELD = "von_mises_pa"
 # Fields on the surface, of replays with obstacles.
-CONTACT = ("pressures_pa", "gaps_m")
+CONTACT_FIELDS = ("pressures_pa", "gaps_m")
 
 
 def export_page(
@@ -56,14 +56,16 @@ def export_page(
         If `run` is not a run folder, or has no such experiment or field.
     """
     result, replays = read_run(run)
-    replay = chosen(replays, experiment, run)
-    with reading_run(Path(run)):
-        text = headline(result)
-    colouring = None if field is None else Colouring.field(field, _on_faces(run, replay, field))
+    replay = experiment_named(replays, experiment, run)
+    with damaged_run_refused(Path(run)):
+        text = run_headline(result)
+    colouring = (
+        None if field is None else Colouring.by_field(field, _field_on_faces(run, replay, field))
+    )
     return write_page(replay, file, text, colouring)
 
 
-def _on_faces(run: str | Path, replay: Replay, field: str) -> Array:
+def _field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
     """Return a field (T, F) on the boundary triangles, at each sample that of the nearest frame.
 
     Point data are averaged over the corners of a triangle; of vectors the norm is taken.
@@ -73,11 +75,11 @@ def _on_faces(run: str | Path, replay: Replay, field: str) -> Array:
     InputError
         If the frames have no such field.
     """
-    if field in CONTACT and (contact_values := getattr(replay, field)) is not None:
+    if field in CONTACT_FIELDS and (contact_values := getattr(replay, field)) is not None:
         return contact_values
     frames = frame_files(Path(run), replay.name)
-    cells = cells_of_faces(replay.tetrahedra, replay.surface)
-    with _reading_frames(Path(run)):
+    cells = cells_below_faces(replay.tetrahedra, replay.surface)
+    with _damaged_frames_refused(Path(run)):
         shown = []
         for _, file in frames:
             frame = meshio.read(file)
@@ -94,9 +96,9 @@ def _on_faces(run: str | Path, replay: Replay, field: str) -> Array:
         return np.array(shown)[nearest]
 
 
-def view(
+def view_run(
     run: str | Path,
-    field: str = FIELD,
+    field: str = DEFAULT_FIELD,
     experiment: str | None = None,
     screenshot: str | Path | None = None,
 ) -> None:
@@ -126,14 +128,14 @@ def view(
             "page with --html, which needs nothing"
         )
     _, replays = read_run(run)
-    replay = chosen(replays, experiment, run)
+    replay = experiment_named(replays, experiment, run)
     frames = frame_files(Path(run), replay.name)
-    with _reading_frames(Path(run)):
-        scene = _Scene(frames, field, replay, off_screen=screenshot is not None)
+    with _damaged_frames_refused(Path(run)):
+        scene = _FrameWindow(frames, field, replay, off_screen=screenshot is not None)
     if screenshot is None:
         scene.plotter.show()
     else:
-        scene.show(frames[len(frames) // 2][0])
+        scene.show_nearest_frame(frames[len(frames) // 2][0])
         scene.plotter.screenshot(str(screenshot))
         scene.plotter.close()
 
@@ -154,7 +156,7 @@ def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
             "have frames; use --html to look at others",
             run,
         )
-    with _reading_frames(run):
+    with _damaged_frames_refused(run):
         sets = ElementTree.parse(listing).getroot().iter("DataSet")
         frames = [(float(s.attrib["timestep"]), listing.parent / s.attrib["file"]) for s in sets]
         if not frames or not all(is_own(run, file) for _, file in (*frames, (0.0, listing))):
@@ -162,12 +164,12 @@ def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
         return frames
 
 
-def _reading_frames(run: Path) -> AbstractContextManager[None]:
+def _damaged_frames_refused(run: Path) -> AbstractContextManager[None]:
     """Return a context in which errors from damaged frames become an InputError on the run."""
     return damage_refused(run, f"{FRAMES_FILE} or one of its frames", "solve the problem again")
 
 
-class _Scene:
+class _FrameWindow:
     """Window with the body of one frame and the measured markers nearest in time.
 
     Parameters
@@ -176,14 +178,14 @@ class _Scene:
         Time [s] and file of each frame.
     field : str
         Point or cell data that colour the body.
-    replay : Replay
+    replay : ReplayCommand
         The experiment, for markers, grasped nodes and obstacles.
     off_screen : bool
         Draw without a window.
     """
 
     def __init__(
-        self, frames: list[tuple[float, Path]], field: str, replay: Replay, off_screen: bool
+        self, frames: list[tuple[float, Path]], field: str, replay: MotionRecord, off_screen: bool
     ) -> None:
         pv: Any = import_module("pyvista")
         self.pv = pv
@@ -193,31 +195,38 @@ class _Scene:
         self.meshes: list[Any] = [pv.read(file) for _, file in frames]
         known = [*self.meshes[0].cell_data, *self.meshes[0].point_data]
         require_among(field, known, None, "--field")
-        self.plotter = pv.Plotter(off_screen=off_screen, window_size=list(WINDOW))
+        self.plotter = pv.Plotter(off_screen=off_screen, window_size=list(WINDOW_SIZE_PIXELS))
         self.plotter.set_background("white")
-        self.range = self._range()
+        self.range = self._value_range()
         self.plotter.add_axes(color="black")
-        self.show(self.times[0])
+        self.show_nearest_frame(self.times[0])
         positions = np.array([mesh.points for mesh in self.meshes])
-        self.plotter.view_vector(Camera.facing(positions, replay.up).axes[2], viewup=replay.up)
-        self._fit()
+        self.plotter.view_vector(
+            ParallelCamera.facing_motion(positions, replay.up).axes[2], viewup=replay.up
+        )
+        self._fit_camera()
         if not off_screen:
             self.plotter.add_slider_widget(
-                self.show, (self.times[0], self.times[-1]), title="time [s]", color=BLACK,
-                pointa=(0.3, 0.08), pointb=(0.7, 0.08), interaction_event="always",
-            )  # fmt: skip
+                self.show_nearest_frame,
+                (self.times[0], self.times[-1]),
+                title="time [s]",
+                color=BLACK,
+                pointa=(0.3, 0.08),
+                pointb=(0.7, 0.08),
+                interaction_event="always",
+            )
 
-    def _range(self) -> tuple[float, float]:
+    def _value_range(self) -> tuple[float, float]:
         """Return the limits of the colour scale, the same for all frames."""
-        values = [self._values(mesh) for mesh in self.meshes]
+        values = [self._field_values(mesh) for mesh in self.meshes]
         return min(float(np.nanmin(v)) for v in values), max(float(np.nanmax(v)) for v in values)
 
-    def _values(self, mesh: Any) -> np.ndarray:
+    def _field_values(self, mesh: Any) -> np.ndarray:
         """Return the field of a mesh (n,) or (E,); of vectors their norms."""
         values = np.asarray(mesh[self.field])
         return np.linalg.norm(values, axis=1) if values.ndim == 2 else values
 
-    def _fit(self) -> None:
+    def _fit_camera(self) -> None:
         """Place the camera so that the whole motion is in view."""
         bounds = np.array([mesh.bounds for mesh in self.meshes])
         extent = np.empty(6)
@@ -226,7 +235,7 @@ class _Scene:
         self.plotter.reset_camera(bounds=extent)
         self.plotter.camera.zoom(1.4)  # the box is seen through its sphere
 
-    def show(self, time_s: float) -> None:
+    def show_nearest_frame(self, time_s: float) -> None:
         """Show the frame nearest to a time."""
         mesh = self.meshes[int(np.abs(self.times - time_s).argmin())]
         sample = int(np.abs(self.replay.t_s - time_s).argmin())

@@ -12,12 +12,12 @@ from ..statistics.relaxed_assumptions import EstimateChange, Probe
 from ..statistics.uncertainty_budget import source_label
 
 # Measures of stiffness, the most important first.
-FOREMOST = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")
+STIFFNESS_NAMES = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")
 # Estimates that have columns in the table.
-SHOWN = 4
+MAX_ESTIMATES = 4
 # Concerns that relaxed assumptions and parts of the data can explain: residuals that are not noise,
 # or predictions that miss. A description that is wrong is none: it is to be corrected first.
-EXPLICABLE = (
+EXPLICABLE_CONCERNS = (
     "assumption/contradicted",
     "noise/larger",
     "residuals/persist",
@@ -27,7 +27,7 @@ EXPLICABLE = (
 )
 # Topics of a verdict that come first.
 FIRST_TO_CORRECT = ("description", "solve")
-DEEPER = (
+DEEPER_CHECK_ADVICE = (
     "For a deeper check, run `solve --probe`: it refits subsets of the data and relaxes each "
     "assumption."
 )
@@ -39,14 +39,14 @@ def probe_section(result: Result) -> Section:
     """
     if not result.probes:
         return Section("Probes", ())
-    names = _shown(result)
+    names = _shown_estimates(result)
     heads = ("refit", "−Δχ²", "size", *map(symbol_of, names))
     rows = [
         (
             source_label(p.name) if p.kind == "assumption" else p.name,
             f"{p.chi_squared:.1f}",
             "" if p.size is None else f"{short(p.size)} ± {short(p.size_error or 0.0)}",
-            *(_moved(p.moves.get(name), result.values[name].value) for name in names),
+            *(_change_with_ratios(p.moves.get(name), result.values[name].value) for name in names),
         )
         for p in result.probes
     ]
@@ -54,7 +54,7 @@ def probe_section(result: Result) -> Section:
         "changes of the estimates; in brackets in half widths of the statistical and of the "
         "combined interval; to first order, but of significant assumptions"
     )
-    return Section("Probes", (Table("", heads, tuple(rows), texts=1), read, *_said(result)))
+    return Section("Probes", (Table("", heads, tuple(rows), texts=1), read, *_conclusions(result)))
 
 
 def probe_lines(result: Result) -> list[str | Table]:
@@ -63,11 +63,11 @@ def probe_lines(result: Result) -> list[str | Table]:
     After routine probes without a significant result the table is left out; empty without probes.
     """
     if is_routine(result) and not any(probe.told for probe in result.probes):
-        return [*_said(result)] if result.probes else []
+        return [*_conclusions(result)] if result.probes else []
     return [each for each in probe_section(result).parts if isinstance(each, (str, Table))]
 
 
-def _first_order(probe: Probe) -> str:
+def _size_and_gain(probe: Probe) -> str:
     """Return the size of a relaxed assumption and the reduction of χ² by it, in words."""
     size = short(probe.size or 0.0)
     error = short(probe.size_error or 0.0)
@@ -93,17 +93,19 @@ def is_deeper_check_worthwhile(result: Result) -> bool:
         return False
     if any(concern.topic in FIRST_TO_CORRECT for concern in concerns):
         return False
-    return any(concern.code in EXPLICABLE for concern in concerns)
+    return any(concern.code in EXPLICABLE_CONCERNS for concern in concerns)
 
 
-def _shown(result: Result) -> list[str]:
+def _shown_estimates(result: Result) -> list[str]:
     """Return the names of the estimates that the table has as columns, at most `SHOWN`."""
     known = [n for n, each in result.values.items() if each.statistical95]
-    first = [name for name in known if name in FOREMOST[:1]]
-    return [*first, *(n for n in known if n in result.parameters and n not in first)][:SHOWN]
+    first = [name for name in known if name in STIFFNESS_NAMES[:1]]
+    return [*first, *(n for n in known if n in result.parameters and n not in first)][
+        :MAX_ESTIMATES
+    ]
 
 
-def _moved(move: EstimateChange | None, value: float) -> str:
+def _change_with_ratios(move: EstimateChange | None, value: float) -> str:
     """Return the change of an estimate with its ratios to the half widths of both intervals; "–"
     for None.
 
@@ -119,15 +121,15 @@ def _moved(move: EstimateChange | None, value: float) -> str:
     shares = ", ".join(
         f"{x:+.1f}" for x in (move.of_statistical95, move.of_combined95) if x is not None
     )
-    return f"{_change(move, value)} ({shares})"
+    return f"{_change_text(move, value)} ({shares})"
 
 
-def _change(move: EstimateChange, value: float) -> str:
+def _change_text(move: EstimateChange, value: float) -> str:
     """Return the change of an estimate as text, in percent of `value` unless that is zero."""
     return f"{100 * move.change / abs(value):+.2f} %" if value else f"{move.change:+.2g}"
 
 
-def _said(result: Result) -> Iterator[str]:
+def _conclusions(result: Result) -> Iterator[str]:
     """Yield sentences on the significant probes, or that there is none.
 
     First come windows and recordings that disagree with the rest, then relaxed assumptions, then
@@ -142,13 +144,14 @@ def _said(result: Result) -> Iterator[str]:
         disagreeing = [p for p in significant if p.kind == kind]
         if disagreeing:
             changes = (
-                f"{p.name}: {listed(_goes(p, result, n) for n in p.told)}" for p in disagreeing
+                f"{p.name}: {listed(_named_change(p, result, n) for n in p.told)}"
+                for p in disagreeing
             )
             yield f"{kind}s disagree significantly ({'; '.join(changes)})"
     if relaxed:
         first = relaxed[0]
-        names = _shown(result)
-        moved = [_goes(first, result, n) for n in names if n in first.moves][:2]
+        names = _shown_estimates(result)
+        moved = [_named_change(first, result, n) for n in names if n in first.moves][:2]
         size = short(first.size or 0.0)
         error = short(first.size_error or 0.0)
         yield (
@@ -160,19 +163,19 @@ def _said(result: Result) -> Iterator[str]:
         if others := [f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in relaxed[1:]]:
             yield f"alternatively {listed(others)}: these assumptions have similar effects"
     elif not significant:
-        tested = " or ".join(_first_order(p) for p in result.probes)
+        tested = " or ".join(_size_and_gain(p) for p in result.probes)
         nothing = "no subset of the data and no relaxed assumption changes the fit significantly"
         yield f"no significant {tested}" if is_routine(result) else nothing
     if not is_routine(result):
-        yield from _matters(result)
+        yield from _most_important_assumption(result)
 
 
-def _goes(probe: Probe, result: Result, name: str) -> str:
+def _named_change(probe: Probe, result: Result, name: str) -> str:
     """Return the change of the estimate `name` in a refit, with its symbol."""
-    return f"{symbol_of(name)} {_change(probe.moves[name], result.values[name].value)}"
+    return f"{symbol_of(name)} {_change_text(probe.moves[name], result.values[name].value)}"
 
 
-def _matters(result: Result) -> Iterator[str]:
+def _most_important_assumption(result: Result) -> Iterator[str]:
     """Yield a sentence on the most important assumption that the data do not determine, if there is
     one.
 
@@ -183,7 +186,7 @@ def _matters(result: Result) -> Iterator[str]:
     undetermined = {
         p.name.partition(" ")[0] for p in result.probes if p.kind == "assumption"
     } - significant
-    for name in (n for n in (*FOREMOST, *result.parameters) if n in result.budget):
+    for name in (n for n in (*STIFFNESS_NAMES, *result.parameters) if n in result.budget):
         source = next((s for s in result.budget[name] if s in undetermined), None)
         if source is not None:
             share = result.budget[name][source]

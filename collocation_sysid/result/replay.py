@@ -1,8 +1,7 @@
 """Motion of one experiment of a run: measured, fitted and simulated shapes and markers.
 
-Pictures, films and the 3-D view need nothing but a `Replay`. It can be read from the arrays of a
-run
-folder (`read_run`), so that they can be drawn again without solving.
+Pictures, films and the 3-D view need nothing but a `ReplayCommand`. It can be read from the arrays
+of a run folder (`read_run`), so that they can be drawn again without solving.
 """
 
 from __future__ import annotations
@@ -28,16 +27,23 @@ from ..runs.result_content import Result
 
 ARRAYS_FILE = "trajectory.npz"
 # Prefix of a wrench array, before its number from 1.
-WRENCH = "wrench_"
+WRENCH_PREFIX = "wrench_"
 # Prefixes of arrays of the attributes that are mappings, before the name.
-GROUPS = {"readings": "reading_", "fields": "field_", "seen": "seen_"}
+GROUP_PREFIXES = {"readings": "reading_", "fields": "field_", "seen": "seen_"}
 # Prefix of the unit of a custom sensor, before its name.
-UNIT = "unit_"
+UNIT_PREFIX = "unit_"
 # Arrays of the body, the same for all experiments of a run.
-OF_BODY = ("undeformed_m", "tetrahedra", "surface", "surface_parts", "surface_nodes", "part_names")
+BODY_ARRAYS = (
+    "undeformed_m",
+    "tetrahedra",
+    "surface",
+    "surface_parts",
+    "surface_nodes",
+    "part_names",
+)
 # Kind and axes of each array: n nodes, E elements, F triangles, T samples, M markers, k modes,
 # p and o points of lines.
-LAYOUT = {
+ARRAY_LAYOUT = {
     "undeformed_m": ("f", "n3"),
     "tetrahedra": ("iu", "E4"),
     "surface": ("iu", "F3"),
@@ -60,15 +66,15 @@ LAYOUT = {
     "pressures_pa": ("f", "TF"),
 }
 # Side of the square that represents a plane, over the body's largest extent.
-LONGER = 1.4
+PLANE_SIZE_RATIO = 1.4
 # Arrays that may have NaN or infinity.
-GAPS = LAYOUT.keys() - {"undeformed_m", "t_s", "up", "marker_places_m"}
+ARRAYS_WITH_NAN = ARRAY_LAYOUT.keys() - {"undeformed_m", "t_s", "up", "marker_places_m"}
 # Largest magnitude of any number in an array: beyond, squares overflow.
-LARGEST = 1e100
+LARGEST_NUMBER = 1e100
 
 
 @dataclass(frozen=True, eq=False)
-class Replay:
+class MotionRecord:
     """Measured, fitted and simulated motion of an experiment at T samples of n nodes and M markers.
 
     Attributes
@@ -166,30 +172,30 @@ class Replay:
     reading_units: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(
+    def from_experiment(
         cls,
         experiment: Experiment,
         fitted: tuple[Array, Array] | None = None,
-        rolled_out: tuple[Array, Array] | None = None,
+        simulated: tuple[Array, Array] | None = None,
         natural_hz: Array | None = None,
         places_m: Array | None = None,
         wrenches: Sequence[Array] = (),
         readings: Mapping[str, Array] | None = None,
-        touched: tuple[Array, Array] | None = None,
-    ) -> Replay:
+        contact: tuple[Array, Array] | None = None,
+    ) -> MotionRecord:
         """Gather the motion of an experiment.
 
         Parameters
         ----------
         experiment : Experiment
-        fitted, rolled_out : ((T, n, 3), (T, M, 3)), optional
+        fitted, simulated : ((T, n, 3), (T, M, 3)), optional
             Positions of nodes and markers [m], of the fit and of the forward simulation.
         natural_hz : (k,), optional
         places_m : (M, 3), optional
             Estimated places of the markers; the stated ones by default.
         wrenches, readings
             See the attributes.
-        touched : ((T, F), (T, F)), optional
+        contact : ((T, F), (T, F)), optional
             Gap [m] and pressure [Pa] on the surface.
         """
         body = experiment.body
@@ -197,8 +203,8 @@ class Replay:
         stated_m = markers.predict_positions(body.nodes_m)
         nodes_m = body.nodes.points_m
         # Frames of obstacles are left out: experiments of a run have one body, but not as many.
-        fitted, rolled_out = (
-            each and (each[0][:, : len(nodes_m)], each[1]) for each in (fitted, rolled_out)
+        fitted, simulated = (
+            each and (each[0][:, : len(nodes_m)], each[1]) for each in (fitted, simulated)
         )
         return cls(
             experiment.name,
@@ -216,14 +222,14 @@ class Replay:
             np.where(markers.located[:, None], stated_m, np.nan),
             markers.positions_m,
             *(fitted or (None, None)),
-            *(rolled_out or (None, None)),
+            *(simulated or (None, None)),
             natural_hz,
             wrenches,
             experiment.is_static,
-            _apart([tendon.points_m for tendon in experiment.tendons]),
+            _join_polylines([tendon.points_m for tendon in experiment.tendons]),
             readings or {},
-            _outlines(experiment),
-            *(touched or (None, None)),
+            _obstacle_outlines(experiment),
+            *(contact or (None, None)),
             reading_units={gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit},
         )
 
@@ -232,9 +238,9 @@ class Replay:
         """Fitted node positions (T, n, 3), else the simulated ones; None if neither exists."""
         return self.positions_m if self.positions_m is not None else self.rolled_out_positions_m
 
-    def seen_m(self, t: int) -> Array:
+    def depth_points_m(self, sample: int) -> Array:
         """Return the points (P, 3) [m] of all depth cameras at the time of the sample with index
-        `t`.
+        `sample`.
 
         Of each camera, the image nearest in time counts if it is at most half a timestep away;
         without one
@@ -245,7 +251,7 @@ class Replay:
         for rows in self.seen.values():
             points = rows[np.isfinite(rows[:, 4])]
             times = np.unique(points[:, 0])
-            differences_s = np.abs(times - self.t_s[t])
+            differences_s = np.abs(times - self.t_s[sample])
             if differences_s.min(initial=np.inf) <= tolerance_s:
                 nearest.append(points[points[:, 0] == times[differences_s.argmin()], 5:])
         return np.concatenate(nearest)
@@ -256,32 +262,33 @@ class Replay:
         shapes_m = self.shapes_m
         return shapes_m is not None and bool(np.isfinite(shapes_m).all(axis=(1, 2)).any())
 
-    def arrays(self, prefix: str = "") -> dict[str, Array]:
+    def to_arrays(self, prefix: str = "") -> dict[str, Array]:
         """Return the arrays to store in a file, by name; attributes that are None are left out.
 
         The names begin with `prefix`, except those of the body, which all experiments of a run
         share.
         Simulated positions are rounded to single precision.
         """
-        stored: dict[str, Any] = {key: getattr(self, key) for key in LAYOUT}
+        stored: dict[str, Any] = {key: getattr(self, key) for key in ARRAY_LAYOUT}
         stored |= {
-            k: stored[k].astype(np.int32) for k, (kinds, _) in LAYOUT.items() if "i" in kinds
+            k: stored[k].astype(np.int32) for k, (kinds, _) in ARRAY_LAYOUT.items() if "i" in kinds
         }
         if self.rolled_out_positions_m is not None:
             stored["rolled_out_positions_m"] = self.rolled_out_positions_m.astype(np.float32)
         stored |= {key: np.array(getattr(self, key)) for key in ("part_names", "marker_names")}
         stored["static"] = np.array(True) if self.static else None
         stored["residuals_m"] = None if self.markers_m is None else self.markers_m - self.measured_m
-        stored |= {f"{WRENCH}{k}": values for k, values in enumerate(self.wrenches, start=1)}
-        for group, front in GROUPS.items():
+        stored |= {f"{WRENCH_PREFIX}{k}": values for k, values in enumerate(self.wrenches, start=1)}
+        for group, front in GROUP_PREFIXES.items():
             stored |= {f"{front}{name}": values for name, values in getattr(self, group).items()}
-        stored |= {f"{UNIT}{n}": np.array(unit) for n, unit in self.reading_units.items()}
+        stored |= {f"{UNIT_PREFIX}{n}": np.array(unit) for n, unit in self.reading_units.items()}
         there = {key: value for key, value in stored.items() if value is not None}
-        return {key if key in OF_BODY else prefix + key: value for key, value in there.items()}
+        return {key if key in BODY_ARRAYS else prefix + key: value for key, value in there.items()}
 
     @classmethod
-    def from_arrays(cls, name: str, arrays: Mapping[str, Any]) -> Replay:
-        """Return the experiment called `name` from the arrays of a run, see `Replay.arrays`.
+    def from_arrays(cls, name: str, arrays: Mapping[str, Any]) -> MotionRecord:
+        """Return the experiment called `name` from the arrays of a run, see
+        `ReplayCommand.to_arrays`.
 
         Raises
         ------
@@ -291,14 +298,14 @@ class Replay:
             If sizes, types or values of the arrays are not consistent.
         """
         prefix = f"{name}/" if f"{name}/t_s" in arrays else ""
-        own = {key: key if key in OF_BODY else prefix + key for key in LAYOUT}
+        own = {key: key if key in BODY_ARRAYS else prefix + key for key in ARRAY_LAYOUT}
         needed = {each.name for each in fields(cls) if each.default is MISSING}
         stored: dict[str, Any] = {
             key: arrays[at] if key in needed else arrays.get(at) for key, at in own.items()
         }
-        keys = (f"{prefix}{WRENCH}{k}" for k in count(1))
+        keys = (f"{prefix}{WRENCH_PREFIX}{k}" for k in count(1))
         stored["wrenches"] = [arrays[key] for key in takewhile(arrays.__contains__, keys)]
-        for group, front in GROUPS.items():
+        for group, front in GROUP_PREFIXES.items():
             group_prefix = f"{prefix}{front}"
             stored[group] = {
                 k.removeprefix(group_prefix): arrays[k]
@@ -308,7 +315,7 @@ class Replay:
         stored["reading_units"] = {
             name: str(arrays[at])
             for name in stored["readings"]
-            if (at := f"{prefix}{UNIT}{name}") in arrays
+            if (at := f"{prefix}{UNIT_PREFIX}{name}") in arrays
         }
         stored["static"] = bool(arrays.get(f"{prefix}static", False))
         _require_shapes(stored)
@@ -322,7 +329,7 @@ class Replay:
         return cls(name=name, **stored)
 
 
-def _outlines(experiment: Experiment) -> Array | None:
+def _obstacle_outlines(experiment: Experiment) -> Array | None:
     """Return the outlines of the obstacles at their stated poses, (T, o, 3) [m]; None without
     obstacles.
     """
@@ -331,15 +338,15 @@ def _outlines(experiment: Experiment) -> Array | None:
     for obstacle in experiment.obstacles:
         low = body.min(axis=0)
         high = body.max(axis=0)
-        size_m = LONGER * float((high - low).max())
-        outline = _apart(obstacle.shape.outline_polylines((low + high) / 2, size_m))
+        size_m = PLANE_SIZE_RATIO * float((high - low).max())
+        outline = _join_polylines(obstacle.shape.outline_polylines((low + high) / 2, size_m))
         assert outline is not None
         rotations, shifts = obstacle.poses.at(experiment.t_s)
         outlines.append(np.einsum("tij,kj->tki", rotations, outline) + shifts[:, None])
     return np.concatenate(outlines, axis=1) if outlines else None
 
 
-def _apart(lines_m: Sequence[Array]) -> Array | None:
+def _join_polylines(lines_m: Sequence[Array]) -> Array | None:
     """Join polylines (P, 3) into one array (p, 3), NaN after each; None without lines."""
     if not lines_m:
         return None
@@ -371,7 +378,7 @@ def nodes_of_faces(cells: NDArray[np.integer], faces: NDArray[np.integer]) -> ND
 def _require_shapes(arrays: Mapping[str, Any]) -> None:
     """Refuse arrays of a file whose sizes, types or values are inconsistent, by a ValueError."""
     sizes: dict[str, int] = {}
-    for key, (kinds, letters) in LAYOUT.items():
+    for key, (kinds, letters) in ARRAY_LAYOUT.items():
         if (array := arrays.get(key)) is None:
             continue
         expected = [int(x) if x.isdigit() else sizes.get(x) for x in letters]
@@ -384,17 +391,17 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
         ):
             raise ValueError(f"{key} has shape {here}, which does not go with the others")
         sizes |= {x: size for x, size in zip(letters, here, strict=True) if not x.isdigit()}
-        if kinds == "f" and not (key in GAPS or np.isfinite(array).all()):
+        if kinds == "f" and not (key in ARRAYS_WITH_NAN or np.isfinite(array).all()):
             raise ValueError(f"{key} holds numbers that are not finite")
-        if kinds == "f" and float(np.nanmax(np.abs(array), initial=0.0)) > LARGEST:
-            raise ValueError(f"{key} holds numbers above {LARGEST:g}")
+        if kinds == "f" and float(np.nanmax(np.abs(array), initial=0.0)) > LARGEST_NUMBER:
+            raise ValueError(f"{key} holds numbers above {LARGEST_NUMBER:g}")
     elements = len(arrays["tetrahedra"])
     fits = {
         "readings": lambda shape: len(shape) == 2 and shape[0] and shape[1] % 3 == 1 < shape[1],
         "fields": lambda shape: shape == (elements, 4),
         "seen": lambda shape: shape[1:] == (8,),
     }
-    for group, front in GROUPS.items():
+    for group, front in GROUP_PREFIXES.items():
         for name, said in arrays[group].items():
             if said.dtype.kind != "f" or not fits[group](said.shape):
                 raise ValueError(f"{front}{name} is {said.dtype} of shape {said.shape}")
@@ -405,7 +412,7 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
         raise ValueError("t_s does not increase, or up is no direction")
 
 
-def read_run(folder: str | Path) -> tuple[Result, list[Replay]]:
+def read_run(folder: str | Path) -> tuple[Result, list[MotionRecord]]:
     """Read the result and the motion of all experiments from a run folder.
 
     The fitted experiments come first, then those for validation that could be simulated.
@@ -419,13 +426,13 @@ def read_run(folder: str | Path) -> tuple[Result, list[Replay]]:
     result = Result.read(folder)
     rolled = result.rollout.experiments
     predicted = [n for n, r in rolled.items() if not r.fitted and r.failed is None]
-    with reading_run(run):
+    with damaged_run_refused(run):
         arrays = read_arrays(run)
         names = [*result.fit.experiments, *predicted]
-        return result, [Replay.from_arrays(name, arrays) for name in names]
+        return result, [MotionRecord.from_arrays(name, arrays) for name in names]
 
 
-def headline(result: Result) -> str:
+def run_headline(result: Result) -> str:
     """Return Young's moduli with their combined standard uncertainties, and the verdict, in one
     line.
     """
@@ -461,6 +468,6 @@ def read_arrays(run: Path) -> dict[str, NDArray[Any]]:
         raise ValueError(error) from error
 
 
-def reading_run(run: Path) -> AbstractContextManager[None]:
+def damaged_run_refused(run: Path) -> AbstractContextManager[None]:
     """Return a context that turns errors from damaged files of a run into an InputError."""
     return damage_refused(run, f"{RESULT_FILE} or {ARRAYS_FILE}", "solve the problem again")

@@ -92,12 +92,12 @@ def comparison_report(folder: str | Path) -> Section:
         )
 
 
-def as_file(report: Section, file: Path) -> str:
+def report_text(report: Section, file: Path) -> str:
     """Return the text of a report for a file: Markdown if its name ends in ``.md``, else HTML."""
-    return as_markdown([report]) if file.suffix == ".md" else as_page(report)
+    return as_markdown([report]) if file.suffix == ".md" else report_html(report)
 
 
-def as_page(report: Section) -> str:
+def report_html(report: Section) -> str:
     """Return a report as the HTML text of one page that contains its pictures."""
     page = files("collocation_sysid.result").joinpath("report.html").read_text("utf-8")
     # A text cannot hold these places, since "<" is escaped.

@@ -27,14 +27,14 @@ from ..runs.result_content import Result
 from ..runs.solved_problem import SolvedProblem
 from ..serialisation import as_json
 from .element_fields import ElementFields
-from .replay import Replay
-from .run_writers import run_folder, write_frames
+from .replay import MotionRecord
+from .run_writers import replaced_folder, write_frames
 
 REFINEMENT_FILE = "refinement.json"
 
 
 def write_run(
-    finished: SolvedProblem, folder: str | Path, *, frames: bool = True, pictures: bool = True
+    solved: SolvedProblem, folder: str | Path, *, frames: bool = True, pictures: bool = True
 ) -> Path:
     """Write the folder of a run completely or not at all, then its pictures, and return the folder.
 
@@ -48,7 +48,7 @@ def write_run(
 
     Parameters
     ----------
-    finished : SolvedProblem
+    solved : SolvedProblem
         The solved problem.
     folder : str or Path
         An earlier, unchanged run at this place is replaced.
@@ -58,38 +58,38 @@ def write_run(
     Raises
     ------
     InputError
-        If the folder holds anything but an earlier run; see `writers.run_folder`.
+        If the folder holds anything but an earlier run; see `writers.replaced_folder`.
     """
-    result = build_result(finished)
-    with run_folder(folder) as place:
-        origin = finished.problem.origin
+    result = build_result(solved)
+    with replaced_folder(folder) as place:
+        origin = solved.problem.origin
         if origin is not None:
             (place / "problem.toml").write_text(origin.text, encoding="utf-8")
-        (place / RESULT_FILE).write_text(_as_text(result), encoding="utf-8")
-        if finished.refinement is not None and finished.refinement.levels:
-            text = as_json(finished.refinement)
+        (place / RESULT_FILE).write_text(_result_text(result), encoding="utf-8")
+        if solved.refinement is not None and solved.refinement.levels:
+            text = as_json(solved.refinement)
             (place / REFINEMENT_FILE).write_text(text + "\n", encoding="utf-8")
-        arrays = _arrays(replays(finished))
+        arrays = _trajectory_arrays(replays(solved))
         np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **arrays)
         if frames:
-            _write_all_frames(finished, place)
+            _write_all_frames(solved, place)
     if pictures:
-        draw_run(finished, Path(folder))
+        draw_run(solved, Path(folder))
     return Path(folder)
 
 
 def draw_run(
-    finished: SolvedProblem, folder: Path, say: Callable[[str], None] | None = None
+    solved: SolvedProblem, folder: Path, report: Callable[[str], None] | None = None
 ) -> Result:
     """Draw the pictures of a run into its folder, and store in ``result.json`` how long that took.
 
     Parameters
     ----------
-    finished : SolvedProblem
+    solved : SolvedProblem
         The solved problem.
     folder : Path
         The folder that `write_run` wrote for this solved problem.
-    say : callable, optional
+    report : callable, optional
         Called with a sentence about each picture before it is drawn.
 
     Returns
@@ -103,10 +103,10 @@ def draw_run(
         If the folder holds another result, or cannot be written to.
     """
     began_s = time.perf_counter()
-    result = build_result(finished)
+    result = build_result(solved)
     file = folder / RESULT_FILE
-    _write_pictures(finished, result, folder, say or (lambda _: None))
-    if not file.is_file() or file.read_text(encoding="utf-8") != _as_text(result):
+    _write_pictures(solved, result, folder, report or (lambda _: None))
+    if not file.is_file() or file.read_text(encoding="utf-8") != _result_text(result):
         raise InputError(
             f"{RESULT_FILE} was changed while the pictures were drawn; draw them again with: "
             f"collocation-sysid plot {folder}",
@@ -114,11 +114,11 @@ def draw_run(
         )
     pictures_s = time.perf_counter() - began_s
     result = replace(result, elapsed_s=replace(result.elapsed_s, pictures=pictures_s))
-    write_whole(file, _as_text(result))
+    write_whole(file, _result_text(result))
     return result
 
 
-def _as_text(result: Result) -> str:
+def _result_text(result: Result) -> str:
     """Return the text of ``result.json``."""
     return as_json(result) + "\n"
 
@@ -131,14 +131,14 @@ def _write_pictures(
     """
     say("drawing the pictures")
     # matplotlib takes a while to import, and nothing else needs it.
-    from .pictures import album, jacobian_sparsity, save_pictures
+    from .pictures import all_pictures, jacobian_sparsity, save_pictures
 
     solution = finished.solution
     jacobian = jacobian_sparsity(solution.collocation, solution.z)
-    save_pictures(folder, album(replays(finished), result) | {"jacobian": jacobian}, say)
+    save_pictures(folder, all_pictures(replays(finished), result) | {"jacobian": jacobian}, say)
 
 
-def _told_of_cells(finished: SolvedProblem, body: Body) -> dict[str, Any]:
+def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
     """Return the cell data that are the same in every frame: region numbers and spatially varying
     constants.
 
@@ -149,7 +149,7 @@ def _told_of_cells(finished: SolvedProblem, body: Body) -> dict[str, Any]:
     (suffix ``_over_prior``).
     """
     data: dict[str, Any] = {"region": body.part_of_cells} if len(body.parts) > 1 else {}
-    for name, values in _in_cells(finished, body).items():
+    for name, values in _field_estimates(finished, body).items():
         heads = (name, f"{name}_lower", f"{name}_upper", f"{name}_over_prior")
         data |= dict(zip(heads, values.T, strict=True))
     return data
@@ -176,12 +176,14 @@ def _write_all_frames(finished: SolvedProblem, place: Path) -> None:
             body.element,
             body.nodes_m,
             {"residual_force_n": residual.reshape(positions.shape)},
-            fields=ElementFields.of(body, body.theta_from_values(finished.solution.parameters)),
-            cell_data=_told_of_cells(finished, body),
+            fields=ElementFields.from_body(
+                body, body.theta_from_values(finished.solution.parameters)
+            ),
+            cell_data=_constant_cell_data(finished, body),
         )
 
 
-def replays(finished: SolvedProblem) -> list[Replay]:
+def replays(finished: SolvedProblem) -> list[MotionRecord]:
     """Return each experiment with its measured, fitted and simulated motion, for pictures and
     files.
 
@@ -203,28 +205,28 @@ def replays(finished: SolvedProblem) -> list[Replay]:
         if (shown := fit or rolled_out) is not None:
             motion = finished.modes_by_experiment.get(experiment.name)
             natural = motion and np.array([mode.frequency_hz for mode in motion.modes])
-            places_m = _places_m(finished, experiment.name)
-            replay = Replay.of(
+            places_m = _marker_places_m(finished, experiment.name)
+            replay = MotionRecord.from_experiment(
                 experiment,
                 fit,
-                rolled_out=rolled_out,
+                simulated=rolled_out,
                 natural_hz=natural,
                 places_m=places_m,
-                wrenches=_sensed(finished, experiment),
-                readings=_own_readings(finished, experiment),
-                touched=_touched(finished, experiment, shown[0]),
+                wrenches=_wrench_columns(finished, experiment),
+                readings=_custom_sensor_columns(finished, experiment),
+                contact=_surface_contact(finished, experiment, shown[0]),
             )
-            of_cells = _in_cells(finished, experiment.body)
-            of_cameras = _seen(finished, experiment)
+            of_cells = _field_estimates(finished, experiment.body)
+            of_cameras = _depth_rows(finished, experiment)
             collected.append(replace(replay, fields=of_cells, seen=of_cameras))
     return collected
 
 
-def _seen(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
+def _depth_rows(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
     """Return the points of each depth camera on the fitted surface, or else on the simulated one.
 
-    The arrays are as in `Replay.fit_summary`, by name of the camera; empty where neither surface is
-    known.
+    The arrays are as in `ReplayCommand.fit_summary`, by name of the camera; empty where neither
+    surface is known.
     """
     part = finished.solution.part_of(experiment.name)
     rollout = finished.rollouts[experiment.name]
@@ -240,15 +242,15 @@ def _seen(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
         surfaces = rollout.depth_surfaces
     if not surfaces:
         return {}
-    from .depth_overlays import compared_rows  # which needs matplotlib
+    from .depth_overlays import surface_rows  # which needs matplotlib
 
     return {
-        name: compared_rows(surface, experiment.upward_direction)
+        name: surface_rows(surface, experiment.upward_direction)
         for name, surface in surfaces.items()
     }
 
 
-def _touched(
+def _surface_contact(
     finished: SolvedProblem, experiment: Experiment, positions_m: Array
 ) -> tuple[Array, Array] | None:
     """Return gap [m] and contact pressure [Pa] on the surface, (T, F) each; None without obstacles.
@@ -265,10 +267,10 @@ def _touched(
     )
 
 
-def _in_cells(finished: SolvedProblem, body: Body) -> dict[str, Array]:
+def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
     """Return the estimates (E, 4) of each spatially varying constant, by name of the field.
 
-    The columns are those of `Replay.fields`. Rows of elements in other regions are NaN.
+    The columns are those of `ReplayCommand.fields`. Rows of elements in other regions are NaN.
     """
     estimates = {}
     for part in body.parts:
@@ -278,7 +280,7 @@ def _in_cells(finished: SolvedProblem, body: Body) -> dict[str, Array]:
     return estimates
 
 
-def _sensed(finished: SolvedProblem, experiment: Experiment) -> list[Array]:
+def _wrench_columns(finished: SolvedProblem, experiment: Experiment) -> list[Array]:
     """Return an array (S, 19) for each force sensor: time, and the wrench measured, fitted and
     simulated.
 
@@ -294,13 +296,13 @@ def _sensed(finished: SolvedProblem, experiment: Experiment) -> list[Array]:
     both = zip(sensors, fit, rolled, strict=True)
     sensed = []
     for sensor, *models in both:
-        columns = _compared(sensor.t_s, sensor.values, *models)
+        columns = _comparison_columns(sensor.t_s, sensor.values, *models)
         columns[:, 1:] *= sensor.symmetry
         sensed.append(columns)
     return sensed
 
 
-def _own_readings(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
+def _custom_sensor_columns(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
     """Return an array (S, 1 + 3m) for each custom sensor, by name.
 
     The columns are the time [s], and its m numbers as measured, fitted and simulated; NaN where the
@@ -311,24 +313,24 @@ def _own_readings(finished: SolvedProblem, experiment: Experiment) -> dict[str, 
     rolled = rollout.readings if isinstance(rollout, ForwardSimulation) else {}
     both = fit.get(experiment.name, {}), rolled
     return {
-        gauge.name: _compared(
+        gauge.name: _comparison_columns(
             gauge.sample_times_s, gauge.measured_values, *(each.get(gauge.name) for each in both)
         )
         for gauge in experiment.readings
     }
 
 
-def _compared(t_s: Array, measured: Array, *models: Array | None) -> Array:
+def _comparison_columns(t_s: Array, measured: Array, *models: Array | None) -> Array:
     """Return the columns time, measured values and the values of each model, as one array.
 
-    `t_s` is (S,), `measured` and each of `models` (S, m); the columns of a model that is None are
-    NaN.
+    `t_s` is (S,), `measured` and each of `drawn_models` (S, m); the columns of a model that is None
+    are NaN.
     """
     columns = (np.full_like(measured, np.nan) if each is None else each for each in models)
     return np.column_stack([t_s, measured, *columns])
 
 
-def _places_m(finished: SolvedProblem, experiment: str) -> Array | None:
+def _marker_places_m(finished: SolvedProblem, experiment: str) -> Array | None:
     """Return the estimated places (M, 3) of the markers on the undeformed body; None where that
     failed.
     """
@@ -341,15 +343,15 @@ def _places_m(finished: SolvedProblem, experiment: str) -> Array | None:
     return np.array([*rollout.places_m.values()]).reshape(-1, 3)
 
 
-def _arrays(seen: Sequence[Replay]) -> dict[str, Array]:
+def _trajectory_arrays(replays: Sequence[MotionRecord]) -> dict[str, Array]:
     """Return the arrays of trajectory.npz by name.
 
     The name of the experiment precedes the names of its arrays, except if it is the only fitted
     one.
     """
-    alone = sum(replay.positions_m is not None for replay in seen) == 1
+    alone = sum(replay.positions_m is not None for replay in replays) == 1
     arrays = {}
-    for replay in seen:
+    for replay in replays:
         bare = alone and replay.positions_m is not None
-        arrays |= replay.arrays("" if bare else f"{replay.name}/")
+        arrays |= replay.to_arrays("" if bare else f"{replay.name}/")
     return arrays

@@ -1,7 +1,7 @@
 """Measured discretisation error of a finished run, added to its folder.
 
 `refine_run` solves the problem of a run folder again at finer steps and meshes, and updates
-``result.json``; `refined` does the update alone.
+``result.json``; `with_refinement` does the update alone.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from ..statistics.combined_intervals import combine
 from ..statistics.discretisation_error import DiscretisationError, Refinement, RefinementLevel
 from ..statistics.estimates import Estimate
 from ..statistics.uncertainty_budget import NUMERICAL as DISCRETISATION
-from .replay import reading_run
+from .replay import damaged_run_refused
 from .run_record import REFINEMENT_FILE
 
 # Code of the concern that is derived again from the new budget.
-UNDETERMINED = "information/combined"
+COMBINED_INFORMATION = "information/combined"
 
 
 def refine_run(
@@ -77,14 +77,14 @@ def refine_run(
         raise InputError("the run did not converge: there is no answer to refine", file)
     problem = Problem.read(run / "problem.toml", allow_code=allow_code, folder=home)
     problem = replace(problem, substeps=before.problem.substeps)
-    estimates = _at_optimum(before, problem.parameters)
-    with reading_run(run):
+    estimates = _estimates_at_optimum(before, problem.parameters)
+    with damaged_run_refused(run):
         known = _known_levels(levels_file, estimates)
         answer = WarmStart.from_result(before, run)
 
     def keep(refinement: Refinement) -> Result:
         """Write a refinement and the updated result into the folder, and return the latter."""
-        after = refined(before, refinement, problem.parameters)
+        after = with_refinement(before, refinement, problem.parameters)
         with whole_file(levels_file) as levels, whole_file(file) as draft:
             levels.write_text(as_json(refinement) + "\n", encoding="utf-8")
             draft.write_text(as_json(after) + "\n", encoding="utf-8")
@@ -94,7 +94,7 @@ def refine_run(
     return refinement, keep(refinement)
 
 
-def refined(before: Result, refinement: Refinement, parameters: Parameters) -> Result:
+def with_refinement(before: Result, refinement: Refinement, parameters: Parameters) -> Result:
     """Return a result with the measured discretisation error in place of the estimated one.
 
     Parameters
@@ -106,12 +106,14 @@ def refined(before: Result, refinement: Refinement, parameters: Parameters) -> R
     parameters : Parameters
         Parameters of the problem, with their coordinates and bounds.
     """
-    optimum = _at_optimum(before, parameters)
+    optimum = _estimates_at_optimum(before, parameters)
 
     def corrected(values: Mapping[str, ReportedEstimate]) -> dict[str, ReportedEstimate]:
         """Return estimates by name, corrected where the refinement measured their error."""
         return {
-            name: _corrected(name, each, optimum[name], refinement.errors[name], parameters)
+            name: _corrected_estimate(
+                name, each, optimum[name], refinement.errors[name], parameters
+            )
             if name in optimum and name in refinement.errors
             else each
             for name, each in values.items()
@@ -121,11 +123,15 @@ def refined(before: Result, refinement: Refinement, parameters: Parameters) -> R
         before, parameters=corrected(before.parameters), derived=corrected(before.derived)
     )
     budget = {
-        name: _shares(shares, before.values[name], after.values[name])
+        name: _updated_shares(shares, before.values[name], after.values[name])
         for name, shares in before.budget.items()
     }
     uncertainties = {name: each.combined_std_error for name, each in after.values.items()}
-    others = [each for each in before.trust.concerns if each.code not in (*NUMERICAL, UNDETERMINED)]
+    others = [
+        each
+        for each in before.trust.concerns
+        if each.code not in (*NUMERICAL, COMBINED_INFORMATION)
+    ]
     concerns = (
         *others,
         *numerical_concerns(optimum, uncertainties, refinement),
@@ -134,7 +140,7 @@ def refined(before: Result, refinement: Refinement, parameters: Parameters) -> R
     return replace(after, budget=budget, trust=Assessment.from_concerns(concerns))
 
 
-def _at_optimum(result: Result, parameters: Parameters) -> dict[str, Estimate]:
+def _estimates_at_optimum(result: Result, parameters: Parameters) -> dict[str, Estimate]:
     """Return the estimates before the correction of the discretisation error, by name."""
     return {
         name: each.at_optimum(name, linear=name in parameters.linear_names)
@@ -142,7 +148,7 @@ def _at_optimum(result: Result, parameters: Parameters) -> dict[str, Estimate]:
     }
 
 
-def _corrected(
+def _corrected_estimate(
     name: str,
     before: ReportedEstimate,
     optimum: Estimate,
@@ -174,7 +180,7 @@ def _corrected(
     return replace(before, **vars(combined), numerical_error=error)
 
 
-def _shares(
+def _updated_shares(
     shares: Mapping[str, float], before: ReportedEstimate, after: ReportedEstimate
 ) -> dict[str, float]:
     """Return the contributions to an estimate's variance with the measured discretisation error.

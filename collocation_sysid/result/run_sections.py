@@ -1,7 +1,7 @@
 """Description of a run in words and tables, for the terminal and for an HTML page.
 
-`summary` is the text after a solve; `run_report` describes a run folder completely, with pictures.
-Both are made from the content of ``result.json``.
+`run_summary` is the text after a solve; `run_report` describes a run folder completely, with
+pictures. Both are made from the content of ``result.json``.
 """
 
 from __future__ import annotations
@@ -39,18 +39,24 @@ from ..serialisation import content
 from ..statistics.assessment import Assessment
 from ..statistics.concerns import Concern, topics_of
 from ..statistics.uncertainty_budget import main_sources, source_label
-from .probe_sections import DEEPER, FOREMOST, is_deeper_check_worthwhile, probe_lines, probe_section
-from .replay import LARGEST, read_arrays, reading_run
+from .probe_sections import (
+    DEEPER_CHECK_ADVICE,
+    STIFFNESS_NAMES,
+    is_deeper_check_worthwhile,
+    probe_lines,
+    probe_section,
+)
+from .replay import LARGEST_NUMBER, damaged_run_refused, read_arrays
 
-MEANINGS = {
+VERDICT_MEANINGS = {
     "good": "nothing speaks against the answer and its error bars",
     "check": "usable after a look at the reasons",
     "doubtful": "something is wrong with the data, the model or the solve",
 }
 # Number of largest errors shown.
-WORST = 8
+SHOWN_ERRORS = 8
 # Samples between two shown errors of a marker: neighbouring errors have the same cause.
-APART = 5
+ERROR_SPACING_SAMPLES = 5
 # Markers whose residuals are diagnosed in the summary.
 SHOWN_DIAGNOSES = 2
 # Estimates whose main sources of uncertainty are named.
@@ -58,11 +64,11 @@ SHOWN_BUDGETS = 3
 # Sources named for each of these estimates.
 SHOWN_SOURCES = 3
 # Smallest share of a variance that is shown.
-LITTLE = 0.01
+SMALLEST_SHOWN_SHARE = 0.01
 # Ratio of combined to statistical standard uncertainty beyond which the sources are named.
-MOSTLY_SYSTEMATIC = 1.5
+SYSTEMATIC_RATIO = 1.5
 
-CAPTIONS = {
+PICTURE_CAPTIONS = {
     "depth": "Points of a depth camera with outlines of the fitted surface, at up to four samples, "
     "and distances of the points behind the surface; grey points do not count.",
     "shapes": "The body at times of the recording; orange: measured markers.",
@@ -87,10 +93,10 @@ CAPTIONS = {
 
 
 # Pictures that show measurement and fit, one of which leads the page.
-COMPARED = ("tracks", "wrench", "reading", "depth")
+LEADING_PICTURES = ("tracks", "wrench", "reading", "depth")
 
 
-def summary(result: Result, folder: Path | None = None, budget: bool = False) -> list[Shown]:
+def run_summary(result: Result, folder: Path | None = None, budget: bool = False) -> list[Shown]:
     """Return the description of a run that fits on one screen.
 
     Parameters
@@ -103,18 +109,23 @@ def summary(result: Result, folder: Path | None = None, budget: bool = False) ->
     """
     largest = sorted(result.residuals, key=lambda each: -each.rms_m)[:SHOWN_DIAGNOSES]
     ended = [f"residuals: {each.sentence}" for each in largest]
-    sections = (_ended(result), *answer(result), _fit(result), _notes(result))
+    sections = (
+        _outcome_section(result),
+        *estimate_sections(result),
+        _fit_section(result),
+        _notes_section(result),
+    )
     tables = [budget_table(result)] if budget and result.budget else []
     written = [] if folder is None else [f"written to {folder}"]
     return [*flat(sections), *tables, *probe_lines(result), *ended, *written]
 
 
-def answer(result: Result) -> list[Shown]:
+def estimate_sections(result: Result) -> list[Shown]:
     """Return the verdict, the recommended remedies, and the table of parameters with their
     intervals.
     """
-    sections = [verdict_of(result.trust), *how_to(result.trust.concerns)]
-    sections += [*_harder(result), _parameters(result)]
+    sections = [verdict_section(result.trust), *remedy_command(result.trust.concerns)]
+    sections += [*_deeper_check_advice(result), _parameter_section(result)]
     return [*flat(sections)]
 
 
@@ -128,29 +139,33 @@ def run_report(run: str | Path) -> Section:
     """
     run = Path(run)
     result = Result.read(run)
-    with reading_run(run):
-        verdict = verdict_of(result.trust, linked=True)
-        took = f" {result.method}, {result.iterations} iterations; {_elapsed(result.elapsed_s)}"
+    with damaged_run_refused(run):
+        verdict = verdict_section(result.trust, linked=True)
+        took = (
+            f" {result.method}, {result.iterations} iterations; {_elapsed_text(result.elapsed_s)}"
+        )
         badge = Span(result.status, f"badge {result.trust.verdict}")
-        pictures = _pictures(run)
-        meaning = Line(f"{MEANINGS[result.trust.verdict]}.", "quiet")
+        pictures = _captioned_pictures(run)
+        meaning = Line(f"{VERDICT_MEANINGS[result.trust.verdict]}.", "quiet")
         parts: list[Shown] = [
             Line((badge, Span(took)), "quiet"),
             replace(verdict, parts=(verdict.parts[0], meaning, *verdict.parts[1:])),
             _cards(result),
-            *flat([_ended(result)]),
+            *flat([_outcome_section(result)]),
             *pictures[:1],
-            Section("What to do", (*_cures(result.trust.concerns), *_harder(result))),
-            _parameters(result),
+            Section(
+                "What to do", (*_remedy_lines(result.trust.concerns), *_deeper_check_advice(result))
+            ),
+            _parameter_section(result),
             Section("Error bars", tuple(_error_bars(result))),
             probe_section(result),
-            _fit(result),
-            _notes(result),
-            *_places(result),
-            *_nuisance(result),
-            Section("Residuals", tuple(_residuals(result, run))),
+            _fit_section(result),
+            _notes_section(result),
+            *_marker_place_sections(result),
+            *_nuisance_sections(result),
+            Section("Residuals", tuple(_residual_tables(result, run))),
             Section("Pictures", tuple(pictures[1:])),
-            Section("Problem and provenance", tuple(_provenance(result, run))),
+            Section("Problem and provenance", tuple(_provenance_parts(result, run))),
         ]
         shown = (each for each in parts if not isinstance(each, Section) or each.parts)
         return Section(result.title or "Run", tuple(shown), level=1)
@@ -159,7 +174,7 @@ def run_report(run: str | Path) -> Section:
 # What terminal and page show ----------------------------------------------------------------------
 
 
-def _ended(result: Result) -> Section:
+def _outcome_section(result: Result) -> Section:
     """Return how the solve ended, with the largest violations of the equations of motion if it
     failed.
     """
@@ -170,7 +185,9 @@ def _ended(result: Result) -> Section:
     return Section("", tuple(parts))
 
 
-def verdict_of(trust: Assessment, linked: bool = False, most: int | None = None) -> Section:
+def verdict_section(
+    trust: Assessment, linked: bool = False, max_reasons: int | None = None
+) -> Section:
     """Return the verdict in one word, with its reasons.
 
     Parameters
@@ -178,41 +195,41 @@ def verdict_of(trust: Assessment, linked: bool = False, most: int | None = None)
     trust : Assessment
     linked : bool
         Whether each reason links to its remedy on the same page.
-    most : int, optional
+    max_reasons : int, optional
         The largest number of reasons to list, gravest first; all by default.
     """
     verdict = trust.verdict
     lines = [Line(f"Verdict: {verdict}", f"strong {verdict}")]
-    for concern in trust.concerns[:most]:
+    for concern in trust.concerns[:max_reasons]:
         cure = Span(" (what to do)", to=f"#cure-{concern.topic}")
         spans = (Span(f"  {concern.message}"), *[cure] * linked)
         lines.append(Line(spans, verdict))
     return Section("", tuple(lines), style=f"verdict {verdict}")
 
 
-def _harder(result: Result) -> list[Line]:
+def _deeper_check_advice(result: Result) -> list[Line]:
     """Return the recommendation of a deeper check where it is worthwhile, else an empty list."""
-    return [Line(DEEPER, "quiet")] if is_deeper_check_worthwhile(result) else []
+    return [Line(DEEPER_CHECK_ADVICE, "quiet")] if is_deeper_check_worthwhile(result) else []
 
 
-def how_to(concerns: Iterable[Concern]) -> list[Line]:
+def remedy_command(concerns: Iterable[Concern]) -> list[Line]:
     """Return the command that explains the remedies of some concerns; empty without concerns."""
     pages = dict.fromkeys(topic.page for topic in topics_of(concerns).values())
     return [Line(f"what to do: {explain_command(*pages)}", "quiet")] if pages else []
 
 
-def _parameters(result: Result) -> Section:
+def _parameter_section(result: Result) -> Section:
     """Return the table of corrected values with combined and statistical uncertainties, and remarks
     on it.
     """
     values = result.values
-    rows = tuple((symbol_with_unit(name), *_cells(result, name)) for name in values)
+    rows = tuple((symbol_with_unit(name), *_estimate_row(result, name)) for name in values)
     heads = ("", "value", "±", "95 % interval", "± stat", "± syst", "guess", "")
     faint = tuple(range(len(result.parameters), len(values)))
     parts: list[Shown] = [Table("", heads, rows, texts=1, faint=faint, aside=1)]
     parts += [field.sentence(name) for name, field in result.fields.items()]
     if any(each.combined95 for each in values.values()):
-        parts.append(_covered(result))
+        parts.append(_coverage_sentence(result))
     elif any(each.statistical95 for each in values.values()):
         parts.append("combined intervals are missing: systematic effects were not evaluated")
     if "mesh" in result.discretisation_kinds:
@@ -229,11 +246,11 @@ def _parameters(result: Result) -> Section:
         if each.known_correction and each.value
     ]:
         parts.append(f"corrected for grip layer and machine as stated: {', '.join(known)}")
-    parts += _not_determined(result)
+    parts += _undetermined_sentence(result)
     return Section("Parameters", (*parts, *_largest_contributions(result), *result.basis))
 
 
-def _not_determined(result: Result) -> list[str]:
+def _undetermined_sentence(result: Result) -> list[str]:
     """Return a sentence that names the estimates whose interval is wider than their value.
 
     The largest contribution to each variance is named too; the list is empty if there is no such
@@ -249,7 +266,7 @@ def _not_determined(result: Result) -> list[str]:
     return [f"not determined, as the interval is wider than the value: {listed(sources)}"]
 
 
-def _covered(result: Result) -> str:
+def _coverage_sentence(result: Result) -> str:
     """Return what the combined intervals contain, and which discretisation error they do not
     contain.
     """
@@ -273,12 +290,12 @@ def _largest_contributions(result: Result) -> list[str]:
         for name, each in result.values.items()
         if each.combined_std_error and each.statistical_std_error and name in result.budget
     }
-    systematic = {name: ratio for name, ratio in ratios.items() if ratio > MOSTLY_SYSTEMATIC}
+    systematic = {name: ratio for name, ratio in ratios.items() if ratio > SYSTEMATIC_RATIO}
     sentences = []
     for name in sorted(systematic, key=lambda name: -systematic[name])[:SHOWN_BUDGETS]:
         shares = list(result.budget[name].items())[:SHOWN_SOURCES]
         sources = ", ".join(
-            f"{source_label(s)} {share:.0%}" for s, share in shares if share > LITTLE
+            f"{source_label(s)} {share:.0%}" for s, share in shares if share > SMALLEST_SHOWN_SHARE
         )
         sentences.append(
             f"largest contributions to the combined uncertainty of {symbol_of(name)}: {sources}"
@@ -289,7 +306,7 @@ def _largest_contributions(result: Result) -> list[str]:
 def budget_table(result: Result) -> Table:
     """Return the table of contributions to the variance of each estimate, in percent."""
     lines = result.budget
-    shown = main_sources(lines, LITTLE)
+    shown = main_sources(lines, SMALLEST_SHOWN_SHARE)
     rows = [
         (source_label(s), *(f"{100 * line.get(s, 0):.0f}" for line in lines.values()))
         for s in shown
@@ -297,10 +314,10 @@ def budget_table(result: Result) -> Table:
     return Table("", ("% of the variance", *map(symbol_of, lines)), tuple(rows))
 
 
-def _cells(result: Result, name: str) -> tuple[str, ...]:
+def _estimate_row(result: Result, name: str) -> tuple[str, ...]:
     """Return the table row of an estimate: value, uncertainties, interval, guess, and a remark."""
     each = result.values[name]
-    interval = _interval(each.combined95)
+    interval = _interval_text(each.combined95)
     remark = each.reason or ""
     if each.at_bound:
         interval = "at its bound"
@@ -311,16 +328,16 @@ def _cells(result: Result, name: str) -> tuple[str, ...]:
         guess = "tied" if each.tied else "fixed"
     return (
         f"{each.value:.5g}",
-        _spread(each.combined_std_error),
+        _deviation_text(each.combined_std_error),
         interval,
-        _spread(each.statistical_std_error),
-        _spread(each.systematic_std_error),
+        _deviation_text(each.statistical_std_error),
+        _deviation_text(each.systematic_std_error),
         guess,
         remark,
     )
 
 
-def _spread(deviation: float | None) -> str:
+def _deviation_text(deviation: float | None) -> str:
     """Return a standard deviation as text; "" if it is None, that is unknown."""
     return "" if deviation is None else short(deviation)
 
@@ -340,7 +357,7 @@ def refinement_table(result: Result) -> Table:
                 "" if error.mesh is None else f"{error.mesh:+.3g}",
                 "" if error.mesh_order is None else f"{error.mesh_order:.1f}",
                 f"{each.value:.5g}",
-                _interval(each.combined95),
+                _interval_text(each.combined95),
             )
         )
     return Table(
@@ -350,30 +367,31 @@ def refinement_table(result: Result) -> Table:
     )
 
 
-def _interval(ends: tuple[float, float] | None) -> str:
+def _interval_text(ends: tuple[float, float] | None) -> str:
     """Return the ends of an interval as text; "" for None."""
     return "" if ends is None else "{:.5g} … {:.5g}".format(*ends)
 
 
-def _fit(result: Result) -> Section:
+def _fit_section(result: Result) -> Section:
     """Return the misfit of measurements and equations, the predictions, the time taken, and side
     results.
     """
     fit = result.fit
     experiments = result.fit.experiments
     marked = any(each.samples for each in experiments.values())
-    markers = f"markers: {_mm(fit.rms_m)} mm RMS, {_mm(fit.noise_rms_m)} mm from noise alone; "
+    markers = f"markers: {_millimetres(fit.rms_m)} mm RMS, "
+    markers += f"{_millimetres(fit.noise_rms_m)} mm from noise alone; "
     dynamics = (
         f"equations of motion violated by at most {result.dynamics.max_violation_n:.1e} N "
         f"({result.dynamics.max_violation_relative:.1e} of the largest force)"
     )
     lines = [markers * marked + dynamics]
     for name, each in experiments.items():
-        if sizes := _forces(each.wrench_rms_n, each.wrench_rms_nm):
-            sigma = _forces(each.wrench_sigma_n, each.wrench_sigma_nm)
+        if sizes := _forces_text(each.wrench_rms_n, each.wrench_rms_nm):
+            sigma = _forces_text(each.wrench_sigma_n, each.wrench_sigma_nm)
             lines.append(f"wrench of '{name}': {sizes} RMS (sigma {sigma})")
         for reading, rms in (each.reading_rms or {}).items():
-            unit = _unit(each.reading_unit, reading)
+            unit = _unit_text(each.reading_unit, reading)
             sigma = short((each.reading_sigma or {})[reading])
             lines.append(f"{reading} of '{name}': {short(rms)}{unit} RMS (sigma {sigma}{unit})")
         unit = "J in the modelled part" if name in (fit.symmetry or {}) else "J"
@@ -384,29 +402,29 @@ def _fit(result: Result) -> Section:
                 f"slips {friction.slipping:.0%} of the time, takes {energy}"
             )
         for camera, error in (each.depth or {}).items():
-            lines.append(f"depth of {camera} in '{name}': {_depth(error)}")
+            lines.append(f"depth of {camera} in '{name}': {_depth_text(error)}")
     for name, each in result.rollout.experiments.items():
-        lines += _simulated(name, each)
+        lines += _simulation_lines(name, each)
     for parts in sorted({*(fit.symmetry or {}).values()}):
         names = listed(f"'{name}'" for name, each in (fit.symmetry or {}).items() if each == parts)
         lines.append(
             f"loads of {names}: of the whole specimen, {parts} times those of the modelled part"
         )
-    lines += [f"time: {_elapsed(result.elapsed_s)}", _iterations(result)]
+    lines += [f"time: {_elapsed_text(result.elapsed_s)}", _iterations_text(result)]
     for name, each in experiments.items():
         if each.beside:
             lines.append(f"also estimated for '{name}': {'; '.join(each.beside)}")
     return Section("Fit", tuple(lines))
 
 
-def _elapsed(elapsed: Elapsed) -> str:
+def _elapsed_text(elapsed: Elapsed) -> str:
     """Return how long each part of a run took; pictures that were not drawn are left out."""
     parts = {"search": elapsed.search, "checks": elapsed.checks, "pictures": elapsed.pictures}
     known = (f"{part} {time_s:.1f} s" for part, time_s in parts.items() if time_s is not None)
     return ", ".join(known)
 
 
-def _iterations(result: Result) -> str:
+def _iterations_text(result: Result) -> str:
     """Return the number of iterations, and how much time of the search they took."""
     timing = result.timing_s
     return (
@@ -415,7 +433,7 @@ def _iterations(result: Result) -> str:
     )
 
 
-def _simulated(name: str, simulated: SimulatedExperiment) -> Iterator[str]:
+def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str]:
     """Yield lines on how far a forward simulation is from the measurements.
 
     For a validation experiment, the errors of a blind prediction and of copied measurements follow
@@ -441,44 +459,48 @@ def _simulated(name: str, simulated: SimulatedExperiment) -> Iterator[str]:
         depth=simulated.depth,
     )
     units = simulated.reading_unit
-    yield f"{kind} '{name}': {_errors(own, units) or 'compared with nothing'}"
+    yield f"{kind} '{name}': {_errors_text(own, units) or 'compared with nothing'}"
     if simulated.fitted:
         return
     if simulated.blind is not None:
-        blind = _errors(simulated.blind, units)
+        blind = _errors_text(simulated.blind, units)
         yield f"  with the nuisance parameters of the fitted recordings (blind): {blind}"
     if simulated.copied is not None:
         copied = simulated.copied
-        yield f"  the measurements of '{copied.copied}' copied: {_errors(copied.error, units)}"
+        yield f"  the measurements of '{copied.copied}' copied: {_errors_text(copied.error, units)}"
     elif simulated.not_copied:
         yield f"  no copy as a yardstick: {simulated.not_copied}"
 
 
-def _errors(error: PredictionErrors, units: Mapping[str, str] | None) -> str:
+def _errors_text(error: PredictionErrors, units: Mapping[str, str] | None) -> str:
     """Return the errors of a prediction in words; "" if nothing is compared.
 
     `units` are the units of custom sensors by name; None if none states a unit.
     """
     texts = []
     if error.rms_m:  # none without markers
-        texts.append(f"{_mm(error.rms_m)} mm RMS, at most {1e3 * (error.max_m or 0.0):.2f} mm")
-    if forces := _forces(error.wrench_rms_n, error.wrench_rms_nm):
+        texts.append(
+            f"{_millimetres(error.rms_m)} mm RMS, at most {1e3 * (error.max_m or 0.0):.2f} mm"
+        )
+    if forces := _forces_text(error.wrench_rms_n, error.wrench_rms_nm):
         texts.append(f"{forces} RMS")
     texts += [
-        f"{reading} {rms:.2g}{_unit(units, reading)} RMS"
+        f"{reading} {rms:.2g}{_unit_text(units, reading)} RMS"
         for reading, rms in (error.reading_rms or {}).items()
     ]
-    texts += [f"depth of {camera} {_depth(each)}" for camera, each in (error.depth or {}).items()]
+    texts += [
+        f"depth of {camera} {_depth_text(each)}" for camera, each in (error.depth or {}).items()
+    ]
     return "; ".join(texts)
 
 
-def _unit(units: Mapping[str, str] | None, reading: str) -> str:
+def _unit_text(units: Mapping[str, str] | None, reading: str) -> str:
     """Return the unit of a custom sensor after a space; "" if it states none."""
     unit = (units or {}).get(reading, "")
     return f" {unit}" if unit else ""
 
 
-def _depth(error: DepthError) -> str:
+def _depth_text(error: DepthError) -> str:
     """Return the distances of a depth camera's points from the surface, in words."""
     if error.rms_m is None:
         return "has no point near the body"
@@ -493,18 +515,18 @@ def _depth(error: DepthError) -> str:
     return f"{beyond}, the others {1e3 * error.rms_within_gate_m:.3g} mm RMS"
 
 
-def _mm(metres: float) -> str:
+def _millimetres(metres: float) -> str:
     """Return a length [m] as text in millimetres, without the unit."""
     return f"{1e3 * metres:.3f}"
 
 
-def _forces(*sizes: float | None) -> str:
+def _forces_text(*sizes: float | None) -> str:
     """Return a force [N] and a torque [N m] in words; "" if neither is measured (None or zero)."""
     pairs = zip(sizes, ("N", "N m"), strict=True)
     return ", ".join(f"{short(size)} {unit}" for size, unit in pairs if size)
 
 
-def _notes(result: Result) -> Section:
+def _notes_section(result: Result) -> Section:
     """Return the notes of a run as a section."""
     return Section("Notes", tuple(f"note: {note}" for note in result.notes))
 
@@ -517,7 +539,7 @@ def _cards(result: Result) -> Cards:
     values = result.values
     fit = result.fit
     simulated = result.rollout
-    name = next((key for key in FOREMOST if key in values), next(iter(values)))
+    name = next((key for key in STIFFNESS_NAMES if key in values), next(iter(values)))
     interval = values[name].combined95
     value = f"{number(values[name].value, 4)} {unit_of(name)}"
     known = "{:.4g} to {:.4g} (95 %)".format(*interval) if interval else "no error bar"
@@ -532,7 +554,7 @@ def _cards(result: Result) -> Cards:
     )
 
 
-def _cures(concerns: Iterable[Concern]) -> Iterator[Line]:
+def _remedy_lines(concerns: Iterable[Concern]) -> Iterator[Line]:
     """Yield a line for each topic of the concerns: meaning, remedy, and documentation."""
     for name, topic in topics_of(concerns).items():
         about = Span(f"{topic.title}.", "strong")
@@ -556,7 +578,7 @@ def _error_bars(result: Result) -> Iterator[Shown]:
         yield budget_table(result)
 
 
-def _places(result: Result) -> Iterator[Section]:
+def _marker_place_sections(result: Result) -> Iterator[Section]:
     """Yield for each experiment a table of the estimated places of its markers [mm]."""
     explanation = (
         "On the undeformed body, in millimetres, each with its standard error. Those that were not "
@@ -569,7 +591,7 @@ def _places(result: Result) -> Iterator[Section]:
             cells = []
             for x, error in zip(place.position_m, errors_m, strict=True):
                 cells += [f"{1e3 * x:.2f}", "–" if error is None else number(1e3 * error, 2)]
-            prior = "exact" if place.prior_m == 0 else _size(place.prior_m, "m")
+            prior = "exact" if place.prior_m == 0 else _size_text(place.prior_m, "m")
             rows.append((marker, *cells, prior, "" if place.given else "not given"))
         heads = ("", "x", "±", "y", "±", "z", "±", "prior ±", "")
         if rows:
@@ -578,7 +600,7 @@ def _places(result: Result) -> Iterator[Section]:
             yield Section(title, (Line(explanation, "quiet"), table))
 
 
-def _nuisance(result: Result) -> Iterator[Section]:
+def _nuisance_sections(result: Result) -> Iterator[Section]:
     """Yield for each experiment a table of its other nuisance parameters, in mm, ms or degrees."""
     explanation = (
         "Of this recording alone, estimated beside the parameters with a prior about zero."
@@ -588,7 +610,7 @@ def _nuisance(result: Result) -> Iterator[Section]:
         for label, each in named.items():
             words, _, unit = label.rstrip("]").rpartition(" [")
             sizes = (each.value, each.std_error, each.prior)
-            rows.append((words, *(_size(size, unit) for size in sizes)))
+            rows.append((words, *(_size_text(size, unit) for size in sizes)))
         table = Table("", ("", "value", "±", "prior ±"), tuple(rows))
         title = f"Nuisance parameters of '{experiment}'"
         is_part = experiment in (result.fit.symmetry or {})
@@ -596,7 +618,7 @@ def _nuisance(result: Result) -> Iterator[Section]:
         yield Section(title, (Line(explanation + loads, "quiet"), table))
 
 
-def _residuals(result: Result, run: Path) -> Iterator[Shown]:
+def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
     """Yield a table of what each marker's residuals suggest, and a table of the largest errors."""
     if result.residuals:
         rows = tuple(
@@ -609,12 +631,12 @@ def _residuals(result: Result, run: Path) -> Iterator[Shown]:
             for each in result.residuals
         )
         yield Table("", ("marker", "RMS", "samples", "suggests"), rows, texts=1)
-    if worst := _worst_errors(run):
+    if worst := _largest_errors(run):
         rows = tuple((w, f"{number(t_s, 4)} s", millimetres(m)) for m, t_s, w in worst)
         yield from ("The largest errors:", Table("", ("marker", "time", "error"), rows))
 
 
-def _worst_errors(run: Path) -> list[tuple[float, float, str]]:
+def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
     """Return the largest marker residuals of a run folder as (error [m], time [s], marker), largest
     first.
 
@@ -634,26 +656,26 @@ def _worst_errors(run: Path) -> list[tuple[float, float, str]]:
         shape = (len(t_s), len(markers), 3)
         residuals_m = arrays[key]
         largest = float(np.nanmax(np.abs(residuals_m), initial=0.0))
-        if residuals_m.shape != shape or largest > LARGEST:
+        if residuals_m.shape != shape or largest > LARGEST_NUMBER:
             raise ValueError(f"{key} does not go with its times and markers")
         errors = np.nan_to_num(np.linalg.norm(residuals_m, axis=2))
-        for _ in range(WORST if errors.size else 0):
+        for _ in range(SHOWN_ERRORS if errors.size else 0):
             t, m = np.unravel_index(int(errors.argmax()), errors.shape)
             if not errors[t, m] > 0:
                 break
             worst.append((float(errors[t, m]), float(t_s[t]), f"{prefix}{markers[m]}"))
-            errors[max(0, t - APART) : t + APART + 1, m] = 0
-    return sorted(worst, key=lambda each: -each[0])[:WORST]
+            errors[max(0, t - ERROR_SPACING_SAMPLES) : t + ERROR_SPACING_SAMPLES + 1, m] = 0
+    return sorted(worst, key=lambda each: -each[0])[:SHOWN_ERRORS]
 
 
-def _pictures(run: Path) -> list[Picture]:
+def _captioned_pictures(run: Path) -> list[Picture]:
     """Return every PNG picture of the folder with its caption.
 
     A picture that compares measurement and fit is first; then follow the pictures known to
     `CAPTIONS`
     in that order, and unknown ones.
     """
-    order = [*CAPTIONS, ""]
+    order = [*PICTURE_CAPTIONS, ""]
     pictures: list[Picture] = []
 
     def kind(file: Path) -> str:
@@ -662,14 +684,14 @@ def _pictures(run: Path) -> list[Picture]:
 
     for file in sorted(own_pictures(run), key=lambda file: (order.index(kind(file)), file.name)):
         about = file.stem.removeprefix(kind(file)).strip("_")
-        caption = CAPTIONS.get(kind(file), file.stem)
+        caption = PICTURE_CAPTIONS.get(kind(file), file.stem)
         pictures.append(Picture(file, f"{about}: {caption}" if about and kind(file) else caption))
-    compared = (each for each in pictures if kind(each.file) in COMPARED)
+    compared = (each for each in pictures if kind(each.file) in LEADING_PICTURES)
     first = next(compared, None)
     return pictures if first is None else [first, *(p for p in pictures if p is not first)]
 
 
-def _provenance(result: Result, run: Path) -> Iterator[Shown]:
+def _provenance_parts(result: Result, run: Path) -> Iterator[Shown]:
     """Yield a table of the problem and software versions, and the problem file as it was run."""
     rows = content(result.problem) | content(result.provenance)
     listed_rows = ((key, each if isinstance(each, list) else [each]) for key, each in rows.items())
@@ -681,7 +703,7 @@ def _provenance(result: Result, run: Path) -> Iterator[Shown]:
         yield Listing("The problem file as run", file.read_text(encoding="utf-8"))
 
 
-def _size(value: float | None, unit: str) -> str:
+def _size_text(value: float | None, unit: str) -> str:
     """Return a value in a suitable unit, such as millimetres for `unit` "m"; "–" for None."""
     factor, shown = in_readable_unit(1.0, unit)
     # No powers of ten for the sizes of bodies.

@@ -1,8 +1,8 @@
 """ParaView frames, and safe replacement of run folders.
 
-`write_frames` writes a trajectory for ParaView. `run_folder` is the context in which a run folder
-is
-written: it appears at the end, complete or not at all, and never replaces files of others.
+`write_frames` writes a trajectory for ParaView. `replaced_folder` is the context in which a run
+folder is written: it appears at the end, complete or not at all, and never replaces files of
+others.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from .element_fields import ElementFields
 
 VTK_CELL_TYPES = ("tetra", "tetra10")  # by meshio's names
 # More frames take disk space and add little to an animation.
-MAX_FRAMES = 200
+MAX_PARAVIEW_FRAMES = 200
 FRAMES_FILE = "trajectory.pvd"
 
 
@@ -71,14 +71,14 @@ def write_vtu(
         )
     points = np.asarray(points_m, dtype=float)
     nodes = np.asarray(cells, dtype=np.int64)
-    at_points = _arrays("point", point_data or {}, len(points), path)
-    in_cells = _arrays("cell", cell_data or {}, len(nodes), path)
+    at_points = _checked_arrays("point", point_data or {}, len(points), path)
+    in_cells = _checked_arrays("cell", cell_data or {}, len(nodes), path)
     by_block: dict[str, Any] = {name: [array] for name, array in in_cells.items()}
     mesh = meshio.Mesh(points, [(meshio_type, nodes)], {**at_points}, by_block)
     meshio.vtu.write(path, mesh, compression="")
 
 
-def _arrays(
+def _checked_arrays(
     kind: str, data: Mapping[str, ArrayLike], count: int, path: str | Path
 ) -> dict[str, NDArray]:
     """Return data as arrays of types that VTK has, with names escaped for XML.
@@ -141,7 +141,7 @@ def write_frames(
     element: Element,
     undeformed_m: ArrayLike,
     point_series: Mapping[str, ArrayLike] | None = None,
-    max_frames: int = MAX_FRAMES,
+    max_frames: int = MAX_PARAVIEW_FRAMES,
     fields: ElementFields | None = None,
     cell_data: Mapping[str, ArrayLike] | None = None,
 ) -> Path:
@@ -189,7 +189,9 @@ def write_frames(
         }
         in_cells = dict(cell_data or {})
         if fields is not None:
-            in_cells |= {name: values[0] for name, values in fields.at(positions[k]).items()}
+            in_cells |= {
+                name: values[0] for name, values in fields.evaluate_at(positions[k]).items()
+            }
         write_vtu(file, positions[k], cells, element.meshio_type, data, in_cells)
         written.append((float(times[k]), file))
     listing = Path(folder) / FRAMES_FILE
@@ -201,8 +203,11 @@ def write_frames(
 
 
 @contextmanager
-def run_folder(
-    path: str | Path, overwrite: bool = True, mark: str = RESULT_FILE, what: str = "run"
+def replaced_folder(
+    path: str | Path,
+    overwrite: bool = True,
+    marker_file: str = RESULT_FILE,
+    content_word: str = "run",
 ) -> Iterator[Path]:
     """Yield a temporary folder to write into, and rename it to `path` at the end.
 
@@ -216,9 +221,9 @@ def run_folder(
     path : str or Path
     overwrite : bool
         Whether an earlier run may be replaced.
-    mark : str
+    marker_file : str
         Name of a file by which an earlier run is recognised.
-    what : str
+    content_word : str
         Word for the content in messages.
 
     Raises
@@ -228,8 +233,8 @@ def run_folder(
         is
         given, so that no work is lost, and again at the end.
     """
-    target = _unlinked(Path(path))
-    require_replaceable(target, overwrite, mark, what)
+    target = _resolved_parent(Path(path))
+    require_replaceable(target, overwrite, marker_file, content_word)
     target.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(target)
     owner = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"
@@ -243,8 +248,8 @@ def run_folder(
         shutil.rmtree(temporary, ignore_errors=True)
         raise
     try:
-        require_replaceable(target, overwrite, mark, what)
-        _put_in_place(temporary, target, target.with_name(f".{target.name}.{owner}.old"))
+        require_replaceable(target, overwrite, marker_file, content_word)
+        _replace_folder(temporary, target, target.with_name(f".{target.name}.{owner}.old"))
     except (InputError, OSError) as error:
         kept = target.with_name(f"{target.name}-{owner}")
         with suppress(OSError):
@@ -254,7 +259,7 @@ def run_folder(
         ) from error
 
 
-def _unlinked(path: Path) -> Path:
+def _resolved_parent(path: Path) -> Path:
     """Return the absolute path with all links resolved, except a link at `path` itself."""
     return path.resolve() if path.name in ("", "..") else path.parent.resolve() / path.name
 
@@ -270,11 +275,11 @@ def _remove_stale(target: Path) -> None:
     for folder in target.parent.glob(f".{glob.escape(target.name)}.*.partial"):
         pattern = rf".*\.{re.escape(platform.node())}-(\d+)-\w+\.partial"
         match = re.fullmatch(pattern, folder.name)
-        if match and not _runs(int(match[1])):
+        if match and not _is_running(int(match[1])):
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _runs(process: int) -> bool:
+def _is_running(process: int) -> bool:
     """Return whether a process with this number is running on this machine."""
     try:
         os.kill(process, 0)
@@ -286,11 +291,11 @@ def _runs(process: int) -> bool:
 
 
 def require_replaceable(
-    target: Path, overwrite: bool = True, mark: str = RESULT_FILE, what: str = "run"
+    target: Path, overwrite: bool = True, marker_file: str = RESULT_FILE, content_word: str = "run"
 ) -> None:
     """Refuse a place for a run folder that holds anything but an earlier run.
 
-    Parameters are those of `run_folder`.
+    Parameters are those of `replaced_folder`.
 
     Raises
     ------
@@ -306,9 +311,10 @@ def require_replaceable(
         raise InputError("is a mount point and cannot be replaced; choose a folder in it", target)
     if not any(target.iterdir()):
         return
-    if not (target / mark).is_file():
+    if not (target / marker_file).is_file():
         raise InputError(
-            f"the folder has files but no {mark}, so it is not an earlier {what} and is left "
+            f"the folder has files but no {marker_file}, "
+            f"so it is not an earlier {content_word} and is left "
             "alone; choose another folder",
             target,
         )
@@ -359,17 +365,17 @@ def require_only_written(folder: Path) -> None:
     )
 
 
-def _put_in_place(new: Path, target: Path, aside: Path) -> None:
-    """Rename the folder `new` to `target`, moving an existing `target` to `aside` until that
+def _replace_folder(new: Path, target: Path, backup: Path) -> None:
+    """Rename the folder `new` to `target`, moving an existing `target` to `backup` until that
     succeeded.
     """
     if not target.exists():
         new.rename(target)
         return
-    target.rename(aside)
+    target.rename(backup)
     try:
         new.rename(target)
     except OSError:
-        aside.rename(target)
+        backup.rename(target)
         raise
-    shutil.rmtree(aside, ignore_errors=True)
+    shutil.rmtree(backup, ignore_errors=True)

@@ -17,9 +17,9 @@ from ..problem import Problem
 
 SHOWN_ITERATIONS = 12
 # Time until the first line.
-FIRST_S = 10.0
+FIRST_LINE_S = 10.0
 # Growth of the elapsed time until each further line.
-SHARE = 0.5
+ELAPSED_GROWTH = 0.5
 
 
 class Heartbeat:
@@ -41,13 +41,16 @@ class Heartbeat:
     NAME = "heartbeat"
 
     def __init__(
-        self, doing: Callable[[], str], tell: Callable[[str], None], first_s: float | None = None
+        self,
+        current_activity: Callable[[], str],
+        show_line: Callable[[str], None],
+        first_s: float | None = None,
     ) -> None:
-        self._doing = doing
-        self._tell = tell
-        self._first_s = FIRST_S if first_s is None else first_s
+        self._doing = current_activity
+        self._tell = show_line
+        self._first_s = FIRST_LINE_S if first_s is None else first_s
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._beat, name=self.NAME, daemon=True)
+        self._thread = threading.Thread(target=self._run, name=self.NAME, daemon=True)
 
     def start(self) -> None:
         """Start the thread and its clock."""
@@ -59,16 +62,16 @@ class Heartbeat:
         if self._thread.is_alive():
             self._thread.join()
 
-    def _beat(self) -> None:
+    def _run(self) -> None:
         """Show lines until `stop` is called; the body of the thread."""
         began = time.monotonic()
         passed_s = 0.0
-        while not self._ended.wait(max(self._first_s, SHARE * passed_s)):
+        while not self._ended.wait(max(self._first_s, ELAPSED_GROWTH * passed_s)):
             passed_s = time.monotonic() - began
             self._tell(f"{self._doing()} ({passed_s:.3g} s so far)")
 
 
-class Progress(Watched):
+class SolveProgress(Watched):
     """Display of the progress of a solve, used as a context.
 
     On a terminal it is a live table of the last iterations. Elsewhere, or if `verbose`, lines are
@@ -98,9 +101,9 @@ class Progress(Watched):
         self._lines: list[Iteration] = []
         self._doing = "finding a start"
         silent = not (console.is_terminal or quiet)
-        self._heartbeat = Heartbeat(self._state, self.line) if silent else None
+        self._heartbeat = Heartbeat(self._activity_with_iterations, self.line) if silent else None
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> SolveProgress:
         for note in self._notes:
             self.line(f"note: {note}")
         super().__enter__()
@@ -116,39 +119,39 @@ class Progress(Watched):
     def iteration(self, line: Iteration) -> None:
         """Show an iteration; the callback of a method."""
         self._lines.append(line)
-        self._told("solving", "  ".join(_cells(line)))
+        self._update_activity("solving", "  ".join(_iteration_row(line)))
 
     def say(self, what: str) -> None:
         """Show what is being done now, as a sentence."""
-        self._told(what, what)
+        self._update_activity(what, what)
 
     def share(self, done: float) -> None:
         """Show the completed share of a simulation, from 0 to 1."""
-        self._told(f"simulating: {done:.0%}")
+        self._update_activity(f"simulating: {done:.0%}")
 
-    def _told(self, doing: str, line: str = "") -> None:
+    def _update_activity(self, activity: str, line: str = "") -> None:
         """Update the display with the current activity, and print `line` if verbose."""
-        self._doing = doing
+        self._doing = activity
         if self.verbose and line:
             self.console.print(Text(line), soft_wrap=True)
-        table = on_terminal(_iterations(self._lines))
+        table = on_terminal(_iteration_table(self._lines))
         self.update(Group(table, Text(self._doing, style="dim")))
 
-    def _state(self) -> str:
+    def _activity_with_iterations(self) -> str:
         """Return the current activity with the number of iterations so far, for the `Heartbeat`."""
         done = f", {len(self._lines)} iterations" if self._lines else ""
         return f"{self._doing}{done}"
 
 
-def _iterations(lines: list[Iteration]) -> Shown:
+def _iteration_table(lines: list[Iteration]) -> Shown:
     """Return the table of the last iterations; "" before the first."""
     if not lines:
         return ""
     heads = ("", "RMS mm", "violation N", *map(symbol_of, lines[-1].parameters), "s")
-    return Table("", heads, tuple(map(_cells, lines[-SHOWN_ITERATIONS:])), names=0)
+    return Table("", heads, tuple(map(_iteration_row, lines[-SHOWN_ITERATIONS:])), names=0)
 
 
-def _cells(line: Iteration) -> tuple[str, ...]:
+def _iteration_row(line: Iteration) -> tuple[str, ...]:
     """Return the table row of an iteration."""
     values = (f"{value:.4g}" for value in line.parameters.values())
     rms_mm = f"{line.rms_m * 1e3:.4f}"

@@ -38,15 +38,15 @@ from ..validated_types import Count, NotNegative, Options, Positive
 from ..written_files import LIST_FILE, hashes_of, is_written_here, list_as_text, listed_hashes
 from .run_writers import (
     FRAMES_FILE,
+    replaced_folder,
     require_no_link,
     require_only_written,
     require_replaceable,
-    run_folder,
     write_frames,
 )
 
 # The key of the file of markers, see `_table_names`.
-_MARKERS = "markers"
+_MARKERS_KEY = "markers"
 
 
 @dataclass(frozen=True)
@@ -137,14 +137,16 @@ def write_data(
     """
     place = Path(folder)
     recipe = recipe or Recipe()
-    _refuse_unguessed(problem)
-    sections = _sections(problem)
+    _require_guesses(problem)
+    sections = _experiment_sections(problem)
     names = [_table_names(each, sections.get(each.name)) for each in problem.experiments]
-    _refuse_shared(problem, names)
+    _require_separate_files(problem, names)
     files = [place / name for named in names for name in named.values()]
     _refuse_foreign(problem, place, files)
     for experiment in problem.experiments if recipe.frames else ():
-        require_replaceable(place / experiment.name, mark=FRAMES_FILE, what="simulation")
+        require_replaceable(
+            place / experiment.name, marker_file=FRAMES_FILE, content_word="simulation"
+        )
     rng = np.random.default_rng(recipe.seed)
     simulated = [
         simulate(
@@ -174,7 +176,9 @@ def write_data(
             if recipe.frames:
                 folder = place / experiment.name
                 body = experiment.body
-                subfolder = run_folder(folder, mark=FRAMES_FILE, what="simulation")
+                subfolder = replaced_folder(
+                    folder, marker_file=FRAMES_FILE, content_word="simulation"
+                )
                 write_frames(
                     stack.enter_context(subfolder),
                     trajectory.t_s,
@@ -217,10 +221,10 @@ def _write_tables(
     noise = recipe.noise_m * rng.normal(size=trajectory.markers_m.shape)
     names = experiment.markers.names
     tracks = trajectory.markers_m + noise
-    if _MARKERS in files:
-        write_markers_csv(files[_MARKERS], experiment.t_s, names, tracks)
+    if _MARKERS_KEY in files:
+        write_markers_csv(files[_MARKERS_KEY], experiment.t_s, names, tracks)
     for k, grasp in enumerate(experiment.grasps):
-        if (key := _numbered("poses", k)) in files:
+        if (key := _numbered_key("poses", k)) in files:
             write_poses_csv(files[key], grasp.poses)
     layouts = _wrench_layouts(section) or [WrenchSection.model_construct()] * len(
         experiment.wrenches
@@ -240,7 +244,7 @@ def _write_tables(
         for k, (sensor, layout) in enumerate(zip(experiment.wrenches, layouts, strict=True)):
             table = BenchTable(sensor.t_s)
             add_wrench(table, layout, sensor.t_s, wrenches[k])
-            write_columns_csv(files[_numbered("wrench", k)], table.columns)
+            write_columns_csv(files[_numbered_key("wrench", k)], table.columns)
     for gauge, read in zip(experiment.readings, trajectory.custom_sensor_values, strict=True):
         noise = recipe.noise_own * gauge.sigma * rng.normal(size=read.shape)
         key = f"reading_{gauge.name}"
@@ -253,7 +257,7 @@ def _wrench_layouts(section: ExperimentSection | None) -> list[WrenchSection]:
     return [each.wrench for each in moved if each.wrench is not None]
 
 
-def _refuse_unguessed(problem: Problem) -> None:
+def _require_guesses(problem: Problem) -> None:
     """Raise an InputError if a parameter has no guess."""
     if names := problem.parameters.names_without_guess:
         key = f"parameters.{names[0]}"
@@ -304,7 +308,7 @@ def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> Non
         require_only_written(place)
 
 
-def _sections(problem: Problem) -> dict[str, ExperimentSection]:
+def _experiment_sections(problem: Problem) -> dict[str, ExperimentSection]:
     """Return the table of each experiment in the problem file, by name; empty without a file."""
     if (origin := problem.origin) is None:
         return {}
@@ -317,11 +321,11 @@ def _table_names(experiment: Experiment, section: ExperimentSection | None) -> d
 
     On a test bench the names, and the keys too, are those of the problem file.
     """
-    keys = [_MARKERS] * bool(experiment.markers.names)
+    keys = [_MARKERS_KEY] * bool(experiment.markers.names)
     for k in range(len(experiment.grasps)):
         moved = section and section.moved_sections[k]
         if moved is None or moved.poses is not None or moved.markers is not None:
-            keys.append(_numbered("poses", k))
+            keys.append(_numbered_key("poses", k))
     bench: list[str] = []
     if section is not None and has_displacement_table(section):
         tables = [
@@ -329,17 +333,17 @@ def _table_names(experiment: Experiment, section: ExperimentSection | None) -> d
         ]
         bench = [table_name(section, table) for table in tables]
     else:
-        keys += [_numbered("wrench", k) for k in range(len(experiment.wrenches))]
+        keys += [_numbered_key("wrench", k) for k in range(len(experiment.wrenches))]
     keys += [f"reading_{gauge.name}" for gauge in experiment.readings]
     return {key: f"{experiment.name}_{key}.csv" for key in keys} | {name: name for name in bench}
 
 
-def _numbered(kind: str, index: int) -> str:
+def _numbered_key(kind: str, index: int) -> str:
     """Return the key of a file by its index, counted from 0: poses, poses_2, …"""
     return f"{kind}_{index + 1}" if index else kind
 
 
-def _refuse_shared(problem: Problem, names: Sequence[Mapping[str, str]]) -> None:
+def _require_separate_files(problem: Problem, names: Sequence[Mapping[str, str]]) -> None:
     """Refuse experiments that read the same file, because a simulation writes one for each.
 
     `names` are the results of `_table_names`, one for each experiment of the problem.

@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 from ..array_types import Array
 from ..display import escape
 from ..files import write_whole
-from .pictures.projection import Camera
-from .replay import Replay
+from .pictures.projection import ParallelCamera
+from .replay import MotionRecord
 
 # More samples than this are thinned, to keep the page a few megabytes.
-MOST_FRAMES = 300
+MAX_PAGE_FRAMES = 300
 # Quantile of the strain at which the colour scale ends: strains in single corners are far larger.
-STRAINED = 0.995
+STRAIN_QUANTILE = 0.995
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Colouring:
         Value at T samples on F boundary triangles; only these trajectories are shown.
     low, high : float
         Values at the two ends of the colour scale.
-    ends : (str, str)
+    end_labels : (str, str)
         Labels of the two ends.
     """
 
@@ -51,34 +51,34 @@ class Colouring:
     values: Mapping[str, Array]
     low: float
     high: float
-    ends: tuple[str, str]
+    end_labels: tuple[str, str]
 
     @classmethod
-    def strain(cls, replay: Replay) -> Colouring:
+    def by_strain(cls, replay: MotionRecord) -> Colouring:
         """Return the colouring of all trajectories by the largest principal strain."""
         values = {name: surface_strain(replay, x) for name, x in _trajectories(replay).items()}
         shown = np.abs(next(iter(values.values())))
-        largest = float(np.nanquantile(shown, STRAINED)) or 1e-6
+        largest = float(np.nanquantile(shown, STRAIN_QUANTILE)) or 1e-6
         return cls("strain", values, 0.0, largest, ("0", f"{100 * largest:.2g} % strain"))
 
     @classmethod
-    def field(cls, name: str, fitted: Array) -> Colouring:
+    def by_field(cls, name: str, values: Array) -> Colouring:
         """Return the colouring of the fitted body by given values.
 
         Parameters
         ----------
         name : str
             Name of the quantity, which the label of the upper end contains.
-        fitted : (T, F)
+        values : (T, F)
             Value at each sample on each boundary triangle; NaN is ignored for the limits.
         """
-        low = float(np.nanmin(fitted))
-        high = float(np.nanmax(fitted))
-        return cls(name, {"fitted": fitted}, low, high, (f"{low:.3g}", f"{high:.3g} {name}"))
+        low = float(np.nanmin(values))
+        high = float(np.nanmax(values))
+        return cls(name, {"fitted": values}, low, high, (f"{low:.3g}", f"{high:.3g} {name}"))
 
 
 def write_page(
-    replay: Replay, file: str | Path, headline: str = "", colouring: Colouring | None = None
+    replay: MotionRecord, file: str | Path, headline: str = "", colouring: Colouring | None = None
 ) -> Path:
     """Write the fitted and the simulated motion of an experiment as a stand-alone web page.
 
@@ -87,7 +87,7 @@ def write_page(
 
     Parameters
     ----------
-    replay : Replay
+    replay : ReplayCommand
         Experiment with at least one trajectory.
     file : str or Path
         HTML file to write; it is replaced only after the page is complete.
@@ -103,7 +103,7 @@ def write_page(
         The file.
     """
     template = files("collocation_sysid.result").joinpath("page.html").read_text(encoding="utf-8")
-    content = _content(replay, colouring or Colouring.strain(replay))
+    content = _page_data(replay, colouring or Colouring.by_strain(replay))
     texts = {
         "TITLE": escape(replay.name),
         "HEADLINE": escape(headline),
@@ -116,7 +116,7 @@ def write_page(
     return Path(file)
 
 
-def _trajectories(replay: Replay) -> dict[str, Array]:
+def _trajectories(replay: MotionRecord) -> dict[str, Array]:
     """Return the node positions (T, n, 3) [m] of the trajectories that exist, by "fitted" and
     "simulated".
     """
@@ -124,11 +124,11 @@ def _trajectories(replay: Replay) -> dict[str, Array]:
     return {name: x for name, x in named.items() if x is not None}
 
 
-def _content(replay: Replay, colouring: Colouring) -> dict[str, Any]:
+def _page_data(replay: MotionRecord, colouring: Colouring) -> dict[str, Any]:
     """Return the data of the page, ready for JSON; arrays are in base64, see
     `_pack_without_lifted`.
     """
-    samples = np.arange(0, len(replay.t_s), -(-len(replay.t_s) // MOST_FRAMES))
+    samples = np.arange(0, len(replay.t_s), -(-len(replay.t_s) // MAX_PAGE_FRAMES))
     surface_nodes, nodes = np.unique(replay.surface_nodes, return_inverse=True)
     nodes = nodes.reshape(len(replay.surface), -1)
     positions = _trajectories(replay)
@@ -145,27 +145,27 @@ def _content(replay: Replay, colouring: Colouring) -> dict[str, Any]:
         "t_s": replay.t_s[samples].tolist(),
         "nodes": len(surface_nodes),
         "markers": replay.measured_m.shape[1],
-        "faces": _packed(nodes[:, :3], "<i4"),
-        "sides": _packed(nodes[:, 3:], "<i4"),
+        "faces": _base64(nodes[:, :3], "<i4"),
+        "sides": _base64(nodes[:, 3:], "<i4"),
         "quantity": colouring.name,
-        "ends": colouring.ends,
-        "shares": {name: _packed(np.rint(255 * x), "u1") for name, x in shares.items()},
+        "ends": colouring.end_labels,
+        "shares": {name: _base64(np.rint(255 * x), "u1") for name, x in shares.items()},
         "opening": int(np.nansum(np.abs(next(iter(shares.values()))), axis=1).argmax()),
         "colours": [[round(255 * c) for c in colormaps["cividis"](k / 8)[:3]] for k in range(9)],
-        "held": _packed(replay.held[samples][:, surface_nodes], "u1"),
+        "held": _base64(replay.held[samples][:, surface_nodes], "u1"),
         "outlines": ""
         if replay.obstacles_m is None
-        else _packed(replay.obstacles_m[samples], "<f4"),
-        "measured": _packed(replay.measured_m[samples], "<f4"),
-        "shapes": {name: _packed(x, "<f4") for name, x in shapes.items()},
-        "axes": Camera.facing(finite_m, replay.up).axes.tolist(),
+        else _base64(replay.obstacles_m[samples], "<f4"),
+        "measured": _base64(replay.measured_m[samples], "<f4"),
+        "shapes": {name: _base64(x, "<f4") for name, x in shapes.items()},
+        "axes": ParallelCamera.facing_motion(finite_m, replay.up).axes.tolist(),
         "centre": ((low + high) / 2).tolist(),
         "size": float(np.linalg.norm(high - low)),
         "body": float(np.ptp(replay.undeformed_m, axis=0).max()),
     }
 
 
-def surface_strain(replay: Replay, positions_m: Array) -> Array:
+def surface_strain(replay: MotionRecord, positions_m: Array) -> Array:
     """Return the largest principal strain (T, F) of the elements below the boundary triangles.
 
     The strain is the largest stretch minus one. It is computed from the corners of an element,
@@ -174,11 +174,11 @@ def surface_strain(replay: Replay, positions_m: Array) -> Array:
 
     Parameters
     ----------
-    replay : Replay
+    replay : ReplayCommand
     positions_m : (T, n, 3)
         Node positions of one of its trajectories.
     """
-    cells = cells_of_faces(replay.tetrahedra, replay.surface)
+    cells = cells_below_faces(replay.tetrahedra, replay.surface)
     corners = replay.tetrahedra[cells]
     undeformed = replay.undeformed_m[corners]
     moved = positions_m[:, corners]
@@ -191,7 +191,7 @@ def surface_strain(replay: Replay, positions_m: Array) -> Array:
     return np.where(there, stretch - 1.0, np.nan)
 
 
-def cells_of_faces(tetrahedra: NDArray[Any], faces: NDArray[Any]) -> NDArray[np.int64]:
+def cells_below_faces(tetrahedra: NDArray[Any], faces: NDArray[Any]) -> NDArray[np.int64]:
     """Return the index (F,) of the tetrahedron that each boundary triangle is a side of.
 
     Parameters
@@ -211,6 +211,8 @@ def cells_of_faces(tetrahedra: NDArray[Any], faces: NDArray[Any]) -> NDArray[np.
     return np.array([known[tuple(face)] for face in np.sort(faces, axis=1).tolist()])
 
 
-def _packed(array: NDArray[Any], kind: str) -> str:
-    """Return an array as base64 text of its bytes in the NumPy data type `kind`, such as "<f4"."""
-    return base64.b64encode(np.ascontiguousarray(array, dtype=kind).tobytes()).decode("ascii")
+def _base64(array: NDArray[Any], data_type: str) -> str:
+    """Return an array as base64 text of its bytes in the NumPy data type `data_type`, such as
+    "<f4".
+    """
+    return base64.b64encode(np.ascontiguousarray(array, dtype=data_type).tobytes()).decode("ascii")

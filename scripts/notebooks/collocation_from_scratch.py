@@ -61,9 +61,9 @@ from collocation_sysid.result.figure_style import (
     ORANGE,
     SKY,
     VERMILION,
-    dress,
-    legend,
+    add_legend,
     new_figure,
+    style_axes,
 )
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.linearised import linearise_fit
@@ -208,14 +208,14 @@ print(f"{iterations} iterations from the guess k = 10, c = 1")
 figure, (left, right) = panels(2)
 left.plot(t, 1e3 * y, ".", color=BLACK, ms=3, label="camera, 1 mm noise")
 left.plot(t, 1e3 * path, color=BLUE, lw=1.1, label="collocation")
-dress(left, "The fitted path", "time [s]", "position [mm]")
+style_axes(left, "The fitted path", "time [s]", "position [mm]")
 left.set_ylim(top=75)
-legend(left)
+add_legend(left)
 right.plot(t, 1e3 * (path - y), ".", color=BLACK, ms=3, label="fitted − measured")
 right.plot(t, 1e3 * (path - nature(t)), color=VERMILION, lw=1.1, label="fitted − true")
-dress(right, "What is left", "time [s]", "error [mm]")
+style_axes(right, "What is left", "time [s]", "error [mm]")
 right.set_ylim(top=3.5)
-legend(right)
+add_legend(right)
 display(figure)
 
 # %% [markdown]
@@ -243,11 +243,11 @@ figure, (left, right) = panels(2)
 left.loglog(trials, shooting_loss, color=BLUE, lw=1.1)
 left.plot(trials[1:-1][valleys], shooting_loss[1:-1][valleys], "o", color=VERMILION, ms=4)
 left.axvline(STIFFNESS, color=BLACK, lw=0.6)
-dress(left, "Shooting: loss and its valleys", "k [N/m]", "mean squared error / σ²")
+style_axes(left, "Shooting: loss and its valleys", "k [N/m]", "mean squared error / σ²")
 right.loglog(guesses, answers, "o-", color=BLUE, ms=4, lw=1.1)
 right.axhline(STIFFNESS, color=BLACK, lw=0.6)
 right.set_ylim(4, 400)
-dress(right, "Collocation: answer by guess", "guess of k [N/m]", "identified k [N/m]")
+style_axes(right, "Collocation: answer by guess", "guess of k [N/m]", "identified k [N/m]")
 display(figure)
 
 # %% [markdown]
@@ -280,7 +280,7 @@ for axes, pattern, title in (
     axes.spy(ca.DM(pattern, 1).full(), markersize=4, color=BLUE)
     axes.axvline(1.5, color=VERMILION, lw=0.8)
     axes.xaxis.set_ticks_position("bottom")
-    dress(axes, title, "k, c | positions", "")
+    style_axes(axes, title, "k, c | positions", "")
     axes.grid(False)
 left.set_ylabel("equations of motion", fontsize=7.5)
 right.axhline(1.5, color=VERMILION, lw=0.8)
@@ -349,9 +349,9 @@ axes.plot(*scatter.T, ".", color=BLUE, ms=4, label="answers to 200 films")
 outline = ellipse(scatter.mean(axis=0), predicted)
 axes.plot(*outline.T, color=VERMILION, lw=1.1, label="predicted from one film, 95 %")
 axes.plot(STIFFNESS, DAMPING, "+", color=BLACK, ms=10, mew=1.5, label="truth")
-dress(axes, "Two hundred films of one swing", "k [N/m]", "c [N s/m]")
+style_axes(axes, "Two hundred films of one swing", "k [N/m]", "c [N s/m]")
 axes.set_ylim(top=axes.get_ylim()[1] + 0.006)
-legend(axes)
+add_legend(axes)
 display(figure)
 
 # %% [markdown]
@@ -419,10 +419,10 @@ for (label, ends), colour in zip(found.items(), (BLUE, VERMILION), strict=True):
 first.axhline(1, color=BLACK, lw=0.6)
 first.set_ylim(1e-6, 3e4)
 third.loglog(weights, conditions[::-1], "o-", ms=3, lw=1.1, color=BLUE)
-dress(first, "k, c: off the constrained answer", "ρ [1/N²]", "error bars")
-dress(second, "Broken law of motion", "ρ [1/N²]", "largest |c| [N]")
-dress(third, "Condition of the Hessian", "ρ [1/N²]", "condition number")
-legend(second)
+style_axes(first, "k, c: off the constrained answer", "ρ [1/N²]", "error bars")
+style_axes(second, "Broken law of motion", "ρ [1/N²]", "largest |c| [N]")
+style_axes(third, "Condition of the Hessian", "ρ [1/N²]", "condition number")
+add_legend(second)
 display(figure)
 
 # %% [markdown]
@@ -495,8 +495,8 @@ for axes, what in ((left, "c"), (right, "k")):
     axes.axvline(zeta, color=BLACK, lw=0.6, ls=":")
     axes.set_xticks(surplus, [f"{number:g}" for number in surplus])
     axes.set_xticks([], minor=True)
-    dress(axes, f"Identified {what}, perfect data", "ωΔt/2   (dotted: ζ)", f"{what} / truth")
-    legend(axes)
+    style_axes(axes, f"Identified {what}, perfect data", "ωΔt/2   (dotted: ζ)", f"{what} / truth")
+    add_legend(axes)
 display(figure)
 
 # %% [markdown]
@@ -600,8 +600,8 @@ assert min(bend_error) < 1e-8
 figure, axes = panels(1, width_mm=90)
 axes.loglog(sizes, slope_error, "o-", ms=3, lw=1.1, color=BLUE, label="energy → force")
 axes.loglog(sizes, bend_error, "o-", ms=3, lw=1.1, color=VERMILION, label="force → stiffness")
-dress(axes, "Derivative against central differences", "step h [m]", "relative difference")
-legend(axes)
+style_axes(axes, "Derivative against central differences", "step h [m]", "relative difference")
+add_legend(axes)
 display(figure)
 
 # %% [markdown]
@@ -652,8 +652,8 @@ for energies, colour, label in (
     (right_sign, BLUE, r"$-\gamma_r\,\partial^2\Psi/\partial x^2\ v$"),
 ):
     axes.semilogy(clock, 1e6 * energies, color=colour, lw=1.1, label=label)
-dress(axes, "Energy of a body nobody drives", "time [s]", "Ψ + kinetic energy [µJ]")
-legend(axes)
+style_axes(axes, "Energy of a body nobody drives", "time [s]", "Ψ + kinetic energy [µJ]")
+add_legend(axes)
 display(figure)
 
 # %% [markdown]
@@ -753,8 +753,8 @@ fitted = SIDE * sponge_z[3:].reshape(-1, 3).T
 for i, colour in enumerate((BLUE, VERMILION, GREEN)):
     axes.plot(times, 1e3 * (seen[i] - corners[3, i]), ".", color=colour, ms=3)
     axes.plot(times, 1e3 * (fitted[i] - corners[3, i]), color=colour, lw=1.1, label="xyz"[i])
-dress(axes, "The free corner: seen (dots) and fitted", "time [s]", "displacement [mm]")
-legend(axes)
+style_axes(axes, "The free corner: seen (dots) and fitted", "time [s]", "displacement [mm]")
+add_legend(axes)
 display(figure)
 
 # %% [markdown]
@@ -775,7 +775,7 @@ for i in range(1, 8):
     axes.axvline(3 * i + 2.5, color="#B0B0B0", lw=0.4)
 axes.set_xticks([1, *(3 * i + 4 for i in range(8))], ["θ", *(f"$x_{i}$" for i in range(8))])
 axes.set_yticks([3 * i + 1 for i in range(8)], [f"$c_{i}$" for i in range(8)])
-dress(axes, "Constraint Jacobian of eight timesteps")
+style_axes(axes, "Constraint Jacobian of eight timesteps")
 axes.grid(False)
 display(figure)
 
@@ -860,7 +860,7 @@ for place, step in enumerate(every):
     axes.text(205 * place, 60, f"{time_s:.2f} s", ha="center", fontsize=7)
 axes.set_aspect("equal")
 axes.set_ylim(-200, 90)
-dress(axes, "Seen from the side: mesh, held nodes (black), markers (orange)", "", "z [mm]")
+style_axes(axes, "Seen from the side: mesh, held nodes (black), markers (orange)", "", "z [mm]")
 axes.set_xticks([])
 axes.grid(False)
 display(figure)
@@ -872,8 +872,8 @@ tip = cylinder.markers.names.index("tip_1")
 for i, axis in enumerate(axes):
     axis.plot(t_s, 1e3 * seen_m[:, tip, i], ".", color=BLACK, ms=4, label="seen")
     axis.plot(t_s, 1e3 * fitted_m[:, tip, i], color=BLUE, lw=1.1, label="fitted")
-    dress(axis, f"tip_1, {'xyz'[i]}", "time [s]", "position [mm]" if i == 0 else "")
-legend(axes[0])
+    style_axes(axis, f"tip_1, {'xyz'[i]}", "time [s]", "position [mm]" if i == 0 else "")
+add_legend(axes[0])
 display(figure)
 
 # %% [markdown]
@@ -906,9 +906,9 @@ width, height = (
 jacobian = collocation.jacobian(solution.z)
 figure, (left, right) = panels(2, height_mm=80)
 left.spy(jacobian[: 4 * height, : 4 + 4 * width], markersize=0.25, color=BLUE, aspect="auto")
-dress(left, "The first four timesteps", "θ (at the far left) and node positions", "motion")
+style_axes(left, "The first four timesteps", "θ (at the far left) and node positions", "motion")
 right.spy(jacobian[:height, 4 : 4 + width], markersize=0.6, color=BLUE, aspect="auto")
-dress(right, "One block: who pulls on whom", "node positions", "motion")
+style_axes(right, "One block: who pulls on whom", "node positions", "motion")
 for axes in (left, right):
     axes.xaxis.set_ticks_position("bottom")
     axes.grid(False)
@@ -990,14 +990,14 @@ left.clabel(lines, fmt="E = %.0f Pa", fontsize=6, manual=places)
 left.plot(*ellipse(lame, lame_covariance).T, color=BLUE, lw=1.2, label="95 % region")
 left.plot(*lame, "o", color=BLUE, ms=4, label="answer")
 left.plot(800, 600, "+", color=VERMILION, ms=10, mew=1.5, label="truth")
-dress(left, "λ and μ err nearly along a line of constant E", "λ [Pa]", "μ [Pa]")
-legend(left)
+style_axes(left, "λ and μ err nearly along a line of constant E", "λ [Pa]", "μ [Pa]")
+add_legend(left)
 names = [r"$\lambda$", r"$\mu$", r"$\gamma_r$", r"$\gamma_m$"]
 image = right.imshow(uncertainty.correlation, vmin=-1, vmax=1, cmap="RdBu_r")
 for (i, j), value in np.ndenumerate(uncertainty.correlation):
     ink = "white" if abs(value) > 0.6 else "black"
     right.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=ink)
-dress(right, "Correlation of the errors")
+style_axes(right, "Correlation of the errors")
 right.grid(False)
 right.set_xticks(range(4), names)
 right.set_yticks(range(4), names)
@@ -1053,8 +1053,8 @@ axes.plot(profile.values, rise, "o-", color=BLUE, ms=4, lw=1.1, label="profile")
 axes.axhline(profile.threshold, color=BLACK, lw=0.6, label="3.84: end of the 95 % interval")
 axes.axvline(exact_poisson, color=VERMILION, lw=0.8, ls=":", label="truth")
 axes.set_ylim(0, 16)
-dress(axes, "Poisson's ratio from one bad marker", "ν", "rise of the loss")
-legend(axes)
+style_axes(axes, "Poisson's ratio from one bad marker", "ν", "rise of the loss")
+add_legend(axes)
 display(figure)
 low, high = profile.interval
 assert low is not None
@@ -1101,8 +1101,8 @@ for shift, colour, (name, (q, deviations)) in zip(
     axes.errorbar(np.arange(4) + shift, error, bar, fmt="o", color=colour, ms=4, label=name)
 axes.axhline(0, color=BLACK, lw=0.6)
 axes.set_xticks(range(4), names)
-dress(axes, "A marker 4 mm off: error and 95 % error bar", "", "error [%]")
-legend(axes)
+style_axes(axes, "A marker 4 mm off: error and 95 % error bar", "", "error [%]")
+add_legend(axes)
 display(figure)
 
 # %% [markdown]
@@ -1137,9 +1137,9 @@ figure, axes = panels(1, width_mm=90)
 for factors, name, colour in zip(np.transpose(widening), "kc", (BLUE, VERMILION), strict=True):
     axes.plot(memory, factors, "o-", ms=4, lw=1.1, color=colour, label=name)
 axes.axhline(1, color=BLACK, lw=0.6)
-dress(axes, "How much too small the error bars are", "memory φ of the noise", "true / assumed")
+style_axes(axes, "How much too small the error bars are", "memory φ of the noise", "true / assumed")
 axes.set_ylim(bottom=0)
-legend(axes)
+add_legend(axes)
 display(figure)
 assert np.allclose(widening[0], 1)
 assert np.max(widening) > 2

@@ -21,8 +21,8 @@ from ...problem.schema import ProblemFile, with_experiment_defaults
 from ...recording import PoseSequence, write_markers_csv, write_poses_csv, write_wrench_csv
 from ...result.animation import film
 from ...result.pictures.album import save_pictures
-from ...result.replay import Replay
-from ...result.run_writers import run_folder
+from ...result.replay import MotionRecord
+from ...result.run_writers import replaced_folder
 from ...serialisation import as_json, content
 from .design_page import design_figures
 from .motion_design import Design, ErrorBars
@@ -65,7 +65,7 @@ def write_design(
 
     Parameters
     ----------
-    design : Design
+    design : DesignCommand
         Design.
     folder : str or Path
         Folder, which may contain an earlier design; that is replaced.
@@ -80,7 +80,7 @@ def write_design(
         If the folder contains anything but an earlier design.
     """
     target = Path(folder)
-    with run_folder(target, mark=DESIGN_FILE, what="design") as place:
+    with replaced_folder(target, marker_file=DESIGN_FILE, content_word="design") as place:
         write_poses_csv(place / POSES_FILE, _gripper_poses(design))
         experiment = design.experiment
         markers = experiment.markers
@@ -94,7 +94,7 @@ def write_design(
         if with_film:
             say("filming the motion")
             shapes_m = design.predicted.positions_m
-            replay = Replay.of(experiment, (shapes_m, markers.positions_m))
+            replay = MotionRecord.from_experiment(experiment, (shapes_m, markers.positions_m))
             film(replay, place / FILM_FILE, FRAMES_PER_SECOND, names=("predicted", ""))
         (place / DESIGN_FILE).write_text(as_json(design_json(design)), encoding="utf-8")
     return target

@@ -11,16 +11,16 @@ from ...display import Line, Shown, Table
 from ...fem.constants import symbol_of, symbol_with_unit
 from ...result.figure_style import (
     BLUE,
-    CYCLE,
+    COLOUR_CYCLE,
     LINE_PT,
     PAGE_MM,
     SMALL_PT,
     VERMILION,
-    dress,
-    legend_above,
-    mathematical,
+    add_legend_above,
+    format_plain_numbers,
     new_figure,
-    plain_numbers,
+    style_axes,
+    symbol_as_mathtext,
 )
 from .hand_motion import angular_motion
 from .motion_design import Design
@@ -92,7 +92,7 @@ def motion_picture(design: Design) -> Figure:
     limits = design.limits
     place, rate, curvature = design.motion.derivatives(t_s)
     angular = angular_motion(place[:, 3:], rate[:, 3:], curvature[:, 3:])
-    for axis, colour in zip(range(3), CYCLE, strict=False):
+    for axis, colour in zip(range(3), COLOUR_CYCLE, strict=False):
         style = {"color": colour, "lw": LINE_PT, "label": "xyz"[axis]}
         shift.plot(t_s, 1e3 * place[:, axis], **style)
         turn.plot(t_s, np.degrees(place[:, 3 + axis]), **style)
@@ -111,12 +111,12 @@ def motion_picture(design: Design) -> Figure:
         axes.plot(t_s, 100 * turned, color=VERMILION, lw=LINE_PT, label="angular")
         axes.axhline(100, color="black", lw=0.6, ls="--")
         axes.set_ylim(bottom=0)
-    dress(shift, "", "", "shift of the hand [mm]")
-    dress(turn, "", "", "rotation vector [°]")
-    dress(speed, "", "time [s]", "speed [% of limit]")
-    dress(growth, "", "time [s]", "acceleration [% of limit]")
-    legend_above(shift, columns=3)
-    legend_above(speed, columns=2)
+    style_axes(shift, "", "", "shift of the hand [mm]")
+    style_axes(turn, "", "", "rotation vector [°]")
+    style_axes(speed, "", "time [s]", "speed [% of limit]")
+    style_axes(growth, "", "time [s]", "acceleration [% of limit]")
+    add_legend_above(shift, columns=3)
+    add_legend_above(speed, columns=2)
     return figure
 
 
@@ -141,10 +141,10 @@ def error_bars_picture(design: Design) -> Figure:
         axes.hlines(rows + shift, low, high, color=colour, lw=2.5, alpha=0.4)
         axes.plot(middle, rows + shift, "o", color=colour, ms=4, mec="none", label=label)
     axes.set_xscale("log")
-    plain_numbers(axes.xaxis)
-    axes.set_yticks(rows, [mathematical(name) or symbol_of(name) for name in names])
+    format_plain_numbers(axes.xaxis)
+    axes.set_yticks(rows, [symbol_as_mathtext(name) or symbol_of(name) for name in names])
     axes.set_ylim(len(names) - 0.5, -0.5)
-    dress(axes, "", "predicted standard error [%]", "")
+    style_axes(axes, "", "predicted standard error [%]", "")
     axes.tick_params(axis="y", labelsize=SMALL_PT)
-    legend_above(axes, columns=2)
+    add_legend_above(axes, columns=2)
     return figure

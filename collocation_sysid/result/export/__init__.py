@@ -1,9 +1,10 @@
 """Export of the identified body to other simulators.
 
-`export_run` writes the files of a target in `TARGETS`, `verify_export` runs the target and compares
-its prediction with that of this package. One module per simulator: `mujoco`, `newton`, `usd`,
-`sofa`, `febio` and `calculix`. For all of them, `identified` reads the body from a run folder,
-`export_target` describes what a simulator can express, and `obstacle_shapes` converts obstacles.
+`write_export` writes the files of a target in `TARGETS`, `verify_export` runs the target and
+compares its prediction with that of this package. One module per simulator: `mujoco`, `newton`,
+`usd`, `sofa`, `febio` and `calculix`. For all of them, `identified` reads the body from a run
+folder, `export_target` describes what a simulator can express, and `obstacle_shapes` converts
+obstacles.
 """
 
 from __future__ import annotations
@@ -17,33 +18,33 @@ from ...display import Table
 from ...errors import InputError, hint_at
 from ...recording import write_poses_csv
 from ...serialisation import as_json
-from ..run_writers import run_folder
+from ..run_writers import replaced_folder
 from . import calculix, febio, mujoco, newton, sofa, usd
-from .export_target import Comparison, Exported, Target
-from .identified import Identified
+from .export_target import ExportedFiles, ExportTarget, PredictionComparison
+from .identified import IdentifiedBody
 
-NUMBERS = "identified.json"
+IDENTIFIED_FILE = "identified.json"
 
 
-TARGETS: dict[str, Target] = {
-    "mujoco": Target("MuJoCo", mujoco.export, mujoco.verify),
-    "newton": Target("Newton", newton.export),
-    "usd": Target("OpenUSD", usd.export, usd.verify),
-    "sofa": Target("SOFA", sofa.export),
-    "febio": Target("FEBio", febio.export),
-    "calculix": Target("CalculiX", calculix.export, calculix.verify),
-    "json": Target("JSON", lambda body: Exported({}, ())),
+TARGETS: dict[str, ExportTarget] = {
+    "mujoco": ExportTarget("MuJoCo", mujoco.export, mujoco.verify),
+    "newton": ExportTarget("Newton", newton.export),
+    "usd": ExportTarget("OpenUSD", usd.export, usd.verify),
+    "sofa": ExportTarget("SOFA", sofa.export),
+    "febio": ExportTarget("FEBio", febio.export),
+    "calculix": ExportTarget("CalculiX", calculix.export, calculix.verify),
+    "json": ExportTarget("JSON", lambda body: ExportedFiles({}, ())),
 }
 
 
-def export_run(body: Identified, to: str, folder: str | Path) -> Exported:
+def write_export(body: IdentifiedBody, target_name: str, folder: str | Path) -> ExportedFiles:
     """Write a body for a target: its files, ``identified.json``, and the poses of its grasps and
     obstacles.
 
     Parameters
     ----------
-    body : Identified
-    to : str
+    body : IdentifiedBody
+    target_name : str
         Name of a target in `TARGETS`.
     folder : str or Path
         Written completely or not at all; an earlier export there is replaced.
@@ -58,34 +59,36 @@ def export_run(body: Identified, to: str, folder: str | Path) -> Exported:
     InputError
         For an unknown target, a body that the target cannot express, or a folder with other files.
     """
-    exported = target_named(to).export(body)
-    with run_folder(folder, mark=NUMBERS, what="export") as place:
+    exported = target_named(target_name).export(body)
+    with replaced_folder(folder, marker_file=IDENTIFIED_FILE, content_word="export") as place:
         for name, text in exported.files.items():
             (place / name).write_text(text, encoding="utf-8")
-        content = {**body.as_dict(), "not_expressed": exported.limits}
-        (place / NUMBERS).write_text(as_json(content) + "\n", encoding="utf-8")
+        content = {**body.as_dict(), "not_expressed": exported.limitations}
+        (place / IDENTIFIED_FILE).write_text(as_json(content) + "\n", encoding="utf-8")
         for k, grasp in enumerate((*body.experiment.grasps, *body.obstacles), start=1):
             write_poses_csv(place / f"poses_{k}.csv", grasp.poses)
     return exported
 
 
-def verify_export(body: Identified, to: str, folder: str | Path) -> Sequence[Comparison]:
+def verify_export(
+    body: IdentifiedBody, target_name: str, folder: str | Path
+) -> Sequence[PredictionComparison]:
     """Run an export in the target itself, and compare its predictions with those of this package.
 
     Parameters
     ----------
-    body : Identified
-    to : str
+    body : IdentifiedBody
+    target_name : str
         Name of a target in `TARGETS`.
     folder : str or Path
-        Folder of `export_run`; the target runs in a temporary copy.
+        Folder of `write_export`; the target runs in a temporary copy.
 
     Raises
     ------
     InputError
         If the target cannot be run from here, or is not installed.
     """
-    target = target_named(to)
+    target = target_named(target_name)
     if target.verify is None:
         able = ", ".join(name for name, each in TARGETS.items() if each.verify is not None)
         raise InputError(f"{target.name} is not run from here; --verify works with {able}")
@@ -95,16 +98,16 @@ def verify_export(body: Identified, to: str, folder: str | Path) -> Sequence[Com
         return target.verify(body, place)
 
 
-def comparison_table(name: str, compared: Sequence[Comparison]) -> Table:
+def comparison_table(name: str, comparisons: Sequence[PredictionComparison]) -> Table:
     """Return the table of predictions of the simulator `name` and of this package."""
     rows = []
-    for each in compared:
+    for each in comparisons:
         values = (f"{value:.5g} {each.unit}" for value in (each.theirs, each.ours))
-        rows.append((each.what, *values, f"{each.relative:+.2%}", each.remark))
+        rows.append((each.what, *values, f"{each.relative_difference:+.2%}", each.remark))
     return Table("", ("", name, "ours", "difference", ""), tuple(rows), names=5)
 
 
-def target_named(name: str) -> Target:
+def target_named(name: str) -> ExportTarget:
     """Return the target in `TARGETS` called `name`.
 
     Raises
@@ -119,14 +122,14 @@ def target_named(name: str) -> Target:
 
 
 __all__ = [
-    "NUMBERS",
+    "IDENTIFIED_FILE",
     "TARGETS",
-    "Comparison",
-    "Exported",
-    "Identified",
-    "Target",
+    "ExportTarget",
+    "ExportedFiles",
+    "IdentifiedBody",
+    "PredictionComparison",
     "comparison_table",
-    "export_run",
     "target_named",
     "verify_export",
+    "write_export",
 ]

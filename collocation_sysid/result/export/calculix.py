@@ -16,62 +16,73 @@ import numpy as np
 
 from ...array_types import Array
 from ...errors import InputError
-from .export_target import Comparison, Exported, Holds, at_rest, heading, longest
-from .identified import Identified, IdentifiedRegion
-from .obstacle_shapes import Wall, walls
+from .export_target import (
+    ExportedFiles,
+    PredictionComparison,
+    TargetCapabilities,
+    comment_lines,
+    equilibria,
+    longest_displacement_m,
+)
+from .identified import IdentifiedBody, IdentifiedRegion
+from .obstacle_shapes import FacetedObstacle, faceted_obstacles
 
 DECK = "body.inp"
 # Time after which a run of CalculiX is stopped.
-LONGEST_S = 600.0
+TIME_LIMIT_S = 600.0
 # Corners of the sides of a tetrahedron in the order of CalculiX.
-SIDES = (0, 1, 2), (0, 1, 3), (1, 2, 3), (0, 2, 3)
+TETRAHEDRON_SIDES = (0, 1, 2), (0, 1, 3), (1, 2, 3), (0, 2, 3)
 # Constant D_i that removes a term of U = Σ (J − 1)^2i / D_i: zero would mean a very stiff term.
-NO_TERM = 1e20
-HOLDS = Holds({}, instead="", mass_damping="", forces="", quadratic=True)
+ABSENT_TERM = 1e20
+CAPABILITIES = TargetCapabilities(
+    {}, other_materials="", mass_damping="", node_forces="", has_quadratic_elements=True
+)
 # Coefficients C_i of the series of Arruda and Boyce.
-_CHAINS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
+_ARRUDA_BOYCE_COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 
 
-def export(body: Identified) -> Exported:
+def export(body: IdentifiedBody) -> ExportedFiles:
     """Return the input deck, with what CalculiX cannot express."""
     static = body.experiment.is_static
-    limits = replace(HOLDS, motion=static, drives=static).lost(body)
+    limits = replace(
+        CAPABILITIES, has_moving_grasps=static, has_moving_obstacles=static
+    ).limitations(body)
     linear = all(region.material == "linear" for region in body.regions)
     materials = ""
     for k, region in enumerate(body.regions):
-        card, limitation = _material(region, linear)
+        card, limitation = _material_card(region, linear)
         limits += [f"{region.name}: {limitation}"] if limitation else []
         materials += (
-            f"*MATERIAL,NAME=M{k}\n{card}*DENSITY\n{_fields(region.density_kg_m3)}\n"
+            f"*MATERIAL,NAME=M{k}\n{card}*DENSITY\n{_format_numbers(region.density_kg_m3)}\n"
             f"*SOLID SECTION,ELSET=E{k},MATERIAL=M{k}\n"
         )
     limits.append("damping is not exported: an equilibrium has none")
-    if body.quadratic:
+    if body.is_quadratic:
         limits.append("the weight of an element is spread by its shape functions, ours is lumped")
-    nodes = (f"{k},{_fields(*point)}\n" for k, point in enumerate(body.nodes_m, start=1))
+    nodes = (f"{k},{_format_numbers(*point)}\n" for k, point in enumerate(body.nodes_m, start=1))
     mesh = f"*NODE,NSET=ALL\n{''.join(nodes)}"
-    kind = "C3D10" if body.quadratic else "C3D4"
+    kind = "C3D10" if body.is_quadratic else "C3D4"
     for k, region in enumerate(body.regions):
         cells = body.body.cells[region.cells] + 1
         lines = (", ".join(map(str, (n + 1, *c))) for n, c in zip(region.cells, cells, strict=True))
         mesh += f"*ELEMENT,TYPE={kind},ELSET=E{k}\n" + "".join(f"{line}\n" for line in lines)
     mesh += "".join(f"*ELSET,ELSET=BODY\nE{k}\n" for k in range(len(body.regions)))
-    head = heading(body, limits, "** ")
-    obstacles = walls(body)
+    head = comment_lines(body, limits, "** ")
+    obstacles = faceted_obstacles(body)
     steps = ""
-    for t_s in _times_s(body):
-        steps += _step(body, obstacles, t_s, linear)
-    return Exported(
-        {DECK: f"{head}{mesh}{materials}{_walls(body, obstacles)}{steps}"}, tuple(limits)
+    for t_s in _step_times_s(body):
+        steps += _step_card(body, obstacles, t_s, linear)
+    return ExportedFiles(
+        {DECK: f"{head}{mesh}{materials}{_obstacle_cards(body, obstacles)}{steps}"}, tuple(limits)
     )
 
 
-def _times_s(body: Identified) -> Array:
+def _step_times_s(body: IdentifiedBody) -> Array:
     """Return the time of each step: all samples of a static recording, else the first one."""
     return body.experiment.t_s[: None if body.experiment.is_static else 1]
 
 
-def _walls(body: Identified, touched: Sequence[Wall]) -> str:
+def _obstacle_cards(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) -> str:
     """Return the obstacles as cards: a tetrahedron under each facet, all of whose nodes are
     prescribed.
     """
@@ -80,66 +91,74 @@ def _walls(body: Identified, touched: Sequence[Wall]) -> str:
     cell_numbers = np.arange(len(body.body.cells)) + 1
     faces = {
         tuple(sorted(corners)): f"{number},S{side}"
-        for side, places in enumerate(SIDES, start=1)
+        for side, places in enumerate(TETRAHEDRON_SIDES, start=1)
         for corners, number in zip(tetrahedra[:, places].tolist(), cell_numbers, strict=True)
     }
-    for k, wall in enumerate(touched):
+    for k, wall in enumerate(obstacles):
         deck += f"*NODE,NSET=W{k}\n"
-        numbered = enumerate(wall.start_m, start=wall.nodes + 1)
-        deck += "".join(f"{i},{_fields(*point)}\n" for i, point in numbered)
+        numbered = enumerate(wall.start_points_m, start=wall.first_node + 1)
+        deck += "".join(f"{i},{_format_numbers(*point)}\n" for i, point in numbered)
         deck += f"*ELEMENT,TYPE=C3D4,ELSET=W{k}\n"
-        for i, nodes in enumerate(wall.tetrahedra + 1, start=wall.cells + 1):
+        for i, nodes in enumerate(wall.tetrahedra + 1, start=wall.first_cell + 1):
             deck += f"{i},{','.join(map(str, nodes))}\n"
         touching = body.body.mesh.surface[wall.faces].tolist()
         sides = "".join(f"{faces[tuple(sorted(face))]}\n" for face in touching)
-        stick = f"*FRICTION\n{_fields(float(wall.obstacle.friction), wall.stiffness_pa_m / 2)}\n"
+        constants = _format_numbers(float(wall.obstacle.friction), wall.stiffness_pa_m / 2)
+        stick = f"*FRICTION\n{constants}\n"
         deck += (
             f"*SOLID SECTION,ELSET=W{k},MATERIAL=WALL\n*SURFACE,NAME=W{k}\nW{k},S1\n"
             f"*SURFACE,NAME=B{k}\n{sides}"
             f"*SURFACE INTERACTION,NAME=W{k}\n*SURFACE BEHAVIOR,PRESSURE-OVERCLOSURE=LINEAR\n"
-            f"{_fields(wall.stiffness_pa_m)}\n{stick if wall.obstacle.has_friction else ''}"
+            f"{_format_numbers(wall.stiffness_pa_m)}\n{stick if wall.obstacle.has_friction else ''}"
             f"*CONTACT PAIR,INTERACTION=W{k},TYPE=SURFACE TO SURFACE\nB{k},W{k}\n"
         )
-    material = f"*MATERIAL,NAME=WALL\n*ELASTIC\n{_fields(body.regions[0].young_pa, 0.3)}\n"
-    return f"{material}*DENSITY\n1.\n{deck}" if touched else ""
+    material = f"*MATERIAL,NAME=WALL\n*ELASTIC\n{_format_numbers(body.regions[0].young_pa, 0.3)}\n"
+    return f"{material}*DENSITY\n1.\n{deck}" if obstacles else ""
 
 
-def _step(body: Identified, touched: Sequence[Wall], t_s: float, linear: bool) -> str:
+def _step_card(
+    body: IdentifiedBody, obstacles: Sequence[FacetedObstacle], t_s: float, is_linear: bool
+) -> str:
     """Return one step: prescribed nodes and obstacles at their places at `t_s`, gravity, and node
     loads.
 
     Parameters
     ----------
-    body : Identified
-    touched : sequence of Wall
+    body : IdentifiedBody
+    obstacles : sequence of FacetedObstacle
         The obstacles.
     t_s : float
         Time of the sample.
-    linear : bool
+    is_linear : bool
         Whether the analysis is geometrically linear.
     """
     displacements_m = [body.experiment.prescribed_displacements([t_s])[1][0] - body.nodes_m]
-    displacements_m += [wall.points_m(t_s) - wall.start_m for wall in touched]
+    displacements_m += [wall.points_at_m(t_s) - wall.start_points_m for wall in obstacles]
     rows = np.concatenate(displacements_m)
     prescribed = np.argwhere(np.isfinite(rows))
     boundary = "".join(
-        f"{n + 1},{a + 1},{a + 1},{_fields(float(rows[n, a]))}\n" for n, a in prescribed
+        f"{n + 1},{a + 1},{a + 1},{_format_numbers(float(rows[n, a]))}\n" for n, a in prescribed
     )
-    prints = "".join(f"*NODE PRINT,NSET=W{k},TOTALS=ONLY\nRF\n" for k in range(len(touched)))
-    loaded = np.argwhere(body.loads_n)
-    loads = "".join(f"{n + 1},{a + 1},{_fields(float(body.loads_n[n, a]))}\n" for n, a in loaded)
+    prints = "".join(f"*NODE PRINT,NSET=W{k},TOTALS=ONLY\nRF\n" for k in range(len(obstacles)))
+    loaded = np.argwhere(body.node_loads_n)
+    loads = "".join(
+        f"{n + 1},{a + 1},{_format_numbers(float(body.node_loads_n[n, a]))}\n" for n, a in loaded
+    )
     pull = float(np.linalg.norm(body.experiment.gravity_m_s2))
     direction = body.experiment.gravity_m_s2 / pull if pull else np.zeros(3)
-    weight = f"*DLOAD\nBODY,GRAV,{_fields(pull)},{_fields(*direction)}\n" if pull else ""
+    weight = (
+        f"*DLOAD\nBODY,GRAV,{_format_numbers(pull)},{_format_numbers(*direction)}\n" if pull else ""
+    )
     return (
-        f"*STEP,INC=1000{'' if linear else ',NLGEOM'}\n*STATIC\n{'1.,1.' if linear else '0.1,1.'}\n"
+        f"*STEP,INC=1000{'' if is_linear else ',NLGEOM'}\n"
+        f"*STATIC\n{'1.,1.' if is_linear else '0.1,1.'}\n"
         + (f"*BOUNDARY\n{boundary}" if boundary else "")
         + (f"*CLOAD\n{loads}" if loads else "")
         + f"{weight}*NODE PRINT,NSET=ALL\nU\n{prints}*NODE FILE\nU\n*EL FILE\nS\n*END STEP\n"
     )
 
 
-def _fields(*values: float) -> str:
+def _format_numbers(*values: float) -> str:
     """Return numbers for a line of the deck, separated by commas.
 
     CalculiX cuts off a number after 20 characters, even within its exponent.
@@ -147,23 +166,23 @@ def _fields(*values: float) -> str:
     return ",".join(f"{float(value):.12g}" for value in values)
 
 
-def _material(region: IdentifiedRegion, linear: bool) -> tuple[str, str]:
+def _material_card(region: IdentifiedRegion, is_linear: bool) -> tuple[str, str]:
     """Return the card of a material, and a sentence on what the card does not express ("" if
     nothing).
 
-    `linear` says whether the analysis is geometrically linear.
+    `is_linear` says whether the analysis is geometrically linear.
     """
     c: Mapping[str, float] = region.constants
     volume = 2 / region.kappa_pa
     if region.material in ("st-venant-kirchhoff", "linear"):
         limitation = ""
-        if region.material == "linear" and not linear:
+        if region.material == "linear" and not is_linear:
             limitation = (
                 "beside large strains the linear material becomes St. Venant and Kirchhoff's"
             )
-        return f"*ELASTIC\n{_fields(region.young_pa, region.poisson)}\n", limitation
+        return f"*ELASTIC\n{_format_numbers(region.young_pa, region.poisson)}\n", limitation
     if region.material == "mooney-rivlin":
-        numbers = _fields(c["c10_pa"], c["c01_pa"], volume)
+        numbers = _format_numbers(c["c10_pa"], c["c01_pa"], volume)
         return f"*HYPERELASTIC,MOONEY-RIVLIN\n{numbers}\n", ""
     if region.material in ("yeoh", "gent"):
         if region.material == "yeoh":
@@ -176,32 +195,35 @@ def _material(region: IdentifiedRegion, linear: bool) -> tuple[str, str]:
             limitation = (
                 f"Gent's energy is a series of three terms: right for Ī₁ − 3 well below {limit:.4g}"
             )
-        numbers = _fields(factors[0], factors[1], factors[2], volume, NO_TERM, NO_TERM)
+        numbers = _format_numbers(
+            factors[0], factors[1], factors[2], volume, ABSENT_TERM, ABSENT_TERM
+        )
         return f"*HYPERELASTIC,YEOH\n{numbers}\n", limitation
     if region.material == "arruda-boyce":
         stretch = c["chain_stretch"]
         slope = sum(
-            2 * a / stretch ** (2 * i - 2) * i * 3 ** (i - 1) for i, a in enumerate(_CHAINS, 1)
+            2 * a / stretch ** (2 * i - 2) * i * 3 ** (i - 1)
+            for i, a in enumerate(_ARRUDA_BOYCE_COEFFICIENTS, 1)
         )
-        numbers = _fields(c["mu_pa"] / slope, stretch, volume)
+        numbers = _format_numbers(c["mu_pa"] / slope, stretch, volume)
         return f"*HYPERELASTIC,ARRUDA-BOYCE\n{numbers}\n", (
             "its energy of the volume is ½ κ ((J² − 1)/2 − ln J), ours ½ κ (J − 1)²: the same at "
             "small changes of volume"
         )
-    numbers = _fields(region.mu_pa / 2, volume)
+    numbers = _format_numbers(region.mu_pa / 2, volume)
     return f"*HYPERELASTIC,NEO HOOKE\n{numbers}\n", (
         f"{region.material} becomes the neo-Hookean of Ī₁ with ½ κ (J − 1)²: the same λ and μ at "
         "small strain, another stress from the second order of the strain on"
     )
 
 
-def verify(body: Identified, folder: Path) -> list[Comparison]:
+def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     """Run CalculiX (`ccx`), and compare the largest displacement at rest and the forces of
     obstacles.
 
     Parameters
     ----------
-    body : Identified
+    body : IdentifiedBody
     folder : Path
         Folder with the deck, into which CalculiX writes its files.
 
@@ -216,32 +238,38 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
     try:
         job = [program, "-i", DECK.removesuffix(".inp")]
         ended = subprocess.run(
-            job, cwd=folder, capture_output=True, text=True, timeout=LONGEST_S, check=False
+            job, cwd=folder, capture_output=True, text=True, timeout=TIME_LIMIT_S, check=False
         )
     except subprocess.TimeoutExpired:
-        raise InputError(f"CalculiX took more than {LONGEST_S:g} s", folder / DECK) from None
-    times = _times_s(body)
-    theirs, their_forces = _last_printed(folder / "body.dat", len(body.nodes_m), len(times))
+        raise InputError(f"CalculiX took more than {TIME_LIMIT_S:g} s", folder / DECK) from None
+    times = _step_times_s(body)
+    theirs, their_forces = _read_final_state(folder / "body.dat", len(body.nodes_m), len(times))
     if theirs is None:
         messages = [x for x in ended.stdout.splitlines() if "ERROR" in x] or [
             "no displacements written"
         ]
         raise InputError(f"CalculiX failed: {messages[0].strip()}", folder / DECK)
-    (*_, ours), (*_, forces) = at_rest(body, len(times))
-    sag_m = longest(ours)
-    difference_m = longest(theirs - ours)
+    (*_, ours), (*_, forces) = equilibria(body, len(times))
+    sag_m = longest_displacement_m(ours)
+    difference_m = longest_displacement_m(theirs - ours)
     share = f" ({difference_m / sag_m:.2%} of it)" if sag_m else ""
     remark = f"no node is further than {difference_m:.3g} m apart{share}"
     what = "at rest" if len(times) == 1 else f"at {times[-1]:g} s"
-    comparisons = [Comparison(f"largest displacement {what}", longest(theirs), sag_m, "m", remark)]
+    comparisons = [
+        PredictionComparison(
+            f"largest displacement {what}", longest_displacement_m(theirs), sag_m, "m", remark
+        )
+    ]
     for each, push, force in zip(body.obstacles, their_forces, forces, strict=True):
         their_n = float(np.linalg.norm(push))
         our_n = float(np.linalg.norm(force))
-        comparisons.append(Comparison(f"force of {each.name} {what}", their_n, our_n, "N"))
+        comparisons.append(
+            PredictionComparison(f"force of {each.name} {what}", their_n, our_n, "N")
+        )
     return comparisons
 
 
-def _last_printed(file: Path, count: int, steps: int) -> tuple[Array | None, Array]:
+def _read_final_state(file: Path, count: int, steps: int) -> tuple[Array | None, Array]:
     """Return the displacements (n, 3) [m] and obstacle forces (o, 3) [N] at the end of the last
     step.
 

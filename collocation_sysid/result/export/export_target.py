@@ -18,7 +18,7 @@ from ...fem.refinement import split_in_eight
 from ...model.forces import Forces
 from ...program.initial_equilibrium import equilibrium
 from ...program.simulation import simulate
-from .identified import Identified
+from .identified import IdentifiedBody
 from .obstacle_shapes import Primitive
 
 LINEAR_ONLY = (
@@ -29,7 +29,7 @@ MEAN_DILATATION = (
     "tet10-p0 becomes the plain quadratic tetrahedron: where ν is near ½ it is too stiff "
     "(ν = {worst:.4g} here)"
 )
-MEMORY = (
+VISCOELASTICITY = (
     "memory is not known; the stiffness is the long-term one, at once it is {at_once:.4g} "
     "times that"
 )
@@ -37,28 +37,28 @@ MOTION = (
     "grasped nodes are held where they are at the first sample; poses_1.csv and so on have the "
     "motion, which something has to drive"
 )
-UNTRIED = (
+UNTESTED = (
     "untested: written after the description of the format, never read by the simulator itself"
 )
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportedFiles:
     """Files of an export.
 
     Attributes
     ----------
     files : mapping of file name to text
-    limits : tuple of str
+    limitations : tuple of str
         What the target cannot express, and what was done instead.
     """
 
     files: Mapping[str, str]
-    limits: tuple[str, ...]
+    limitations: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Comparison:
+class PredictionComparison:
     """One quantity as predicted by the target (`theirs`) and by this package (`ours`), in `unit`.
 
     `what` names the quantity, `remark` adds a sentence.
@@ -71,13 +71,13 @@ class Comparison:
     remark: str = ""
 
     @property
-    def relative(self) -> float:
+    def relative_difference(self) -> float:
         """Relative difference (theirs − ours) / ours; NaN if ours is zero."""
         return (self.theirs - self.ours) / self.ours if self.ours else float("nan")
 
 
 @dataclass(frozen=True)
-class Target:
+class ExportTarget:
     """Simulator to which a body can be exported.
 
     Attributes
@@ -93,68 +93,70 @@ class Target:
     """
 
     name: str
-    export: Callable[[Identified], Exported]
-    verify: Callable[[Identified, Path], Sequence[Comparison]] | None = None
+    export: Callable[[IdentifiedBody], ExportedFiles]
+    verify: Callable[[IdentifiedBody, Path], Sequence[PredictionComparison]] | None = None
 
 
 @dataclass(frozen=True)
-class Holds:
+class TargetCapabilities:
     """Features of a body that a simulator can express; all others become limitations of an export.
 
     Attributes
     ----------
     materials : mapping of str to str
-        Names in the simulator of the materials that it has; all others become what `instead`
-        states.
-    instead, stiffness_damping, mass_damping : str
+        Names in the simulator of the materials that it has; all others become what
+        `other_materials` states.
+    other_materials, stiffness_damping, mass_damping : str
         Sentences on other materials, and on the two kinds of damping; they may contain `{material}`
         and
         the names of constants of a region. Empty if the simulator expresses the damping.
-    damping : str
+    damping_law : str
         Name of the damping law that the simulator has, for which no sentence is needed.
-    memory, motion, drives, quadratic : bool
+    has_viscoelasticity, has_moving_grasps, has_moving_obstacles, has_quadratic_elements : bool
         Whether it has viscoelastic branches, moving grasps, moving obstacles, and elements with
         nodes on
         their edges (which are split otherwise).
-    forces : str
+    node_forces : str
         Sentence for forces on nodes; empty if the simulator has them.
-    shapes : tuple of str
+    obstacle_shapes : tuple of str
         Kinds of `Primitive` that obstacles may have.
-    roundings, faces, friction : bool
+    has_rounded_edges, has_contact_faces, has_friction : bool
         Whether obstacles may have rounded edges, be limited to some faces of the body, and have
         friction.
-    tried : bool
+    is_tested : bool
         Whether such files have been read by the simulator itself.
     """
 
     materials: Mapping[str, str]
-    instead: str = "{material} becomes the neo-Hookean material of the same λ and μ at small strain"
+    other_materials: str = (
+        "{material} becomes the neo-Hookean material of the same λ and μ at small strain"
+    )
     stiffness_damping: str = ""
     mass_damping: str = "γ_m = {gamma_m_1_s:.4g} 1/s is not known"
-    damping: str = ""
-    memory: bool = False
-    motion: bool = False
-    drives: bool = False
-    forces: str = "forces on nodes are left out"
-    quadratic: bool = False
-    shapes: tuple[str, ...] = ("plane", "sphere", "box", "cylinder", "capsule")
-    roundings: bool = True
-    faces: bool = True
-    friction: bool = True
-    tried: bool = True
+    damping_law: str = ""
+    has_viscoelasticity: bool = False
+    has_moving_grasps: bool = False
+    has_moving_obstacles: bool = False
+    node_forces: str = "forces on nodes are left out"
+    has_quadratic_elements: bool = False
+    obstacle_shapes: tuple[str, ...] = ("plane", "sphere", "box", "cylinder", "capsule")
+    has_rounded_edges: bool = True
+    has_contact_faces: bool = True
+    has_friction: bool = True
+    is_tested: bool = True
 
-    def lost(self, body: Identified) -> list[str]:
+    def limitations(self, body: IdentifiedBody) -> list[str]:
         """Return sentences on what the simulator cannot express of a body, and what was done
         instead.
         """
-        sentences = [*_never_held(body)]
-        sentences += self._lost_of_obstacles(body)
+        sentences = [*_common_limitations(body)]
+        sentences += self._obstacle_limitations(body)
         for region in body.regions:
             damped = bool(region.gamma_r_s)
             templates = [
-                *[MEMORY] * (bool(region.branches) and not self.memory),
-                *[self.instead] * (region.material not in self.materials),
-                *[self.stiffness_damping] * (damped and region.damping != self.damping),
+                *[VISCOELASTICITY] * (bool(region.branches) and not self.has_viscoelasticity),
+                *[self.other_materials] * (region.material not in self.materials),
+                *[self.stiffness_damping] * (damped and region.damping != self.damping_law),
                 *[self.mass_damping] * bool(region.gamma_m_1_s),
             ]
             at_once = 1 + sum(branch.share for branch in region.branches)
@@ -162,34 +164,34 @@ class Holds:
             sentences += [
                 f"{region.name}: {each.format(**values)}" for each in filter(None, templates)
             ]
-        if not self.motion:
+        if not self.has_moving_grasps:
             sentences.append(MOTION)
-        if body.quadratic and not self.quadratic:
+        if body.is_quadratic and not self.has_quadratic_elements:
             sentences.append(LINEAR_ONLY)
         elif body.body.element.mean_dilatation:
             worst = max(region.poisson for region in body.regions)
             sentences.append(MEAN_DILATATION.format(worst=worst))
-        if body.experiment.forces and self.forces:
-            sentences.append(self.forces)
-        return sentences if self.tried else [*sentences, UNTRIED]
+        if body.experiment.forces and self.node_forces:
+            sentences.append(self.node_forces)
+        return sentences if self.is_tested else [*sentences, UNTESTED]
 
-    def _lost_of_obstacles(self, body: Identified) -> Iterator[str]:
+    def _obstacle_limitations(self, body: IdentifiedBody) -> Iterator[str]:
         """Yield sentences on what the simulator cannot express of the obstacles."""
         for each in body.obstacles:
-            if (kind := Primitive.of(each.shape).kind) not in self.shapes:
+            if (kind := Primitive.from_solid(each.shape).kind) not in self.obstacle_shapes:
                 yield f"{each.name}: what the body may touch is not exported if it is a {kind}"
                 continue
-            if getattr(each.shape, "rounding_m", 0.0) and not self.roundings:
+            if getattr(each.shape, "rounding_m", 0.0) and not self.has_rounded_edges:
                 yield f"{each.name}: its edges are not rounded"
-            if each.faces is not None and not self.faces:
+            if each.faces is not None and not self.has_contact_faces:
                 yield f"{each.name}: all of the body may touch it"
-            if each.friction and not self.friction:
+            if each.friction and not self.has_friction:
                 yield f"{each.name}: nothing rubs on it"
-            if len(each.poses.t_s) > 1 and not self.drives:
+            if len(each.poses.t_s) > 1 and not self.has_moving_obstacles:
                 yield f"{each.name} is where it is at the first sample; its poses have the motion"
 
 
-def _never_held(body: Identified) -> Iterator[str]:
+def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
     """Yield sentences on what none of the targets can express."""
     e = body.experiment
     times = body.experiment.t_s
@@ -208,25 +210,25 @@ def _never_held(body: Identified) -> Iterator[str]:
         yield "grasps that begin or end to hold within the recording stay as they begin"
 
 
-def at_rest(body: Identified, samples: int = 1) -> tuple[Array, Array]:
+def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
     """Return the equilibria of this package at the first samples, without the loads that exports
     omit.
 
     Parameters
     ----------
-    body : Identified
+    body : IdentifiedBody
     samples : int
         Number of samples; more than one for static recordings only.
 
     Returns
     -------
     moved_m : (T, n, 3)
-        Displacements of the nodes from `Identified.nodes_m`.
+        Displacements of the nodes from `IdentifiedBody.nodes_m`.
     forces_n : (T, o, 3)
         Forces of each obstacle on the body.
     """
     experiment = replace(
-        body.touching or body.experiment,
+        body.experiment_with_obstacles or body.experiment,
         tendons=(),
         pressures=(),
         loaded_since_s=np.inf,
@@ -247,27 +249,29 @@ def at_rest(body: Identified, samples: int = 1) -> tuple[Array, Array]:
     return moved_m, np.stack(on_body, axis=1) if on_body else np.zeros((samples, 0, 3))
 
 
-def longest(way_m: Array) -> float:
+def longest_displacement_m(displacements_m: Array) -> float:
     """Return the largest length of displacements (n, 3)."""
-    return float(np.linalg.norm(way_m, axis=1).max())
+    return float(np.linalg.norm(displacements_m, axis=1).max())
 
 
-def linear_cells(body: Identified) -> list[Index]:
+def linear_tetrahedra(body: IdentifiedBody) -> list[Index]:
     """Return the linear tetrahedra (k, 4) of each region; quadratic ones are split on the same
     nodes.
     """
-    if not body.quadratic:
+    if not body.is_quadratic:
         return [body.body.cells[region.cells] for region in body.regions]
     eight = split_in_eight(body.body.mesh).tetrahedra.reshape(-1, 8, 4)
     return [eight[region.cells].reshape(-1, 4) for region in body.regions]
 
 
-def numbers(values: Iterable[float] | Array, separator: str = " ") -> str:
+def numbers_as_text(values: Iterable[float] | Array, separator: str = " ") -> str:
     """Return numbers as text from which they are read back exactly."""
     return separator.join(repr(float(value)) for value in np.ravel(np.asarray(values)))
 
 
-def heading(body: Identified, limits: Iterable[str], start: str, end: str = "") -> str:
+def comment_lines(
+    body: IdentifiedBody, limitations: Iterable[str], start: str, end: str = ""
+) -> str:
     """Return comment lines on the body: title, warnings, limitations, and constants of each region.
 
     Each line begins with `start` and ends with `end`, the marks of a comment in the format.
@@ -275,7 +279,7 @@ def heading(body: Identified, limits: Iterable[str], start: str, end: str = "") 
     lines = [
         f"{body.title}: as identified; SI units",
         *(f"warning: {warning}" for warning in body.warnings),
-        *(f"not expressed: {limit}" for limit in limits),
+        *(f"not expressed: {limit}" for limit in limitations),
     ]
     for region in body.regions:
         lines.append(
@@ -289,6 +293,6 @@ def heading(body: Identified, limits: Iterable[str], start: str, end: str = "") 
     return "".join(f"{start}{text}{end}\n" for text in texts)
 
 
-def attribute(text: str) -> str:
+def xml_attribute(text: str) -> str:
     """Return a name as a quoted attribute of XML, with marks in place of control characters."""
     return quoteattr(printable(text))

@@ -9,14 +9,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...array_types import Index
-from .export_target import Exported, Holds, heading, numbers
-from .identified import Identified, IdentifiedRegion
-from .obstacle_shapes import Wall, walls
+from .export_target import ExportedFiles, TargetCapabilities, comment_lines, numbers_as_text
+from .identified import IdentifiedBody, IdentifiedRegion
+from .obstacle_shapes import FacetedObstacle, faceted_obstacles
 
 MODEL = "body.feb"
 # Number of the volumetric energy ½ κ (J − 1)² among those of an uncoupled material.
-SQUARE = 2
-HOLDS = Holds(
+QUADRATIC_PRESSURE_MODEL = 2
+CAPABILITIES = TargetCapabilities(
     {
         "mooney-rivlin": "Mooney-Rivlin",
         "neo-hookean": "neo-Hookean",
@@ -28,52 +28,57 @@ HOLDS = Holds(
     "γ_r (λ + 2/3 μ) is kelvin-voigt, but for the ratio of volumes J",
     mass_damping="γ_m = {gamma_m_1_s:.4g} 1/s is not exported; in a dynamic step a body load "
     '"mass damping" is it',
-    memory=True,
-    forces="",
-    quadratic=True,
-    tried=False,
+    has_viscoelasticity=True,
+    node_forces="",
+    has_quadratic_elements=True,
+    is_tested=False,
 )
 
 
-def export(body: Identified) -> Exported:
+def export(body: IdentifiedBody) -> ExportedFiles:
     """Return the model of a static step with growing loads, and what FEBio cannot express."""
-    limits = HOLDS.lost(body)
-    materials = "".join(_material(k, region, limits) for k, region in enumerate(body.regions, 1))
-    if body.loads_n.any():
+    limits = CAPABILITIES.limitations(body)
+    materials = "".join(
+        _material_xml(k, region, limits) for k, region in enumerate(body.regions, 1)
+    )
+    if body.node_loads_n.any():
         limits.append("point masses and forces on nodes are left out")
-    xml = '<?xml version="1.0" encoding="UTF-8"?>\n' + heading(body, limits, "<!-- ", " -->")
+    xml = '<?xml version="1.0" encoding="UTF-8"?>\n' + comment_lines(body, limits, "<!-- ", " -->")
     xml += '<febio_spec version="4.0">\n<Module type="solid"/>\n'
     xml += (
         "<Control><analysis>STATIC</analysis><time_steps>10</time_steps>"
         "<step_size>0.1</step_size></Control>\n"
     )
-    obstacles = walls(body)
+    obstacles = faceted_obstacles(body)
     for wall in range(len(obstacles)):
         materials += (
             f'<material id="{len(body.regions) + wall + 1}" name="wall_{wall}" type="rigid body">'
             "<density>1</density></material>\n"
         )
-    xml += f"<Material>\n{materials}</Material>\n{_mesh(body, obstacles)}{_boundary(body)}"
-    xml += _touching(obstacles)
+    xml += f"<Material>\n{materials}</Material>\n"
+    xml += f"{_mesh_xml(body, obstacles)}{_prescribed_displacement_xml(body)}"
+    xml += _contact_xml(obstacles)
     # A body load pushes against the vector that it is given.
-    against = numbers(-body.experiment.gravity_m_s2, ",")
+    against = numbers_as_text(-body.experiment.gravity_m_s2, ",")
     xml += (
         f'<Loads><body_load type="body force"><force lc="1">{against}</force></body_load></Loads>\n'
         '<LoadData><load_controller id="1" type="loadcurve"><interpolate>LINEAR</interpolate>'
         "<points><pt>0,0</pt><pt>1,1</pt></points></load_controller></LoadData>\n"
         '<Output><plotfile type="febio"><var type="displacement"/></plotfile></Output>\n'
     )
-    return Exported({MODEL: f"{xml}</febio_spec>\n"}, tuple(limits))
+    return ExportedFiles({MODEL: f"{xml}</febio_spec>\n"}, tuple(limits))
 
 
-def _material(number: int, region: IdentifiedRegion, limits: list[str]) -> str:
+def _material_xml(number: int, region: IdentifiedRegion, limits: list[str]) -> str:
     """Return the XML of the material numbered `number` from 1; limitations are appended to
     `limits`.
     """
-    kind, values, uncoupled = _law(region, limits)
+    kind, values, uncoupled = _elastic_law(region, limits)
     inner = "".join(f"<{tag}>{value!r}</{tag}>" for tag, value in values.items())
     if uncoupled:
-        inner += f"<k>{region.kappa_pa!r}</k><pressure_model>{SQUARE}</pressure_model>"
+        inner += (
+            f"<k>{region.kappa_pa!r}</k><pressure_model>{QUADRATIC_PRESSURE_MODEL}</pressure_model>"
+        )
     density = f"<density>{region.density_kg_m3!r}</density>"
     name = f'name="{region.name}"'
     if not region.branches:
@@ -93,7 +98,7 @@ def _material(number: int, region: IdentifiedRegion, limits: list[str]) -> str:
     )
 
 
-def _law(region: IdentifiedRegion, limits: list[str]) -> tuple[str, dict[str, float], bool]:
+def _elastic_law(region: IdentifiedRegion, limits: list[str]) -> tuple[str, dict[str, float], bool]:
     """Return the type of a material, its constants, and whether it is uncoupled into shape and
     volume.
 
@@ -101,39 +106,41 @@ def _law(region: IdentifiedRegion, limits: list[str]) -> tuple[str, dict[str, fl
     """
     c = region.constants
     if region.material == "mooney-rivlin":
-        return HOLDS.materials[region.material], {"c1": c["c10_pa"], "c2": c["c01_pa"]}, True
+        return CAPABILITIES.materials[region.material], {"c1": c["c10_pa"], "c2": c["c01_pa"]}, True
     moduli = {"E": region.young_pa, "v": region.poisson}
     if region.material == "linear":
         limits.append(f"{region.name}: a linear material turns with the body there, ours does not")
-    return HOLDS.materials.get(region.material, "neo-Hookean"), moduli, False
+    return CAPABILITIES.materials.get(region.material, "neo-Hookean"), moduli, False
 
 
-def _mesh(body: Identified, touched: Sequence[Wall]) -> str:
+def _mesh_xml(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) -> str:
     """Return the XML of nodes, elements, sets and prescribed displacements of the body and the
     obstacles.
     """
-    solids, facets = _walls(body, touched)
+    solids, facets = _obstacle_mesh_xml(body, obstacles)
     xml = '<Mesh>\n<Nodes name="nodes">\n'
     for k, point in enumerate(body.nodes_m, 1):
-        xml += f'<node id="{k}">{numbers(point, ",")}</node>\n'
+        xml += f'<node id="{k}">{numbers_as_text(point, ",")}</node>\n'
     xml += f"</Nodes>\n{solids}"
     for region in body.regions:
-        kind = "tet10" if body.quadratic else "tet4"
+        kind = "tet10" if body.is_quadratic else "tet4"
         xml += f'<Elements type="{kind}" name="cells_{region.name}">\n'
         for cell, nodes in zip(region.cells, body.body.cells[region.cells] + 1, strict=True):
             xml += f'<elem id="{cell + 1}">{",".join(map(str, nodes))}</elem>\n'
         xml += "</Elements>\n"
-    for axis, is_prescribed in zip("xyz", body.held.T, strict=True):
+    for axis, is_prescribed in zip("xyz", body.is_prescribed.T, strict=True):
         if is_prescribed.any():
             nodes = ",".join(map(str, np.flatnonzero(is_prescribed) + 1))
             xml += f'<NodeSet name="held_{axis}">{nodes}</NodeSet>\n'
     xml += facets
     domains = "".join(
         f'<SolidDomain name="cells_{name}" mat="{name}"/>\n'
-        for name in [r.name for r in body.regions] + [f"wall_{k}" for k in range(len(touched))]
+        for name in [r.name for r in body.regions] + [f"wall_{k}" for k in range(len(obstacles))]
     )
     maps = ""
-    for axis, is_prescribed, displacement in zip("xyz", body.held.T, body.moved_m.T, strict=True):
+    for axis, is_prescribed, displacement in zip(
+        "xyz", body.is_prescribed.T, body.prescribed_displacements_m.T, strict=True
+    ):
         if displacement.any():
             rows = "".join(
                 f'<node lid="{i}">{float(v)!r}</node>'
@@ -144,12 +151,14 @@ def _mesh(body: Identified, touched: Sequence[Wall]) -> str:
     return f"{xml}</Mesh>\n<MeshDomains>\n{domains}</MeshDomains>\n{data}"
 
 
-def _boundary(body: Identified) -> str:
+def _prescribed_displacement_xml(body: IdentifiedBody) -> str:
     """Return the XML of the prescribed displacements: zero, or the way to where a second grasp
     holds the nodes.
     """
     conditions = ""
-    for axis, is_prescribed, displacement in zip("xyz", body.held.T, body.moved_m.T, strict=True):
+    for axis, is_prescribed, displacement in zip(
+        "xyz", body.is_prescribed.T, body.prescribed_displacements_m.T, strict=True
+    ):
         where = f'name="hold_{axis}" node_set="held_{axis}"'
         if displacement.any():
             conditions += (
@@ -161,7 +170,9 @@ def _boundary(body: Identified) -> str:
     return f"<Boundary>\n{conditions}</Boundary>\n"
 
 
-def _walls(body: Identified, touched: Sequence[Wall]) -> tuple[str, str]:
+def _obstacle_mesh_xml(
+    body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]
+) -> tuple[str, str]:
     """Return the XML of the obstacles' nodes and elements, and that of the contact surfaces.
 
     Each obstacle has a tetrahedron under each facet.
@@ -169,17 +180,17 @@ def _walls(body: Identified, touched: Sequence[Wall]) -> tuple[str, str]:
     solids = ""
     facets = ""
     corners = body.body.mesh.surface
-    for k, wall in enumerate(touched):
+    for k, wall in enumerate(obstacles):
         nodes = "".join(
-            f'<node id="{i}">{numbers(point, ",")}</node>\n'
-            for i, point in enumerate(wall.start_m, wall.nodes + 1)
+            f'<node id="{i}">{numbers_as_text(point, ",")}</node>\n'
+            for i, point in enumerate(wall.start_points_m, wall.first_node + 1)
         )
-        cells = _rows("elem", wall.tetrahedra + 1, wall.cells)
+        cells = _numbered_elements("elem", wall.tetrahedra + 1, wall.first_cell)
         solids += f'<Nodes name="nodes_wall_{k}">\n{nodes}</Nodes>\n'
         solids += f'<Elements type="tet4" name="cells_wall_{k}">\n{cells}</Elements>\n'
         touching = body.body.nodes.nodes_of_faces(corners[wall.faces]) + 1
         for name, sides in (("body", touching), ("wall", wall.triangles + 1)):
-            rows = _rows(f"tri{sides.shape[1]}", sides)
+            rows = _numbered_elements(f"tri{sides.shape[1]}", sides)
             facets += f'<Surface name="{name}_side_{k}">\n{rows}</Surface>\n'
         facets += (
             f'<SurfacePair name="pair_{k}"><primary>body_side_{k}</primary>'
@@ -188,15 +199,15 @@ def _walls(body: Identified, touched: Sequence[Wall]) -> tuple[str, str]:
     return solids, facets
 
 
-def _rows(tag: str, rows: Index, after: int = 0) -> str:
-    """Return XML elements called `tag`, one for each row, numbered from `after` + 1."""
+def _numbered_elements(tag: str, rows: Index, offset: int = 0) -> str:
+    """Return XML elements called `tag`, one for each row, numbered from `offset` + 1."""
     return "".join(
         f'<{tag} id="{k}">{",".join(map(str, row))}</{tag}>\n'
-        for k, row in enumerate(rows.tolist(), after + 1)
+        for k, row in enumerate(rows.tolist(), offset + 1)
     )
 
 
-def _touching(touched: Sequence[Wall]) -> str:
+def _contact_xml(obstacles: Sequence[FacetedObstacle]) -> str:
     """Return the XML of the obstacles' motion and contact; "" without obstacles.
 
     An obstacle begins where it does not touch the body and moves to its place. Its pressure is
@@ -204,10 +215,10 @@ def _touching(touched: Sequence[Wall]) -> str:
     """
     driven = ""
     contacts = ""
-    for k, wall in enumerate(touched):
+    for k, wall in enumerate(obstacles):
         fixed = "".join(f"<{dof}_dof>1</{dof}_dof>" for dof in ("Ru", "Rv", "Rw"))
         driven += f'<rigid_bc type="rigid_fixed"><rb>wall_{k}</rb>{fixed}</rigid_bc>\n'
-        for axis, way in zip("xyz", -wall.back_m, strict=True):
+        for axis, way in zip("xyz", -wall.retraction_m, strict=True):
             driven += (
                 f'<rigid_bc type="rigid_displacement"><rb>wall_{k}</rb><dof>{axis}</dof>'
                 f'<value lc="1">{float(way)!r}</value><relative>0</relative></rigid_bc>\n'
@@ -218,4 +229,4 @@ def _touching(touched: Sequence[Wall]) -> str:
             "<auto_penalty>0</auto_penalty><symmetric_stiffness>0</symmetric_stiffness>"
             f"<fric_coeff>{float(wall.obstacle.friction)!r}</fric_coeff></contact>\n"
         )
-    return f"<Rigid>\n{driven}</Rigid>\n<Contact>\n{contacts}</Contact>\n" if touched else ""
+    return f"<Rigid>\n{driven}</Rigid>\n<Contact>\n{contacts}</Contact>\n" if obstacles else ""

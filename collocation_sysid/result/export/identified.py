@@ -25,11 +25,11 @@ from ...recording import Experiment, Markers, Obstacle
 from ...recording.obstacle_solids import solid_key
 from ...runs.result_content import ReportedEstimate, Result
 from ...runs.warm_start import WarmStart
-from ..replay import Replay, read_arrays, reading_run
+from ..replay import MotionRecord, damaged_run_refused, read_arrays
 
 
 @dataclass(frozen=True)
-class Branch:
+class IdentifiedBranch:
     """Viscoelastic branch: share of the long-term stiffness, and relaxation time [s]."""
 
     name: str
@@ -73,7 +73,7 @@ class IdentifiedRegion:
     damping: str
     gamma_r_s: float
     gamma_m_1_s: float
-    branches: tuple[Branch, ...]
+    branches: tuple[IdentifiedBranch, ...]
 
     @property
     def kappa_pa(self) -> float:
@@ -81,7 +81,7 @@ class IdentifiedRegion:
         return self.lambda_pa + 2 / 3 * self.mu_pa
 
 
-def alone(experiment: Experiment) -> Experiment:
+def without_obstacles(experiment: Experiment) -> Experiment:
     """Return an experiment without its obstacles, which simulators have as separate objects.
 
     Measurements are replaced by one placeholder marker, because there may be none on the body.
@@ -111,7 +111,7 @@ def alone(experiment: Experiment) -> Experiment:
 
 
 @dataclass(frozen=True, eq=False)
-class Identified:
+class IdentifiedBody:
     """Body as a run identified it, in the grasp of one of its recordings.
 
     Attributes
@@ -128,9 +128,9 @@ class Identified:
         Constants of the body.
     experiment : Experiment
         The recording with corrected gravity and grasps, and without obstacles.
-    rolled_out_m : (T, n, 3) or None
+    simulated_m : (T, n, 3) or None
         Forward simulation of this package at the samples.
-    touching : Experiment or None
+    experiment_with_obstacles : Experiment or None
         The recording with its obstacles, whose friction coefficients are numbers; None without
         obstacles.
     """
@@ -142,13 +142,13 @@ class Identified:
     body: Body
     theta: Array
     experiment: Experiment
-    rolled_out_m: Array | None
-    touching: Experiment | None = None
+    simulated_m: Array | None
+    experiment_with_obstacles: Experiment | None = None
 
     @classmethod
     def read(
         cls, run: str | Path, experiment: str | None = None, allow_code: bool = False
-    ) -> Identified:
+    ) -> IdentifiedBody:
         """Read the body from a run folder.
 
         Parameters
@@ -169,7 +169,7 @@ class Identified:
         result = Result.read(folder)
         answer = WarmStart.from_result(result, folder)
         home = result.problem_folder(folder, "which export needs")
-        with reading_run(folder):
+        with damaged_run_refused(folder):
             warnings = _warnings(result)
         problem = Problem.read(folder / "problem.toml", allow_code=allow_code, folder=home)
         problem = problem.with_lengths(
@@ -192,13 +192,13 @@ class Identified:
                 f"no experiment {experiment!r} was fitted; expected {', '.join(names)}", folder
             )
         segment = collocation.transcriptions[names.index(experiment) if experiment else 0]
-        with reading_run(folder):
+        with damaged_run_refused(folder):
             values = {
                 item.name: result.parameters[item.name].value for item in problem.parameters.items
             }
         phi = answer.apply_to_nuisance(collocation)[0][segment.nuisance_indices.indices]
-        with reading_run(folder):
-            replay = Replay.from_arrays(segment.experiment.name, read_arrays(folder))
+        with damaged_run_refused(folder):
+            replay = MotionRecord.from_arrays(segment.experiment.name, read_arrays(folder))
             body = segment.body
             if replay.undeformed_m.shape != body.nodes.points_m.shape:
                 raise ValueError("the mesh is not that of the problem file")
@@ -211,7 +211,7 @@ class Identified:
         touching = corrected.with_obstacles(obstacles) if obstacles else None
         if obstacles:
             with located(folder):
-                corrected = alone(corrected)
+                corrected = without_obstacles(corrected)
             body = corrected.body
             rolled_out_m = None if rolled_out_m is None else rolled_out_m[:, : len(body.nodes_m)]
         return cls(
@@ -229,7 +229,11 @@ class Identified:
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
         """Obstacles with which the body may come into contact."""
-        return () if self.touching is None else self.touching.obstacles
+        return (
+            ()
+            if self.experiment_with_obstacles is None
+            else self.experiment_with_obstacles.obstacles
+        )
 
     @property
     def start_s(self) -> float:
@@ -242,36 +246,36 @@ class Identified:
         return self.experiment.rigid_positions([self.start_s])[0]
 
     @cached_property
-    def held(self) -> NDArray[np.bool_]:
+    def is_prescribed(self) -> NDArray[np.bool_]:
         """Whether a node's coordinate has a prescribed displacement at the first sample (n, 3)."""
         return self.experiment.is_prescribed([self.start_s])[0]
 
     @cached_property
-    def held_m(self) -> Array:
+    def prescribed_m(self) -> Array:
         """Prescribed coordinates (n, 3) at the first sample, NaN where a coordinate is free."""
         return self.experiment.prescribed_displacements([self.start_s])[1][0]
 
     @property
-    def grasped(self) -> NDArray[np.bool_]:
+    def is_node_prescribed(self) -> NDArray[np.bool_]:
         """Whether a node is prescribed along all axes at the first sample (n,)."""
-        return np.asarray(self.held.all(axis=1))
+        return np.asarray(self.is_prescribed.all(axis=1))
 
     @cached_property
-    def moved_m(self) -> Array:
+    def prescribed_displacements_m(self) -> Array:
         """Prescribed coordinates minus `nodes_m` (n, 3), and 0 where a coordinate is free.
 
         It is not zero where a second grasp holds nodes elsewhere than the rigidly placed body has
         them.
         """
-        return np.nan_to_num(self.held_m - self.nodes_m)
+        return np.nan_to_num(self.prescribed_m - self.nodes_m)
 
     @property
-    def quadratic(self) -> bool:
+    def is_quadratic(self) -> bool:
         """Whether the elements have nodes on their edges."""
         return self.body.element.nodes == 10
 
     @cached_property
-    def tied_kg(self) -> Array:
+    def point_masses_kg(self) -> Array:
         """Point masses attached to the nodes (n,) at the first sample."""
         return self.experiment.point_mass_at_nodes_kg([self.start_s])[0]
 
@@ -281,16 +285,16 @@ class Identified:
         return self.body.mass_of_dofs(self.theta)[::3]
 
     @cached_property
-    def mass_kg(self) -> Array:
+    def total_node_mass_kg(self) -> Array:
         """Lumped mass at each node (n,), with point masses."""
-        return self.node_mass_kg + self.tied_kg
+        return self.node_mass_kg + self.point_masses_kg
 
     @cached_property
-    def loads_n(self) -> Array:
+    def node_loads_n(self) -> Array:
         """Forces on the nodes (n, 3) at the first sample, with the weight of point masses but not
         of the body.
         """
-        weight = self.tied_kg[:, None] * self.experiment.gravity_m_s2
+        weight = self.point_masses_kg[:, None] * self.experiment.gravity_m_s2
         return self.experiment.stated_node_forces_n([self.start_s])[0] + weight
 
     @cached_property
@@ -318,7 +322,9 @@ class Identified:
                     values.get("gamma_r_s", 0.0),
                     values.get("gamma_m_1_s", 0.0),
                     tuple(
-                        Branch(b.name, values[f"{b.name}.share"], values[f"{b.name}.tau_s"])
+                        IdentifiedBranch(
+                            b.name, values[f"{b.name}.share"], values[f"{b.name}.tau_s"]
+                        )
                         for b in part.prony
                     ),
                 )
@@ -350,7 +356,7 @@ class Identified:
             "nodes_m": self.nodes_m,
             "cells": body.cells,
             "node_mass_kg": self.node_mass_kg,
-            "tied_mass_kg": self.tied_kg,
+            "tied_mass_kg": self.point_masses_kg,
             "regions": self.regions,
             "experiment": e.name,
             "kind": e.kind,
@@ -363,7 +369,7 @@ class Identified:
                     "axes": grasp.axes,
                     "from_s": grasp.from_s,
                     "until_s": grasp.until_s,
-                    "positions_m": self.held_m[grasp.nodes],
+                    "positions_m": self.prescribed_m[grasp.nodes],
                     "pose_t_s": grasp.poses.t_s,
                     "pose_positions_m": grasp.poses.positions_m,
                     "pose_quaternions_xyzw": grasp.poses.quaternions_xyzw,
@@ -381,7 +387,7 @@ class Identified:
                 }
                 for each in self.obstacles
             ],
-            "node_loads_n": self.loads_n,
+            "node_loads_n": self.node_loads_n,
         }
 
 

@@ -18,25 +18,33 @@ from ...errors import InputError
 from ...model.forces import Forces
 from ...program.natural_modes import natural_modes
 from ...recording import Grasp, Solid
-from .export_target import Comparison, Exported, Holds, attribute, heading, linear_cells, numbers
-from .identified import Identified
-from .obstacle_shapes import Primitive, grown
+from .export_target import (
+    ExportedFiles,
+    PredictionComparison,
+    TargetCapabilities,
+    comment_lines,
+    linear_tetrahedra,
+    numbers_as_text,
+    xml_attribute,
+)
+from .identified import IdentifiedBody
+from .obstacle_shapes import Primitive, offset_solid
 
 MODEL = "body.xml"
 # Oldest major version: with 3.3 to 3.8 and 3.17 the first natural frequency is 10 % too high, with
 # 3.10 and 3.12 33 %.
-SINCE = 4
+OLDEST_VERSION = 4
 # Timestep over the largest one at which explicit damping and elasticity are stable.
-SAFE = 0.5
+STEP_SAFETY_FACTOR = 0.5
 # Half the thickness of the skin that collides, in mean edges.
-SKIN = 0.02
+RELATIVE_SKIN_RADIUS = 0.02
 # Mass of the body that carries grasped nodes over that of the specimen: the nodes do not move it.
-HEAVY = 1e3
+CARRIER_MASS_RATIO = 1e3
 # Displacement of nodes in the differences for the stiffness, in mean edges.
-PROBE = 1e-5
+RELATIVE_DIFFERENCE_STEP = 1e-5
 # Steps of a verified motion: some minutes.
-MOST_STEPS = 2_000_000
-HOLDS = Holds(
+MAX_STEPS = 2_000_000
+CAPABILITIES = TargetCapabilities(
     {"st-venant-kirchhoff": "flex"},
     "a flex is St. Venant and Kirchhoff's; {material} has the same E and ν at small strain, "
     "another stress from its second order on",
@@ -44,14 +52,14 @@ HOLDS = Holds(
     "at small strain",
     "damping by mass, γ_m = {gamma_m_1_s:.4g} 1/s, is not known, and MuJoCo refuses dampers on the "
     "nodes of a flex",
-    damping="material",
-    motion=True,
-    roundings=False,
-    faces=False,
+    damping_law="material",
+    has_moving_grasps=True,
+    has_rounded_edges=False,
+    has_contact_faces=False,
 )
 
 
-def export(body: Identified) -> Exported:
+def export(body: IdentifiedBody) -> ExportedFiles:
     """Return the model, whose key "start" is the state at the first sample.
 
     Raises
@@ -66,37 +74,38 @@ def export(body: Identified) -> Exported:
                 f"{grasp.until_s:g} s; a mocap body of MuJoCo holds nodes along all axes, "
                 "throughout: export to calculix or json"
             )
-    limits = HOLDS.lost(body)
+    limits = CAPABILITIES.limitations(body)
     if body.experiment.grasps:
         limits.append(
             "the weld of grasped nodes to the mocap bodies lags two steps behind: for a motion, "
             "set position and velocity of the free joints at every step, as --verify does"
         )
-    step_s = _step_s(body)
-    x = heading(body, limits, "<!-- ", " -->")
-    x += f"<mujoco model={attribute(body.title or 'body')}>\n"
-    gravity = numbers(body.experiment.gravity_m_s2)
+    step_s = _stable_step_s(body)
+    x = comment_lines(body, limits, "<!-- ", " -->")
+    x += f"<mujoco model={xml_attribute(body.title or 'body')}>\n"
+    gravity = numbers_as_text(body.experiment.gravity_m_s2)
     x += f'<option timestep="{step_s!r}" gravity="{gravity}" jacobian="sparse"/>\n'
-    x += f"<worldbody>\n{_grasps(body)}{_obstacles(body, step_s)}{_nodes(body)}</worldbody>\n"
-    x += f"<deformable>\n{_flexes(body)}</deformable>\n"
-    x += f"<equality>\n{_welds(body, step_s)}</equality>\n"
-    x += f"<keyframe>\n{_start(body)}</keyframe>\n"
-    return Exported({MODEL: f"{x}</mujoco>\n"}, tuple(limits))
+    bodies = f"{_grasp_xml(body)}{_obstacle_xml(body, step_s)}{_node_xml(body)}"
+    x += f"<worldbody>\n{bodies}</worldbody>\n"
+    x += f"<deformable>\n{_flex_xml(body)}</deformable>\n"
+    x += f"<equality>\n{_weld_xml(body, step_s)}</equality>\n"
+    x += f"<keyframe>\n{_keyframe_xml(body)}</keyframe>\n"
+    return ExportedFiles({MODEL: f"{x}</mujoco>\n"}, tuple(limits))
 
 
-def _grasps(body: Identified) -> str:
+def _grasp_xml(body: IdentifiedBody) -> str:
     """Return the XML of each grasp: a mocap body, and the free body welded to it that carries the
     nodes.
 
     The second body is needed because nodes of an elastic flex cannot be attached to a mocap body.
     """
     lines = ""
-    mass = body.node_mass_kg.sum() * HEAVY
+    mass = body.node_mass_kg.sum() * CARRIER_MASS_RATIO
     size = np.ptp(body.nodes_m, axis=0).max()
     inertia = float(mass * size**2)
     for k, grasp in enumerate(body.experiment.grasps):
-        position, turn = _pose(grasp, body.start_s)
-        at = f'pos="{numbers(position)}" quat="{numbers(turn)}"'
+        position, turn = _pose_at(grasp, body.start_s)
+        at = f'pos="{numbers_as_text(position)}" quat="{numbers_as_text(turn)}"'
         lines += (
             f'<body name="hand{k}" mocap="true" {at}/>\n<body name="grasp{k}" {at} gravcomp="1">'
             f'<freejoint/><inertial pos="0 0 0" mass="{float(mass)!r}" '
@@ -105,7 +114,7 @@ def _grasps(body: Identified) -> str:
     return lines
 
 
-def _obstacles(body: Identified, step_s: float) -> str:
+def _obstacle_xml(body: IdentifiedBody, step_s: float) -> str:
     """Return the XML of each obstacle: a mocap body, as stiff as the step `step_s` allows, with
     friction.
 
@@ -113,29 +122,31 @@ def _obstacles(body: Identified, step_s: float) -> str:
     surface.
     """
     lines = ""
-    skin = SKIN * _edge_m(body)
+    skin = RELATIVE_SKIN_RADIUS * _mean_edge_m(body)
     for k, each in enumerate(body.obstacles):
-        position, turn = _pose(each, body.start_s)
+        position, turn = _pose_at(each, body.start_s)
         rubs = float(each.friction)
-        geom = _geom(grown(each.shape, -skin))
+        geom = _geom_attributes(offset_solid(each.shape, -skin))
         lines += (
-            f'<body name="obstacle{k}" mocap="true" pos="{numbers(position)}" '
-            f'quat="{numbers(turn)}"><geom name={attribute(each.name)} {geom} '
+            f'<body name="obstacle{k}" mocap="true" pos="{numbers_as_text(position)}" '
+            f'quat="{numbers_as_text(turn)}"><geom name={xml_attribute(each.name)} {geom} '
             f'priority="1" condim="{3 if rubs else 1}" friction="{rubs!r} 0 0" '
             f'solref="{2 * step_s!r} 1"/></body>\n'
         )
     return lines
 
 
-def _geom(solid: Solid) -> str:
+def _geom_attributes(solid: Solid) -> str:
     """Return the XML attributes of a solid: type, size and placement."""
-    shape = Primitive.of(solid)
-    turn = numbers(shape.turn.as_quat(scalar_first=True))
-    size = numbers(shape.size_m) if len(shape.size_m) else "0 0 1"
-    return f'type="{shape.kind}" size="{size}" pos="{numbers(shape.place_m)}" quat="{turn}"'
+    shape = Primitive.from_solid(solid)
+    turn = numbers_as_text(shape.rotation.as_quat(scalar_first=True))
+    size = numbers_as_text(shape.size_m) if len(shape.size_m) else "0 0 1"
+    return (
+        f'type="{shape.kind}" size="{size}" pos="{numbers_as_text(shape.centre_m)}" quat="{turn}"'
+    )
 
 
-def _welds(body: Identified, step_s: float) -> str:
+def _weld_xml(body: IdentifiedBody, step_s: float) -> str:
     """Return the XML of the constraints between the mocap bodies and the bodies that carry grasped
     nodes.
     """
@@ -146,30 +157,30 @@ def _welds(body: Identified, step_s: float) -> str:
     )
 
 
-def _pose(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
+def _pose_at(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
     """Return position (3,) [m] and quaternion (w, x, y, z) of a grasp or obstacle at a time."""
     rotations, positions = grasp.poses.at([t_s])
     return positions[0], np.roll(Rotation.from_matrix(rotations[0]).as_quat(), 1)
 
 
-def _nodes(body: Identified) -> str:
+def _node_xml(body: IdentifiedBody) -> str:
     """Return the XML of the free nodes, each a body on three slides."""
     lines = ""
-    mass = body.mass_kg
-    for n in np.flatnonzero(~body.grasped):
+    mass = body.total_node_mass_kg
+    for n in np.flatnonzero(~body.is_node_prescribed):
         joints = "".join(
             f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1")
         )
         inertia = max(1e-6 * float(mass[n]), 1e-12)  # a node does not turn, but must have some
         lines += (
-            f'<body name="node{n}" pos="{numbers(body.nodes_m[n])}">'
+            f'<body name="node{n}" pos="{numbers_as_text(body.nodes_m[n])}">'
             f'<inertial pos="0 0 0" mass="{float(mass[n])!r}" '
             f'diaginertia="{inertia!r} {inertia!r} {inertia!r}"/>{joints}</body>\n'
         )
     return lines
 
 
-def _flexes(body: Identified) -> str:
+def _flex_xml(body: IdentifiedBody) -> str:
     """Return the XML of a flex for each region: node positions relative to their bodies, and
     elements.
     """
@@ -178,13 +189,14 @@ def _flexes(body: Identified) -> str:
     for k, grasp in enumerate(body.experiment.grasps):
         names[grasp.nodes] = f"grasp{k}"
         places[grasp.nodes] = body.body.nodes_m[grasp.nodes]
-    skin = SKIN * _edge_m(body)
+    skin = RELATIVE_SKIN_RADIUS * _mean_edge_m(body)
     lines = ""
-    for region, cells in zip(body.regions, linear_cells(body), strict=True):
+    for region, cells in zip(body.regions, linear_tetrahedra(body), strict=True):
         used, elements = np.unique(cells, return_inverse=True)
         lines += (
             f'<flex name="{region.name}" dim="3" radius="{skin!r}" body="{" ".join(names[used])}" '
-            f'vertex="{numbers(places[used])}" element="{" ".join(map(str, elements.ravel()))}">\n'
+            f'vertex="{numbers_as_text(places[used])}" '
+            f'element="{" ".join(map(str, elements.ravel()))}">\n'
             '<contact contype="1" conaffinity="0" selfcollide="none"/>\n'
             f'<elasticity young="{region.young_pa!r}" poisson="{region.poisson!r}" '
             f'damping="{region.gamma_r_s!r}"/>\n</flex>\n'
@@ -192,26 +204,26 @@ def _flexes(body: Identified) -> str:
     return lines
 
 
-def _edge_m(body: Identified) -> float:
+def _mean_edge_m(body: IdentifiedBody) -> float:
     """Return the mean edge length of the mesh."""
     ends = body.body.nodes_m[body.body.mesh.edges]
     return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
 
 
-def _start(body: Identified) -> str:
+def _keyframe_xml(body: IdentifiedBody) -> str:
     """Return the XML of the state at the first sample: simulated displacements and velocities."""
-    free = ~body.grasped
-    shape = body.nodes_m if body.rolled_out_m is None else body.rolled_out_m[0]
+    free = ~body.is_node_prescribed
+    shape = body.nodes_m if body.simulated_m is None else body.simulated_m[0]
     started = body.experiment.start_velocities_m_s
     velocity = np.zeros_like(shape) if started is None else started
     grasps = body.experiment.grasps
-    carriers = [np.concatenate(_pose(grasp, body.start_s)) for grasp in grasps]
-    places = numbers(np.concatenate([*carriers, (shape - body.nodes_m)[free].ravel()]))
-    speeds = numbers(np.concatenate([np.zeros(6 * len(grasps)), velocity[free].ravel()]))
+    carriers = [np.concatenate(_pose_at(grasp, body.start_s)) for grasp in grasps]
+    places = numbers_as_text(np.concatenate([*carriers, (shape - body.nodes_m)[free].ravel()]))
+    speeds = numbers_as_text(np.concatenate([np.zeros(6 * len(grasps)), velocity[free].ravel()]))
     return f'<key name="start" qpos="{places}" qvel="{speeds}"/>\n'
 
 
-def _step_s(body: Identified) -> float:
+def _stable_step_s(body: IdentifiedBody) -> float:
     """Return a timestep that divides the sampling interval and keeps the integration stable."""
     state = body.body.nodes_m.reshape(1, -1)
     at = body.body.linearise(state, np.zeros_like(state), body.theta)
@@ -222,12 +234,12 @@ def _step_s(body: Identified) -> float:
     largest = eigsh(scaled, 1, which="LA", v0=start, return_eigenvectors=False)
     omega = float(np.sqrt(largest[0]))
     ratio = max(region.gamma_r_s for region in body.regions) * omega / 2
-    step_s = SAFE * 2 / omega * (np.hypot(1, ratio) - ratio)
+    step_s = STEP_SAFETY_FACTOR * 2 / omega * (np.hypot(1, ratio) - ratio)
     interval_s = body.experiment.timestep_s
     return interval_s / int(np.ceil(interval_s / step_s))
 
 
-def verify(body: Identified, folder: Path) -> list[Comparison]:
+def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     """Run MuJoCo, and compare the first natural frequency and, if there is a motion, the
     deformation.
 
@@ -236,18 +248,18 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
     InputError
         If MuJoCo is missing, too old, or refuses the model.
     """
-    mujoco = _mujoco()
+    mujoco = _import_mujoco()
     try:
         model = mujoco.MjModel.from_xml_path(str(folder / MODEL))
     except ValueError as error:
         raise InputError(f"MuJoCo refuses the model: {error}", folder / MODEL) from error
-    compared = [_first_frequency(body, mujoco, model)]
-    if not body.experiment.is_static and body.rolled_out_m is not None:
-        compared.append(_motion(body, mujoco, model))
+    compared = [_compare_first_frequency(body, mujoco, model)]
+    if not body.experiment.is_static and body.simulated_m is not None:
+        compared.append(_compare_motion(body, mujoco, model))
     return compared
 
 
-def _mujoco() -> ModuleType:
+def _import_mujoco() -> ModuleType:
     """Return the module mujoco.
 
     Raises
@@ -262,23 +274,25 @@ def _mujoco() -> ModuleType:
             'mujoco is not installed: pip install "collocation-sysid[mujoco]"'
         ) from error
     version: str = getattr(mujoco, "__version__")  # noqa: B009 (not in its stubs)
-    if int(version.partition(".")[0]) < SINCE:
+    if int(version.partition(".")[0]) < OLDEST_VERSION:
         raise InputError(
             f"found MuJoCo {version}, which takes a flex for stiffer than is written; "
-            f'expected {SINCE} or newer: pip install --upgrade "collocation-sysid[mujoco]"'
+            f'expected {OLDEST_VERSION} or newer: pip install --upgrade "collocation-sysid[mujoco]"'
         )
     return mujoco
 
 
-def _first_frequency(body: Identified, mujoco: ModuleType, model: Any) -> Comparison:
+def _compare_first_frequency(
+    body: IdentifiedBody, mujoco: ModuleType, model: Any
+) -> PredictionComparison:
     """Return the first natural frequency of the undeformed body in MuJoCo and here [Hz].
 
     MuJoCo's stiffness is found by central differences of its forces.
     """
     data = mujoco.MjData(model)
-    free = ~body.grasped
+    free = ~body.is_node_prescribed
     grasps = len(body.experiment.grasps)
-    probe = PROBE * _edge_m(body)
+    probe = RELATIVE_DIFFERENCE_STEP * _mean_edge_m(body)
     count = 3 * int(free.sum())
     columns = np.zeros((count, count))
     for column in range(count):
@@ -289,7 +303,7 @@ def _first_frequency(body: Identified, mujoco: ModuleType, model: Any) -> Compar
             mujoco.mj_forward(model, data)
             ends.append(data.qfrc_passive[6 * grasps :].copy())
         columns[:, column] = (ends[1] - ends[0]) / (2 * probe)
-    mass = np.repeat((body.mass_kg)[free], 3)
+    mass = np.repeat((body.total_node_mass_kg)[free], 3)
     root = 1 / np.sqrt(mass)
     squares = eigh((columns + columns.T) / 2 * np.outer(root, root), eigvals_only=True)
     oscillating = squares[squares > 1e-9 * squares[-1]]
@@ -298,10 +312,10 @@ def _first_frequency(body: Identified, mujoco: ModuleType, model: Any) -> Compar
     in_vacuum = replace(body.experiment, air_density_kg_m3="none")
     forces = Forces.from_experiment(in_vacuum, body.start_s, body.theta)
     ours = natural_modes(forces, body.nodes_m, dofs, 1).frequencies_hz
-    return Comparison("first natural frequency, undeformed", theirs, float(ours[0]), "Hz")
+    return PredictionComparison("first natural frequency, undeformed", theirs, float(ours[0]), "Hz")
 
 
-def _motion(body: Identified, mujoco: ModuleType, model: Any) -> Comparison:
+def _compare_motion(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> PredictionComparison:
     """Return the RMS deformation over the recording in MuJoCo and here [m].
 
     Deformation is the distance from the rigidly moved body.
@@ -312,50 +326,54 @@ def _motion(body: Identified, mujoco: ModuleType, model: Any) -> Comparison:
         If more than `MOST_STEPS` steps are needed.
     """
     e = body.experiment
-    free = ~body.grasped
+    free = ~body.is_node_prescribed
     data = mujoco.MjData(model)
     model.eq_active0[:] = 0
     mujoco.mj_resetDataKeyframe(model, data, 0)
     steps = round(e.timestep_s / model.opt.timestep)
-    if steps * len(e.t_s) > MOST_STEPS:
+    if steps * len(e.t_s) > MAX_STEPS:
         raise InputError(f"{steps * len(e.t_s)} steps are too many to predict the motion with")
     first = 7 * len(e.grasps)
     shapes = [data.qpos[first:].reshape(-1, 3).copy()]
     for k in range(steps * (len(e.t_s) - 1)):
-        _drive(body, mujoco, data, (body.start_s + k * model.opt.timestep, model.opt.timestep))
+        _set_grasp_state(
+            body, mujoco, data, (body.start_s + k * model.opt.timestep, model.opt.timestep)
+        )
         mujoco.mj_step(model, data)
         if (k + 1) % steps == 0:
             shapes.append(data.qpos[first:].reshape(-1, 3).copy())
     theirs = np.array(shapes) + body.nodes_m[free]
-    assert body.rolled_out_m is not None
-    ours = body.rolled_out_m[:, free]
+    assert body.simulated_m is not None
+    ours = body.simulated_m[:, free]
     rigid_m = e.rigid_positions(e.t_s)[:, free]
-    size_m = _rms(ours - rigid_m)
-    difference_m = _rms(theirs - ours)
+    size_m = _rms_length(ours - rigid_m)
+    difference_m = _rms_length(theirs - ours)
     share = f", {difference_m / size_m:.2%} of it" if size_m else ""
     remark = f"they are {difference_m:.3g} m apart (RMS){share}"
     what = "RMS deformation over the recording"
-    return Comparison(what, _rms(theirs - rigid_m), size_m, "m", remark)
+    return PredictionComparison(what, _rms_length(theirs - rigid_m), size_m, "m", remark)
 
 
-def _drive(body: Identified, mujoco: ModuleType, data: Any, step: tuple[float, float]) -> None:
+def _set_grasp_state(
+    body: IdentifiedBody, mujoco: ModuleType, data: Any, time_and_step_s: tuple[float, float]
+) -> None:
     """Set pose and velocity of the bodies that carry grasped nodes, and the pose of obstacles, in
     `data`.
 
-    `step` is the time and the timestep [s]; velocities lead to the pose one step later.
+    `time_and_step_s` is the time and the timestep [s]; velocities lead to the pose one step later.
     """
-    t_s, step_s = step
+    t_s, step_s = time_and_step_s
     last_s = float(body.experiment.t_s[-1])
     turning = np.zeros(3)
     for k, grasp in enumerate(body.experiment.grasps):
-        here, there = (_pose(grasp, min(at_s, last_s)) for at_s in (t_s, t_s + step_s))
+        here, there = (_pose_at(grasp, min(at_s, last_s)) for at_s in (t_s, t_s + step_s))
         mujoco.mju_subQuat(turning, there[1], here[1])
         data.qpos[7 * k : 7 * k + 7] = np.concatenate(here)
         data.qvel[6 * k : 6 * k + 6] = np.concatenate([there[0] - here[0], turning]) / step_s
     for k, each in enumerate(body.obstacles, len(body.experiment.grasps)):
-        data.mocap_pos[k], data.mocap_quat[k] = _pose(each, min(t_s, last_s))
+        data.mocap_pos[k], data.mocap_quat[k] = _pose_at(each, min(t_s, last_s))
 
 
-def _rms(way: Array) -> float:
+def _rms_length(vectors: Array) -> float:
     """Return the root mean square length of vectors (…, 3)."""
-    return float(np.sqrt((way**2).sum(axis=-1).mean()))
+    return float(np.sqrt((vectors**2).sum(axis=-1).mean()))

@@ -9,29 +9,29 @@ import numpy as np
 
 from ...recording import Obstacle
 from ...serialisation import content
-from .export_target import Exported, Holds, heading, linear_cells
-from .identified import Identified
-from .obstacle_shapes import OneContact, Primitive, walls
+from .export_target import ExportedFiles, TargetCapabilities, comment_lines, linear_tetrahedra
+from .identified import IdentifiedBody
+from .obstacle_shapes import Primitive, SharedContact, faceted_obstacles
 
-MODULE = "body.py"
-NUMBERS = "body.json"
-HOLDS = Holds(
+MODULE_FILE = "body.py"
+DATA_FILE = "body.json"
+CAPABILITIES = TargetCapabilities(
     {"stable-neo-hookean": "soft mesh"},
     "{material} becomes the stable neo-Hookean energy of the same λ and μ at small strain",
     "damping γ_r becomes a viscosity k = γ_r μ / 2 [Pa s] with the stress 4 k Ė, the law "
     '"material" without its part λ tr(Ė): changes of volume are damped less; here it is {damping}',
-    roundings=False,
-    faces=False,
+    has_rounded_edges=False,
+    has_contact_faces=False,
 )
 # Size arguments of each shape in Newton; zeros mean an infinite plane.
-SIZES = {
+SIZE_ARGUMENTS = {
     "plane": ("width", "length"),
     "sphere": ("radius",),
     "box": ("hx", "hy", "hz"),
     "cylinder": ("radius", "half_height"),
     "capsule": ("radius", "half_height"),
 }
-_BUILD = '''
+_MODULE_SOURCE = '''
 import json
 from pathlib import Path
 
@@ -89,7 +89,7 @@ def model(device=None):
 '''
 
 
-def export(body: Identified) -> Exported:
+def export(body: IdentifiedBody) -> ExportedFiles:
     """Return the module ``body.py`` and its numbers ``body.json``.
 
     The elastic constants are those of Newton's `SolverVBD`, whose energy is the stable neo-Hookean
@@ -98,50 +98,50 @@ def export(body: Identified) -> Exported:
     """
     cells = []
     constants = []
-    for region, own in zip(body.regions, linear_cells(body), strict=True):
+    for region, own in zip(body.regions, linear_tetrahedra(body), strict=True):
         cells.append(own)
         # Its damping stress is 4 k Ė, ours γ_r (2 μ Ė + λ tr Ė): alike where the volume stays.
         damping = region.gamma_r_s * region.mu_pa / 2
         constants.append(np.tile([region.mu_pa, region.lambda_pa, damping], (len(own), 1)))
-    contact = OneContact.of(walls(body))
+    contact = SharedContact.from_obstacles(faceted_obstacles(body))
     limits = [
-        *HOLDS.lost(body),
-        *contact.lost,
+        *CAPABILITIES.limitations(body),
+        *contact.limitations,
         "SolverSemiImplicit takes other constants for the same material, k_mu = 4/3 μ and "
         "k_lambda = λ + 5/6 μ, and another damping",
         "positions are single precision",
     ]
     k_mu, k_lambda, k_damp = np.concatenate(constants).T
     data = {
-        "nodes_m": np.where(body.held, body.held_m, body.nodes_m),
+        "nodes_m": np.where(body.is_prescribed, body.prescribed_m, body.nodes_m),
         "cells": np.concatenate(cells),
         "k_mu": k_mu,
         "k_lambda": k_lambda,
         "k_damp": k_damp,
-        "node_mass_kg": body.mass_kg,
-        "held": body.grasped,
+        "node_mass_kg": body.total_node_mass_kg,
+        "held": body.is_node_prescribed,
         "gravity_m_s2": body.experiment.gravity_m_s2,
-        "contact_m": contact.radius_m,
-        "contact_n_m": contact.node_n_m,
+        "contact_m": contact.particle_radius_m,
+        "contact_n_m": contact.node_stiffness_n_m,
         "contact_mu": contact.friction,
-        "obstacles": [_obstacle(each, body.start_s) for each in body.obstacles],
+        "obstacles": [_obstacle_data(each, body.start_s) for each in body.obstacles],
     }
     files = {
-        MODULE: heading(body, limits, "# ") + _BUILD,
-        NUMBERS: json.dumps(content(data)) + "\n",
+        MODULE_FILE: comment_lines(body, limits, "# ") + _MODULE_SOURCE,
+        DATA_FILE: json.dumps(content(data)) + "\n",
     }
-    return Exported(files, tuple(limits))
+    return ExportedFiles(files, tuple(limits))
 
 
-def _obstacle(obstacle: Obstacle, t_s: float) -> dict[str, Any]:
+def _obstacle_data(obstacle: Obstacle, t_s: float) -> dict[str, Any]:
     """Return the data of an obstacle at time `t_s` for the JSON file."""
-    shape = Primitive.of(obstacle.shape)
-    place_m, turn = shape.placed(obstacle, t_s)
+    shape = Primitive.from_solid(obstacle.shape)
+    place_m, turn = shape.pose_at(obstacle, t_s)
     sizes = shape.size_m if len(shape.size_m) else np.zeros(2)
     return {
         "name": obstacle.name,
         "kind": shape.kind,
-        "size": dict(zip(SIZES[shape.kind], sizes.tolist(), strict=True)),
+        "size": dict(zip(SIZE_ARGUMENTS[shape.kind], sizes.tolist(), strict=True)),
         "place_m": place_m,
         "quaternion_xyzw": turn.as_quat(),
         "friction": float(obstacle.friction),

@@ -19,50 +19,60 @@ from scipy.spatial.transform import Rotation
 from ...array_types import Array, Index
 from ...errors import InputError, printable
 from ...recording import Grasp, Obstacle
-from .export_target import Comparison, Exported, Holds, at_rest, heading, linear_cells, longest
-from .identified import Identified, IdentifiedRegion
-from .obstacle_shapes import OneContact, Primitive, walls
+from .export_target import (
+    ExportedFiles,
+    PredictionComparison,
+    TargetCapabilities,
+    comment_lines,
+    equilibria,
+    linear_tetrahedra,
+    longest_displacement_m,
+)
+from .identified import IdentifiedBody, IdentifiedRegion
+from .obstacle_shapes import Primitive, SharedContact, faceted_obstacles
 
-STAGE = "body.usda"
-OWN = "collocationSysid"
+STAGE_FILE = "body.usda"
+ATTRIBUTE_NAMESPACE = "collocationSysid"
 # Factor on velocities after each step of Newton, so that the body comes to rest.
-BRAKE = 0.95
+VELOCITY_FACTOR = 0.95
 # Iterations of the solver in each step.
-ITERATIONS = 20
+SOLVER_ITERATIONS = 20
 # Steps until the body is at rest.
-STEPS = 400
+REST_STEPS = 400
 # Timestep of Newton.
-STEP_S = 2e-3
-HOLDS = Holds(
+REST_STEP_S = 2e-3
+CAPABILITIES = TargetCapabilities(
     {},
     "{material} becomes whatever energy the simulator has for E and ν: Newton's is the stable "
     "neo-Hookean one",
     "damping γ_r is no part of the schemas: it stands as an attribute of our own",
     "γ_m = {gamma_m_1_s:.4g} 1/s is no part of the schemas: it stands as an attribute of our own",
-    motion=True,
-    drives=True,
-    roundings=False,
-    faces=False,
+    has_moving_grasps=True,
+    has_moving_obstacles=True,
+    has_rounded_edges=False,
+    has_contact_faces=False,
 )
-SINGLE = "numbers are single precision"
+SINGLE_PRECISION = "numbers are single precision"
 REGIONS = (
     "regions are subsets of tetrahedra, each with its material; a simulator that takes one "
     "material a body, as Newton 1.8, takes that of the largest"
 )
-TIED = "point masses on nodes are left out"
+POINT_MASSES = "point masses on nodes are left out"
 TILT = (
     "gravity points {degrees:.3g}° away from −z of the stage, as estimated from the recording; a "
     "simulator that takes its magnitude alone, and lets it point along −z, leaves that out"
 )
-UNMOVED = "the points of the body are those of the first sample: the run has no forward simulation"
+NO_SIMULATION = (
+    "the points of the body are those of the first sample: the run has no forward simulation"
+)
 # Angle from which gravity counts as tilted: single precision of its direction rounds to less.
 LEAST_TILT_DEG = 1e-3
 # Frames per second of a single sample, which has no rate of its own.
 SINGLE_RATE_HZ = 24.0
-AXES = "nodes that are held along single axes only are free"
+SINGLE_AXES = "nodes that are held along single axes only are free"
 
 
-def export(body: Identified) -> Exported:
+def export(body: IdentifiedBody) -> ExportedFiles:
     """Return the USD stage.
 
     Raises
@@ -70,12 +80,14 @@ def export(body: Identified) -> Exported:
     InputError
         If usd-core is not installed.
     """
-    pxr = _library()
-    limits = [*HOLDS.lost(body), SINGLE]
-    limits += [TIED] * bool(body.tied_kg.any())
+    pxr = _import_usd()
+    limits = [*CAPABILITIES.limitations(body), SINGLE_PRECISION]
+    limits += [POINT_MASSES] * bool(body.point_masses_kg.any())
     limits += [REGIONS] * (len(body.regions) > 1)
-    limits += [AXES] * bool((body.held.any(axis=1) != body.grasped).any())
-    limits += [UNMOVED] * (body.rolled_out_m is None)
+    limits += [SINGLE_AXES] * bool(
+        (body.is_prescribed.any(axis=1) != body.is_node_prescribed).any()
+    )
+    limits += [NO_SIMULATION] * (body.simulated_m is None)
     tilt_deg = _tilt_deg(body.experiment.gravity_m_s2)
     limits += [TILT.format(degrees=tilt_deg)] * (tilt_deg > LEAST_TILT_DEG)
     stage = pxr.Usd.Stage.CreateInMemory()
@@ -90,19 +102,19 @@ def export(body: Identified) -> Exported:
     stage.SetEndTimeCode(float(rate_hz * t_s[-1]))
     world = pxr.UsdGeom.Xform.Define(stage, "/World").GetPrim()
     stage.SetDefaultPrim(world)
-    world.SetDocumentation(heading(body, limits, ""))
+    world.SetDocumentation(comment_lines(body, limits, ""))
     scene = pxr.UsdPhysics.Scene.Define(stage, "/World/Physics")
     gravity = body.experiment.gravity_m_s2
     size = float(np.linalg.norm(gravity))
     scene.CreateGravityMagnitudeAttr(size)
     scene.CreateGravityDirectionAttr(pxr.Gf.Vec3f(*(gravity / (size or 1.0)).tolist()))
-    placed_m = np.where(body.held, body.held_m, body.nodes_m)
-    _mesh(pxr, stage, body, placed_m)
+    placed_m = np.where(body.is_prescribed, body.prescribed_m, body.nodes_m)
+    _add_mesh(pxr, stage, body, placed_m)
     for k, grasp in enumerate(body.experiment.grasps, start=1):
-        _gripper(pxr, stage, k, grasp, body, placed_m)
+        _add_gripper(pxr, stage, k, grasp, body, placed_m)
     for k, obstacle in enumerate(body.obstacles, start=1):
-        _obstacle(pxr, stage, f"/World/Obstacle_{k}", obstacle, body)
-    return Exported({STAGE: stage.GetRootLayer().ExportToString()}, tuple(limits))
+        _add_obstacle(pxr, stage, f"/World/Obstacle_{k}", obstacle, body)
+    return ExportedFiles({STAGE_FILE: stage.GetRootLayer().ExportToString()}, tuple(limits))
 
 
 def _rate_hz(t_s: Array) -> float:
@@ -119,7 +131,7 @@ def _tilt_deg(gravity_m_s2: Array) -> float:
     return float(np.degrees(np.arctan2(across, downwards))) if gravity_m_s2.any() else 0.0
 
 
-def _library() -> Any:
+def _import_usd() -> Any:
     """Return the modules of usd-core as attributes of one object.
 
     Raises
@@ -135,24 +147,25 @@ def _library() -> Any:
     return SimpleNamespace(**{each.__name__.rpartition(".")[2]: each for each in modules})
 
 
-def _mesh(pxr: Any, stage: Any, body: Identified, placed_m: Array) -> None:
+def _add_mesh(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Array) -> None:
     """Add the tetrahedra, masses, materials and simulated motion of the body to the stage.
 
-    `pxr` are the modules of `_emit_library_call`; `placed_m` (n, 3) are the initial node positions.
+    `pxr` are the modules of `_emit_library_call`; `start_positions_m` (n, 3) are the initial node
+    positions.
     """
     body_prim = pxr.UsdGeom.Xform.Define(stage, "/World/Body").GetPrim()
     body_prim.AddAppliedSchema("PhysicsDeformableBodyAPI")
     mesh = pxr.UsdGeom.TetMesh.Define(stage, "/World/Body/Mesh")
-    cells = linear_cells(body)
+    cells = linear_tetrahedra(body)
     prim = mesh.GetPrim()
     prim.AddAppliedSchema("PhysicsVolumeDeformableSimAPI")
     pxr.UsdPhysics.CollisionAPI.Apply(prim)
     # A simulator begins with the default; the samples are played back where nothing is simulated.
-    points = mesh.CreatePointsAttr(placed_m.astype(np.float32))
+    points = mesh.CreatePointsAttr(start_positions_m.astype(np.float32))
     t_s = body.experiment.t_s
     codes = (_rate_hz(t_s) * t_s).tolist()
-    if body.rolled_out_m is not None:
-        for code, shape_m in zip(codes, body.rolled_out_m, strict=True):
+    if body.simulated_m is not None:
+        for code, shape_m in zip(codes, body.simulated_m, strict=True):
             points.Set(shape_m.astype(np.float32), code)
     mesh.CreateTetVertexIndicesAttr(np.concatenate(cells).astype(np.int32))
     mesh.CreateSurfaceFaceVertexIndicesAttr(pxr.UsdGeom.TetMesh.ComputeSurfaceFaces(mesh))
@@ -160,24 +173,24 @@ def _mesh(pxr: Any, stage: Any, body: Identified, placed_m: Array) -> None:
     rest = prim.CreateAttribute("physics:restShapePoints", number.Point3fArray, False)
     rest.Set(body.nodes_m.astype(np.float32))
     masses = prim.CreateAttribute("physics:masses", number.FloatArray, False)
-    masses.Set(_masses_kg(body, cells).astype(np.float32))
-    _token(pxr, prim, "physics:masses:elementType", "tetrahedron")
-    grasped = prim.CreateAttribute(f"{OWN}:graspedPoints", number.IntArray)
-    grasped.Set(np.flatnonzero(body.grasped).astype(np.int32))
-    names = _prim_names([region.name for region in body.regions])
+    masses.Set(_cell_masses_kg(body, cells).astype(np.float32))
+    _set_token(pxr, prim, "physics:masses:elementType", "tetrahedron")
+    grasped = prim.CreateAttribute(f"{ATTRIBUTE_NAMESPACE}:graspedPoints", number.IntArray)
+    grasped.Set(np.flatnonzero(body.is_node_prescribed).astype(np.int32))
+    names = _unique_prim_names([region.name for region in body.regions])
     pairs = zip(body.regions, names, strict=True)
-    materials = [_material(pxr, stage, region, name) for region, name in pairs]
-    _bind(pxr, prim, materials[int(np.argmax([len(each) for each in cells]))])
+    materials = [_add_material(pxr, stage, region, name) for region, name in pairs]
+    _bind_material(pxr, prim, materials[int(np.argmax([len(each) for each in cells]))])
     firsts = np.cumsum([0, *map(len, cells)])
     for k, material in enumerate(materials if len(cells) > 1 else ()):
         indices = pxr.Vt.IntArray(range(firsts[k], firsts[k + 1]))
         subset = pxr.UsdGeom.Subset.CreateGeomSubset(
             mesh, names[k], pxr.UsdGeom.Tokens.tetrahedron, indices, "materialBind"
         )
-        _bind(pxr, subset.GetPrim(), material)
+        _bind_material(pxr, subset.GetPrim(), material)
 
 
-def _masses_kg(body: Identified, cells: list[Index]) -> Array:
+def _cell_masses_kg(body: IdentifiedBody, cells: list[Index]) -> Array:
     """Return the mass of each tetrahedron, region after region.
 
     `cells` are the tetrahedra (k, 4) of each region.
@@ -188,7 +201,7 @@ def _masses_kg(body: Identified, cells: list[Index]) -> Array:
     return np.concatenate([region.density_kg_m3 * volume for region, volume in pairs])
 
 
-def _material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> Any:
+def _add_material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> Any:
     """Add the material of a region to the stage under `name`, and return it."""
     material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{name}")
     prim = material.GetPrim()
@@ -197,52 +210,54 @@ def _material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> Any:
         "physics:youngsModulus": region.young_pa,
         "physics:poissonsRatio": region.poisson,
         "physics:density": region.density_kg_m3,
-        f"{OWN}:gammaR_s": region.gamma_r_s,
-        f"{OWN}:gammaM_1_s": region.gamma_m_1_s,
+        f"{ATTRIBUTE_NAMESPACE}:gammaR_s": region.gamma_r_s,
+        f"{ATTRIBUTE_NAMESPACE}:gammaM_1_s": region.gamma_m_1_s,
     }
-    values |= {f"{OWN}:{name}": value for name, value in region.constants.items()}
+    values |= {f"{ATTRIBUTE_NAMESPACE}:{name}": value for name, value in region.constants.items()}
     number = pxr.Sdf.ValueTypeNames
     for name, value in values.items():
-        prim.CreateAttribute(name, number.Float, name.startswith(OWN)).Set(float(value))
+        prim.CreateAttribute(name, number.Float, name.startswith(ATTRIBUTE_NAMESPACE)).Set(
+            float(value)
+        )
     for name, text in (("material", region.material), ("damping", region.damping)):
-        prim.CreateAttribute(f"{OWN}:{name}", number.String).Set(text)
+        prim.CreateAttribute(f"{ATTRIBUTE_NAMESPACE}:{name}", number.String).Set(text)
     return material
 
 
-def _bind(pxr: Any, prim: Any, material: Any) -> None:
+def _bind_material(pxr: Any, prim: Any, material: Any) -> None:
     """Bind a physics material to a prim."""
     binding = pxr.UsdShade.MaterialBindingAPI.Apply(prim)
     binding.Bind(material, pxr.UsdShade.Tokens.weakerThanDescendants, "physics")
 
 
-def _token(pxr: Any, prim: Any, name: str, text: str) -> None:
+def _set_token(pxr: Any, prim: Any, name: str, text: str) -> None:
     """Set a uniform token attribute of a prim."""
     kind = pxr.Sdf.ValueTypeNames.Token
     fixed = pxr.Sdf.VariabilityUniform
     prim.CreateAttribute(name, kind, False, fixed).Set(text)
 
 
-def _gripper(
-    pxr: Any, stage: Any, number: int, grasp: Grasp, body: Identified, placed_m: Array
+def _add_gripper(
+    pxr: Any, stage: Any, number: int, grasp: Grasp, body: IdentifiedBody, start_positions_m: Array
 ) -> None:
     """Add a kinematic rigid body that follows the poses of a grasp, and attach the grasped nodes to
     it.
 
-    `number` counts grasps from 1; `placed_m` (n, 3) are the initial node positions.
+    `number` counts grasps from 1; `start_positions_m` (n, 3) are the initial node positions.
     """
     path = f"/World/Gripper_{number}"
     gripper = pxr.UsdGeom.Xform.Define(stage, path)
     pxr.UsdPhysics.RigidBodyAPI.Apply(gripper.GetPrim()).CreateKinematicEnabledAttr(True)
     matrices, positions_m = grasp.poses.at(body.experiment.t_s)
-    _put(pxr, gripper, positions_m, Rotation.from_matrix(matrices), body.experiment.t_s)
-    nodes = np.intersect1d(grasp.nodes, np.flatnonzero(body.grasped))
+    _set_poses(pxr, gripper, positions_m, Rotation.from_matrix(matrices), body.experiment.t_s)
+    nodes = np.intersect1d(grasp.nodes, np.flatnonzero(body.is_node_prescribed))
     prim = stage.DefinePrim(f"{path}/Grasp", "PhysicsAttachment")
     types = pxr.Sdf.ValueTypeNames
     for name, target in (("src0", "/World/Body/Mesh"), ("src1", path)):
         prim.CreateRelationship(f"physics:{name}", False).SetTargets([pxr.Sdf.Path(target)])
     for name, text in (("type0", "point"), ("type1", "xform")):
-        _token(pxr, prim, f"physics:{name}", text)
-    local_m = (placed_m[nodes] - positions_m[0]) @ matrices[0]
+        _set_token(pxr, prim, f"physics:{name}", text)
+    local_m = (start_positions_m[nodes] - positions_m[0]) @ matrices[0]
     for name, kind, values in (
         ("indices0", types.IntArray, nodes.astype(np.int32)),
         ("coords1", types.Vector3fArray, local_m.astype(np.float32)),
@@ -250,39 +265,41 @@ def _gripper(
         prim.CreateAttribute(f"physics:{name}", kind, False).Set(values)
 
 
-def _put(pxr: Any, prim: Any, places_m: Array, turns: Rotation, t_s: Array) -> None:
+def _set_poses(pxr: Any, prim: Any, positions_m: Array, rotations: Rotation, t_s: Array) -> None:
     """Place a prim at positions (T, 3) and rotations at times (T,), by default as in the first row.
 
     With empty `t_s`, the only row holds for all time.
     """
     codes = (_rate_hz(t_s) * t_s).tolist()
-    wxyz = turns.as_quat(scalar_first=True)
+    wxyz = rotations.as_quat(scalar_first=True)
     place = prim.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble)
     turn = prim.AddOrientOp(pxr.UsdGeom.XformOp.PrecisionDouble)
     for k, time in enumerate([pxr.Usd.TimeCode.Default(), *codes]):
         row = max(k - 1, 0)
-        place.Set(pxr.Gf.Vec3d(*places_m[row].tolist()), time)
+        place.Set(pxr.Gf.Vec3d(*positions_m[row].tolist()), time)
         turn.Set(pxr.Gf.Quatd(*wxyz[row].tolist()), time)
 
 
-def _obstacle(pxr: Any, stage: Any, path: str, obstacle: Obstacle, body: Identified) -> None:
+def _add_obstacle(
+    pxr: Any, stage: Any, path: str, obstacle: Obstacle, body: IdentifiedBody
+) -> None:
     """Add an obstacle with its friction to the stage under `path`; it is kinematic if it moves."""
-    shape = Primitive.of(obstacle.shape)
+    shape = Primitive.from_solid(obstacle.shape)
     t_s = body.experiment.t_s
     frame = path
     if len(obstacle.poses.t_s) > 1:
         moving = pxr.UsdGeom.Xform.Define(stage, path)
         pxr.UsdPhysics.RigidBodyAPI.Apply(moving.GetPrim()).CreateKinematicEnabledAttr(True)
         matrices, places_m = obstacle.poses.at(t_s)
-        _put(pxr, moving, places_m, Rotation.from_matrix(matrices), t_s)
-        place_m = shape.place_m
-        turn = shape.turn
+        _set_poses(pxr, moving, places_m, Rotation.from_matrix(matrices), t_s)
+        place_m = shape.centre_m
+        turn = shape.rotation
         frame = f"{path}/Shape"
     else:
-        place_m, turn = shape.placed(obstacle, body.start_s)
+        place_m, turn = shape.pose_at(obstacle, body.start_s)
     kinds = {"box": "Cube"}
     solid = getattr(pxr.UsdGeom, kinds.get(shape.kind, shape.kind.title())).Define(stage, frame)
-    _put(pxr, solid, place_m[None], Rotation.concatenate([turn]), t_s[:0])
+    _set_poses(pxr, solid, place_m[None], Rotation.concatenate([turn]), t_s[:0])
     if shape.kind == "box":
         solid.CreateSizeAttr(2.0)
         solid.AddScaleOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Vec3d(*shape.size_m))
@@ -298,10 +315,10 @@ def _obstacle(pxr: Any, stage: Any, path: str, obstacle: Obstacle, body: Identif
     rubbing = pxr.UsdPhysics.MaterialAPI.Apply(material.GetPrim())
     for attribute in (rubbing.CreateStaticFrictionAttr, rubbing.CreateDynamicFrictionAttr):
         attribute(float(obstacle.friction))
-    _bind(pxr, solid.GetPrim(), material)
+    _bind_material(pxr, solid.GetPrim(), material)
 
 
-def _prim_names(names: Sequence[str]) -> list[str]:
+def _unique_prim_names(names: Sequence[str]) -> list[str]:
     """Return names that USD accepts, a different one for each of `names`."""
     unique: list[str] = []
     for name in names:
@@ -313,7 +330,7 @@ def _prim_names(names: Sequence[str]) -> list[str]:
     return unique
 
 
-def verify(body: Identified, folder: Path) -> list[Comparison]:
+def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     """Run Newton on the exported stage, and compare the largest displacement at rest.
 
     Raises
@@ -327,35 +344,39 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
         raise InputError("install Newton to verify the export: pip install newton") from error
 
     builder = newton.ModelBuilder()
-    contact = OneContact.of(walls(body))
+    contact = SharedContact.from_obstacles(faceted_obstacles(body))
     if body.obstacles:
-        builder.default_particle_radius = contact.radius_m
+        builder.default_particle_radius = contact.particle_radius_m
     # Its rigid bodies would be simulated too; what they hold stands still instead.
-    builder.add_usd(str(folder / STAGE), ignore_paths=["/World/Gripper_.*"])
-    grasped = np.flatnonzero(body.grasped)
+    builder.add_usd(str(folder / STAGE_FILE), ignore_paths=["/World/Gripper_.*"])
+    grasped = np.flatnonzero(body.is_node_prescribed)
     for k in grasped:
         builder.particle_mass[k] = 0.0
     builder.color()
     model = builder.finalize(device="cpu")
     if body.obstacles:
-        model.soft_contact_ke = contact.node_n_m
+        model.soft_contact_ke = contact.node_stiffness_n_m
         model.soft_contact_mu = contact.friction
-        model.shape_material_ke.fill_(contact.node_n_m)
+        model.shape_material_ke.fill_(contact.node_stiffness_n_m)
     pipeline = newton.CollisionPipeline(model)
     # What is touched stands still, and is nothing to solve for.
     solver = newton.solvers.SolverVBD(
-        model, iterations=ITERATIONS, integrate_with_external_rigid_solver=True
+        model, iterations=SOLVER_ITERATIONS, integrate_with_external_rigid_solver=True
     )
     before: Any = model.state()
     after = model.state()
     control = model.control()
     contacts = pipeline.contacts()
-    for _ in range(STEPS):
+    for _ in range(REST_STEPS):
         pipeline.collide(before, contacts)
-        solver.step(before, after, control, contacts, STEP_S)
+        solver.step(before, after, control, contacts, REST_STEP_S)
         before, after = after, before
-        before.particle_qd.assign(BRAKE * before.particle_qd.numpy())
+        before.particle_qd.assign(VELOCITY_FACTOR * before.particle_qd.numpy())
     theirs = before.particle_q.numpy().astype(float) - body.nodes_m
-    sag_m = longest(at_rest(body)[0][0])
-    remark = "".join(contact.lost)
-    return [Comparison("largest displacement at rest", longest(theirs), sag_m, "m", remark)]
+    sag_m = longest_displacement_m(equilibria(body)[0][0])
+    remark = "".join(contact.limitations)
+    return [
+        PredictionComparison(
+            "largest displacement at rest", longest_displacement_m(theirs), sag_m, "m", remark
+        )
+    ]

@@ -1,37 +1,38 @@
 """Pictures of a run, one kind per module; each function takes arrays and returns a Figure.
 
-Over time: `over_time` (markers, wrenches, custom sensors) and `spectrum`. In space: `shapes` (body
-and markers at several times), `mesh_pictures`, `field_intervals` (a spatially varying constant),
-`depth_comparison_picture` (images of depth cameras) and `instability` (a buckling mode). Statistics
-and method: `confidence`, `search_pictures` and `jacobian`. `album` collects all pictures of a run
-and writes them; `projection` and `scene` draw bodies in space for the others.
+Over time: `over_time` (markers, wrenches, custom sensors) and `spectrum_picture`. In space:
+`shapes_picture` (body and markers at several times), `mesh_pictures`, `field_intervals` (a
+spatially varying constant), `depth_comparison_picture` (images of depth cameras) and `instability`
+(a buckling mode). Statistics and method: `confidence`, `search_pictures` and `jacobian`.
+`all_pictures` collects all pictures of a run and writes them; `projection` and `scene` draw bodies
+in space for the others.
 
 Positions are in metres and drawn in millimetres; colours and type sizes are those of
 `result.figure_style`.
 """
 
-from .album import album, save_pictures
+from .album import all_pictures, save_pictures
 from .confidence import Confidence, confidence_ellipses, correlation_matrix
 from .jacobian import jacobian_sparsity
 from .mesh_pictures import elements_picture, mesh_picture
-from .over_time import error_over_time, tracks
+from .over_time import marker_errors, marker_tracks
 from .search_pictures import convergence, scan_picture
-from .shapes import shapes
-from .spectrum import spectrum
+from .shapes import shapes_picture
+from .spectrum import spectrum_picture
 
 __all__ = [
     "Confidence",
-    "album",
+    "all_pictures",
     "confidence_ellipses",
     "convergence",
     "correlation_matrix",
     "elements_picture",
-    "error_over_time",
     "jacobian_sparsity",
+    "marker_errors",
+    "marker_tracks",
     "mesh_picture",
     "save_pictures",
     "scan_picture",
-    "shapes",
-    "spectrum",
-    "tracks",
+    "shapes_picture",
+    "spectrum_picture",
 ]

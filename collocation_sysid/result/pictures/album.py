@@ -14,25 +14,25 @@ from ...files import safe_name, whole_file
 from ...recording.measured_wrench import COMPONENTS, UNITS
 from ...runs.result_content import Result
 from ..figure_style import RESOLUTION_DPI
-from ..replay import Replay, read_run, reading_run
+from ..replay import MotionRecord, damaged_run_refused, read_run
 from .confidence import Confidence, budget_picture, confidence_ellipses, correlation_matrix
 from .depth_comparison_picture import depth_picture
 from .field_intervals import field_picture
 from .mesh_pictures import elements_picture, mesh_picture
-from .over_time import error_over_time, readings_picture, tracks
+from .over_time import marker_errors, marker_tracks, sensor_picture
 from .search_pictures import convergence, scan_picture
-from .shapes import contact_shapes, shapes
-from .spectrum import spectrum
+from .shapes import contact_pictures, shapes_picture
+from .spectrum import spectrum_picture
 
 
-def album(
-    replays: Sequence[Replay], result: Result, truth: Mapping[str, float] | None = None
+def all_pictures(
+    replays: Sequence[MotionRecord], result: Result, truth: Mapping[str, float] | None = None
 ) -> dict[str, Figure]:
     """Return all pictures of a run except that of its Jacobian, by file name without ending.
 
     Parameters
     ----------
-    replays : sequence of Replay
+    replays : sequence of ReplayCommand
         The experiments; the mesh is drawn with grasps and markers of the first.
     result : Result
     truth : mapping, optional
@@ -42,7 +42,7 @@ def album(
     pictures = {"convergence": convergence(result.history, names, truth)} if result.history else {}
     if (scan := result.scan) is not None:
         pictures["scan"] = scan_picture(scan.young_pa, scan.misfit, scan.best)
-    confidence = Confidence.of(result)
+    confidence = Confidence.from_result(result)
     if confidence is not None and len(confidence.names) > 1:
         pictures["confidence"] = confidence_ellipses(confidence)
         pictures["correlation"] = correlation_matrix(confidence)
@@ -54,11 +54,11 @@ def album(
         pictures["elements"] = elements_picture(body.undeformed_m, body.tetrahedra)
         for name, values in body.fields.items():
             pictures[f"field_{name}"] = field_picture(body, name, values)
-    drawn = (named for replay in replays for named in _of_experiment(replay))
-    return of_different_names(chain(pictures.items(), drawn))
+    drawn = (named for replay in replays for named in _experiment_pictures(replay))
+    return with_unique_names(chain(pictures.items(), drawn))
 
 
-def of_different_names(pictures: Iterable[tuple[str, Figure]]) -> dict[str, Figure]:
+def with_unique_names(pictures: Iterable[tuple[str, Figure]]) -> dict[str, Figure]:
     """Return pictures by file name; a number is appended to a name that another picture has
     already.
     """
@@ -70,36 +70,36 @@ def of_different_names(pictures: Iterable[tuple[str, Figure]]) -> dict[str, Figu
     return named
 
 
-def _of_experiment(replay: Replay) -> Iterator[tuple[str, Figure]]:
+def _experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
     """Yield name and picture of everything that is known of one experiment."""
     t_s = replay.t_s
     measured = replay.measured_m
-    fitted = _finite(replay.markers_m)
-    rolled_out = _finite(replay.rolled_out_m)
+    fitted = _infinities_as_nan(replay.markers_m)
+    rolled_out = _infinities_as_nan(replay.rolled_out_m)
     names = replay.marker_names
     if len(names):
-        yield f"tracks_{replay.name}", tracks(t_s, names, measured, fitted, rolled_out)
-        yield f"error_{replay.name}", error_over_time(t_s, measured, fitted, rolled_out)
+        yield f"tracks_{replay.name}", marker_tracks(t_s, names, measured, fitted, rolled_out)
+        yield f"error_{replay.name}", marker_errors(t_s, measured, fitted, rolled_out)
     if len(names) and not replay.static:
-        yield f"spectrum_{replay.name}", spectrum(t_s, measured, fitted, replay.natural_hz)
+        yield f"spectrum_{replay.name}", spectrum_picture(t_s, measured, fitted, replay.natural_hz)
     for k, sensed in enumerate(replay.wrenches, start=1):
         which = "" if len(replay.wrenches) == 1 else f"_{k}"
-        yield f"wrench_{replay.name}{which}", readings_picture(sensed, COMPONENTS, UNITS)
+        yield f"wrench_{replay.name}{which}", sensor_picture(sensed, COMPONENTS, UNITS)
     for name, values in replay.readings.items():
         places = values.shape[1] // 3
         names = [f"{name} {k + 1}" for k in range(places)] if places > 1 else [name]
         unit = replay.reading_units.get(name)
         units = [unit] * places if unit else []
-        yield f"reading_{replay.name}_{name}", readings_picture(values, names, units)
+        yield f"reading_{replay.name}_{name}", sensor_picture(values, names, units)
     for name, points in replay.seen.items():
         yield f"depth_{replay.name}_{name}", depth_picture(points)
     if replay.has_shapes:
-        yield f"shapes_{replay.name}", shapes(replay)
-        for name, figure in contact_shapes(replay).items():
+        yield f"shapes_{replay.name}", shapes_picture(replay)
+        for name, figure in contact_pictures(replay).items():
             yield f"{name}_{replay.name}", figure
 
 
-def _finite(markers_m: Array | None) -> Array | None:
+def _infinities_as_nan(markers_m: Array | None) -> Array | None:
     """Return markers with NaN in place of infinities, where a method or simulation diverged; None
     for None.
     """
@@ -132,7 +132,7 @@ def save_pictures(
     return files
 
 
-def redraw(
+def redraw_pictures(
     run: str | Path, folder: str | Path, say: Callable[[str], None] | None = None
 ) -> list[Path]:
     """Write the pictures of a run folder into `folder`, all but that of the Jacobian, and return
@@ -146,5 +146,5 @@ def redraw(
         If `run` is not a run folder.
     """
     result, replays = read_run(run)
-    with reading_run(Path(run)):
-        return save_pictures(folder, album(replays, result), say)
+    with damaged_run_refused(Path(run)):
+        return save_pictures(folder, all_pictures(replays, result), say)

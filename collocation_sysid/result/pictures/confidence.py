@@ -18,23 +18,23 @@ from ...statistics.uncertainty_budget import main_sources, source_label
 from ..figure_style import (
     BLACK,
     BLUE,
+    COLOUR_CYCLE,
     COLUMN_MM,
-    CYCLE,
     SKY,
     SMALL_PT,
     TEXT_PT,
-    dress,
     framed_figure,
-    mathematical,
+    style_axes,
+    symbol_as_mathtext,
 )
 from .scene import round_length
 
 # Radius of the joint 95 % region of two normal parameters over the half width of one interval.
-JOINT = float(np.sqrt(chi2.ppf(0.95, 2)) / norm.ppf(0.975))
+JOINT_RADIUS = float(np.sqrt(chi2.ppf(0.95, 2)) / norm.ppf(0.975))
 # Half width of the logarithm beyond which an interval is cut off at the edge of the panel.
-WIDEST = np.log(1e3)
+MAX_HALF_WIDTH = np.log(1e3)
 # Deviation of a logarithm beyond which axes show factors instead of percent.
-FACTORS = 1.0
+FACTOR_THRESHOLD = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Confidence:
     quantiles: Array
 
     @classmethod
-    def of(cls, result: Result) -> Confidence | None:
+    def from_result(cls, result: Result) -> Confidence | None:
         """Return the estimates of a result that have an uncertainty; those at a bound have none.
 
         None if the result has no error bars.
@@ -77,13 +77,13 @@ class Confidence:
         )
 
 
-def ellipse(known: Confidence, i: int, j: int, points: int = 181) -> Array:
+def ellipse_outline(confidence: Confidence, i: int, j: int, points: int = 181) -> Array:
     """Return the outline (points, 2) of the joint 95 % region of two logarithms, about their
     estimates.
 
     Parameters
     ----------
-    known : Confidence
+    confidence : Confidence
     i, j : int
         Indices of the two parameters.
     points : int
@@ -92,13 +92,13 @@ def ellipse(known: Confidence, i: int, j: int, points: int = 181) -> Array:
     pair = [i, j]
     angle = np.linspace(0.0, 2 * np.pi, points)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
-    deviation = np.sqrt(np.diag(known.covariance)[pair])
-    rho = float(np.clip(known.covariance[i, j] / deviation.prod(), -1.0, 1.0))
+    deviation = np.sqrt(np.diag(confidence.covariance)[pair])
+    rho = float(np.clip(confidence.covariance[i, j] / deviation.prod(), -1.0, 1.0))
     root = np.array([[1.0, 0.0], [rho, np.sqrt(1 - rho**2)]])
-    return JOINT * known.quantiles[pair] * deviation * (circle @ root.T)
+    return JOINT_RADIUS * confidence.quantiles[pair] * deviation * (circle @ root.T)
 
 
-def confidence_ellipses(known: Confidence) -> Figure:
+def confidence_ellipses(confidence: Confidence) -> Figure:
     """Draw the joint 95 % region of every pair of parameters.
 
     Axes are deviations from the estimate, in percent, or factors where these are large; the cross
@@ -109,12 +109,14 @@ def confidence_ellipses(known: Confidence) -> Figure:
 
     Parameters
     ----------
-    known : Confidence
+    confidence : Confidence
         At least two parameters.
     """
-    count = len(known.names) - 1
-    half = (known.quantiles * np.sqrt(np.diag(known.covariance))).tolist()
-    scales = [_Scale.of(1.15 * min(JOINT * each, WIDEST)) for each in half]
+    count = len(confidence.names) - 1
+    half = (confidence.quantiles * np.sqrt(np.diag(confidence.covariance))).tolist()
+    scales = [
+        _DeviationAxis.from_reach(1.15 * min(JOINT_RADIUS * each, MAX_HALF_WIDTH)) for each in half
+    ]
     figure = framed_figure(COLUMN_MM, COLUMN_MM if count > 1 else 62, 14, 2, 11, 2)
     spaces = {"wspace": 0.12, "hspace": 0.12}
     panels = figure.subplots(count, count, squeeze=False, gridspec_kw=spaces)
@@ -124,31 +126,31 @@ def confidence_ellipses(known: Confidence) -> Figure:
             continue
         i = column
         j = row + 1
-        _draw_pair(axes, ellipse(known, i, j), half[i], half[j])
-        dress(axes)
+        _draw_pair(axes, ellipse_outline(confidence, i, j), half[i], half[j])
+        style_axes(axes)
         axes.set(xlim=scales[i].limits, ylim=scales[j].limits)
         last = row == count - 1
         first = column == 0
         axes.set_xticks(scales[i].ticks, scales[i].labels if last else [""] * 3)
         axes.set_yticks(scales[j].ticks, scales[j].labels if first else [""] * 3)
-        axes.set_xlabel(scales[i].title(known.names[i]) if last else "", fontsize=TEXT_PT)
+        axes.set_xlabel(scales[i].axis_label(confidence.names[i]) if last else "", fontsize=TEXT_PT)
         if first:
-            axes.set_ylabel(scales[j].title(known.names[j]), fontsize=TEXT_PT)
+            axes.set_ylabel(scales[j].axis_label(confidence.names[j]), fontsize=TEXT_PT)
             axes.yaxis.set_label_coords(-0.13 * count, 0.5)
     note = "deviation from the estimate:\n95 % region of each pair,\n95 % interval of each alone"
     figure.text(0.98, 0.97, note if count > 1 else "", ha="right", va="top", fontsize=SMALL_PT)
     return figure
 
 
-def _draw_pair(axes: Axes, outline: Array, wide: float, high: float) -> None:
-    """Draw a region (points, 2) and a cross of half widths `wide` and `high`."""
+def _draw_pair(axes: Axes, outline: Array, half_width: float, half_height: float) -> None:
+    """Draw a region (points, 2) and a cross of half widths `half_width` and `half_height`."""
     axes.fill(*outline.T, facecolor=to_rgba(SKY, 0.35), edgecolor=BLUE, lw=1.0)
-    for line in ([[-wide, wide], [0, 0]], [[0, 0], [-high, high]]):
+    for line in ([[-half_width, half_width], [0, 0]], [[0, 0], [-half_height, half_height]]):
         axes.plot(*line, color=BLACK, lw=0.8, solid_capstyle="butt")
 
 
 @dataclass(frozen=True)
-class _Scale:
+class _DeviationAxis:
     """Axis of a logarithm's deviation from its estimate.
 
     Attributes
@@ -167,9 +169,9 @@ class _Scale:
     unit: str
 
     @classmethod
-    def of(cls, reach: float) -> _Scale:
+    def from_reach(cls, reach: float) -> _DeviationAxis:
         """Return an axis with round numbers within ± `reach`: percent, or factors if it is wide."""
-        if reach > FACTORS:
+        if reach > FACTOR_THRESHOLD:
             factor = round_length(np.exp(0.9 * reach))
             size = float(np.log(factor))
             return cls(reach, (-size, 0.0, size), (f"÷{factor:g}", "1", f"×{factor:g}"), "")
@@ -183,21 +185,21 @@ class _Scale:
         """Ends of the axis, symmetric about zero."""
         return -self.reach, self.reach
 
-    def title(self, name: str) -> str:
+    def axis_label(self, name: str) -> str:
         """Return the label of the axis of the parameter `name`."""
-        return mathematical(name) + self.unit
+        return symbol_as_mathtext(name) + self.unit
 
 
-def correlation_matrix(known: Confidence) -> Figure:
+def correlation_matrix(confidence: Confidence) -> Figure:
     """Draw the correlation of every pair of parameters, as colours and numbers.
 
     Parameters
     ----------
-    known : Confidence
+    confidence : Confidence
         At least two parameters.
     """
-    correlation = correlation_from_covariance(known.covariance)
-    count = len(known.names)
+    correlation = correlation_from_covariance(confidence.covariance)
+    count = len(confidence.names)
     figure = framed_figure(64, 52, 8, 7, 6, 5)
     axes, bar_axes = figure.subplots(1, 2, width_ratios=(1, 0.06), gridspec_kw={"wspace": 0.06})
     image = axes.imshow(correlation, cmap="PuOr", vmin=-1, vmax=1)
@@ -206,8 +208,8 @@ def correlation_matrix(known: Confidence) -> Figure:
             j, i, f"{value:.2f}".replace("-", "−"), ha="center", va="center",
             fontsize=SMALL_PT, color="white" if abs(value) > 0.65 else BLACK,
         )  # fmt: skip
-    symbols = [mathematical(name) for name in known.names]
-    dress(axes, "correlation")
+    symbols = [symbol_as_mathtext(name) for name in confidence.names]
+    style_axes(axes, "correlation")
     axes.grid(False)
     axes.set_xticks(range(count), symbols, fontsize=TEXT_PT)
     axes.set_yticks(range(count), symbols, fontsize=TEXT_PT)
@@ -221,7 +223,7 @@ def correlation_matrix(known: Confidence) -> Figure:
 
 # Smallest share of a variance with a colour of its own; smaller ones are drawn together, and so are
 # all but the largest sources, because there are only as many distinguishable colours.
-LITTLE = 0.03
+SMALLEST_DRAWN_SHARE = 0.03
 OTHERS = "others"
 GREY = "#B4B4B4"
 # Columns of the legend.
@@ -238,14 +240,14 @@ def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
     shares : mapping of estimate to mapping of source to share
         Shares of the variance, from 0 to 1.
     """
-    drawn = main_sources(shares, LITTLE)[: len(CYCLE)]
+    drawn = main_sources(shares, SMALLEST_DRAWN_SHARE)[: len(COLOUR_CYCLE)]
     rows = list(shares)[::-1]
     sources = [*drawn, OTHERS]
     legend_mm = LEGEND_LINE_MM * -(-len(sources) // LEGEND_COLUMNS) + 3
     figure = framed_figure(COLUMN_MM, 12 + legend_mm + 7 * len(rows), 14, 4, 10, legend_mm)
     axes = figure.subplots()
     starts = [0.0] * len(rows)
-    for source, colour in zip(sources, [*CYCLE[: len(drawn)], GREY], strict=True):
+    for source, colour in zip(sources, [*COLOUR_CYCLE[: len(drawn)], GREY], strict=True):
         widths = [
             1 - sum(shares[row].get(s, 0.0) for s in drawn)
             if source == OTHERS
@@ -258,9 +260,9 @@ def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
         for bar in bars:  # a white line keeps neighbours apart
             bar.set(edgecolor="white", linewidth=0.4)
         starts = [a + b for a, b in zip(starts, widths, strict=True)]
-    axes.set_yticks(range(len(rows)), [mathematical(row) for row in rows])
+    axes.set_yticks(range(len(rows)), [symbol_as_mathtext(row) for row in rows])
     axes.set_xlim(0, 1)
-    dress(axes, "", "share of the variance", "")
+    style_axes(axes, "", "share of the variance", "")
     figure.legend(
         loc="upper left", ncols=LEGEND_COLUMNS, frameon=False, fontsize=SMALL_PT,
         handlelength=1.2, labelspacing=0.3, columnspacing=1.5,

@@ -17,22 +17,22 @@ from ..figure_style import PAGE_MM, SMALL_PT, VERMILION
 
 MM_PER_INCH = 25.4
 # Largest width of a panel, as a share of the page.
-WIDEST = 0.6
+MAX_PANEL_SHARE = 0.6
 # Height of a title [inch].
-TITLES = 0.4
+TITLE_HEIGHT_INCH = 0.4
 # Smallest and largest height of a panel over its width.
-HIGH = (0.3, 1.0)
+PANEL_ASPECT_LIMITS = (0.3, 1.0)
 # Rows of outlines above which lines are thinner than 1 pt.
-FACES = 600
+THICK_LINE_ROWS = 600
 # Share of the area of the points that their dots cover.
-COVERED = 0.3
+COVERED_SHARE = 0.3
 # Percentile of the distances at which the colour scale ends.
-SHOWN = 95
+SCALE_PERCENTILE = 95
 # Distance from the points up to which outlines are shown, over the extent of the points.
-BEYOND = 0.5
+OUTLINE_MARGIN = 0.5
 
 
-def depth_picture(seen: Array) -> Figure:
+def depth_picture(rows: Array) -> Figure:
     """Draw depth images with outlines of the surface, and below them the distances from the
     surface.
 
@@ -42,23 +42,27 @@ def depth_picture(seen: Array) -> Figure:
 
     Parameters
     ----------
-    seen : (k, 8)
-        Rows of `Replay.fit_summary`.
+    rows : (k, 8)
+        Rows of `ReplayCommand.fit_summary`.
     """
-    times = np.unique(seen[np.isnan(seen[:, 3]), 0])
-    points = seen[np.isfinite(seen[:, 3])]
+    times = np.unique(rows[np.isnan(rows[:, 3]), 0])
+    points = rows[np.isfinite(rows[:, 3])]
     if not len(points):
-        return _sentence("no point is near enough to the body to count")
+        return _sentence_figure("no point is near enough to the body to count")
     fitted = bool(np.isfinite(points[:, 4]).any())
-    axes, dot = _sheet(points, times, 1 + fitted)
+    axes, dot = _new_panels(points, times, 1 + fitted)
     nearest, farthest = np.percentile(points[:, 3], [1, 99])
     depth = {"cmap": "viridis", "vmin": nearest, "vmax": farthest, "s": dot}
-    end = max(1e-3, 1e3 * float(np.nanpercentile(np.abs(points[:, 4]), SHOWN))) if fitted else 1.0
+    end = (
+        max(1e-3, 1e3 * float(np.nanpercentile(np.abs(points[:, 4]), SCALE_PERCENTILE)))
+        if fitted
+        else 1.0
+    )
     behind = {"cmap": "RdBu", "vmin": -end, "vmax": end, "s": dot}
     for column, t_s in zip(axes.T, times, strict=True):
         here = points[points[:, 0] == t_s]
-        lines = seen[(seen[:, 0] == t_s) & np.isnan(seen[:, 3]), 1:3]
-        image = _panel(column[0], here[:, 1:3], here[:, 3], lines, VERMILION, depth)
+        lines = rows[(rows[:, 0] == t_s) & np.isnan(rows[:, 3]), 1:3]
+        image = _draw_panel(column[0], here[:, 1:3], here[:, 3], lines, VERMILION, depth)
         scales = [(image, "depth [m]")]
         title = f"t = {t_s:.4g} s" if len(times) > 1 else ""
         column[0].set_title(title, fontsize=SMALL_PT)
@@ -66,7 +70,7 @@ def depth_picture(seen: Array) -> Figure:
             used = here[np.isfinite(here[:, 4])]
             unused = here[~np.isfinite(here[:, 4])]
             column[1].plot(*unused[:, 1:3].T, ".", ms=1.5, color="0.7")
-            distances = _panel(column[1], used[:, 1:3], 1e3 * used[:, 4], lines, "0.6", behind)
+            distances = _draw_panel(column[1], used[:, 1:3], 1e3 * used[:, 4], lines, "0.6", behind)
             scales.append((distances, "behind surface [mm]"))
             rms = np.sqrt(np.mean((1e3 * used[:, 4]) ** 2))
             column[1].set_title(f"{rms:.2g} mm RMS, {len(used):,} points", fontsize=SMALL_PT)
@@ -80,23 +84,25 @@ def depth_picture(seen: Array) -> Figure:
     return axes[0, 0].figure
 
 
-def _sentence(text: str) -> Figure:
+def _sentence_figure(text: str) -> Figure:
     """Return a small figure that has only a sentence."""
-    figure = Figure(figsize=(WIDEST * PAGE_MM / MM_PER_INCH, TITLES), layout="constrained")
+    figure = Figure(
+        figsize=(MAX_PANEL_SHARE * PAGE_MM / MM_PER_INCH, TITLE_HEIGHT_INCH), layout="constrained"
+    )
     axes = figure.subplots()
     axes.set_axis_off()
     axes.text(0.5, 0.5, text, ha="center", va="center", fontsize=SMALL_PT)
     return figure
 
 
-def _sheet(points: Array, times: Array, rows: int) -> tuple[NDArray[np.object_], float]:
+def _new_panels(points: Array, times: Array, rows: int) -> tuple[NDArray[np.object_], float]:
     """Return panels (rows, times) with the proportions of the points' extent, and the area of a
     dot.
 
     Parameters
     ----------
     points : (P, 8)
-        Points of `Replay.fit_summary`.
+        Points of `ReplayCommand.fit_summary`.
     times : (m,)
         Times of the samples, one column each.
     rows : int
@@ -109,23 +115,31 @@ def _sheet(points: Array, times: Array, rows: int) -> tuple[NDArray[np.object_],
     """
     inch = PAGE_MM / MM_PER_INCH
     count = len(times)
-    across = min(1 / count, WIDEST)
+    across = min(1 / count, MAX_PANEL_SHARE)
     width, height = np.ptp(points[:, 1:3], axis=0)
-    panel = across * inch * float(np.clip(height / max(width, 1e-12), *HIGH)) + TITLES
-    size = (max(WIDEST, across * count) * inch, panel * rows)
-    dot = COVERED * (72 * across * inch) ** 2 * HIGH[0] / max(1, len(points) / count)
+    panel = (
+        across * inch * float(np.clip(height / max(width, 1e-12), *PANEL_ASPECT_LIMITS))
+        + TITLE_HEIGHT_INCH
+    )
+    size = (max(MAX_PANEL_SHARE, across * count) * inch, panel * rows)
+    dot = (
+        COVERED_SHARE
+        * (72 * across * inch) ** 2
+        * PANEL_ASPECT_LIMITS[0]
+        / max(1, len(points) / count)
+    )
     return Figure(figsize=size, layout="constrained").subplots(rows, count, squeeze=False), dot
 
 
-def _panel(
-    axes: Axes, places: Array, values: Array, lines: Array, colour: str, looks: dict[str, Any]
+def _draw_panel(
+    axes: Axes, image_points: Array, values: Array, lines: Array, colour: str, style: dict[str, Any]
 ) -> PathCollection:
     """Draw points and outlines, and return the points; outlines far from all points are cut off.
 
     Parameters
     ----------
     axes : Axes
-    places : (P, 2)
+    image_points : (P, 2)
         u and v of the points.
     values : (P,)
         Values that colour the points.
@@ -133,17 +147,17 @@ def _panel(
         u and v of the outlines, NaN after each face.
     colour : str
         Colour of the outlines.
-    looks : dict
+    style : dict
         Further arguments of `Axes.scatter`.
     """
-    drawn = axes.scatter(*places.T, c=values, linewidths=0, zorder=1, **looks)
+    drawn = axes.scatter(*image_points.T, c=values, linewidths=0, zorder=1, **style)
     # Of more faces thinner ones, or these would hide the points.
-    thin = min(0.5, FACES / max(1, len(lines)))
+    thin = min(0.5, THICK_LINE_ROWS / max(1, len(lines)))
     axes.plot(*lines.T, color=colour, linewidth=thin, zorder=2)
-    low = places.min(axis=0)
-    high = places.max(axis=0)
-    room = BEYOND * (high - low).max()
-    both = np.vstack([places, lines[np.isfinite(lines).all(axis=1)]])
+    low = image_points.min(axis=0)
+    high = image_points.max(axis=0)
+    room = OUTLINE_MARGIN * (high - low).max()
+    both = np.vstack([image_points, lines[np.isfinite(lines).all(axis=1)]])
     low = np.maximum(both.min(axis=0), low - room)
     high = np.minimum(both.max(axis=0), high + room)
     margin = 0.03 * (high - low).max()

@@ -14,29 +14,29 @@ from ...array_types import Array
 from ...fem.constants import symbol_with_unit
 from ...fem.mesh import boundary_of
 from ..figure_style import PAGE_MM, SMALL_PT
-from ..replay import Replay
-from .projection import Camera
-from .scene import Drawn, View, draw_directions, draw_scale, sheet, width_over_height
-from .shapes import COLOURS
+from ..replay import MotionRecord
+from .projection import ParallelCamera
+from .scene import BodyDrawing, SheetView, aspect_ratio, draw_directions, draw_scale, sheet
+from .shapes import FIELD_COLOURS
 
 HEAD_MM = 5.0
 FOOT_MM = 8.0
 CORNER_MM = 14.0
 BAR_ROOM_MM = 20.0
 GAP_MM = 3.0
-TALLEST_MM = 55.0
-TITLES = "lower end", "estimate", "upper end"
+MAX_BODY_HEIGHT_MM = 55.0
+COLUMN_TITLES = "lower end", "estimate", "upper end"
 # Ratio of posterior to prior standard deviation above which colours fade.
-TOLD = 0.5
+FADING_START = 0.5
 # Ratio at which colours have faded completely: the data add nothing to the prior.
-UNTOLD = 1.0
+FADING_END = 1.0
 # Largest share of white, so that faded colours can still be compared.
-PALEST = 0.8
+MAX_FADING = 0.8
 # Colour of other regions.
-OTHERS = np.array([0.85, 0.85, 0.85])
+OTHER_REGION_COLOUR = np.array([0.85, 0.85, 0.85])
 
 
-def field_picture(seen: Replay, name: str, values: Array) -> Figure:
+def field_picture(replay: MotionRecord, name: str, values: Array) -> Figure:
     """Draw the estimate and the ends of its interval on the body, and below them on a cut through
     it.
 
@@ -44,42 +44,46 @@ def field_picture(seen: Replay, name: str, values: Array) -> Figure:
 
     Parameters
     ----------
-    seen : Replay
+    replay : ReplayCommand
         An experiment with this body.
     name : str
         Name of the constant.
     values : (E, 4)
-        Its values in each element, see `Replay.fields`.
+        Its values in each element, see `ReplayCommand.fields`.
     """
-    nodes_m = seen.undeformed_m
-    cells = np.asarray(seen.tetrahedra, dtype=np.int64)
-    camera = Camera.facing(nodes_m[None], seen.up)
+    nodes_m = replay.undeformed_m
+    cells = np.asarray(replay.tetrahedra, dtype=np.int64)
+    camera = ParallelCamera.facing_motion(nodes_m[None], replay.up)
     # An upright cut, if it is looked at from above.
-    across = camera.axes[2] - (camera.axes[2] @ seen.up) * seen.up
+    across = camera.axes[2] - (camera.axes[2] @ replay.up) * replay.up
     forward = nodes_m[cells].mean(axis=1) @ across
     behind = np.flatnonzero(forward <= np.median(forward))
     rows = np.arange(len(cells)), behind
-    aspect = width_over_height(camera, nodes_m)
+    aspect = aspect_ratio(camera, nodes_m)
     width = (PAGE_MM - CORNER_MM - BAR_ROOM_MM - 2 * GAP_MM) / 3
-    height = min(width / aspect, TALLEST_MM)
+    height = min(width / aspect, MAX_BODY_HEIGHT_MM)
     total = HEAD_MM + 2 * height + GAP_MM + FOOT_MM
     figure, axes = sheet(PAGE_MM, total)
     known = values[np.isfinite(values[:, 0])]
     # Wide intervals where the data add nothing would take up the colour scale.
     low = np.quantile(known[:, 1], 0.05)
     high = np.quantile(known[:, 2], 0.95)
-    scale = ScalarMappable((LogNorm if low > 0 else Normalize)(low, high), COLOURS)
-    untold = np.clip((values[:, 3] - TOLD) / (UNTOLD - TOLD), 0.0, PALEST)[:, None]
+    scale = ScalarMappable((LogNorm if low > 0 else Normalize)(low, high), FIELD_COLOURS)
+    untold = np.clip((values[:, 3] - FADING_START) / (FADING_END - FADING_START), 0.0, MAX_FADING)[
+        :, None
+    ]
     no_nodes = np.zeros(len(nodes_m), dtype=bool)
     for row, own in enumerate(rows):
         faces, owners = boundary_of(cells[own])
-        for column, (title, place) in enumerate(zip(TITLES, (1, 0, 2), strict=True)):
+        for column, (title, place) in enumerate(zip(COLUMN_TITLES, (1, 0, 2), strict=True)):
             corner = CORNER_MM + column * (width + GAP_MM), FOOT_MM + (1 - row) * (height + GAP_MM)
-            view = View.fitting(camera, nodes_m, (width, height), corner)
+            view = SheetView.fit_points(camera, nodes_m, (width, height), corner)
             colours = scale.to_rgba(values[:, place])[:, :3]
             colours = (1 - np.nan_to_num(untold)) * colours + np.nan_to_num(untold)
-            colours[np.isnan(values[:, place])] = OTHERS
-            Drawn(axes, view, faces).show(nodes_m, no_nodes, np.zeros((0, 3)), colours[own[owners]])
+            colours[np.isnan(values[:, place])] = OTHER_REGION_COLOUR
+            BodyDrawing(axes, view, faces).update(
+                nodes_m, no_nodes, np.zeros((0, 3)), colours[own[owners]]
+            )
             if row == 0:
                 axes.text(
                     corner[0] + width / 2, total - HEAD_MM / 2, title, ha="center", va="center",

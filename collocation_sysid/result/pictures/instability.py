@@ -9,35 +9,36 @@ from matplotlib.figure import Figure
 
 from ...program.loss_of_stability import LostStability
 from ..figure_style import PAGE_MM, SMALL_PT
-from .projection import Camera
-from .scene import Drawn, View, draw_directions, draw_scale, sheet, width_over_height
-from .shapes import COLOURS
+from .projection import ParallelCamera
+from .scene import BodyDrawing, SheetView, aspect_ratio, draw_directions, draw_scale, sheet
+from .shapes import FIELD_COLOURS
 
 HEAD_MM = 6.0
 FOOT_MM = 8.0
 MARGIN_MM = 14.0
-TALLEST_MM = 90.0
+MAX_BODY_HEIGHT_MM = 90.0
 # Longest drawn displacement over the largest extent of the body.
-DRAWN = 0.08
+RELATIVE_AMPLITUDE = 0.08
 
 
-def instability_picture(lost: LostStability) -> Figure:
+def instability_picture(instability: LostStability) -> Figure:
     """Draw the body displaced along the unstable mode, coloured by the mode's amplitude."""
-    extent_m = float(np.ptp(lost.positions_m, axis=0).max())
-    shown_m = lost.positions_m + DRAWN * extent_m * lost.mode
-    camera = Camera.facing(shown_m[None], np.array([0.0, 0.0, 1.0]))
-    aspect = width_over_height(camera, shown_m)
+    extent_m = float(np.ptp(instability.positions_m, axis=0).max())
+    shown_m = instability.positions_m + RELATIVE_AMPLITUDE * extent_m * instability.mode
+    camera = ParallelCamera.facing_motion(shown_m[None], np.array([0.0, 0.0, 1.0]))
+    aspect = aspect_ratio(camera, shown_m)
     width = PAGE_MM - 2 * MARGIN_MM
-    height = min(width / aspect, TALLEST_MM)
+    height = min(width / aspect, MAX_BODY_HEIGHT_MM)
     figure, axes = sheet(PAGE_MM, HEAD_MM + height + FOOT_MM)
-    view = View.fitting(camera, shown_m, (width, height), (MARGIN_MM, FOOT_MM))
-    amplitude = np.linalg.norm(lost.mode, axis=1)[lost.faces].mean(axis=1)
-    colours = ScalarMappable(Normalize(0.0, 1.0), COLOURS).to_rgba(amplitude)[:, :3]
+    view = SheetView.fit_points(camera, shown_m, (width, height), (MARGIN_MM, FOOT_MM))
+    amplitude = np.linalg.norm(instability.mode, axis=1)[instability.faces].mean(axis=1)
+    colours = ScalarMappable(Normalize(0.0, 1.0), FIELD_COLOURS).to_rgba(amplitude)[:, :3]
     none = np.zeros(len(shown_m), dtype=bool)
-    Drawn(axes, view, lost.faces).show(shown_m, none, np.zeros((0, 3)), colours)
+    BodyDrawing(axes, view, instability.faces).update(shown_m, none, np.zeros((0, 3)), colours)
     title = (
-        f"unstable mode: stretches {lost.smaller_stretch:.3g} and {lost.larger_stretch:.3g}, "
-        f"wavelength {1e3 * lost.wavelength_m:.3g} mm"
+        f"unstable mode: stretches {instability.smaller_stretch:.3g} "
+        f"and {instability.larger_stretch:.3g}, "
+        f"wavelength {1e3 * instability.wavelength_m:.3g} mm"
     )
     axes.text(PAGE_MM / 2, HEAD_MM / 2 + height + FOOT_MM, title, ha="center", fontsize=SMALL_PT)
     draw_directions(axes, camera, (6.0, FOOT_MM))

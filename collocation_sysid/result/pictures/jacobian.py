@@ -15,14 +15,14 @@ from matplotlib.image import AxesImage
 from ...array_types import Array
 from ...program.collocation import Collocation
 from ...runs.check.derivatives import shortened_experiment
-from ..figure_style import PAGE_MM, SMALL_PT, dress, framed_figure, mathematical
+from ..figure_style import PAGE_MM, SMALL_PT, framed_figure, style_axes, symbol_as_mathtext
 
 # Timesteps shown: enough to see the band, few enough to see its blocks.
 SHOWN_STEPS = 6
 # Further samples evaluated: rows of the last shown steps depend on two steps ahead.
 SPARE_SAMPLES = 4
 # Picture elements across a panel.
-RASTER = 400
+RASTER_SIZE = 400
 # Decades of magnitude that the colour scale spans.
 DECADES = 6
 
@@ -63,22 +63,22 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     grid = figure.add_gridspec(1, 6, width_ratios=widths, wspace=0.03)
     left, middle, right, bar_axes = (figure.add_subplot(grid[k]) for k in (0, 1, 3, 5))
     if nq:
-        _draw(left, matrix[:, :nq], norm)
-    _draw(middle, band, norm)
-    image = _draw(right, block, norm)
-    dress(left, "", "", "equations of motion")
+        _draw_magnitudes(left, matrix[:, :nq], norm)
+    _draw_magnitudes(middle, band, norm)
+    image = _draw_magnitudes(right, block, norm)
+    style_axes(left, "", "", "equations of motion")
     left.set_xticks(
-        np.arange(nq) + 0.5, [mathematical(p.name) for p in collocation.parameters.free]
+        np.arange(nq) + 0.5, [symbol_as_mathtext(p.name) for p in collocation.parameters.free]
     )
     left.set_ylim(rows, 0)
     _tick_blocks(left, "y", "c", range(first, steps), height)
-    dress(middle, f"{steps} of {total} timesteps", "node positions")
+    style_axes(middle, f"{steps} of {total} timesteps", "node positions")
     _tick_blocks(middle, "x", "x", range(steps), width)
     _tick_blocks(middle, "y", "c", range(first, steps), height)
     middle.tick_params(labelleft=False, left=False)
     name = rf"$\partial c_{{{steps - 1}}} / \partial x_{{{steps - 1}}}$"
     free = "" if segment.has_constraints_of_grasps else ", free ones only"
-    dress(right, f"{name}: the mesh graph", "column, 3 node + axis", f"row{free}")
+    style_axes(right, f"{name}: the mesh graph", "column, 3 node + axis", f"row{free}")
     for axes in (left, middle, right):
         axes.grid(False)
         axes.spines[:].set_visible(True)
@@ -104,14 +104,14 @@ def _first_steps(collocation: Collocation, z: Array) -> tuple[Collocation, Array
     return short, short.pack(p, [part.x[: segment.grid_times] for part, segment in pairs])
 
 
-def _draw(axes: Axes, matrix: sp.csc_array, norm: LogNorm) -> AxesImage:
+def _draw_magnitudes(axes: Axes, matrix: sp.csc_array, norm: LogNorm) -> AxesImage:
     """Draw the magnitudes of a sparse matrix on a raster no finer than the picture.
 
     Each raster element has the largest magnitude of its entries.
     """
     rows, columns = matrix.shape  # type: ignore[misc]
     entries = sp.coo_array(matrix)
-    raster = np.full((min(RASTER, rows), min(RASTER, columns)), -1.0)
+    raster = np.full((min(RASTER_SIZE, rows), min(RASTER_SIZE, columns)), -1.0)
     places = (
         entries.row.astype(np.int64) * raster.shape[0] // rows,
         entries.col.astype(np.int64) * raster.shape[1] // columns,

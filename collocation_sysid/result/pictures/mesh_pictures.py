@@ -15,23 +15,23 @@ from numpy.typing import NDArray
 
 from ...array_types import Array
 from ...fem.mesh_checks import edge_lengths, mean_ratios
-from ..figure_style import BLUE, COLUMN_MM, SMALL_PT, VERMILION, dress, framed_figure
-from ..replay import Replay
-from .projection import ELEVATION_DEG, Camera, Triangles
+from ..figure_style import BLUE, COLUMN_MM, SMALL_PT, VERMILION, framed_figure, style_axes
+from ..replay import MotionRecord
+from .projection import ELEVATION_DEG, ParallelCamera, Triangles
 from .scene import (
-    Drawn,
-    View,
+    BodyDrawing,
+    SheetView,
+    aspect_ratio,
     draw_directions,
-    draw_key,
+    draw_legend,
     draw_scale,
-    key,
+    legend_handles,
+    part_legend_handle,
     sheet,
-    skin_key,
-    width_over_height,
 )
 
 # More names than this would be a list, not a picture.
-MOST_NAMES = 24
+MAX_WRITTEN_NAMES = 24
 HEAD_MM = 6.0
 FOOT_MM = 14.0
 GAP_MM = 3.0
@@ -39,46 +39,46 @@ GAP_MM = 3.0
 LINE_MM = 3.2
 # Mean width of a letter.
 LETTER_MM = 1.4
-TALLEST_MM = 70.0
+MAX_BODY_HEIGHT_MM = 70.0
 # Shortest distance on paper at which two marks are drawn apart: nearer ones cover each other.
-SEEN_MM = 0.4
-GIVEN = "place given"
-UNKNOWN = "no place given"
+MIN_MARK_DISTANCE_MM = 0.4
+STATED_PLACE = "place given"
+UNSTATED_PLACE = "no place given"
 TENDON = "tendons"
-LOOKS: dict[str, dict[str, Any]] = {
-    GIVEN: {"ls": "", "marker": "x", "ms": 3.2, "mec": BLUE, "mew": 0.8},
+MARK_STYLES: dict[str, dict[str, Any]] = {
+    STATED_PLACE: {"ls": "", "marker": "x", "ms": 3.2, "mec": BLUE, "mew": 0.8},
     TENDON: {"color": BLUE, "lw": 1.0, "marker": ".", "ms": 2.0},
-    UNKNOWN: {"ls": "", "marker": "s", "ms": 5.0, "mfc": "none", "mec": BLUE, "mew": 0.6},
+    UNSTATED_PLACE: {"ls": "", "marker": "s", "ms": 5.0, "mfc": "none", "mec": BLUE, "mew": 0.6},
 }
 
 
-def mesh_picture(seen: Replay) -> Figure:
+def mesh_picture(replay: MotionRecord) -> Figure:
     """Draw the undeformed body from the front and from behind, with names of its markers.
 
     Tendons are drawn through the body. A cross is the stated place of a marker whose estimated
     place
     differs; a frame surrounds a marker whose place was not stated.
     """
-    nodes_m = seen.undeformed_m
-    surface = seen.surface
-    up = seen.up
-    names = seen.marker_names
-    places_m = seen.marker_places_m
-    stated_m = seen.given_places_m
-    is_grasped = np.asarray(seen.held.any(axis=0))
-    part_names = seen.part_names
-    front = Camera.facing(nodes_m[None], up)
+    nodes_m = replay.undeformed_m
+    surface = replay.surface
+    up = replay.up
+    names = replay.marker_names
+    places_m = replay.marker_places_m
+    stated_m = replay.given_places_m
+    is_grasped = np.asarray(replay.held.any(axis=0))
+    part_names = replay.part_names
+    front = ParallelCamera.facing_motion(nodes_m[None], up)
     behind = front.raised(-ELEVATION_DEG).turned(180.0, up).raised(ELEVATION_DEG)
     everything = np.vstack([nodes_m, places_m, stated_m])
-    aspect = width_over_height(front, everything)
-    named = 0 < len(names) <= MOST_NAMES
+    aspect = aspect_ratio(front, everything)
+    named = 0 < len(names) <= MAX_WRITTEN_NAMES
     margin = min(26.0, 4.0 + LETTER_MM * max(map(len, names))) if named else 2.0
     is_side_by_side = aspect < 1.0
     room = COLUMN_MM - 2 * margin
     width = (room - GAP_MM) / 2 if is_side_by_side else room
-    height = min(width / aspect, TALLEST_MM / (1 if is_side_by_side else 2))
+    height = min(width / aspect, MAX_BODY_HEIGHT_MM / (1 if is_side_by_side else 2))
     elsewhere = not np.array_equal(stated_m, places_m)
-    marked = elsewhere or seen.tendons_m is not None
+    marked = elsewhere or replay.tendons_m is not None
     head = HEAD_MM + LINE_MM * ((len(part_names) > 1) + marked)
     total = head + FOOT_MM + (height if is_side_by_side else 2 * height + GAP_MM)
     figure, axes = sheet(COLUMN_MM, total)
@@ -86,20 +86,20 @@ def mesh_picture(seen: Replay) -> Figure:
         (margin, total - head - height),
         (margin + width + GAP_MM, FOOT_MM) if is_side_by_side else (margin, FOOT_MM),
     )
-    first = _seen_first(front, behind, places_m, nodes_m, surface)
+    first = _are_named_in_front(front, behind, places_m, nodes_m, surface)
     views = []
     marks = set[str]()
     for camera, corner, mine in zip((front, behind), corners, (first, ~first), strict=True):
-        view = View.fitting(camera, everything, (width, height), corner)
-        Drawn(axes, view, surface, seen.surface_parts, seen.surface_nodes).show(
+        view = SheetView.fit_points(camera, everything, (width, height), corner)
+        BodyDrawing(axes, view, surface, replay.surface_parts, replay.surface_nodes).update(
             nodes_m, is_grasped, places_m
         )
-        marks |= _draw_given(axes, view, places_m, stated_m)
-        if seen.tendons_m is not None:
-            axes.plot(*view.places(seen.tendons_m).T, zorder=5.5, **LOOKS[TENDON])
+        marks |= _draw_stated_places(axes, view, places_m, stated_m)
+        if replay.tendons_m is not None:
+            axes.plot(*view.to_sheet_mm(replay.tendons_m).T, zorder=5.5, **MARK_STYLES[TENDON])
             marks.add(TENDON)
         if named:
-            dots = view.places(places_m[mine])
+            dots = view.to_sheet_mm(places_m[mine])
             own = [name for name, here in zip(names, mine, strict=True) if here]
             _write_names(axes, dots, own, COLUMN_MM / 2, (margin - 1, COLUMN_MM - margin + 1))
         views.append(view)
@@ -108,22 +108,25 @@ def mesh_picture(seen: Replay) -> Figure:
     draw_scale(axes, views[0].mm_per_m, (COLUMN_MM / 2 - 12, 4.0), 15.0)
     entries = ["grasped"] if is_grasped.any() else []
     entries += ["markers", "behind the body"] if len(names) else []
-    lines = [key(*entries), [Line2D([], [], label=w, **LOOKS[w]) for w in sorted(marks)]]
+    lines = [
+        legend_handles(*entries),
+        [Line2D([], [], label=w, **MARK_STYLES[w]) for w in sorted(marks)],
+    ]
     if len(part_names) > 1:
-        lines.append([skin_key(k, name or "rest") for k, name in enumerate(part_names)])
+        lines.append([part_legend_handle(k, name or "rest") for k, name in enumerate(part_names)])
     for k, handles in enumerate(filter(None, lines)):
-        draw_key(axes, handles, (1.0, total - 1.5 - k * LINE_MM))
+        draw_legend(axes, handles, (1.0, total - 1.5 - k * LINE_MM))
     return figure
 
 
-def _draw_given(axes: Axes, view: View, places_m: Array, given_m: Array) -> set[str]:
+def _draw_stated_places(axes: Axes, view: SheetView, places_m: Array, stated_m: Array) -> set[str]:
     """Mark markers whose estimated place differs from the stated one, or that have no stated place.
 
     Parameters
     ----------
     axes : Axes
     view : DepthCameraModel
-    places_m, given_m : (M, 3)
+    places_m, stated_m : (M, 3)
         Estimated and stated places; stated ones are NaN where there is none.
 
     Returns
@@ -131,30 +134,34 @@ def _draw_given(axes: Axes, view: View, places_m: Array, given_m: Array) -> set[
     set of str
         The kinds of marks that were drawn, for the legend.
     """
-    estimated_mm = view.places(places_m)
-    stated_mm = view.places(given_m)
+    estimated_mm = view.to_sheet_mm(places_m)
+    stated_mm = view.to_sheet_mm(stated_m)
     drawn = set[str]()
-    unknown = np.isnan(given_m[:, 0])
-    moved = np.linalg.norm(estimated_mm - stated_mm, axis=1) > SEEN_MM  # False for NaN
+    unknown = np.isnan(stated_m[:, 0])
+    moved = np.linalg.norm(estimated_mm - stated_mm, axis=1) > MIN_MARK_DISTANCE_MM  # False for NaN
     if unknown.any():
-        axes.plot(*estimated_mm[unknown].T, zorder=6, **LOOKS[UNKNOWN])
-        drawn.add(UNKNOWN)
+        axes.plot(*estimated_mm[unknown].T, zorder=6, **MARK_STYLES[UNSTATED_PLACE])
+        drawn.add(UNSTATED_PLACE)
     if moved.any():
-        axes.plot(*stated_mm[moved].T, zorder=6, **LOOKS[GIVEN])
+        axes.plot(*stated_mm[moved].T, zorder=6, **MARK_STYLES[STATED_PLACE])
         segments = np.stack([stated_mm[moved], estimated_mm[moved]], axis=1)
         axes.add_collection(LineCollection(list(segments), colors=BLUE, linewidths=0.5, zorder=6))
-        drawn.add(GIVEN)
+        drawn.add(STATED_PLACE)
     return drawn
 
 
-def _seen_first(
-    front: Camera, behind: Camera, places_m: Array, nodes_m: Array, surface: Triangles
+def _are_named_in_front(
+    front: ParallelCamera,
+    behind: ParallelCamera,
+    places_m: Array,
+    nodes_m: Array,
+    surface: Triangles,
 ) -> NDArray[np.bool_]:
     """Return for each marker (M,) whether its name is written in the front view, else in the one
     from behind.
     """
-    hidden = [camera.hidden(places_m, nodes_m, surface) for camera in (front, behind)]
-    is_in_front = front.nearness(places_m) >= front.nearness(nodes_m).mean()
+    hidden = [camera.are_hidden(places_m, nodes_m, surface) for camera in (front, behind)]
+    is_in_front = front.depths_m(places_m) >= front.depths_m(nodes_m).mean()
     return np.where(hidden[0] == hidden[1], is_in_front, ~hidden[0])
 
 
@@ -184,7 +191,7 @@ def _write_names(
         edges, (np.flatnonzero(on_left), np.flatnonzero(~on_left)), ("right", "left"), strict=True
     ):
         members = members[np.argsort(dots[members, 1])]
-        for m, level in zip(members, apart(dots[members, 1], LINE_MM), strict=True):
+        for m, level in zip(members, spread_levels(dots[members, 1], LINE_MM), strict=True):
             inner = edge + (1.5 if align == "right" else -1.5)
             axes.plot(
                 [dots[m, 0], inner, edge], [dots[m, 1], level, level], color="#707070", lw=0.4,
@@ -194,7 +201,7 @@ def _write_names(
             axes.text(edge + (-0.5 if align == "right" else 0.5), level, names[int(m)], **text)
 
 
-def apart(levels: Array, gap: float) -> Array:
+def spread_levels(levels: Array, gap: float) -> Array:
     """Return ascending levels (k,), moved as little as possible to be at least `gap` from each
     other.
     """
@@ -210,7 +217,7 @@ def apart(levels: Array, gap: float) -> Array:
     return np.concatenate([*means, np.zeros(0)]) + steps
 
 
-BINS = 24
+HISTOGRAM_BINS = 24
 
 
 def elements_picture(nodes_m: Array, tetrahedra: NDArray[np.integer]) -> Figure:
@@ -234,12 +241,12 @@ def elements_picture(nodes_m: Array, tetrahedra: NDArray[np.integer]) -> Figure:
     widest = float(size_mm.max())
     spread = np.ptp(size_mm) > 0.02 * widest
     limits = (float(size_mm.min()), widest) if spread else (0.9 * widest, 1.1 * widest)
-    left.hist(size_mm, BINS, range=limits, color=BLUE)
-    right.hist(quality, BINS, range=(0.0, 1.0), color=BLUE)
+    left.hist(size_mm, HISTOGRAM_BINS, range=limits, color=BLUE)
+    right.hist(quality, HISTOGRAM_BINS, range=(0.0, 1.0), color=BLUE)
     worst = float(quality.min())
     right.axvline(worst, color=VERMILION, lw=1.0)
-    dress(left, f"{len(tetrahedra)} elements", "size [mm]", "elements")
-    dress(right, f"worst {worst:.2f}", "quality, 1 = regular")
+    style_axes(left, f"{len(tetrahedra)} elements", "size [mm]", "elements")
+    style_axes(right, f"worst {worst:.2f}", "quality, 1 = regular")
     right.title.set_color(VERMILION)
     for axes in (left, right):
         axes.grid(False, axis="x")

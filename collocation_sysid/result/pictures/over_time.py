@@ -20,17 +20,17 @@ from ..figure_style import (
     PAGE_MM,
     TEXT_PT,
     VERMILION,
-    Picture,
-    dress,
+    NotebookFigure,
+    add_figure_legend,
+    add_legend_above,
     framed_figure,
-    legend_above,
-    legend_of_all,
-    log_axis,
+    make_log_axis,
+    style_axes,
 )
 
 
-def models(
-    fitted_m: Array | None, rolled_out_m: Array | None
+def drawn_models(
+    fitted_m: Array | None, simulated_m: Array | None
 ) -> list[tuple[str, Array, dict[str, Any]]]:
     """Return label, markers (T, M, 3) and line style of each trajectory that is not None.
 
@@ -38,7 +38,7 @@ def models(
     """
     named = (
         ("fitted", fitted_m, {"color": BLUE, "lw": LINE_PT}),
-        ("simulated", rolled_out_m, {"color": VERMILION, "lw": LINE_PT, "ls": (0, (4, 2))}),
+        ("simulated", simulated_m, {"color": VERMILION, "lw": LINE_PT, "ls": (0, (4, 2))}),
     )
     return [(label, model, style) for label, model, style in named if model is not None]
 
@@ -46,7 +46,7 @@ def models(
 Box = tuple[float, float, float, float]
 
 # More markers make a figure higher than a page, in which it is scaled down to illegible numbers.
-MOST_MARKERS = 3
+MAX_SHOWN_MARKERS = 3
 ROW_MM = 27.0
 GAP_MM = 6.5
 LEGEND_MM = 12.0
@@ -57,13 +57,13 @@ BETWEEN_MM = 10.0
 UPPER_SHARE = 0.64
 
 
-def tracks(
+def marker_tracks(
     t_s: Array,
     names: Sequence[str],
     measured_m: Array,
     fitted_m: Array | None,
-    rolled_out_m: Array | None = None,
-    max_markers: int = MOST_MARKERS,
+    simulated_m: Array | None = None,
+    max_markers: int = MAX_SHOWN_MARKERS,
 ) -> Figure:
     """Draw the coordinates of markers over time, each with model minus measurement below.
 
@@ -77,18 +77,18 @@ def tracks(
         Names of the markers.
     measured_m : (T, M, 3)
         Measured markers, NaN where missing.
-    fitted_m, rolled_out_m : (T, M, 3) or None
+    fitted_m, simulated_m : (T, M, 3) or None
         Fitted markers, and those of a simulation with the estimated parameters.
     max_markers : int
         Of more markers, those with the largest residuals are shown.
     """
-    drawn = models(fitted_m, rolled_out_m)
+    drawn = drawn_models(fitted_m, simulated_m)
     shown = _worst_markers(measured_m, [model for _, model, _ in drawn], max_markers)
     some = f"{len(shown)} of {len(names)} markers, those with the largest errors"
     title = some if len(shown) < len(names) else ""
     head = LEGEND_MM + (5.0 if title else 0.0)
     height = head + len(shown) * (ROW_MM + GAP_MM) - GAP_MM + FOOT_MM
-    figure = Picture(figsize=(PAGE_MM / 25.4, height / 25.4))
+    figure = NotebookFigure(figsize=(PAGE_MM / 25.4, height / 25.4))
     errors = [1e3 * (model - measured_m)[:, shown] for _, model, _ in drawn]
     reach = max((float(np.nanmax(np.abs(e), initial=0.0)) for e in errors), default=0.0) or 1.0
     margin = 0.03 * (t_s[-1] - t_s[0]) or 1.0
@@ -97,16 +97,16 @@ def tracks(
     dots = {"ls": "", "marker": ".", "ms": 3.5, "color": BLACK, "mec": "none", "alpha": 0.7}
     for row, marker in enumerate(shown):
         for axis, letter in enumerate("xyz"):
-            upper_box, lower_box = _boxes(row, axis, height, head)
+            upper_box, lower_box = _axes_boxes(row, axis, height, head)
             upper = figure.add_axes(upper_box)
             lower = figure.add_axes(lower_box)
             measured = 1e3 * measured_m[:, marker, axis]
-            dress(upper, f"{names[marker]}, {letter}", "", "" if axis else "[mm]")
-            dress(lower, "", "", "" if axis else "error")
+            style_axes(upper, f"{names[marker]}, {letter}", "", "" if axis else "[mm]")
+            style_axes(lower, "", "", "" if axis else "error")
             for each in (upper, lower):
                 each.set_xlim(start, stop)
                 each.xaxis.set_major_locator(MaxNLocator(4))
-                each.yaxis.set_label_coords((3.5 - LEFT_MM) / _width_mm(), 0.5)
+                each.yaxis.set_label_coords((3.5 - LEFT_MM) / _column_width_mm(), 0.5)
             upper.plot(t_s, measured, label="measured", zorder=3, **dots)
             lower.axhline(0.0, color=BLACK, lw=0.6)
             for label, model_m, style in drawn:
@@ -126,11 +126,11 @@ def tracks(
         "borderaxespad": 0.0,
     }
     title_style = {"title": title, "title_fontsize": TEXT_PT, "alignment": "left"}
-    legend_of_all(figure, 3, markerscale=2, **placement, **title_style)
+    add_figure_legend(figure, 3, markerscale=2, **placement, **title_style)
     return figure
 
 
-def _boxes(row: int, axis: int, height: float, head: float) -> tuple[Box, Box]:
+def _axes_boxes(row: int, axis: int, height: float, head: float) -> tuple[Box, Box]:
     """Return the positions of an upper and a lower pair of axes, in shares of the figure.
 
     Parameters
@@ -140,7 +140,7 @@ def _boxes(row: int, axis: int, height: float, head: float) -> tuple[Box, Box]:
     height, head : float
         Heights of the figure and of the space above the first row [mm].
     """
-    width = _width_mm()
+    width = _column_width_mm()
     x = (LEFT_MM + axis * (width + BETWEEN_MM)) / PAGE_MM
     bottom = height - head - row * (ROW_MM + GAP_MM) - ROW_MM
     split = (1 - UPPER_SHARE) * ROW_MM
@@ -150,7 +150,7 @@ def _boxes(row: int, axis: int, height: float, head: float) -> tuple[Box, Box]:
     )
 
 
-def _width_mm() -> float:
+def _column_width_mm() -> float:
     """Return the width of one of the three columns."""
     return (PAGE_MM - LEFT_MM - RIGHT_MM - 2 * BETWEEN_MM) / 3
 
@@ -169,11 +169,11 @@ def _worst_markers(measured_m: Array, models_m: Sequence[Array], count: int) -> 
 
 
 # Errors whose ratio is larger are drawn on a logarithmic axis.
-FAR_APART = 15.0
+LOG_AXIS_RATIO = 15.0
 
 
-def error_over_time(
-    t_s: Array, measured_m: Array, fitted_m: Array | None, rolled_out_m: Array | None = None
+def marker_errors(
+    t_s: Array, measured_m: Array, fitted_m: Array | None, simulated_m: Array | None = None
 ) -> Figure:
     """Draw the root mean square distance of the markers over time, fitted and simulated.
 
@@ -183,26 +183,26 @@ def error_over_time(
         Times of the samples.
     measured_m : (T, M, 3)
         Measured markers, NaN where missing; samples without any marker leave a gap.
-    fitted_m, rolled_out_m : (T, M, 3) or None
+    fitted_m, simulated_m : (T, M, 3) or None
         Fitted and simulated markers.
     """
     figure = framed_figure(COLUMN_MM, 52, 13, 2, 9.5, 9)
     axes = figure.subplots()
     totals = []
-    for label, model_m, style in models(fitted_m, rolled_out_m):
+    for label, model_m, style in drawn_models(fitted_m, simulated_m):
         squares = np.sum((model_m - measured_m) ** 2, axis=2)
         if not np.isfinite(squares).any():
             continue
         totals.append(float(1e3 * np.sqrt(np.nanmean(squares))))
         label = f"{label}: {totals[-1]:.3g} mm over all"
         axes.plot(t_s, 1e3 * rms_over_markers(squares), label=label, **style)
-    dress(axes, "", "time [s]", "RMS over markers [mm]")
-    if totals and max(totals) > FAR_APART * min(totals) > 0:
-        log_axis(axes)
+    style_axes(axes, "", "time [s]", "RMS over markers [mm]")
+    if totals and max(totals) > LOG_AXIS_RATIO * min(totals) > 0:
+        make_log_axis(axes)
     else:
         axes.set_ylim(bottom=0.0)
     if totals:
-        legend_above(axes, columns=1)
+        add_legend_above(axes, columns=1)
     return figure
 
 
@@ -219,31 +219,33 @@ def rms_over_markers(squares: Array) -> Array:
 HEIGHT_MM = 42.0
 
 
-def readings_picture(said: Array, names: Sequence[str], units: Sequence[str] = ()) -> Figure:
+def sensor_picture(samples: Array, names: Sequence[str], units: Sequence[str] = ()) -> Figure:
     """Draw the numbers of a sensor over time, three in a row, as the force above the torque of a
     wrench.
 
     Parameters
     ----------
-    said : (S, 1 + 3m)
+    samples : (S, 1 + 3m)
         Time [s], and m numbers as measured, fitted and simulated; NaN where there are none.
     names : sequence of m str
     units : sequence of m str, or empty
         Units of the numbers; not written if empty.
     """
     t_s, measured, fitted, rolled_out = np.split(
-        said, [1, *np.cumsum([len(names)] * 2) + 1], axis=1
+        samples, [1, *np.cumsum([len(names)] * 2) + 1], axis=1
     )
     there = np.asarray(np.isfinite(measured).any(axis=0))
     shown = [k for k in range(len(names)) if there[k - k % 3 : k - k % 3 + 3].any()]
     columns = min(3, len(shown))
     size = PAGE_MM / 25.4, HEIGHT_MM * -(-len(shown) // columns) / 25.4
-    figure = Picture(figsize=size, layout="constrained")
+    figure = NotebookFigure(figsize=size, layout="constrained")
     grid = figure.subplots(-(-len(shown) // columns), columns, sharex=True, squeeze=False)
-    drawn = models(*(each if np.isfinite(each).any() else None for each in (fitted, rolled_out)))
+    drawn = drawn_models(
+        *(each if np.isfinite(each).any() else None for each in (fitted, rolled_out))
+    )
     for k, each in zip(shown, grid.flat, strict=False):
         last = k in shown[-columns:]
-        dress(each, names[k], "time [s]" if last else "", f"[{units[k]}]" if units else "")
+        style_axes(each, names[k], "time [s]" if last else "", f"[{units[k]}]" if units else "")
         each.yaxis.set_major_locator(MaxNLocator(4))
         dots = {"ls": "", "marker": ".", "ms": 3.0, "color": BLACK, "mec": "none", "alpha": 0.5}
         each.plot(t_s[:, 0], measured[:, k], label="measured", **dots)
@@ -251,5 +253,5 @@ def readings_picture(said: Array, names: Sequence[str], units: Sequence[str] = (
             each.plot(t_s[:, 0], values[:, k], label=label, **style)
     for each in grid.flat[len(shown) :]:
         each.set_visible(False)
-    legend_of_all(figure, 3)
+    add_figure_legend(figure, 3)
     return figure

@@ -16,17 +16,17 @@ from ...array_types import Array
 Triangles = NDArray[np.integer]
 
 # Angle between the view and the normal of the plane of motion, to show depth.
-TURN_DEG = 25.0
+AZIMUTH_DEG = 25.0
 # Angle by which the view looks down.
 ELEVATION_DEG = 18.0
 # Brightness of a face turned away from the light.
-AMBIENT = 0.62
+AMBIENT_BRIGHTNESS = 0.62
 # Direction towards the light in the axes of the camera.
-LIGHT = np.array([-0.4, 0.5, 0.8]) / np.linalg.norm([-0.4, 0.5, 0.8])
+LIGHT_DIRECTION = np.array([-0.4, 0.5, 0.8]) / np.linalg.norm([-0.4, 0.5, 0.8])
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class ParallelCamera:
     """Parallel projection along a viewing direction.
 
     Attributes
@@ -38,18 +38,18 @@ class Camera:
     axes: Array
 
     @classmethod
-    def looking(cls, towards: ArrayLike, up: ArrayLike) -> Camera:
-        """Return the camera that is in the direction `towards` (3,) from the body, with `up` (3,)
+    def from_direction(cls, direction: ArrayLike, up: ArrayLike) -> ParallelCamera:
+        """Return the camera that is in the direction `direction` (3,) from the body, with `up` (3,)
         upright.
         """
-        direction = np.asarray(towards, dtype=float)
+        direction = np.asarray(direction, dtype=float)
         direction = direction / np.linalg.norm(direction)
         right = np.cross(np.asarray(up, dtype=float), direction)
         right /= np.linalg.norm(right)
         return cls(np.array([right, np.cross(direction, right), direction]))
 
     @classmethod
-    def facing(cls, positions_m: Array, up: ArrayLike) -> Camera:
+    def facing_motion(cls, positions_m: Array, up: ArrayLike) -> ParallelCamera:
         """Return a camera that faces the plane in which a body moves most, or is widest.
 
         The direction is horizontal, then turned by `TURN_DEG` and raised by `ELEVATION_DEG`.
@@ -71,29 +71,29 @@ class Camera:
         # Of the two opposite directions the one nearer to +x, −y.
         if least @ (1.0, -1.1, 0.01) < 0:
             least = -least
-        return cls.looking(least, up).turned(TURN_DEG, up).raised(ELEVATION_DEG)
+        return cls.from_direction(least, up).turned(AZIMUTH_DEG, up).raised(ELEVATION_DEG)
 
-    def turned(self, angle_deg: float, up: ArrayLike) -> Camera:
+    def turned(self, angle_deg: float, up: ArrayLike) -> ParallelCamera:
         """Return the camera moved around the body by an angle [°] about `up` (3,)."""
         turn = Rotation.from_rotvec(np.radians(angle_deg) * np.asarray(up, dtype=float))
-        return Camera(turn.apply(self.axes))
+        return ParallelCamera(turn.apply(self.axes))
 
-    def raised(self, angle_deg: float) -> Camera:
+    def raised(self, angle_deg: float) -> ParallelCamera:
         """Return the camera raised by an angle [°]; negative to look from further below."""
         angle = np.radians(angle_deg)
         right, top, forward = self.axes
         direction = np.cos(angle) * forward + np.sin(angle) * top
-        return Camera(np.array([right, np.cross(direction, right), direction]))
+        return ParallelCamera(np.array([right, np.cross(direction, right), direction]))
 
     def project(self, points_m: ArrayLike) -> Array:
         """Return the positions (…, 2) [m] in the picture of points (…, 3) [m]."""
         return np.asarray(points_m) @ self.axes[:2].T
 
-    def nearness(self, points_m: ArrayLike) -> Array:
+    def depths_m(self, points_m: ArrayLike) -> Array:
         """Return the coordinate (…) [m] of points (…, 3) [m] towards the viewer."""
         return np.asarray(points_m) @ self.axes[2]
 
-    def faces(
+    def visible_faces(
         self, positions_m: Array, surface: Triangles
     ) -> tuple[Array, Array, NDArray[np.int64]]:
         """Return the triangles that are turned towards the viewer, from far to near.
@@ -119,10 +119,12 @@ class Camera:
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         front = np.flatnonzero(normals[:, 2] > 0)
         order = front[np.argsort(corners[front, :, 2].mean(axis=1), kind="stable")]
-        light = np.clip(normals[order] @ LIGHT, 0.0, 1.0)
-        return corners[order, :, :2], AMBIENT + (1 - AMBIENT) * light, order
+        light = np.clip(normals[order] @ LIGHT_DIRECTION, 0.0, 1.0)
+        return corners[order, :, :2], AMBIENT_BRIGHTNESS + (1 - AMBIENT_BRIGHTNESS) * light, order
 
-    def hidden(self, points_m: Array, positions_m: Array, surface: Triangles) -> NDArray[np.bool_]:
+    def are_hidden(
+        self, points_m: Array, positions_m: Array, surface: Triangles
+    ) -> NDArray[np.bool_]:
         """Return for each point (k, 3) whether it is behind the surface; False for NaN.
 
         Parameters
@@ -137,7 +139,7 @@ class Camera:
         points = np.asarray(points_m) @ self.axes.T
         size = np.ptp(positions_m, axis=0).max()
         a, b, c = (corners[:, i, :2] for i in range(3))
-        area = _cross(b - a, c - a)
+        area = _plane_cross_product(b - a, c - a)
         facing = area > 1e-9 * size**2
         a = a[facing]
         b = b[facing]
@@ -147,9 +149,9 @@ class Camera:
         behind = np.zeros(len(points), dtype=bool)
         for k, point in enumerate(points):
             place = point[:2]
-            weights = np.stack(
-                [_cross(b - place, c - place), _cross(c - place, a - place)], axis=1
-            ) / area[:, None]  # fmt: skip
+            opposite_a = _plane_cross_product(b - place, c - place)
+            opposite_b = _plane_cross_product(c - place, a - place)
+            weights = np.stack([opposite_a, opposite_b], axis=1) / area[:, None]
             weights = np.column_stack([weights, 1 - weights.sum(axis=1)])
             is_inside = (weights >= 0).all(axis=1)
             surface_depth = np.einsum("kc,kc->k", weights[is_inside], depth[is_inside])
@@ -158,6 +160,6 @@ class Camera:
         return behind
 
 
-def _cross(a: Array, b: Array) -> Array:
+def _plane_cross_product(a: Array, b: Array) -> Array:
     """Return the cross product (…) of vectors in the plane (…, 2)."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

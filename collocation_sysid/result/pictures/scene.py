@@ -16,24 +16,24 @@ from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
 from ...array_types import Array
-from ..figure_style import BLACK, BLUE, SMALL_PT, VERMILION, Picture
-from .projection import Camera, Triangles
+from ..figure_style import BLACK, BLUE, SMALL_PT, VERMILION, NotebookFigure
+from .projection import ParallelCamera, Triangles
 
-EDGE = "#5A6B7B"
+EDGE_COLOUR = "#5A6B7B"
 # Colours of the parts of a body, repeated for further parts.
-SKINS = ("#B4D0EA", "#F0D3A0", "#B9DDC2", "#E2C3D9", "#D9D9A8", "#C9C3E6")
+PART_COLOURS = ("#B4D0EA", "#F0D3A0", "#B9DDC2", "#E2C3D9", "#D9D9A8", "#C9C3E6")
 # Triangles above which edges are not drawn, because they would hide the faces.
-EDGED = 6000
-_DOT = {"ls": "", "marker": "o", "ms": 3.2, "mec": VERMILION, "mew": 0.7}
-_SEEN = {"ls": "", "marker": ".", "ms": 2.4, "mec": "none", "mfc": BLUE}
+MAX_EDGED_TRIANGLES = 6000
+_MARKER_STYLE = {"ls": "", "marker": "o", "ms": 3.2, "mec": VERMILION, "mew": 0.7}
+_DEPTH_POINT_STYLE = {"ls": "", "marker": ".", "ms": 2.4, "mec": "none", "mfc": BLUE}
 # Largest number of drawn points of depth cameras; more only take longer to draw.
-MOST_SEEN = 1000
-_SQUARE = {"ls": "", "marker": "s", "ms": 2.2, "mfc": BLACK, "mec": "none"}
+MAX_DEPTH_POINTS = 1000
+_GRASPED_STYLE = {"ls": "", "marker": "s", "ms": 2.2, "mfc": BLACK, "mec": "none"}
 
 
 def sheet(width_mm: float, height_mm: float) -> tuple[Figure, Axes]:
     """Return a figure with one invisible pair of axes [mm], from the lower left corner."""
-    figure = Picture(figsize=(width_mm / 25.4, height_mm / 25.4))
+    figure = NotebookFigure(figsize=(width_mm / 25.4, height_mm / 25.4))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0, width_mm), ylim=(0, height_mm))
     axes.set_axis_off()
@@ -41,12 +41,12 @@ def sheet(width_mm: float, height_mm: float) -> tuple[Figure, Axes]:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class SheetView:
     """Parallel projection of a body onto the sheet, with scale and position.
 
     Attributes
     ----------
-    camera : Camera
+    camera : ParallelCamera
         Viewing direction.
     mm_per_m : float
         Scale: millimetres on the sheet per metre in space.
@@ -54,53 +54,53 @@ class View:
         Position on the sheet of the origin of space.
     """
 
-    camera: Camera
+    camera: ParallelCamera
     mm_per_m: float
     origin_mm: Array
 
     @classmethod
-    def fitting(
-        cls, camera: Camera, points_m: Array, room_mm: ArrayLike, corner_mm: ArrayLike
-    ) -> View:
+    def fit_points(
+        cls, camera: ParallelCamera, points_m: Array, room_mm: ArrayLike, corner_mm: ArrayLike
+    ) -> SheetView:
         """Return the view that shows all points as large as possible in the middle of a box on the
         sheet.
 
         Parameters
         ----------
-        camera : Camera
+        camera : ParallelCamera
         points_m : (…, 3)
             Points to show; NaN is ignored.
         room_mm, corner_mm : (2,)
             Width and height of the box, and its lower left corner.
         """
-        low, high = _extent(camera, points_m)
+        low, high = _projected_extent(camera, points_m)
         room = np.asarray(room_mm, dtype=float)
         corner = np.asarray(corner_mm, dtype=float)
         scale = float(np.min(room / np.maximum(high - low, 1e-12)))
         return cls(camera, scale, corner + room / 2 - scale * (low + high) / 2)
 
-    def shifted(self, by_mm: ArrayLike) -> View:
+    def moved_by(self, by_mm: ArrayLike) -> SheetView:
         """Return the view moved on the sheet by `by_mm` (2,)."""
         return replace(self, origin_mm=self.origin_mm + np.asarray(by_mm))
 
-    def places(self, points_m: ArrayLike) -> Array:
+    def to_sheet_mm(self, points_m: ArrayLike) -> Array:
         """Return the positions (…, 2) [mm] on the sheet of points (…, 3) [m]."""
         return self.origin_mm + self.mm_per_m * self.camera.project(points_m)
 
 
-def width_over_height(camera: Camera, points_m: Array) -> float:
+def aspect_ratio(camera: ParallelCamera, points_m: Array) -> float:
     """Return the aspect ratio of points (…, 3) as the camera shows them."""
-    low, high = _extent(camera, points_m)
+    low, high = _projected_extent(camera, points_m)
     return float((high - low)[0] / (high - low)[1])
 
 
-def _extent(camera: Camera, points_m: Array) -> tuple[Array, Array]:
+def _projected_extent(camera: ParallelCamera, points_m: Array) -> tuple[Array, Array]:
     """Return the lower left and the upper right corner (2,) [m] of points (…, 3) in the picture."""
     places = camera.project(points_m).reshape(-1, 2)
     return np.nanmin(places, axis=0), np.nanmax(places, axis=0)
 
 
-def with_outlines(points_m: Array, outlines_m: Array | None) -> Array:
+def with_near_outlines(points_m: Array, outlines_m: Array | None) -> Array:
     """Return points (T, n, 3) of a body joined with outlines (T, o, 3) of obstacles near it.
 
     Outline points further away than half the body's extent are moved to that distance. Without
@@ -116,7 +116,7 @@ def with_outlines(points_m: Array, outlines_m: Array | None) -> Array:
     return np.concatenate([points_m, clipped_m], axis=1)
 
 
-class Drawn:
+class BodyDrawing:
     """Body with its grasped nodes and markers on a sheet, which can be updated for another sample.
 
     Parameters
@@ -131,46 +131,52 @@ class Drawn:
         default.
     nodes : (F, k), optional
         Nodes of each triangle, of which grasped ones are marked; the corners by default.
-    wire : str, optional
+    edge_colour : str, optional
         Colour of the triangles' edges; then only these edges are drawn, above everything else.
     """
 
     def __init__(
         self,
         axes: Axes,
-        view: View,
+        view: SheetView,
         surface: Triangles,
         parts: NDArray[np.integer] | None = None,
         nodes: NDArray[np.integer] | None = None,
-        wire: str | None = None,
+        edge_colour: str | None = None,
     ) -> None:
         self.view = view
         self.surface = surface
-        self.wire = wire
+        self.edge_colour = edge_colour
         self.nodes = surface if nodes is None else nodes
-        indices = np.zeros(len(surface), dtype=np.int64) if parts is None else parts % len(SKINS)
-        self.skins = np.array([to_rgb(skin) for skin in SKINS])[indices]
-        self.edged = len(surface) <= EDGED
-        self.skin = PolyCollection([], linewidths=0.3 if self.edged else 0.1, edgecolors=EDGE)
-        self.skin.set_joinstyle("round")
-        if wire is not None:
-            self.skin.set(facecolor="none", edgecolor=wire, zorder=2.5)
-            self.skin.set_linewidth(0.6 if self.edged else 0.1)
-        axes.add_collection(self.skin, autolim=False)
-        self.grasped = axes.add_line(Line2D([], [], zorder=3, **_SQUARE))
+        indices = (
+            np.zeros(len(surface), dtype=np.int64) if parts is None else parts % len(PART_COLOURS)
+        )
+        self.part_colours = np.array([to_rgb(skin) for skin in PART_COLOURS])[indices]
+        self.has_edges = len(surface) <= MAX_EDGED_TRIANGLES
+        self.faces = PolyCollection(
+            [], linewidths=0.3 if self.has_edges else 0.1, edgecolors=EDGE_COLOUR
+        )
+        self.faces.set_joinstyle("round")
+        if edge_colour is not None:
+            self.faces.set(facecolor="none", edgecolor=edge_colour, zorder=2.5)
+            self.faces.set_linewidth(0.6 if self.has_edges else 0.1)
+        axes.add_collection(self.faces, autolim=False)
+        self.grasped = axes.add_line(Line2D([], [], zorder=3, **_GRASPED_STYLE))
         self.outlines = axes.add_line(Line2D([], [], zorder=0.5, lw=0.6, color=BLACK))
-        self.seen = axes.add_line(Line2D([], [], zorder=3.5, **_SEEN))
-        self.rings = axes.add_line(Line2D([], [], mfc="none", zorder=4, **_DOT))
-        self.dots = axes.add_line(Line2D([], [], mfc=VERMILION, zorder=5, **_DOT))
+        self.depth_points = axes.add_line(Line2D([], [], zorder=3.5, **_DEPTH_POINT_STYLE))
+        self.hidden_markers = axes.add_line(Line2D([], [], mfc="none", zorder=4, **_MARKER_STYLE))
+        self.visible_markers = axes.add_line(
+            Line2D([], [], mfc=VERMILION, zorder=5, **_MARKER_STYLE)
+        )
 
-    def show(
+    def update(
         self,
         positions_m: Array,
-        held: NDArray[np.bool_],
+        is_grasped: NDArray[np.bool_],
         markers_m: Array,
-        skins: Array | None = None,
+        colours: Array | None = None,
         outlines_m: Array | None = None,
-        seen_m: Array | None = None,
+        depth_points_m: Array | None = None,
     ) -> None:
         """Update the drawing.
 
@@ -182,40 +188,43 @@ class Drawn:
         ----------
         positions_m : (n, 3)
             Positions of the nodes.
-        held : (n,) bool
+        is_grasped : (n,) bool
             Whether a node is grasped.
         markers_m : (M, 3)
             Markers, NaN where missing.
-        skins : (F, 3), optional
+        colours : (F, 3), optional
             Colours of the triangles; those of their parts by default.
         outlines_m : (o, 3), optional
             Outlines of obstacles, NaN between lines; unchanged by default.
-        seen_m : (P, 3), optional
+        depth_points_m : (P, 3), optional
             Points of depth cameras; unchanged by default.
         """
         camera = self.view.camera
-        polygons, brightness, faces = camera.faces(positions_m, self.surface)
-        if skins is not None:  # colours that tell something are shaded half as much
+        polygons, brightness, faces = camera.visible_faces(positions_m, self.surface)
+        if colours is not None:  # colours that tell something are shaded half as much
             brightness = (1 + brightness) / 2
-        colours: Any = brightness[:, None] * (self.skins if skins is None else skins)[faces]
-        self.skin.set_verts(list(self.view.origin_mm + self.view.mm_per_m * polygons))
-        if self.wire is not None:
+        unshaded = self.part_colours if colours is None else colours
+        shaded: Any = brightness[:, None] * unshaded[faces]
+        self.faces.set_verts(list(self.view.origin_mm + self.view.mm_per_m * polygons))
+        if self.edge_colour is not None:
             return
-        self.skin.set_facecolor(colours)
-        if not self.edged:
-            self.skin.set_edgecolor(colours)
+        self.faces.set_facecolor(shaded)
+        if not self.has_edges:
+            self.faces.set_edgecolor(shaded)
         visible = np.unique(self.nodes[faces])
-        self.grasped.set_data(*self.view.places(positions_m[visible[held[visible]]]).T)
+        self.grasped.set_data(*self.view.to_sheet_mm(positions_m[visible[is_grasped[visible]]]).T)
         if outlines_m is not None:
-            self.outlines.set_data(*self.view.places(outlines_m).T)
-        if seen_m is not None:
-            few_m = seen_m[:: 1 + len(seen_m) // MOST_SEEN]
-            self.seen.set_data(
-                *self.view.places(few_m[~camera.hidden(few_m, positions_m, self.surface)]).T
+            self.outlines.set_data(*self.view.to_sheet_mm(outlines_m).T)
+        if depth_points_m is not None:
+            few_m = depth_points_m[:: 1 + len(depth_points_m) // MAX_DEPTH_POINTS]
+            self.depth_points.set_data(
+                *self.view.to_sheet_mm(
+                    few_m[~camera.are_hidden(few_m, positions_m, self.surface)]
+                ).T
             )
-        hidden = camera.hidden(markers_m, positions_m, self.surface)
-        self.rings.set_data(*self.view.places(markers_m[hidden]).T)
-        self.dots.set_data(*self.view.places(markers_m[~hidden]).T)
+        hidden = camera.are_hidden(markers_m, positions_m, self.surface)
+        self.hidden_markers.set_data(*self.view.to_sheet_mm(markers_m[hidden]).T)
+        self.visible_markers.set_data(*self.view.to_sheet_mm(markers_m[~hidden]).T)
 
 
 def draw_scale(axes: Axes, mm_per_m: float, corner_mm: ArrayLike, longest_mm: float = 20.0) -> None:
@@ -240,13 +249,15 @@ def draw_scale(axes: Axes, mm_per_m: float, corner_mm: ArrayLike, longest_mm: fl
 
 
 def round_length(longest: float) -> float:
-    """Return the largest of 1, 2, 5 · 10ᵏ that is not above `longest`, a positive number."""
+    """Return the largest of 1, 2, 5 · 10ᵏ that is not above `longest_displacement_m`, a positive
+    number.
+    """
     decade = 10.0 ** np.floor(np.log10(longest))
     return float(max(f * decade for f in (1, 2, 5) if f * decade <= longest * (1 + 1e-9)))
 
 
 def draw_directions(
-    axes: Axes, camera: Camera, origin_mm: ArrayLike, length_mm: float = 5.0
+    axes: Axes, camera: ParallelCamera, origin_mm: ArrayLike, length_mm: float = 5.0
 ) -> None:
     """Draw arrows along x, y and z from `origin_mm` (2,), except an axis that points along the
     view.
@@ -263,7 +274,7 @@ def draw_directions(
         axes.text(x, y, letter, ha="center", va="center", fontsize=SMALL_PT)
 
 
-def key(*entries: str) -> list[Line2D]:
+def legend_handles(*entries: str) -> list[Line2D]:
     """Return legend handles of the named marks.
 
     Parameters
@@ -271,23 +282,29 @@ def key(*entries: str) -> list[Line2D]:
     *entries : {"grasped", "markers", "measured", "behind the body", "seen in depth"}
     """
     styles = {
-        "grasped": {**_SQUARE, "ms": 3.0},
-        "behind the body": {**_DOT, "mfc": "none"},
-        "seen in depth": {**_SEEN, "ms": 4.0},
+        "grasped": {**_GRASPED_STYLE, "ms": 3.0},
+        "behind the body": {**_MARKER_STYLE, "mfc": "none"},
+        "seen in depth": {**_DEPTH_POINT_STYLE, "ms": 4.0},
     }
     return [
-        Line2D([], [], label=name, **styles.get(name, {**_DOT, "mfc": VERMILION}))
+        Line2D([], [], label=name, **styles.get(name, {**_MARKER_STYLE, "mfc": VERMILION}))
         for name in entries
     ]
 
 
-def skin_key(part: int, name: str) -> Line2D:
+def part_legend_handle(part: int, name: str) -> Line2D:
     """Return the legend handle of the part of the body with index `part`."""
-    look: Any = {**_SQUARE, "ms": 4.0, "mec": EDGE, "mew": 0.3, "mfc": SKINS[part % len(SKINS)]}
+    look: Any = {
+        **_GRASPED_STYLE,
+        "ms": 4.0,
+        "mec": EDGE_COLOUR,
+        "mew": 0.3,
+        "mfc": PART_COLOURS[part % len(PART_COLOURS)],
+    }
     return Line2D([], [], label=name, **look)
 
 
-def draw_key(axes: Axes, entries: Sequence[Line2D], corner_mm: ArrayLike) -> None:
+def draw_legend(axes: Axes, entries: Sequence[Line2D], corner_mm: ArrayLike) -> None:
     """Draw one line of legend whose upper left corner is at `corner_mm` (2,)."""
     names = [str(entry.get_label()) for entry in entries]
     place: Any = tuple(np.asarray(corner_mm))

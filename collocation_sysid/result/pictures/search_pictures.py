@@ -17,21 +17,21 @@ from ...methods.solution import Iteration
 from ..figure_style import (
     BLACK,
     BLUE,
+    COLOUR_CYCLE,
     COLUMN_MM,
-    CYCLE,
     LINE_PT,
     ORANGE,
     SMALL_PT,
     TEXT_PT,
     VERMILION,
-    dress,
+    add_legend_above,
     framed_figure,
-    legend_above,
-    log_axis,
-    mathematical,
+    make_log_axis,
+    style_axes,
+    symbol_as_mathtext,
 )
 
-_RUNG = "#808080"
+_STAGE_COLOUR = "#808080"
 
 
 def convergence(
@@ -61,14 +61,14 @@ def convergence(
         ("loss", [i.loss for i in history], BLUE),
         ("violation [N]", [i.violation_n for i in history], VERMILION),
     )
-    rungs = _rungs(history)
+    rungs = _continuation_stages(history)
     for axes, (label, values, colour) in zip(panels, curves, strict=False):
         for part in rungs:
             style: dict[str, Any] = {"ms": 2.5, "lw": LINE_PT, "color": colour}
-            axes.plot(numbers[part], _positive(values[part]), "o-", **style)
-        dress(axes, "", "", label)
-        log_axis(axes)
-    _mark_rungs(panels[:3], history, rungs)
+            axes.plot(numbers[part], _positive_or_nan(values[part]), "o-", **style)
+        style_axes(axes, "", "", label)
+        make_log_axis(axes)
+    _mark_continuation_stages(panels[:3], history, rungs)
     drawn = list(history[0].parameters) if names is None and history else list(names or ())
     _draw_parameters(panels[3], history, drawn, truth)
     panels[3].set_xlabel("iteration", fontsize=TEXT_PT)
@@ -79,15 +79,15 @@ def convergence(
     return figure
 
 
-def _rungs(history: Sequence[Iteration]) -> list[slice]:
+def _continuation_stages(history: Sequence[Iteration]) -> list[slice]:
     """Return the ranges of iterations over which the same share of the timesteps was fitted."""
     shares = [iteration.share for iteration in history]
     starts = [k for k in range(len(shares)) if k == 0 or shares[k] != shares[k - 1]]
     return [slice(a, b) for a, b in pairwise([*starts, len(shares)])] if starts else []
 
 
-def _mark_rungs(
-    panels: Sequence[Axes], history: Sequence[Iteration], rungs: Sequence[slice]
+def _mark_continuation_stages(
+    panels: Sequence[Axes], history: Sequence[Iteration], stages: Sequence[slice]
 ) -> None:
     """Mark the iterations at which the fit takes in more timesteps; loss and error increase there.
 
@@ -95,18 +95,18 @@ def _mark_rungs(
     ----------
     panels : sequence of Axes
     history : sequence of Iteration
-    rungs : sequence of slice
-        Ranges of `_rungs`; a single range is not marked.
+    stages : sequence of slice
+        Ranges of `_continuation_stages`; a single range is not marked.
     """
-    if len(rungs) < 2:
+    if len(stages) < 2:
         return
-    for part in rungs:
+    for part in stages:
         first = history[part.start]
         if part.start:
             between = (history[part.start - 1].number + first.number) / 2
             for axes in panels:
-                axes.axvline(between, color=_RUNG, lw=0.8, ls=(0, (2, 2)), zorder=0.5)
-    shares = ", ".join(f"{100 * history[part.start].share:.3g}" for part in rungs)
+                axes.axvline(between, color=_STAGE_COLOUR, lw=0.8, ls=(0, (2, 2)), zorder=0.5)
+    shares = ", ".join(f"{100 * history[part.start].share:.3g}" for part in stages)
     panels[0].set_title(f"fitted: {shares} % of the timesteps in turn", fontsize=SMALL_PT)
 
 
@@ -121,19 +121,21 @@ def _draw_parameters(
     numbers = [iteration.number for iteration in history]
     for k, name in enumerate(names if history else ()):
         values = np.array([iteration.parameters[name] for iteration in history], dtype=float)
-        symbol = mathematical(name)
+        symbol = symbol_as_mathtext(name)
         unit = unit_of(name)
         reference = values[-1] if truth is None else truth[name]
         label = f"{symbol} = {values[-1]:.4g} {unit}"
-        style = {"ms": 2.5, "lw": LINE_PT, "color": CYCLE[k % len(CYCLE)]}
-        axes.plot(numbers, _positive(values / (reference or 1.0)), "o-", label=label, **style)
-    dress(axes, "", "", f"θ / {'final θ' if truth is None else 'truth'}")
-    log_axis(axes)
+        style = {"ms": 2.5, "lw": LINE_PT, "color": COLOUR_CYCLE[k % len(COLOUR_CYCLE)]}
+        axes.plot(
+            numbers, _positive_or_nan(values / (reference or 1.0)), "o-", label=label, **style
+        )
+    style_axes(axes, "", "", f"θ / {'final θ' if truth is None else 'truth'}")
+    make_log_axis(axes)
     if history and names:
-        legend_above(axes, columns=2)
+        add_legend_above(axes, columns=2)
 
 
-def _positive(values: Sequence[float] | Array) -> Array:
+def _positive_or_nan(values: Sequence[float] | Array) -> Array:
     """Return values with NaN where they are not positive and finite, for a logarithmic axis."""
     array = np.asarray(values, dtype=float)
     return np.where((array > 0) & np.isfinite(array), array, np.nan)
@@ -157,9 +159,9 @@ def scan_picture(young_pa: Array, misfit: Array, best: int) -> Figure:
     figure = framed_figure(COLUMN_MM, HEIGHT_MM, 14, 2, 9.5, 6)
     axes = figure.subplots()
     axes.plot(young_pa, misfit, "o-", ms=2.5, lw=LINE_PT, color=BLUE, label="simulated")
-    dress(axes, "", "Young's modulus E [Pa]", "misfit [σ]")
+    style_axes(axes, "", "Young's modulus E [Pa]", "misfit [σ]")
     axes.set_xscale("log")
-    log_axis(axes)
+    make_log_axis(axes)
     failed = np.isnan(misfit)
     if failed.any():
         foot = np.full(int(failed.sum()), axes.get_ylim()[0])
@@ -168,5 +170,5 @@ def scan_picture(young_pa: Array, misfit: Array, best: int) -> Figure:
             label="not simulable",
         )  # fmt: skip
     axes.plot(young_pa[best], misfit[best], "D", ms=5, color=ORANGE, zorder=3, label="start")
-    legend_above(axes, columns=3)
+    add_legend_above(axes, columns=3)
     return figure

@@ -20,40 +20,54 @@ from ...errors import InputError, hint_at
 from ...fem.body import Body
 from ..element_fields import ElementFields
 from ..figure_style import PAGE_MM, SMALL_PT
-from ..replay import Replay
-from .projection import ELEVATION_DEG, Camera
-from .scene import Drawn, View, draw_directions, draw_key, draw_scale, key, sheet, with_outlines
+from ..replay import MotionRecord
+from .projection import ELEVATION_DEG, ParallelCamera
+from .scene import (
+    BodyDrawing,
+    SheetView,
+    draw_directions,
+    draw_legend,
+    draw_scale,
+    legend_handles,
+    sheet,
+    with_near_outlines,
+)
 
-SHOWN = 6
+SHOWN_SHAPES = 6
 HEAD_MM = 5.0
 FOOT_MM = 5.0
 CORNER_MM = 14.0
-TALLEST_MM = 60.0
+MAX_BODY_HEIGHT_MM = 60.0
 GAP_MM = 4.0
 BAR_MM = 2.5
 BAR_ROOM_MM = 20.0
 # From pale to dark, on which markers and grasped nodes stand out; its darkest fifth is left out.
-COLOURS = ListedColormap(colormaps["YlGnBu"](np.linspace(0.0, 0.8, 256))).with_extremes(bad="0.85")
+FIELD_COLOURS = ListedColormap(colormaps["YlGnBu"](np.linspace(0.0, 0.8, 256))).with_extremes(
+    bad="0.85"
+)
 
 
 @dataclass(frozen=True, eq=False)
-class Coloured:
+class SurfaceField:
     """Field that colours the surface of a body.
 
     Attributes
     ----------
     title : str
         Name with unit.
-    at : callable
+    values_at : callable
         Returns the values (k, F) on the boundary triangles at samples with indices (k,).
     """
 
     title: str
-    at: Callable[[Index], Array]
+    values_at: Callable[[Index], Array]
 
 
-def shapes(
-    seen: Replay, count: int = SHOWN, field: Coloured | None = None, camera: Camera | None = None
+def shapes_picture(
+    replay: MotionRecord,
+    count: int = SHOWN_SHAPES,
+    field: SurfaceField | None = None,
+    camera: ParallelCamera | None = None,
 ) -> Figure:
     """Draw the body at evenly spaced samples, side by side in one scale.
 
@@ -63,25 +77,25 @@ def shapes(
 
     Parameters
     ----------
-    seen : Replay
+    replay : ReplayCommand
         An experiment with at least one trajectory.
     count : int
         Number of samples.
-    field : Coloured, optional
+    field : SurfaceField, optional
         Colours of the body; those of its parts by default.
-    camera : Camera, optional
+    camera : ParallelCamera, optional
         Viewing direction; onto the plane of motion by default.
     """
-    t_s = seen.t_s
-    positions_m = seen.shapes_m
-    measured_m = seen.measured_m
+    t_s = replay.t_s
+    positions_m = replay.shapes_m
+    measured_m = replay.measured_m
     assert positions_m is not None  # it was chosen among those that have some
     finite = np.flatnonzero(np.isfinite(positions_m).all(axis=(1, 2)))
     shown = finite[np.unique(np.linspace(0, len(finite) - 1, count).astype(int))]
-    surface_m = positions_m[:, np.unique(seen.surface)]
-    camera = camera or Camera.facing(surface_m[finite], seen.up)
-    outlines_m = None if seen.obstacles_m is None else seen.obstacles_m[shown]
-    extents_m = with_outlines(
+    surface_m = positions_m[:, np.unique(replay.surface)]
+    camera = camera or ParallelCamera.facing_motion(surface_m[finite], replay.up)
+    outlines_m = None if replay.obstacles_m is None else replay.obstacles_m[shown]
+    extents_m = with_near_outlines(
         np.concatenate([surface_m[shown], measured_m[shown]], axis=1), outlines_m
     )
     places = camera.project(extents_m)
@@ -91,17 +105,17 @@ def shapes(
     high = float(np.nanmax(places[..., 1]))
     width = PAGE_MM - CORNER_MM - (BAR_ROOM_MM if field else 0.0)
     room = width - len(shown) * GAP_MM
-    scale = min(room / float((rights - lefts).sum()), TALLEST_MM / (high - low))
+    scale = min(room / float((rights - lefts).sum()), MAX_BODY_HEIGHT_MM / (high - low))
     gap = GAP_MM + (room - scale * float((rights - lefts).sum())) / len(shown)
     total = HEAD_MM + scale * (high - low) + FOOT_MM
     figure, axes = sheet(PAGE_MM, total)
-    colours = [None] * len(shown) if field is None else _coloured(axes, field, shown)
+    colours = [None] * len(shown) if field is None else _draw_colour_bar(axes, field, shown)
     start = CORNER_MM + (gap - GAP_MM) / 2
     for t, first, last, colour in zip(shown, lefts, rights, colours, strict=True):
-        view = View(camera, scale, np.array([start - scale * first, FOOT_MM - scale * low]))
-        body = Drawn(axes, view, seen.surface, seen.surface_parts, seen.surface_nodes)
-        obstacles_m = None if seen.obstacles_m is None else seen.obstacles_m[t]
-        body.show(positions_m[t], seen.held[t], measured_m[t], colour, obstacles_m)
+        view = SheetView(camera, scale, np.array([start - scale * first, FOOT_MM - scale * low]))
+        body = BodyDrawing(axes, view, replay.surface, replay.surface_parts, replay.surface_nodes)
+        obstacles_m = None if replay.obstacles_m is None else replay.obstacles_m[t]
+        body.update(positions_m[t], replay.held[t], measured_m[t], colour, obstacles_m)
         text = {"ha": "center", "va": "center", "fontsize": SMALL_PT}
         middle = start + scale * (last - first) / 2
         axes.text(middle, FOOT_MM / 2, f"{t_s[t] - t_s[0]:.3g} s", **text)
@@ -109,18 +123,18 @@ def shapes(
     draw_directions(axes, camera, (7.5, FOOT_MM + 3.0))
     draw_scale(axes, scale, (2.0, total - 2.5))
     marks = ("measured", "behind the body") if np.isfinite(measured_m).any() else ()
-    draw_key(axes, key("grasped", *marks), (PAGE_MM * 0.3, total - 1.0))
+    draw_legend(axes, legend_handles("grasped", *marks), (PAGE_MM * 0.3, total - 1.0))
     return figure
 
 
-def _coloured(axes: Axes, field: Coloured, samples: Index) -> Array:
+def _draw_colour_bar(axes: Axes, field: SurfaceField, samples: Index) -> Array:
     """Draw the colour bar of a field, and return the colours (k, F, 3) at samples with indices
     (k,).
     """
-    values = field.at(samples)
+    values = field.values_at(samples)
     low = np.nanmin(values)
     high = np.nanmax(values)
-    scale = ScalarMappable(Normalize(0.0 if 0 <= low < high / 5 else low, high), COLOURS)
+    scale = ScalarMappable(Normalize(0.0 if 0 <= low < high / 5 else low, high), FIELD_COLOURS)
     height = axes.get_ylim()[1]
     place = (PAGE_MM - BAR_ROOM_MM + 2, FOOT_MM, BAR_MM, height - HEAD_MM - FOOT_MM)
     bar_axes = axes.inset_axes(place, transform=axes.transData)
@@ -132,65 +146,71 @@ def _coloured(axes: Axes, field: Coloured, samples: Index) -> Array:
     return scale.to_rgba(values)[..., :3]
 
 
-def contact_shapes(seen: Replay) -> dict[str, Figure]:
-    """Return the pictures of `shapes` coloured by contact pressure and by gap, as "pressure" and
-    "gap".
+def contact_pictures(replay: MotionRecord) -> dict[str, Figure]:
+    """Return the pictures of `shapes_picture` coloured by contact pressure and by gap, as
+    "pressure" and "gap".
 
     The viewing direction is the one from which most of the pressure is visible. Empty without
     obstacles.
     """
-    positions_m = seen.shapes_m
-    gaps_m = seen.gaps_m
-    pressures_pa = seen.pressures_pa
+    positions_m = replay.shapes_m
+    gaps_m = replay.gaps_m
+    pressures_pa = replay.pressures_pa
     if positions_m is None or gaps_m is None or pressures_pa is None:
         return {}
-    camera = _towards(seen, positions_m, pressures_pa)
+    camera = _camera_facing_weights(replay, positions_m, pressures_pa)
     fields = {
-        "pressure": Coloured("pressure [Pa]", lambda samples: pressures_pa[samples]),
-        "gap": Coloured("gap [mm]", lambda samples: 1e3 * gaps_m[samples]),
+        "pressure": SurfaceField("pressure [Pa]", lambda samples: pressures_pa[samples]),
+        "gap": SurfaceField("gap [mm]", lambda samples: 1e3 * gaps_m[samples]),
     }
-    return {name: shapes(seen, SHOWN, field, camera) for name, field in fields.items()}
+    return {
+        name: shapes_picture(replay, SHOWN_SHAPES, field, camera) for name, field in fields.items()
+    }
 
 
-def _towards(seen: Replay, positions_m: Array, weights: Array) -> Camera:
+def _camera_facing_weights(
+    replay: MotionRecord, positions_m: Array, weights: Array
+) -> ParallelCamera:
     """Return the camera, of four directions around the body, from which most of the weights are
     visible.
 
     Parameters
     ----------
-    seen : Replay
+    replay : ReplayCommand
     positions_m : (T, n, 3)
         Positions of the nodes.
     weights : (T, F)
         Weights of the boundary triangles, such as the pressure.
     """
     there = np.isfinite(positions_m).all(axis=(1, 2))
-    front = Camera.facing(positions_m[there][:, np.unique(seen.surface)], seen.up)
+    front = ParallelCamera.facing_motion(
+        positions_m[there][:, np.unique(replay.surface)], replay.up
+    )
     low = front.raised(-2 * ELEVATION_DEG)
-    views = [front, low, front.turned(180.0, seen.up), low.turned(180.0, seen.up)]
-    corners = positions_m[there][:, seen.surface]
+    views = [front, low, front.turned(180.0, replay.up), low.turned(180.0, replay.up)]
+    corners = positions_m[there][:, replay.surface]
     normals = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
     shown = [(np.maximum(normals @ view.axes[2], 0) * weights[there]).sum() for view in views]
     return views[int(np.argmax(shown))]
 
 
-FIELDS = {
+FIELD_TITLES = {
     "von_mises_pa": "von Mises stress [Pa]",
     "energy_density_j_m3": "elastic energy [J/m³]",
     "det_f": "volume over undeformed, det F",
 }
 # More would be too small to tell anything.
-MOST_SHAPES = 20
+MAX_SHAPES = 20
 
 
-def portrait(
-    replay: Replay, body: Body, constants: Mapping[str, float], field: str | None, count: int
+def field_shapes(
+    replay: MotionRecord, body: Body, constants: Mapping[str, float], field: str | None, count: int
 ) -> Figure:
     """Draw `count` shapes of an experiment, coloured by a field of its elements.
 
     Parameters
     ----------
-    replay : Replay
+    replay : ReplayCommand
     body : Body
     constants : mapping of name to value
         Constants of the body, for stresses and energies.
@@ -204,23 +224,25 @@ def portrait(
     InputError
         For an unknown field, or a number of shapes out of range.
     """
-    if not 1 <= count <= MOST_SHAPES:
-        raise InputError(f"count is {count}; expected 1 to {MOST_SHAPES} shapes")
-    if field is not None and field not in FIELDS:
-        expected = f"expected one of {', '.join(FIELDS)}{hint_at(field, list(FIELDS))}"
+    if not 1 <= count <= MAX_SHAPES:
+        raise InputError(f"count is {count}; expected 1 to {MAX_SHAPES} shapes")
+    if field is not None and field not in FIELD_TITLES:
+        expected = f"expected one of {', '.join(FIELD_TITLES)}{hint_at(field, list(FIELD_TITLES))}"
         raise InputError(f"no field {field!r}; {expected}")
-    coloured = None if field is None else _on_surface(replay, body, constants, field)
-    return shapes(replay, count, coloured)
+    coloured = None if field is None else _surface_field(replay, body, constants, field)
+    return shapes_picture(replay, count, coloured)
 
 
-def _on_surface(seen: Replay, body: Body, constants: Mapping[str, float], field: str) -> Coloured:
+def _surface_field(
+    replay: MotionRecord, body: Body, constants: Mapping[str, float], field: str
+) -> SurfaceField:
     """Return a field of the elements, see `FIELDS`, as values on the boundary triangles."""
-    elements = ElementFields.of(body, body.theta_from_values(constants))
+    elements = ElementFields.from_body(body, body.theta_from_values(constants))
     cells = body.mesh.surface_cells
 
     def at(samples: Index) -> Array:
         """Return the values (k, F) on the boundary triangles at samples with indices (k,)."""
-        assert seen.shapes_m is not None
-        return elements.at(seen.shapes_m[samples])[field][:, cells]
+        assert replay.shapes_m is not None
+        return elements.evaluate_at(replay.shapes_m[samples])[field][:, cells]
 
-    return Coloured(FIELDS[field], at)
+    return SurfaceField(FIELD_TITLES[field], at)

@@ -15,21 +15,21 @@ from ..figure_style import (
     COLUMN_MM,
     LINE_PT,
     SMALL_PT,
-    dress,
+    add_legend_above,
     framed_figure,
-    legend_above,
-    log_axis,
+    make_log_axis,
+    style_axes,
 )
 
 # Length of the zero-padded signal over its own: smoother curve, same resolution.
-PADDING = 4
+PADDING_FACTOR = 4
 # Smallest share of samples with a marker: gaps are interpolated linearly.
-SEEN = 0.5
+MIN_PRESENT_SHARE = 0.5
 # Decades below the largest density that are shown; smaller densities are rounding errors.
-DECADES = 8
+SHOWN_DECADES = 8
 
 
-def spectrum(
+def spectrum_picture(
     t_s: Array, measured_m: Array, fitted_m: Array | None, natural_hz: Array | None
 ) -> Figure:
     """Draw the spectral density of the measured tracks and of the residual, with the natural
@@ -54,13 +54,13 @@ def spectrum(
     if fitted_m is not None:
         _, rest = spectral_density(measured_m - fitted_m, rate)
         axes.plot(hertz, rest, color=BLUE, lw=LINE_PT, label="measured − fitted")
-    dress(axes, "", "frequency [Hz]", "density [mm²/Hz]")
-    log_axis(axes)
+    style_axes(axes, "", "frequency [Hz]", "density [mm²/Hz]")
+    make_log_axis(axes)
     low, high = axes.get_ylim()
-    axes.set_ylim(max(low, np.nanmax(density, initial=0.0) * 10.0**-DECADES), 4 * high)
+    axes.set_ylim(max(low, np.nanmax(density, initial=0.0) * 10.0**-SHOWN_DECADES), 4 * high)
     axes.set_xlim(0, rate / 2)
     _draw_modes(axes, natural_hz if natural_hz is not None else np.zeros(0), rate / 2)
-    legend_above(axes, columns=2)
+    add_legend_above(axes, columns=2)
     return figure
 
 
@@ -86,8 +86,8 @@ def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
         The density is NaN where it is zero, or if no marker is present often enough.
     """
     present = np.asarray(np.isfinite(tracks_m).all(axis=2))
-    markers = np.flatnonzero(present.mean(axis=0) >= SEEN)
-    padded = PADDING * len(tracks_m)
+    markers = np.flatnonzero(present.mean(axis=0) >= MIN_PRESENT_SHARE)
+    padded = PADDING_FACTOR * len(tracks_m)
     if not len(markers):
         hertz = np.arange(padded // 2 + 1) * rate_hz / padded
         return hertz[1:], np.full(len(hertz) - 1, np.nan)
@@ -105,7 +105,7 @@ def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
 def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
     """Draw lines at the natural frequencies below `limit_hz`, numbered from 1 at the top."""
     shown = natural_hz[natural_hz < limit_hz]
-    for group in _together(shown, 0.05 * limit_hz):
+    for group in _neighbour_groups(shown, 0.05 * limit_hz):
         for hertz in shown[group]:
             axes.axvline(hertz, color="#808080", lw=0.8, ls=(0, (2, 1.5)), zorder=0.9)
         numbers = f"{group[0] + 1}" if len(group) == 1 else f"{group[0] + 1}–{group[-1] + 1}"
@@ -118,7 +118,7 @@ def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
         axes.plot([], [], color="#808080", lw=0.8, ls=(0, (2, 1.5)), label="natural frequencies")
 
 
-def _together(ascending: Array, gap: float) -> list[NDArray[np.int64]]:
+def _neighbour_groups(ascending: Array, gap: float) -> list[NDArray[np.int64]]:
     """Return groups of indices of ascending values whose neighbours are nearer to each other than
     `gap`.
     """
