@@ -99,11 +99,11 @@ class Run(SolvedProblem):
         InputError
             For an unknown experiment or field, an invalid count, or a run without motion.
         """
-        from .result.animation import chosen  # how it looks is no part of a run
+        from .result.animation import experiment_named  # how it looks is no part of a run
         from .result.pictures.shapes import field_shapes
         from .result.run_record import replays
 
-        replay = chosen(replays(self), experiment)
+        replay = experiment_named(replays(self), experiment)
         bodies = {each.name: each.body for each in self.problem.experiments}
         return field_shapes(replay, bodies[replay.name], self.parameters, field, count)
 

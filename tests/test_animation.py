@@ -110,7 +110,7 @@ def test_the_simulation_is_drawn_as_edges_over_the_fit(run):
     assert to_hex(simulated.faces.get_edgecolor()[0]) == to_hex(title.get_color()) == to_hex(GREEN)
     (alone,) = FilmFigure(nod).drawings
     assert alone[0] == "simulated"
-    assert alone[3].wire is None
+    assert alone[3].edge_colour is None
 
 
 def test_a_film_has_the_errors_of_both_beside_the_body_and_a_line_at_its_time(run):

@@ -176,7 +176,7 @@ def test_without_a_scheduler_left_the_best_is_kept(there, monkeypatch):
 FAULTS = """
 import resource, threading
 import numpy as np
-from collocation_sysid.methods import workers
+from collocation_sysid.methods import experiment_executors
 
 def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -185,7 +185,7 @@ def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
 def compared():
-    print(faults(), workers._run_alone(lambda: faults() and faults()))
+    print(faults(), experiment_executors._run_alone(lambda: faults() and faults()))
 
 thread = threading.Thread(target=compared)
 thread.start()

@@ -259,7 +259,7 @@ def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(found)
     film.show_sample(0)
     u, _ = drawn.depth_points.get_data()
     assert 0 < len(u) <= reading.correspondences.is_compared.sum()
-    shown = drawn.view.places(sparse.depth_points_m(0))
+    shown = drawn.view.to_sheet_mm(sparse.depth_points_m(0))
     assert np.isin(np.round(u, 6), np.round(shown[:, 0], 6)).all()
     film.show_sample(2)
     assert len(drawn.depth_points.get_data()[0]) == 0

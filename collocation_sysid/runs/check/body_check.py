@@ -25,7 +25,7 @@ POOR_QUALITY = 0.1
 # with quadratic ones a beam's stiffness is found 6 % too low at 0.45, and 12 % at 0.49.
 LOCKING_POISSON = {"tet4": 0.4, "tet10": 0.45}
 # Rounding of Poisson's ratio, which is converted to λ and μ and back, and of the elements across.
-ROUNDING = 1e-6
+ROUNDING = 1e-9
 # Ratio of length to thickness above which a body bends like a beam.
 LEAST_SLENDERNESS = 2.5
 # Elements needed across the thickness of a bending body: with averaged dilatation one element
