@@ -559,7 +559,7 @@ def test_drawing_needs_no_display_and_leaves_pyplot_alone():
     code = (
         "import sys, collocation_sysid as c; assert 'matplotlib' not in sys.modules;"
         "import collocation_sysid.result.animation; from results_small import a_result;"
-        "from collocation_sysid.result.pictures import album; album([], a_result());"
+        "from collocation_sysid.result.pictures import all_pictures; all_pictures([], a_result());"
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     here = Path(__file__).parent
