@@ -89,10 +89,10 @@ ENDLESS = {
 }
 READ_ENDLESS = """
 import sys
-from collocation_sysid import apart
+from collocation_sysid import isolated_process
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.mesh import TetMesh
-apart.READING_S = 3
+isolated_process.READING_S = 3
 for name in sys.argv[1:]:
     try:
         TetMesh.read(name)
@@ -377,8 +377,8 @@ DEAF = """
 import os, signal, sys, threading, time
 from collocation_sysid import cli
 from collocation_sysid.methods import nlpsol
-from collocation_sysid.result import record
-record._write_pictures = lambda *_: None
+from collocation_sysid.result import run_record
+run_record._write_pictures = lambda *_: None
 sys.argv = ["collocation-sysid", "solve", "problem.toml", "--out", "run", "-q"]
 def end():
     for _ in range({times}):
