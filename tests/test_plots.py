@@ -551,7 +551,7 @@ def test_an_experiment_can_be_read_back_from_its_arrays():
     assert arrays["hung cube/rolled_out_positions_m"].dtype == np.float32
     again = MotionRecord.from_arrays("hung cube", arrays)
     np.testing.assert_array_equal(again.positions_m, seen.positions_m)
-    np.testing.assert_array_equal(again.held, seen.held)
+    np.testing.assert_array_equal(again.is_prescribed, seen.is_prescribed)
     assert again.marker_names == list(seen.marker_names)
 
 

@@ -206,11 +206,15 @@ class LiveEstimator:
         self.model = LiveModel.from_problem(problem)
         model = self.model
         self.names = self.model.experiment.markers.names
-        far_m = REACH_BODY_SIZES * model.body_size_m
+        most_motion_m = REACH_BODY_SIZES * model.body_size_m
         neighbours = model.neighbouring_samples
-        self._reach_m = far_m + float(np.linalg.norm(model.segment.body.nodes_m.mean(axis=0)))
+        self._reach_m = most_motion_m + float(
+            np.linalg.norm(model.segment.body.nodes_m.mean(axis=0))
+        )
         stencils = [each.stencil for each in model.instruments]
-        self.intake = FrameBuffer(model.interval_s, model.substeps, neighbours, far_m, stencils)
+        self.intake = FrameBuffer(
+            model.interval_s, model.substeps, neighbours, most_motion_m, stencils
+        )
         self.counts = self.intake.counts
         self.samples = 0
         self.budget_s = options.budget_s or BUDGET_FRACTION * model.interval_s
@@ -305,7 +309,7 @@ class LiveEstimator:
         notes += self._add_samples(readings, squares)
         self._update_estimate()
         if self.first_pass is not None and not self.first_pass.has_failed and self.search is None:
-            self._relinearise_if_far(
+            self._relinearise_if_moved(
                 self.first_pass, self.first_pass, began, RELINEARISE_DISTANCE_FIRST
             )
         self.budget.frame_s = self.clock() - before
@@ -348,10 +352,10 @@ class LiveEstimator:
         else:
             rows = len(batch_run.solution.history) * len(self.log)
             estimates = {name: batch_run.estimates[name] for name in last.estimates}
-            left_out = Assessment.from_concerns(
+            unassessed = Assessment.from_concerns(
                 data_concerns(ResidualScatter(), self.counts, self.samples)
             )
-            trust = batch_run.trust.combined_with(left_out)
+            trust = batch_run.trust.combined_with(unassessed)
             last = replace(last, marker_rms_m=batch_run.solution.rms_m)
         return replace(
             last,
@@ -420,7 +424,7 @@ class LiveEstimator:
             if track is None:
                 self._start_pass(rows[0])
             elif not track.has_failed:
-                done = track.add_rows([row.poses for row in rows[: track.rows_left_in_block]])
+                done = track.add_rows([row.poses for row in rows[: track.remaining_rows_of_block]])
         except SimulationError as error:
             if track is None:
                 self.intake.reset()
@@ -683,7 +687,7 @@ class LiveEstimator:
             if again is None:
                 break
             if not done and again.base is not None:
-                self._relinearise_if_far(self.first_pass, again, began, RELINEARISE_DISTANCE)
+                self._relinearise_if_moved(self.first_pass, again, began, RELINEARISE_DISTANCE)
             affordable = min(
                 self._affordable_rows(done, self.clock() - began), again.repeatable_rows
             )
@@ -763,7 +767,7 @@ class LiveEstimator:
                 return None
         return WindowPass(self.model, p, track.prior, self._block_rows, base)
 
-    def _relinearise_if_far(
+    def _relinearise_if_moved(
         self, track: WindowPass, pass_to_move: WindowPass, began: float, distance: float
     ) -> None:
         """Move the linearisation point of a pass to the estimate if it is far and there is time.
@@ -801,13 +805,15 @@ class LiveEstimator:
         points = [*track.linearisation_points, again.linearisation_points[0]]
         expected = max(track.information.loss(point) for point in points)
         # Of a pass that turned the sum of squares is not that of a simulation.
-        is_near = (
+        is_within_trust_region = (
             track.last_relinearised_row
             and self._largest_distance(track, track.linearisation_point, again.linearisation_points)
             <= REPEAT_DISTANCE
         )
         fits = (
-            track.has_failed or is_near or again.loss <= ACCEPTED_RATIO * expected + ACCEPTED_EXCESS
+            track.has_failed
+            or is_within_trust_region
+            or again.loss <= ACCEPTED_RATIO * expected + ACCEPTED_EXCESS
         )
         if not again.has_failed and fits:
             again.base = None

@@ -236,18 +236,20 @@ class StreamingSweep:
         rows = self.model.template_rows
         dofs = self.segment.dof_count
         empty = np.zeros((rows, dofs))
-        given = np.zeros((rows, len(self.grasped), self.count))
-        felt = GraspReactions.zeros(rows, len(self.sensed), self.count, len(self.model.first_poses))
-        return SweepState(0, 0, empty, empty, given, felt, None, ())
+        node_loads = np.zeros((rows, len(self.grasped), self.count))
+        reactions = GraspReactions.zeros(
+            rows, len(self.sensed), self.count, len(self.model.first_poses)
+        )
+        return SweepState(0, 0, empty, empty, node_loads, reactions, None, ())
 
     def _moved_state(self, state: SweepState, at: Array) -> SweepState:
         """Return a state moved from the linearisation point `at` to p, to first order."""
         if state.last_rows is None or (at == self.p).all():
             return state
         moving = self.moving
-        flat = self.model.transformed(at)
-        old_rates = self.model.transformation_derivatives(flat)
-        change = (self.transformed - flat)[moving]
+        transformed = self.model.transformed(at)
+        old_rates = self.model.transformation_derivatives(transformed)
+        change = (self.transformed - transformed)[moving]
         step = change / old_rates[moving]
         factors = np.ones(self.count)
         factors[1:] = (self.rates / old_rates)[moving]
@@ -275,12 +277,14 @@ class StreamingSweep:
             for w, k in zip(columns_of_rows, stored, strict=True)
         ]
         all_wrenches = np.array([wrenches for *_, wrenches in state.observed_rows])
-        all_wrenches[..., 0] += all_wrenches[..., 1:] @ ((self.transformed - flat) / old_rates)
+        all_wrenches[..., 0] += all_wrenches[..., 1:] @ (
+            (self.transformed - transformed) / old_rates
+        )
         all_wrenches[..., 1:] *= self.rates / old_rates
         read = tuple(zip(stored_rows, point_columns, all_wrenches, strict=True))
-        felt = state.reactions.moved_to(step, factors)
+        reactions = state.reactions.moved_to(step, factors)
         return replace(
-            state, x=x, force=force, reactions=felt, last_rows=memory, observed_rows=read
+            state, x=x, force=force, reactions=reactions, last_rows=memory, observed_rows=read
         )
 
     def _resume(self, state: SweepState) -> None:
@@ -513,8 +517,8 @@ class StreamingSweep:
         rows = slice(self.end - len(columns), self.end)
         all_columns = np.array(columns)
         all_columns[:, :, 0] = self.x[rows]
-        by_flat = (all_columns[:, :, 1:] / self.rates[self.moving]).astype(np.float32)
-        pairs = zip(self.x[rows].copy(), by_flat, strict=True)
+        by_transformed = (all_columns[:, :, 1:] / self.rates[self.moving]).astype(np.float32)
+        pairs = zip(self.x[rows].copy(), by_transformed, strict=True)
         stored_rows = [StoredRow(self.transformed, *pair) for pair in pairs]
         self.felt.apply_correction(rows, all_columns[:, self.sensed])
         self.read.extend(

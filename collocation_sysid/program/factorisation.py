@@ -147,7 +147,7 @@ class _RefinedFactor:
         Factor of S.
     skew : sparse array
         K.
-    factorise_whole : callable
+    factorise_complete : callable
         Returns the factor of S + K, which is used if the series does not converge.
     positive_definite : bool
         Always true.
@@ -157,14 +157,14 @@ class _RefinedFactor:
 
     symmetric: Factor
     skew: sp.csc_array
-    factorise_whole: Callable[[], Factor]
+    factorise_complete: Callable[[], Factor]
     positive_definite: bool = True
     divergence_flags: list[bool] = field(default_factory=list)
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
         """Solve for right-hand sides (k,) or (k, m)."""
         if self.divergence_flags:
-            return self.factorise_whole().solve(right, transposed)
+            return self.factorise_complete().solve(right, transposed)
         solution = correction = self.symmetric.solve(right)
         size = last = np.abs(solution).max(axis=0, initial=TINY)
         shrinks = 1.0
@@ -176,7 +176,7 @@ class _RefinedFactor:
             shrinks = float((length / last).max(initial=0.0))
             if not shrinks <= CONTRACTION:
                 self.divergence_flags.append(True)
-                return self.factorise_whole().solve(right, transposed)
+                return self.factorise_complete().solve(right, transposed)
             solution = solution + correction
             last = length
         return solution
@@ -348,11 +348,11 @@ class Factoriser:
             return _SparseFactor(lu, _has_positive_pivots(lu))
 
         @cache
-        def whole() -> Factor:
+        def complete_factor() -> Factor:
             return _SparseFactor(self._superlu(values, pivot_below=1.0, skew=skew), True)
 
         entries = self._signs * skew[self._full_source]
-        return _RefinedFactor(definite, self._sparse_matrix(entries), whole)
+        return _RefinedFactor(definite, self._sparse_matrix(entries), complete_factor)
 
     def _factorise_definite(self, values: Array) -> Factor | None:
         """Return the factor of a symmetric matrix, or None if it is not positive definite."""

@@ -175,7 +175,9 @@ class PrescribedColumns:
     def from_columns(cls, sweep: Sweep, dofs: Index, columns: Array) -> PrescribedColumns:
         """Build the prescribed rows of dofs (g,) that change by `columns` (N, g, c) [m]."""
         return cls(
-            dofs, columns, sweep.dynamics.is_temporarily_held[:, dofs] | ~np.isin(dofs, sweep.free)
+            dofs,
+            columns,
+            sweep.dynamics.is_temporarily_prescribed[:, dofs] | ~np.isin(dofs, sweep.free),
         )
 
     @property
@@ -346,7 +348,7 @@ class Sweep:
         self.matrix = Submatrix(self.pattern, self.free)
         self.beside = Submatrix(self.pattern, self.free, transcription.prescribed_motion.dofs)
         self.of_sensed = Submatrix(self.pattern, self.sensed)
-        self._takes = bool(self.dynamics.is_temporarily_held.any())
+        self._takes = bool(self.dynamics.is_temporarily_prescribed.any())
 
     def __reduce__(self) -> tuple[type[Sweep], tuple[Transcription, int, None, Choice]]:
         return Sweep, (self.segment, self.dynamics.row_count, None, self.factorisation)
@@ -461,7 +463,7 @@ class Sweep:
                 known = np.zeros(x.shape[1])
                 for j, other in enumerate(later, 1):
                     known += other.w[j] * y[t + j]
-                known[self.dynamics.is_temporarily_held[t]] = 0
+                known[self.dynamics.is_temporarily_prescribed[t]] = 0
                 remaining[t] -= p[0] * by_state + q[0] * by_rate
                 if known.any():
                     by_position = self.matrix.extract(step.by_position, -step.skew) @ known
@@ -490,7 +492,7 @@ class Sweep:
         the time prescribes the dof, in place.
         """
         if self._takes:
-            rows[self.dynamics.is_temporarily_held[t, self.free]] = 0
+            rows[self.dynamics.is_temporarily_prescribed[t, self.free]] = 0
         return rows
 
     @property
@@ -510,8 +512,8 @@ class Sweep:
     def _step_bytes(self) -> int:
         """Memory of one time step: element results and one factor [bytes]."""
         solver = self.factoriser
-        numbers = solver.unsymmetric_factor_size if self.body.is_unsymmetric else solver.factor_size
-        return 8 * (self.body.linearisation_width + numbers)
+        values = solver.unsymmetric_factor_size if self.body.is_unsymmetric else solver.factor_size
+        return 8 * (self.body.linearisation_width + values)
 
     def dynamics_at(self, equations: EquationsAtParameters) -> Dynamics:
         """Return the equations of motion of the first rows with the inputs of a setting."""
@@ -586,7 +588,7 @@ class Sweep:
         time get a diagonal entry alone.
         """
         pattern = self.pattern
-        is_prescribed = dynamics.is_temporarily_held[grid_times]
+        is_prescribed = dynamics.is_temporarily_prescribed[grid_times]
 
         def matrix(k: int) -> tuple[Array, Array]:
             values = rows[k].block(

@@ -66,7 +66,7 @@ UNITS = (
     ("torques", {"newton millimetres": 1e-3, "kilogram-force metres": 9.80665}, TORQUES),
 )
 # Offset over the standard deviation of the tare's prior from which on the sensor was not zeroed.
-FAR_TARE = 3.0
+LARGEST_TARE = 3.0
 # Error of a calibration that gives no concern.
 SAME_GAIN = 0.05
 # Error of the reference point that gives no concern [m].
@@ -128,9 +128,9 @@ def _misses(part: ExperimentIterate) -> bool:
     # They are behind the markers.
     pairs = zip(part.segment.sensors, part.observables[1:], strict=False)
     return any(
-        float(np.sum(sensor.residuals(looked, part.phi) ** 2))
+        float(np.sum(sensor.residuals(observation, part.phi) ** 2))
         > MISFIT**2 * sensor.is_compared_by_component.sum()
-        for sensor, looked in pairs
+        for sensor, observation in pairs
     )
 
 
@@ -143,21 +143,21 @@ def _markers_misfit(part: ExperimentIterate) -> float:
 
 
 def _from_markers(
-    collocation: Collocation, seen: Sequence[Transcription], method: ReducedSpace
+    collocation: Collocation, transcriptions: Sequence[Transcription], method: ReducedSpace
 ) -> list[ExperimentIterate]:
     """Return experiments fitted to their markers alone, with the nuisance parameters of the
     wrenches at zero; empty if the fit fails.
     """
-    if not seen:
+    if not transcriptions:
         return []
-    without_wrenches = [without_grasp_sensors(segment.experiment) for segment in seen]
+    without_wrenches = [without_grasp_sensors(segment.experiment) for segment in transcriptions]
     try:
         solution = method(replace(collocation, experiments=without_wrenches))
     except (InputError, SimulationError):
         return []
     solution.unless_interrupted()
     parts = []
-    for segment, part in zip(seen, solution.parts, strict=True):
+    for segment, part in zip(transcriptions, solution.parts, strict=True):
         values = dict(zip(part.segment.nuisance.names, part.phi, strict=True))
         phi = np.array([values.get(name, 0.0) for name in segment.nuisance.names])
         parts.append(ExperimentIterate(segment, part.q, phi, part.x))
@@ -229,9 +229,9 @@ class _OneSensor:
             if is_measured.any()
             else 0.0
         )
-        if largest > FAR_TARE:
+        if largest > LARGEST_TARE:
             of = f"the wrench of '{self.part.segment.experiment.name}'"
-            yield Hypothesis("wrench-tare", of, strength=float(largest / FAR_TARE))
+            yield Hypothesis("wrench-tare", of, strength=float(largest / LARGEST_TARE))
 
     def misfit(self, trial: DescribedWrench) -> float:
         """Return the root mean square of the residuals of a description in standard
