@@ -780,7 +780,7 @@ else:
         namespace={
             "__module__": __name__,
             "__doc__": _DOCSTRING
-            + "\n".join(f"{row.name} : float or None\n    {row.said}." for row in KINDS)
+            + "\n".join(f"{row.name} : float or None\n    {row.description}." for row in KINDS)
             + _SCOPE_DOCSTRING,
         },
     )
