@@ -226,8 +226,8 @@ class LiveEstimator:
         self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
         self.prior = SquareRootInformation.empty(model.parameter_count)
         self.first_pass: WindowPass | None = None
-        self._joined = CombinedPasses(self.prior, [], [])
-        self._held_m = np.full((1, 3), np.nan)
+        self._combined = CombinedPasses(self.prior, [], [])
+        self._last_positions_m = np.full((1, 3), np.nan)
         self.second_pass: WindowPass | None = None
         self.log: list[LoggedRow] = []
         self.search = self._new_search() if problem.parameters.names_without_guess else None
@@ -396,8 +396,8 @@ class LiveEstimator:
             if self.counts["with a wrench"] == 1:
                 notes.append("wrenches are left out: no grasp of the problem has a sensor")
         if frame.pose is not None:
-            self._held_m = frame.pose[0]
-        distances_m = np.linalg.norm(frame.tracks_m[:, None] - self._held_m, axis=2)
+            self._last_positions_m = frame.pose[0]
+        distances_m = np.linalg.norm(frame.tracks_m[:, None] - self._last_positions_m, axis=2)
         self.samples += int(np.isfinite(frame.tracks_m[:, 0]).sum())
         is_implausible = (distances_m > self._reach_m).all(axis=1)
         if is_implausible.any():
@@ -559,7 +559,7 @@ class LiveEstimator:
             track = WindowPass(self.model, self.p, self.prior, self._block_rows)
             track.add_rows([row.poses], guesses)
         self.first_pass = track
-        self._joined = CombinedPasses.from_passes(track, None)
+        self._combined = CombinedPasses.from_passes(track, None)
 
     def _restart(self) -> None:
         """Keep the information so far as a prior, and wait for a new start."""
@@ -580,7 +580,7 @@ class LiveEstimator:
         """
         if self.first_pass is None or self.first_pass.has_failed:
             return np.inf
-        return self._largest_distance(self.first_pass, self.p, self._joined.points)
+        return self._largest_distance(self.first_pass, self.p, self._combined.points)
 
     def _largest_distance(self, track: WindowPass, p: Array, points: Sequence[Array]) -> float:
         """Return the largest distance of p from some points, in the standard errors of a pass."""
@@ -591,8 +591,8 @@ class LiveEstimator:
     def _update_estimate(self) -> None:
         """Update the estimate p from the joint information of both passes."""
         if self.first_pass is not None and not self.first_pass.has_failed:
-            self._joined = CombinedPasses.from_passes(self.first_pass, self.second_pass)
-            self.p = self._constrained_minimum(self.first_pass, self._joined.information)
+            self._combined = CombinedPasses.from_passes(self.first_pass, self.second_pass)
+            self.p = self._constrained_minimum(self.first_pass, self._combined.information)
 
     def _constrained_minimum(self, track: WindowPass, known: SquareRootInformation) -> Array:
         """Return the minimum of a quadratic loss within bounds and the trust region about a
@@ -613,7 +613,7 @@ class LiveEstimator:
         samples = len(self.log) / self.model.substeps
         deviation = POINT_PRIOR_DEVIATION * max(1.0, samples / TRIAL_SAMPLES)
         slopes = np.diag(1 / (deviation * self.model.collocation.reach_p * track.sweep.rates))
-        information = self._joined.information.with_rows(
+        information = self._combined.information.with_rows(
             np.zeros(size), slopes, track.sweep.transformed
         )
         return self._constrained_minimum(track, information)
@@ -637,9 +637,9 @@ class LiveEstimator:
             }
             return estimates_only, Assessment.from_concerns(grave)
         if self.counts["looked"] % SCATTER_INTERVAL_FRAMES == 0:
-            self.scatter = self._joined.scatter(self.model.transformed(self.p))
+            self.scatter = self._combined.scatter(self.model.transformed(self.p))
         self.counts["looked"] += 1
-        estimates = self._estimates_at(self._joined.information, self.p)
+        estimates = self._estimates_at(self._combined.information, self.p)
         grave += data_concerns(self.scatter, self.counts, self.samples)
         grave += estimate_concerns(estimates, self.linearisation_distance)
         return estimates, Assessment.from_concerns(grave)

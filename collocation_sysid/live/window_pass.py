@@ -95,7 +95,7 @@ class WindowPass:
             model, p, prior.with_problem(model.prior_information(p)), *self.start
         )
         self.blocks: list[WindowBlock] = []
-        self._turns = [(0, self.sweep.transformed)]
+        self._base_changes = [(0, self.sweep.transformed)]
         self.has_failed = False
         self.rows = 0
         self._off: list[Array] = []
@@ -147,7 +147,7 @@ class WindowPass:
         self.sweep = StreamingSweep(
             self.model, p, self.information, self.sweep.state, self.linearisation_point
         )
-        self._turns.append((self.rows, self.sweep.transformed))
+        self._base_changes.append((self.rows, self.sweep.transformed))
 
     @property
     def last_relinearised_row(self) -> int:
@@ -155,7 +155,7 @@ class WindowPass:
 
         0 if never.
         """
-        return self._turns[-1][0]
+        return self._base_changes[-1][0]
 
     @property
     def linearisation_points(self) -> list[Array]:
@@ -164,8 +164,11 @@ class WindowPass:
 
     def linearisation_points_from(self, row: int) -> list[Array]:
         """Return the transformed parameters at which the rows from an index on are linearised."""
-        before = [transformed for first, transformed in self._turns if first <= row]
-        return [*before[-1:], *[flat for first, flat in self._turns if first > row]]
+        before = [transformed for first, transformed in self._base_changes if first <= row]
+        return [
+            *before[-1:],
+            *[transformed for first, transformed in self._base_changes if first > row],
+        ]
 
     def add_residuals(self, residuals: Sequence[LinearisedResidual]) -> None:
         """Add the linearised residuals of samples after the last rows."""
@@ -231,9 +234,10 @@ class WindowPass:
         block = self.blocks.pop(0)
         self.rows -= len(block.stored_rows)
         changes = [
-            (max(0, row - len(block.stored_rows)), transformed) for row, transformed in self._turns
+            (max(0, row - len(block.stored_rows)), transformed)
+            for row, transformed in self._base_changes
         ]
-        self._turns = [
+        self._base_changes = [
             *[turn for turn in changes if not turn[0]][-1:],
             *[t for t in changes if t[0]],
         ]

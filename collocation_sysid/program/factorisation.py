@@ -224,9 +224,9 @@ class Factoriser:
         position[free] = np.arange(len(free))
         rows = position[pattern.rows]
         columns = position[pattern.columns]
-        self._kept = np.flatnonzero((rows >= 0) & (columns >= 0))
-        rows = rows[self._kept]
-        columns = columns[self._kept]
+        self._free_entries = np.flatnonzero((rows >= 0) & (columns >= 0))
+        rows = rows[self._free_entries]
+        columns = columns[self._free_entries]
         self._size = len(free)
         ones = np.ones(len(rows))
         graph = sp.csr_array((ones, (rows, columns)), shape=(self._size, self._size))
@@ -241,7 +241,7 @@ class Factoriser:
         strict = rows != columns
         self._full_rows = np.concatenate([rows, columns[strict]])
         self._full_columns = np.concatenate([columns, rows[strict]])
-        self._full_source = np.concatenate([self._kept, self._kept[strict]])
+        self._full_source = np.concatenate([self._free_entries, self._free_entries[strict]])
         # Whether an entry has the skew part's own sign; none on the diagonal.
         self._signs = np.concatenate([strict.astype(float), -np.ones(strict.sum())])
         self._entries = pattern.entry_count
@@ -296,7 +296,7 @@ class Factoriser:
         """Skyline factorisation for narrow bands; None for others."""
         if not self.is_banded or self.half_bandwidth > NARROW:
             return None
-        return make_skyline(self._size, *self._ranks, self._kept)
+        return make_skyline(self._size, *self._ranks, self._free_entries)
 
     @property
     def _sparse_work(self) -> float:
@@ -369,7 +369,7 @@ class Factoriser:
         if self.skyline:
             return None
         band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
-        band.T.reshape(-1)[self._band_places] = values[self._kept]
+        band.T.reshape(-1)[self._band_places] = values[self._free_entries]
         return _BandFactor(band, self._order) if cholesky_in_place(band) else None
 
     def _pardiso(self) -> Pardiso:

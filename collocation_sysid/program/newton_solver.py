@@ -114,7 +114,7 @@ class NewtonSolver:
         self.pattern = experiment.sparsity
         self.factoriser = Factoriser.cached(self.pattern, self.free)
         self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
-        self._kept: Factor | None = None
+        self._last_factor: Factor | None = None
 
     def solve(
         self,
@@ -170,7 +170,7 @@ class NewtonSolver:
         step = self._step(factor, value)
         for _ in range(self.options.max_iterations):
             if self._is_last(step):
-                self._kept = factor
+                self._last_factor = factor
                 x[self.free] += step
                 return x
             x, factor, step = self._backtrack(x, step, factor, residual, linearise, keep_definite)
@@ -188,8 +188,8 @@ class NewtonSolver:
         """
         is_own = False
         for _ in range(self.options.max_iterations):
-            if self._kept is not None:
-                improved, done = self._chord_steps(x, residual, self._kept)
+            if self._last_factor is not None:
+                improved, done = self._chord_steps(x, residual, self._last_factor)
                 if done:
                     return improved, True
                 if improved is x and is_own:
@@ -197,7 +197,7 @@ class NewtonSolver:
                 x = improved
             _, *matrix = self._timed(linearise, x)
             try:
-                self._kept = self._factorise(matrix, x, False)
+                self._last_factor = self._factorise(matrix, x, False)
                 is_own = True
             except NewtonFailure:
                 break

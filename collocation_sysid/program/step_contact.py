@@ -140,7 +140,7 @@ class StepContact:
         self._theta = theta
         self._pattern = pattern
         self._from = np.full((2, 1), np.nan)
-        self._near = list[tuple[Contact, ContactCandidates]]()
+        self._candidates_of_contacts = list[tuple[Contact, ContactCandidates]]()
         edges_m = [each.law_of_contact.surface.edge_m for each in contacts]
         self.acts = bool(contacts)
         self._margin_m = MARGIN * min(edges_m, default=0.0)
@@ -208,7 +208,7 @@ class StepContact:
         ends = np.array([xi - self._half_s * nu, xi + self._half_s * nu])
         if not np.abs(ends - self._from).max() <= CHANGE * self._margin_m:
             self._from = ends
-            self._near = []
+            self._candidates_of_contacts = []
             for each in self._contacts:
                 gaps = each.law_of_contact.gaps(each.points.vectors(ends)).min(axis=0)
                 (chosen,) = np.nonzero(gaps < each.law_of_contact.widths_m + self._margin_m)
@@ -216,6 +216,6 @@ class StepContact:
                     candidates = ContactCandidates.from_indices(
                         each.law_of_contact, self._pattern, chosen.tobytes()
                     )
-                    self._near.append((each, candidates))
-        for contact, candidates in self._near:
+                    self._candidates_of_contacts.append((each, candidates))
+        for contact, candidates in self._candidates_of_contacts:
             yield candidates, *candidates.inputs(contact, xi, nu, self._theta)

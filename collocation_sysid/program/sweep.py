@@ -203,7 +203,7 @@ class PrescribedColumns:
         q = step.row.q[0]
         force = np.zeros((len(sweep.free), self.column_count))
         skew = step.row.skew(0, step.skew, step.rate_skew)
-        matrix = sweep.beside.extract(p * step.by_position + q * step.by_velocity, skew)
+        matrix = sweep.prescribed_block.extract(p * step.by_position + q * step.by_velocity, skew)
         force[:, changed] = matrix @ now[:, changed]
         return force
 
@@ -346,7 +346,9 @@ class Sweep:
         self.sensed = transcription.sensed_dofs
         self.factoriser = Factoriser.cached(self.pattern, self.free, factorisation)
         self.matrix = Submatrix(self.pattern, self.free)
-        self.beside = Submatrix(self.pattern, self.free, transcription.prescribed_motion.dofs)
+        self.prescribed_block = Submatrix(
+            self.pattern, self.free, transcription.prescribed_motion.dofs
+        )
         self.of_sensed = Submatrix(self.pattern, self.sensed)
         self._takes = bool(self.dynamics.is_temporarily_prescribed.any())
 
@@ -649,7 +651,7 @@ class ForwardSubstitution:
     ) -> None:
         self.solver = solver
         self.columns = columns
-        self.held = grasp_forces if len(solver.sensed) else None
+        self.grasp_forces = grasp_forces if len(solver.sensed) else None
         self.violation_n = 0.0
         self.indefinite = 0
         size = solver.pattern.size
@@ -664,7 +666,7 @@ class ForwardSubstitution:
         self.past_forces = deque(last.forces, maxlen=reach)
         # Also where these rows do not: they may be continued.
         self.weighs_past = bool(solver.segment.dynamics.tables.w[:, 1:].any())
-        self.carried: list[MemoryForwardColumns | ForceForwardColumns] = []
+        self.internal_states: list[MemoryForwardColumns | ForceForwardColumns] = []
         self._known = last.history_columns
 
     @property
@@ -674,7 +676,7 @@ class ForwardSubstitution:
             solutions=tuple(self.past),
             increments=tuple(self.past_increments),
             forces=tuple(self.past_forces),
-            history_columns=tuple(each.columns for each in self.carried),
+            history_columns=tuple(each.columns for each in self.internal_states),
         )
 
     def iterate_rows(self, x: Array, done: int = 0, out: Array | None = None) -> Iterator[Array]:
@@ -698,11 +700,11 @@ class ForwardSubstitution:
         acceleration = dynamics.acceleration(x)
         known = self._known or [None] * len(histories)
         pairs = zip(histories, known, strict=True)
-        self.carried = [
+        self.internal_states = [
             each.forward_columns(columns.input_derivatives, done, own) for each, own in pairs
         ]
         for t in range(done, first):  # the start is given
-            for each in self.carried:
+            for each in self.internal_states:
                 each.advance(partial(np.zeros, self.shape), partial(np.zeros, self.shape))
             start = np.zeros(self.shape)
             if columns.prescribed is not None:
@@ -766,7 +768,7 @@ class ForwardSubstitution:
         if self.weighs_past:
             right += weighted_sum_of_past(w, self.past_increments, self._of_free)
         right -= mass * weighted_sum_of_past(s, self.past, self.shape).take(free, axis=0)
-        for each in self.carried:
+        for each in self.internal_states:
             force = force + each.force_columns()
         forced = force.take(free, axis=0)
         forced += self._past_force(step, row)
@@ -780,12 +782,12 @@ class ForwardSubstitution:
         out[free] = solution
         if prescribed is not None:
             prescribed.write_into(t, out)
-        for each in self.carried:
+        for each in self.internal_states:
             each.advance(
                 partial(self._stencil_sum, row.p, out), partial(self._stencil_sum, row.q, out)
             )
-        if self.held is not None:
-            self._store_grasp_forces(self.held, step, force, out)
+        if self.grasp_forces is not None:
+            self._store_grasp_forces(self.grasp_forces, step, force, out)
         self.past.appendleft(out)
 
     def _store_grasp_forces(

@@ -382,8 +382,8 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
     force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(smaller)
     force = force / (2 * SMALL)
     # Of a body made under gravity the deflection over the size grows with the weight over s².
-    heavier = at.force_change_by_scan_weight() * (-2.0 if at.body.has_stated_mass else 1.0)
-    mass = (0.0 if at.body.has_stated_mass else 3.0) * at.own_mass_kg
+    heavier = at.force_change_by_scan_weight() * (-2.0 if at.body.has_declared_mass else 1.0)
+    mass = (0.0 if at.body.has_declared_mass else 3.0) * at.own_mass_kg
     for number, contact in at.contacts.items():
         has_stiffness = contact.law_of_contact.obstacle.stiffness_pa_m is not None
         force += (2.0 if has_stiffness else 1.0) * at.contact_n(number)

@@ -131,9 +131,9 @@ class PenaltyProblem:
         return np.concatenate(
             [
                 each
-                if given.constraints_per_time == s.constraints_per_time
-                else each.reshape(-1, s.dof_count)[:, given.constrained_dofs].ravel()
-                for given, s, each in rows
+                if values.constraints_per_time == s.constraints_per_time
+                else each.reshape(-1, s.dof_count)[:, values.constrained_dofs].ravel()
+                for values, s, each in rows
             ]
         )
 
