@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from problem_files import replace_cell, replace_text, run_command, settings
+from problem_files import REFERENCES, replace_cell, replace_text, run_command, settings
 
 from collocation_sysid import machine
 from collocation_sysid.errors import InputError
@@ -280,6 +280,17 @@ def test_a_problem_that_memory_cannot_hold_is_refused_when_it_is_read(
         assert found in refused(command[0], "problem.toml", *command[1:], *settings(setting))
     assert time.process_time() - began < 10
     assert not (tiny / "run").exists()
+
+
+def test_unknown_positions_of_more_markers_than_memory_can_hold_are_refused(
+    tiny: Path, monkeypatch: pytest.MonkeyPatch
+):
+    replace_text(f"reference_m = {REFERENCES}\n", "")(tiny)
+    monkeypatch.setattr(problem_size, "MANY_MARKERS", 2)
+    monkeypatch.setattr(problem_size, "machine_memory_mb", lambda: 0.4)
+    message = refused("check", "problem.toml")
+    assert "markers of unknown position take about" in message
+    assert "expected fewer markers (markers.names), their positions (reference_m)" in message
 
 
 def test_a_generated_mesh_that_memory_cannot_hold_is_refused_before_it_is_made(

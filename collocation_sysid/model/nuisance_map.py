@@ -189,7 +189,9 @@ class NuisanceMap:
         scope = experiment.nuisance.scope
         middle_m = experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0)
         scales = np.array([entry.sigma for entry in entries], dtype=float)
-        steps = {e.row.name: e.row.step(experiment) for e in entries if e.row.step is not None}
+        # Of each kind once: a body may carry thousands of markers.
+        rows = {entry.row.name: entry.row for entry in entries}
+        steps = {name: row.step(experiment) for name, row in rows.items() if row.step is not None}
         reach = [min(e.row.reach, steps.get(e.row.name, np.inf) / e.sigma) for e in entries]
         grasped_nodes = prescribed_nodes(experiment.body_grasps)
         nuisance_map = cls(

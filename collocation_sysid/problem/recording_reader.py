@@ -507,7 +507,14 @@ class RecordingReader:
             samples = len(t_s) // every
             if rate_hz and not static:
                 samples = int(min((t_s[-1] - t_s[0]) * rate_hz, MOST_SAMPLES)) + 1
-            require_feasible(replace(self.size, samples=samples), self.say)
+            places = section.markers.reference_m
+            size = replace(
+                self.size,
+                samples=samples,
+                markers=len(table.names),
+                unplaced_markers=sum(name not in places for name in table.names),
+            )
+            require_feasible(size, self.say)
         try:
             aligned = align(
                 poses, table, section.window_s, rate_hz, every, grasp_intervals_s, static
