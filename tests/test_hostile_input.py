@@ -27,7 +27,7 @@ from collocation_sysid.fem.structured import (
     count_cylinder_elements,
     cylinder_of_edge,
 )
-from collocation_sysid.isolated_process import Failed, ProcessLimits, computed_apart
+from collocation_sysid.isolated_process import Failed, ProcessLimits, run_isolated
 from collocation_sysid.problem import Problem, loading, problem_size
 from collocation_sysid.recording import read_markers, read_poses, write_markers_csv
 from collocation_sysid.recording.formats.depth_files import read_depth
@@ -89,10 +89,10 @@ ENDLESS = {
 }
 READ_ENDLESS = """
 import sys
-from collocation_sysid import apart
+from collocation_sysid import isolated_process
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.mesh import TetMesh
-apart.READING_S = 3
+isolated_process.READING_S = 3
 for name in sys.argv[1:]:
     try:
         TetMesh.read(name)
@@ -120,9 +120,9 @@ def test_readers_that_do_not_find_the_end_of_a_mesh_are_stopped(tmp_path: Path):
 def test_readers_have_a_limit_of_memory():
     take = "found = {'a': numpy.ones(int(sys.argv[1]))}"
     limits = ProcessLimits(time_s=60, memory_mb=300)
-    assert len(computed_apart(take, "1000", limits=limits)["a"]) == 1000
+    assert len(run_isolated(take, "1000", limits=limits)["a"]) == 1000
     with pytest.raises(Failed, match="MemoryError"):
-        computed_apart(take, "100000000", limits=limits)
+        run_isolated(take, "100000000", limits=limits)
 
 
 @pytest.mark.parametrize("content", ["ply\nformat ascii 1.0\nelement vertex 3\n", "ply\n", "x"])
@@ -377,8 +377,8 @@ DEAF = """
 import os, signal, sys, threading, time
 from collocation_sysid import cli
 from collocation_sysid.methods import nlpsol
-from collocation_sysid.result import record
-record._write_pictures = lambda *_: None
+from collocation_sysid.result import run_record
+run_record._write_pictures = lambda *_: None
 sys.argv = ["collocation-sysid", "solve", "problem.toml", "--out", "run", "-q"]
 def end():
     for _ in range({times}):

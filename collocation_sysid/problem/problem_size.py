@@ -24,7 +24,7 @@ ANNOUNCED_NODES = 20_000
 NODES = 4953
 STEP_S = 0.57
 STEP_POWER = 1.5
-FACTOR_NUMBERS = 4.8e6
+FACTOR_ENTRIES = 4.8e6
 FACTOR_POWER = 1.4
 # Rows shorter than this take as long: Python calls [s].
 LEAST_STEP_S = 2e-3
@@ -70,9 +70,9 @@ class Size:
         copies = SIMULATION_COPIES
         if self.unknowns:
             copies = SEARCH_COPIES + SENSITIVITY_COPIES * self.unknowns
-        numbers = copies * 3 * self.nodes * self.timesteps
-        numbers += FACTOR_NUMBERS * (self.nodes / NODES) ** FACTOR_POWER
-        return (8 * numbers + BYTES_PER_ELEMENT * self.elements) / 1e6
+        values = copies * 3 * self.nodes * self.timesteps
+        values += FACTOR_ENTRIES * (self.nodes / NODES) ** FACTOR_POWER
+        return (8 * values + BYTES_PER_ELEMENT * self.elements) / 1e6
 
     def time_s(self) -> float:
         """Time of a solve in the reduced space, or of a simulation, on one thread."""

@@ -70,13 +70,13 @@ class NuisanceRow:
         Unit of the values: "m", "s", "rad", …
     sigma : float or None
         Standard deviation of the prior; None where it is not estimated by default.
-    said : str
+    description : str
         Description, for documentation.
     label : str
         Name in tables of results, with {which} for the component and {axis}; the name by default.
     key : str
         Key of [experiment.nuisance] in the problem file.
-    beside : float or None
+    reference : float or None
         Standard deviation if the key's table states other priors only.
     of : str
         Component that has values of its own: the recording, or each marker, grasp, …; "recording"
@@ -93,7 +93,7 @@ class NuisanceRow:
         Largest change in a step of the solver, in prior standard deviations.
     step : callable, optional
         ``step(experiment)``, largest change in a step of the solver, in `unit`.
-    told : str
+    sentence : str
         Sentence in the terminal, with {size}, {way} and {which}.
     by : {"length", "worst", "each"}
         Values that the terminal shows: the longest vector, the value farthest from its prior, or
@@ -115,11 +115,11 @@ class NuisanceRow:
     name: str
     unit: str
     sigma: float | None
-    said: str = ""
+    description: str = ""
     label: str = ""
     _: KW_ONLY
     key: str = ""
-    beside: float | None = None
+    reference: float | None = None
     of: Component = "recording"
     axes: str = ""
     changes: tuple[ModelPart, ...] = ("reading",)
@@ -128,7 +128,7 @@ class NuisanceRow:
     high: float = np.inf
     reach: float = 1.0
     step: Callable[[Any], float] | None = None
-    told: str = ""
+    sentence: str = ""
     by: Literal["length", "worst", "each"] = "each"
     same: Callable[[Any], dict[str, Any]] = lambda experiment: {}
     reading: Callable[[Any, Any, Any, Any], Any] | None = None
@@ -253,7 +253,8 @@ PLACE = NuisanceRow(
     reach=UNLIMITED_REACH,
     step=_largest_place_step_m,
     label="place of {which}, {axis}",
-    said="errors of the places in reference_m without a reference_sigma_m; they turn with the body",
+    description="errors of the places in reference_m without a reference_sigma_m; they turn "
+    "with the body",
     same=lambda e: {"body": id(e.body), "kind of places": e.markers.on_surface},
 )
 OFFSET = NuisanceRow(
@@ -266,8 +267,8 @@ OFFSET = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="length",
     label="camera offset of {which}, {axis}",
-    told="camera offsets up to {size}",
-    said="a constant offset of each marker in the cameras' frame",
+    sentence="camera offsets up to {size}",
+    description="a constant offset of each marker in the cameras' frame",
     reading=_shift_position,
 )
 CALIBRATION_SCALE = NuisanceRow(
@@ -277,8 +278,8 @@ CALIBRATION_SCALE = NuisanceRow(
     key="calibration_scale",
     considered=2e-3,
     label="scale of the cameras",
-    told="cameras see lengths {signed}",
-    said="a factor on all lengths that the cameras see, how far from one",
+    sentence="cameras see lengths {signed}",
+    description="a factor on all lengths that the cameras see, how far from one",
     applies=_has_markers,
     reading=lambda y, values, t_s, data: y + values * (y - ca.DM(data.pivot_m)),
 )
@@ -290,8 +291,8 @@ CALIBRATION_DISTORTION = NuisanceRow(
     considered=0.02,
     applies=_has_markers,
     label="distortion of the cameras",
-    told="cameras' distortion {signed}",
-    said="radial distortion of first order about the body's middle: a factor 1 + k r²",
+    sentence="cameras' distortion {signed}",
+    description="radial distortion of first order about the body's middle: a factor 1 + k r²",
     reading=_distort_position,
 )
 TIME = NuisanceRow(
@@ -302,8 +303,8 @@ TIME = NuisanceRow(
     changes=("clock",),
     applies=_is_motion,
     label="time shift",
-    told="markers seen {size} {way} than their times say{limit}",
-    said="how much later than their times say markers were seen, on the grasps' clock",
+    sentence="markers seen {size} {way} than their times say{limit}",
+    description="how much later than their times say markers were seen, on the grasps' clock",
     same=lambda e: {"time between samples": round(e.timestep_s, 12)},
     clock=lambda values, t_s, data: values,
 )
@@ -316,8 +317,8 @@ CLOCK_RATE = NuisanceRow(
     changes=("clock",),
     applies=lambda experiment: _is_motion(experiment) and _has_markers(experiment),
     label="rate of the markers' clock",
-    told="the markers' clock {signed} slow",
-    said="how much slower than the grasps' clock that of the markers goes",
+    sentence="the markers' clock {signed} slow",
+    description="how much slower than the grasps' clock that of the markers goes",
     clock=lambda values, t_s, data: values * (t_s - data.recorded_s[0]),
 )
 POSE_TURN = NuisanceRow(
@@ -329,8 +330,9 @@ POSE_TURN = NuisanceRow(
     changes=("reading", "gravity"),
     by="length",
     label="turn of the pose, {axis}",
-    told="poses turned by {size}",
-    said="a constant turn of grasps and body in the cameras' frame, which turns gravity in the "
+    sentence="poses turned by {size}",
+    description="a constant turn of grasps and body in the cameras' frame, which turns gravity "
+    "in the "
     "body's",
     reading=_rotate_position,
 )
@@ -343,8 +345,8 @@ POSE_SHIFT = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="length",
     label="shift of the pose, {axis}",
-    told="poses shifted by {size}",
-    said="a constant shift of both",
+    sentence="poses shifted by {size}",
+    description="a constant shift of both",
     reading=_shift_position,
 )
 TILT = NuisanceRow(
@@ -357,8 +359,8 @@ TILT = NuisanceRow(
     applies=lambda experiment: bool(np.any(experiment.gravity_m_s2)),
     by="length",
     label="tilt of gravity, {axis}",
-    told="gravity tilted by {size}",
-    said="a tilt of the direction of gravity",
+    sentence="gravity tilted by {size}",
+    description="a tilt of the direction of gravity",
     same=lambda e: {"gravity": tuple(e.gravity_m_s2)},
 )
 GRASP_TURN = NuisanceRow(
@@ -371,8 +373,8 @@ GRASP_TURN = NuisanceRow(
     applies=_has_observable_hand_eye,
     by="length",
     label="turn in the grasp, {axis}",
-    told="body turned in its grasp by {size}",
-    said="a constant turn of the body in its grasps",
+    sentence="body turned in its grasp by {size}",
+    description="a constant turn of the body in its grasps",
     same=_hand_eye_sharing_key,
 )
 GRASP_SHIFT = NuisanceRow(
@@ -385,8 +387,9 @@ GRASP_SHIFT = NuisanceRow(
     applies=_has_observable_hand_eye,
     by="length",
     label="shift in the grasp, {axis}",
-    told="body shifted in its grasp by {size}",
-    said="a constant shift of it there; both where the start is an equilibrium and markers see it",
+    sentence="body shifted in its grasp by {size}",
+    description="a constant shift of it there; both where the start is an equilibrium and "
+    "markers see it",
     same=_hand_eye_sharing_key,
 )
 ZERO = NuisanceRow(
@@ -399,8 +402,8 @@ ZERO = NuisanceRow(
     changes=("grasps",),
     by="worst",
     label="zero of grasp {which}, {axis}",
-    told="zero of a displacement off by {size}",
-    said="a constant offset of each displacement along each of its axes",
+    sentence="zero of a displacement off by {size}",
+    description="a constant offset of each displacement along each of its axes",
 )
 OBSTACLE_OFFSET = NuisanceRow(
     "obstacle_offset_m",
@@ -412,8 +415,8 @@ OBSTACLE_OFFSET = NuisanceRow(
     by="worst",
     applies=lambda experiment: bool(experiment.obstacles),
     label="place of {which}",
-    told="an obstacle is off by {size}",
-    said="a constant offset of each obstacle along its normal, or along the axis of its "
+    sentence="an obstacle is off by {size}",
+    description="a constant offset of each obstacle along its normal, or along the axis of its "
     "displacement: where contact begins",
 )
 OBSTACLE_TILT = NuisanceRow(
@@ -428,8 +431,9 @@ OBSTACLE_TILT = NuisanceRow(
     considered=0.2 * DEGREE,
     applies=lambda experiment: any(each.shape.has_tilt for each in experiment.obstacles),
     label="tilt of {which}, {axis}",
-    told="an obstacle is tilted by {size}",
-    said="a constant tilt of each plane or box that may be touched, about its point or middle",
+    sentence="an obstacle is tilted by {size}",
+    description="a constant tilt of each plane or box that may be touched, about its point or "
+    "middle",
 )
 OBSTACLE_TIME = NuisanceRow(
     "obstacle_time_s",
@@ -442,8 +446,8 @@ OBSTACLE_TIME = NuisanceRow(
     considered=1e-3,
     applies=lambda experiment: any(len(each.poses.t_s) > 1 for each in experiment.obstacles),
     label="delay of {which}",
-    told="an obstacle is late by {size}",
-    said="how much later than stated each obstacle moves, to first order",
+    sentence="an obstacle is late by {size}",
+    description="how much later than stated each obstacle moves, to first order",
 )
 TENSION_FACTOR = NuisanceRow(
     "tension_factor",
@@ -453,8 +457,8 @@ TENSION_FACTOR = NuisanceRow(
     of="tendon",
     changes=("drives",),
     label="{which}, more than stated",
-    told="{which} by {signed}",
-    said="a factor on the tension of each tendon, how far from one",
+    sentence="{which} by {signed}",
+    description="a factor on the tension of each tendon, how far from one",
 )
 TENSION_OFFSET = NuisanceRow(
     "tension_lost_n",
@@ -464,8 +468,8 @@ TENSION_OFFSET = NuisanceRow(
     of="tendon",
     changes=("drives",),
     label="{which}, lost",
-    told="{which} {signed}",
-    said="tension of each tendon that friction takes",
+    sentence="{which} {signed}",
+    description="tension of each tendon that friction takes",
 )
 PRESSURE_FACTOR = NuisanceRow(
     "pressure_factor",
@@ -475,8 +479,8 @@ PRESSURE_FACTOR = NuisanceRow(
     of="pressure",
     changes=("drives",),
     label="{which}, more than stated",
-    told="{which} by {signed}",
-    said="a factor on each pressure, how far from one",
+    sentence="{which} by {signed}",
+    description="a factor on each pressure, how far from one",
 )
 PRESSURE_OFFSET = NuisanceRow(
     "pressure_lost_pa",
@@ -486,8 +490,8 @@ PRESSURE_OFFSET = NuisanceRow(
     of="pressure",
     changes=("drives",),
     label="{which}, lost",
-    told="{which} {signed}",
-    said="an offset that each pressure lacks",
+    sentence="{which} {signed}",
+    description="an offset that each pressure lacks",
 )
 JOINING = NuisanceRow(
     "joining_s",
@@ -498,8 +502,9 @@ JOINING = NuisanceRow(
     changes=("loads",),
     step=lambda experiment: SAMPLES_A_STEP * experiment.timestep_s,
     label="{which}",
-    told="{which} {number}{error}{unit} {way} than {stated}",
-    said="how much later than stated each point mass or force joins or leaves, where it does so "
+    sentence="{which} {number}{error}{unit} {way} than {stated}",
+    description="how much later than stated each point mass or force joins or leaves, where it "
+    "does so "
     "within the recording",
 )
 TARE = NuisanceRow(
@@ -512,8 +517,8 @@ TARE = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="worst",
     label="tare{which} of {axis}",
-    told="tare up to {size}",
-    said="a constant offset of each component of a wrench, in its sigmas",
+    sentence="tare up to {size}",
+    description="a constant offset of each component of a wrench, in its sigmas",
 )
 SENSOR_TIME = NuisanceRow(
     "sensor_time_s",
@@ -527,8 +532,9 @@ SENSOR_TIME = NuisanceRow(
     high=3.0,
     by="worst",
     label="time shift of the sensor{which}",
-    told="sensor late by {size}",
-    said="how much later than their times say wrenches were measured; three deviations at most",
+    sentence="sensor late by {size}",
+    description="how much later than their times say wrenches were measured; three deviations "
+    "at most",
 )
 SENSOR_LAG = NuisanceRow(
     "sensor_lag_s",
@@ -542,8 +548,9 @@ SENSOR_LAG = NuisanceRow(
     high=3.0,
     by="worst",
     label="lag of the sensor{which}",
-    told="lag of the sensor {size}",
-    said="time constant of a first-order low-pass in the sensor; from zero to three deviations",
+    sentence="lag of the sensor {size}",
+    description="time constant of a first-order low-pass in the sensor; from zero to three "
+    "deviations",
 )
 TOOL_MASS = NuisanceRow(
     "tool_kg",
@@ -555,8 +562,8 @@ TOOL_MASS = NuisanceRow(
     low=0.0,
     by="worst",
     label="mass of the tool{which}",
-    told="tool of {size}",
-    said="a mass between a sensor and the body",
+    sentence="tool of {size}",
+    description="a mass between a sensor and the body",
 )
 TOOL_CENTRE = NuisanceRow(
     "tool_m",
@@ -568,10 +575,11 @@ TOOL_CENTRE = NuisanceRow(
     changes=("sensor",),
     applies=lambda experiment: bool(experiment.nuisance.tool_kg),
     by="worst",
-    beside=0.05,
+    reference=0.05,
     label="centre of the tool{which}, {axis}",
-    told="its centre off by {size}",
-    said="its centre about the sensor's point; in the world's frame that of the grasped nodes",
+    sentence="its centre off by {size}",
+    description="its centre about the sensor's point; in the world's frame that of the grasped "
+    "nodes",
 )
 DEPTH_TURN = NuisanceRow(
     "depth_turn_rad",
@@ -586,8 +594,8 @@ DEPTH_TURN = NuisanceRow(
     high=4.0,
     by="length",
     label="turn of {which}, {axis}",
-    told="a depth camera is turned by {size}",
-    said="a turn of each depth camera about the middle of the body, along its own axes",
+    sentence="a depth camera is turned by {size}",
+    description="a turn of each depth camera about the middle of the body, along its own axes",
     same=_camera_sharing_key,
 )
 DEPTH_SHIFT = NuisanceRow(
@@ -605,8 +613,9 @@ DEPTH_SHIFT = NuisanceRow(
     step=lambda experiment: CAMERA_SHIFT_A_STEP_M,
     by="length",
     label="shift of {which}, {axis}",
-    told="a depth camera is shifted by {size}",
-    said="a shift of it; where neither is given, the first image is aligned to the body first",
+    sentence="a depth camera is shifted by {size}",
+    description="a shift of it; where neither is given, the first image is aligned to the body "
+    "first",
     same=_camera_sharing_key,
 )
 DEPTH_BIAS = NuisanceRow(
@@ -623,8 +632,8 @@ DEPTH_BIAS = NuisanceRow(
     step=lambda experiment: CAMERA_SHIFT_A_STEP_M,
     by="worst",
     label="bias of {which}",
-    told="depth is off by {size}",
-    said="what is to be added to each depth of an image",
+    sentence="depth is off by {size}",
+    description="what is to be added to each depth of an image",
 )
 DEPTH_SCALE = NuisanceRow(
     "depth_scale",
@@ -639,8 +648,8 @@ DEPTH_SCALE = NuisanceRow(
     reach=4.0,
     by="worst",
     label="scale of {which}",
-    told="depth is off by {size} of itself",
-    said="a factor on each depth of an image, how far from one",
+    sentence="depth is off by {size} of itself",
+    description="a factor on each depth of an image, how far from one",
 )
 DEPTH_TIME = NuisanceRow(
     "depth_time_s",
@@ -654,8 +663,8 @@ DEPTH_TIME = NuisanceRow(
     high=3.0,
     by="worst",
     label="time shift of {which}",
-    told="a depth camera is late by {size}",
-    said="how much later than its times say a depth camera saw; three deviations at most",
+    sentence="a depth camera is late by {size}",
+    description="how much later than its times say a depth camera saw; three deviations at most",
 )
 DEPTH_EDGE = NuisanceRow(
     "depth_edge_px",
@@ -670,8 +679,9 @@ DEPTH_EDGE = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="worst",
     label="edge of {which}",
-    told="silhouettes end {size} inside the body",
-    said="how many pixels inside the outline of the body its silhouette ends in the images of each "
+    sentence="silhouettes end {size} inside the body",
+    description="how many pixels inside the outline of the body its silhouette ends in the "
+    "images of each "
     "depth camera, all around",
 )
 
@@ -770,7 +780,7 @@ else:
         namespace={
             "__module__": __name__,
             "__doc__": _DOCSTRING
-            + "\n".join(f"{row.name} : float or None\n    {row.said}." for row in KINDS)
+            + "\n".join(f"{row.name} : float or None\n    {row.description}." for row in KINDS)
             + _SCOPE_DOCSTRING,
         },
     )

@@ -62,7 +62,7 @@ def probe_lines(result: Result) -> list[str | Table]:
 
     After routine probes without a significant result the table is left out; empty without probes.
     """
-    if is_routine(result) and not any(probe.told for probe in result.probes):
+    if is_routine(result) and not any(probe.sentences for probe in result.probes):
         return [*_conclusions(result)] if result.probes else []
     return [each for each in probe_section(result).parts if isinstance(each, (str, Table))]
 
@@ -136,7 +136,7 @@ def _conclusions(result: Result) -> Iterator[str]:
     the most
     important assumption that the data do not determine.
     """
-    significant = [probe for probe in result.probes if probe.told]
+    significant = [probe for probe in result.probes if probe.sentences]
     relaxed = sorted(
         (p for p in significant if p.kind == "assumption"), key=lambda p: -p.chi_squared
     )
@@ -144,7 +144,7 @@ def _conclusions(result: Result) -> Iterator[str]:
         disagreeing = [p for p in significant if p.kind == kind]
         if disagreeing:
             changes = (
-                f"{p.name}: {listed(_named_change(p, result, n) for n in p.told)}"
+                f"{p.name}: {listed(_named_change(p, result, n) for n in p.sentences)}"
                 for p in disagreeing
             )
             yield f"{kind}s disagree significantly ({'; '.join(changes)})"
@@ -182,7 +182,7 @@ def _most_important_assumption(result: Result) -> Iterator[str]:
     The most important assumption contributes most to the variance of the first stiffness that has a
     budget.
     """
-    significant = {name.partition(" ")[0] for p in result.probes for name in p.told}
+    significant = {name.partition(" ")[0] for p in result.probes for name in p.sentences}
     undetermined = {
         p.name.partition(" ")[0] for p in result.probes if p.kind == "assumption"
     } - significant

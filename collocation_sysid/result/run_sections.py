@@ -21,7 +21,7 @@ from ..display import (
     Shown,
     Span,
     Table,
-    flat,
+    flattened_parts,
     millimetres,
     number,
     own_pictures,
@@ -117,7 +117,7 @@ def run_summary(result: Result, folder: Path | None = None, budget: bool = False
     )
     tables = [budget_table(result)] if budget and result.budget else []
     written = [] if folder is None else [f"written to {folder}"]
-    return [*flat(sections), *tables, *probe_lines(result), *ended, *written]
+    return [*flattened_parts(sections), *tables, *probe_lines(result), *ended, *written]
 
 
 def estimate_sections(result: Result) -> list[Shown]:
@@ -126,7 +126,7 @@ def estimate_sections(result: Result) -> list[Shown]:
     """
     sections = [verdict_section(result.trust), *remedy_command(result.trust.concerns)]
     sections += [*_deeper_check_advice(result), _parameter_section(result)]
-    return [*flat(sections)]
+    return [*flattened_parts(sections)]
 
 
 def run_report(run: str | Path) -> Section:
@@ -151,7 +151,7 @@ def run_report(run: str | Path) -> Section:
             Line((badge, Span(took)), "quiet"),
             replace(verdict, parts=(verdict.parts[0], meaning, *verdict.parts[1:])),
             _cards(result),
-            *flat([_outcome_section(result)]),
+            *flattened_parts([_outcome_section(result)]),
             *pictures[:1],
             Section(
                 "What to do", (*_remedy_lines(result.trust.concerns), *_deeper_check_advice(result))
@@ -226,7 +226,7 @@ def _parameter_section(result: Result) -> Section:
     rows = tuple((symbol_with_unit(name), *_estimate_row(result, name)) for name in values)
     heads = ("", "value", "±", "95 % interval", "± stat", "± syst", "guess", "")
     faint = tuple(range(len(result.parameters), len(values)))
-    parts: list[Shown] = [Table("", heads, rows, texts=1, faint=faint, aside=1)]
+    parts: list[Shown] = [Table("", heads, rows, texts=1, faint=faint, note_column=1)]
     parts += [field.sentence(name) for name, field in result.fields.items()]
     if any(each.combined95 for each in values.values()):
         parts.append(_coverage_sentence(result))
@@ -412,8 +412,8 @@ def _fit_section(result: Result) -> Section:
         )
     lines += [f"time: {_elapsed_text(result.elapsed_s)}", _iterations_text(result)]
     for name, each in experiments.items():
-        if each.beside:
-            lines.append(f"also estimated for '{name}': {'; '.join(each.beside)}")
+        if each.notes:
+            lines.append(f"also estimated for '{name}': {'; '.join(each.notes)}")
     return Section("Fit", tuple(lines))
 
 
@@ -592,7 +592,7 @@ def _marker_place_sections(result: Result) -> Iterator[Section]:
             for x, error in zip(place.position_m, errors_m, strict=True):
                 cells += [f"{1e3 * x:.2f}", "–" if error is None else number(1e3 * error, 2)]
             prior = "exact" if place.prior_m == 0 else _size_text(place.prior_m, "m")
-            rows.append((marker, *cells, prior, "" if place.given else "not given"))
+            rows.append((marker, *cells, prior, "" if place.is_declared else "not given"))
         heads = ("", "x", "±", "y", "±", "z", "±", "prior ±", "")
         if rows:
             table = Table("", heads, tuple(rows), texts=1)
@@ -640,7 +640,7 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
     """Return the largest marker residuals of a run folder as (error [m], time [s], marker), largest
     first.
 
-    Of each marker, two listed errors are more than `APART` samples apart.
+    Of each marker, two listed errors are more than `LEAST_DISAGREEMENT_RATIO` samples apart.
 
     Raises
     ------

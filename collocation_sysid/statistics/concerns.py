@@ -90,7 +90,7 @@ TOPICS: Mapping[str, Topic] = {
             "grasp-layer": "the fit is better if the grasp holds one layer of nodes {deep}: check "
             "the box of grasp.nodes against where the fingers end",
             "grasp": "the grasp of '{experiment}' cuts through elements: with its box a tenth of "
-            "an edge larger it holds {nearly_held} nodes more than {nodes}, or as much smaller "
+            "an edge larger it holds {nearly_grasped} nodes more than {nodes}, or as much smaller "
             "{nearly_free} less, and the stiffness found depends on them; move the edge of "
             "grasp.nodes between layers of nodes, or mesh the body with a layer where the fingers "
             "end",
@@ -414,9 +414,9 @@ def message_of(code: str, data: Mapping[str, Any]) -> str:
     """
     topic, _, rest = code.partition("/")
     shown = {k: listed(v) if isinstance(v, (list, tuple)) else v for k, v in data.items()}
-    said = TOPICS[topic].messages[rest].format(**shown)
-    nearer = f" ({data['nearer']:.2g} times nearer)" if "nearer" in data else ""
-    return f"{data['of']}: {said}{nearer}" if data.get("of") else said
+    message = TOPICS[topic].messages[rest].format(**shown)
+    distance_text = f" ({data['nearer']:.2g} times nearer)" if "nearer" in data else ""
+    return f"{data['of']}: {message}{distance_text}" if data.get("of") else message
 
 
 @dataclass(frozen=True)

@@ -95,5 +95,5 @@ def _plain_columns(content: bytes) -> Mapping[str, Array] | None:
     return dict(zip(names, values.T, strict=True))
 
 
-def _refuse_short(expected: int, found: int) -> None:
-    raise InputError(f"has {found} points; expected {expected}, as its header states: is it cut?")
+def _refuse_short(expected: int, count: int) -> None:
+    raise InputError(f"has {count} points; expected {expected}, as its header states: is it cut?")

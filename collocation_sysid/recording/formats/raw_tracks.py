@@ -143,9 +143,9 @@ class Header:
         line : int, optional
             Line for the message; that of the key by default.
         """
-        stated = self.number(key)
-        if stated is not None and stated != count:
-            message = f"{key} is {stated:g}, but {count} {what} are there; is the file cut short?"
+        declared = self.number(key)
+        if declared is not None and declared != count:
+            message = f"{key} is {declared:g}, but {count} {what} are there; is the file cut short?"
             raise InputError(message, where=f"line {line or self.entries[key][1]}")
 
 
