@@ -287,7 +287,7 @@ def test_unknown_positions_of_more_markers_than_memory_can_hold_are_refused(
 ):
     replace_text(f"reference_m = {REFERENCES}\n", "")(tiny)
     monkeypatch.setattr(problem_size, "MANY_MARKERS", 2)
-    monkeypatch.setattr(problem_size, "machine_memory_mb", lambda: 0.4)
+    monkeypatch.setattr(problem_size, "machine_memory_mb", lambda: 0.7)
     message = refused("check", "problem.toml")
     assert "markers of unknown position take about" in message
     assert "expected fewer markers (markers.names), their positions (reference_m)" in message
