@@ -134,7 +134,7 @@ class Listing:
 
 
 @dataclass(frozen=True)
-class Section:
+class TitledParts:
     """Group of parts with a title and optionally a style."""
 
     title: str
@@ -143,13 +143,13 @@ class Section:
     style: str = ""
 
 
-Shown = str | Line | Items | Table | Cards | Picture | Listing | Section
+Shown = str | Line | Items | Table | Cards | Picture | Listing | TitledParts
 
 
 def flattened_parts(parts: Iterable[Shown]) -> Iterator[Shown]:
     """Yield the parts of all sections without their titles, for terminals."""
     for part in parts:
-        yield from flattened_parts(part.parts) if isinstance(part, Section) else (part,)
+        yield from flattened_parts(part.parts) if isinstance(part, TitledParts) else (part,)
 
 
 def own_pictures(folder: Path) -> list[Path]:
@@ -227,7 +227,7 @@ def _on_terminal(part: Shown) -> RenderableType:
             return _text(f"{part.caption} {part.file}")
         case Listing():
             return Group(_text(part.title, "bold"), _text(part.text))
-        case Section():
+        case TitledParts():
             return _titled(part.title, *map(_on_terminal, part.parts))
 
 
@@ -336,7 +336,7 @@ def as_html(part: Shown) -> str:
             title = escape(part.title)
             text = escape(part.text)
             return f"<details><summary>{title}</summary><pre>{text}</pre></details>\n"
-        case Section():
+        case TitledParts():
             inner = "".join(map(as_html, part.parts))
             if part.style:
                 return f"<div{_class(part.style)}>\n{inner}</div>\n"
@@ -410,7 +410,7 @@ def _markdown(part: Shown) -> str:
         case Listing():
             fence = _longer_than_any("```", part.text)
             return f"{escape_markdown(part.title)}:\n\n{fence}\n{printable(part.text)}\n{fence}"
-        case Section():
+        case TitledParts():
             heading = f"{'#' * part.level} {escape_markdown(part.title)}"
             title = heading if part.title else ""
             return "\n\n".join(filter(None, (title, *map(_markdown, part.parts))))
@@ -428,7 +428,8 @@ def _markdown_span(span: Span) -> str:
         return _enclosing_ticks(span.text, escape_markdown(text))
     if span.style == "strong":
         return _enclosing_ticks(span.text, f"**{escape_markdown(text)}**")
-    fence, pad = _longer_than_any("`", text), " " if "`" in text else ""
+    fence = _longer_than_any("`", text)
+    pad = " " if "`" in text else ""
     code = " ".join(printable(text).split())
     return _enclosing_ticks(span.text, f"{fence}{pad}{code}{pad}{fence}")
 

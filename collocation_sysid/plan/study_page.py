@@ -10,7 +10,7 @@ from math import exp
 from pathlib import Path
 from typing import Any
 
-from ..display import Items, Line, Section, Shown, Table, as_markdown
+from ..display import Items, Line, Shown, Table, TitledParts, as_markdown
 from ..fem.constants import symbol_of, symbol_with_unit, unit_of
 from ..files import SCHEMA, replaced_file, write_text_file
 from ..serialisation import as_json
@@ -233,12 +233,12 @@ def as_csv(rows: Sequence[Row]) -> str:
     return text.getvalue()
 
 
-def report_section(report: StudyReport) -> Section:
+def report_section(report: StudyReport) -> TitledParts:
     """Return tables and failures as a section for a paper's appendix or an issue."""
     failures = (Items(tuple(report.failures)),) if report.failures else ()
-    without = tuple(Section("Runs without an answer", (each,)) for each in failures)
+    without = tuple(TitledParts("Runs without an answer", (each,)) for each in failures)
     parts = (*report.headline, *report.notes, *report.views, *without)
-    return Section(report.title, parts, level=1)
+    return TitledParts(report.title, parts, level=1)
 
 
 def _in_words(head: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from ..display import Section, Table, short
+from ..display import Table, TitledParts, short
 from ..errors import listed
 from ..fem.constants import symbol_of
 from ..runs.result_content import Result
@@ -33,12 +33,12 @@ DEEPER_CHECK_ADVICE = (
 )
 
 
-def probe_section(result: Result) -> Section:
+def probe_section(result: Result) -> TitledParts:
     """Return the table of all probes with its conclusions; a section without parts if there are no
     probes.
     """
     if not result.probes:
-        return Section("Probes", ())
+        return TitledParts("Probes", ())
     names = _shown_estimates(result)
     heads = ("refit", "−Δχ²", "size", *map(symbol_of, names))
     rows = [
@@ -54,7 +54,9 @@ def probe_section(result: Result) -> Section:
         "changes of the estimates; in brackets in half widths of the statistical and of the "
         "combined interval; to first order, but of significant assumptions"
     )
-    return Section("Probes", (Table("", heads, tuple(rows), texts=1), read, *_conclusions(result)))
+    return TitledParts(
+        "Probes", (Table("", heads, tuple(rows), texts=1), read, *_conclusions(result))
+    )
 
 
 def probe_lines(result: Result) -> list[str | Table]:
