@@ -17,10 +17,10 @@ from ..display import (
     Line,
     Listing,
     Picture,
-    Section,
     Shown,
     Span,
     Table,
+    TitledParts,
     flattened_parts,
     millimetres,
     number,
@@ -129,7 +129,7 @@ def estimate_sections(result: Result) -> list[Shown]:
     return [*flattened_parts(sections)]
 
 
-def run_report(run: str | Path) -> Section:
+def run_report(run: str | Path) -> TitledParts:
     """Return the complete report of a run folder, with its pictures.
 
     Raises
@@ -153,28 +153,28 @@ def run_report(run: str | Path) -> Section:
             _cards(result),
             *flattened_parts([_outcome_section(result)]),
             *pictures[:1],
-            Section(
+            TitledParts(
                 "What to do", (*_remedy_lines(result.trust.concerns), *_deeper_check_advice(result))
             ),
             _parameter_section(result),
-            Section("Error bars", tuple(_error_bars(result))),
+            TitledParts("Error bars", tuple(_error_bars(result))),
             probe_section(result),
             _fit_section(result),
             _notes_section(result),
             *_marker_place_sections(result),
             *_nuisance_sections(result),
-            Section("Residuals", tuple(_residual_tables(result, run))),
-            Section("Pictures", tuple(pictures[1:])),
-            Section("Problem and provenance", tuple(_provenance_parts(result, run))),
+            TitledParts("Residuals", tuple(_residual_tables(result, run))),
+            TitledParts("Pictures", tuple(pictures[1:])),
+            TitledParts("Problem and provenance", tuple(_provenance_parts(result, run))),
         ]
-        shown = (each for each in parts if not isinstance(each, Section) or each.parts)
-        return Section(result.title or "Run", tuple(shown), level=1)
+        shown = (each for each in parts if not isinstance(each, TitledParts) or each.parts)
+        return TitledParts(result.title or "Run", tuple(shown), level=1)
 
 
 # What terminal and page show ----------------------------------------------------------------------
 
 
-def _outcome_section(result: Result) -> Section:
+def _outcome_section(result: Result) -> TitledParts:
     """Return how the solve ended, with the largest violations of the equations of motion if it
     failed.
     """
@@ -182,12 +182,12 @@ def _outcome_section(result: Result) -> Section:
     if not result.converged:
         parts.append("Largest violations of the equations of motion:")
         parts += [f"  {violation}" for violation in result.dynamics.largest]
-    return Section("", tuple(parts))
+    return TitledParts("", tuple(parts))
 
 
 def verdict_section(
     trust: Assessment, linked: bool = False, max_reasons: int | None = None
-) -> Section:
+) -> TitledParts:
     """Return the verdict in one word, with its reasons.
 
     Parameters
@@ -204,7 +204,7 @@ def verdict_section(
         cure = Span(" (what to do)", to=f"#cure-{concern.topic}")
         spans = (Span(f"  {concern.message}"), *[cure] * linked)
         lines.append(Line(spans, verdict))
-    return Section("", tuple(lines), style=f"verdict {verdict}")
+    return TitledParts("", tuple(lines), style=f"verdict {verdict}")
 
 
 def _deeper_check_advice(result: Result) -> list[Line]:
@@ -218,7 +218,7 @@ def remedy_command(concerns: Iterable[Concern]) -> list[Line]:
     return [Line(f"what to do: {explain_command(*pages)}", "quiet")] if pages else []
 
 
-def _parameter_section(result: Result) -> Section:
+def _parameter_section(result: Result) -> TitledParts:
     """Return the table of corrected values with combined and statistical uncertainties, and remarks
     on it.
     """
@@ -247,7 +247,7 @@ def _parameter_section(result: Result) -> Section:
     ]:
         parts.append(f"corrected for grip layer and machine as stated: {', '.join(known)}")
     parts += _undetermined_sentence(result)
-    return Section("Parameters", (*parts, *_largest_contributions(result), *result.basis))
+    return TitledParts("Parameters", (*parts, *_largest_contributions(result), *result.basis))
 
 
 def _undetermined_sentence(result: Result) -> list[str]:
@@ -372,7 +372,7 @@ def _interval_text(ends: tuple[float, float] | None) -> str:
     return "" if ends is None else "{:.5g} … {:.5g}".format(*ends)
 
 
-def _fit_section(result: Result) -> Section:
+def _fit_section(result: Result) -> TitledParts:
     """Return the misfit of measurements and equations, the predictions, the time taken, and side
     results.
     """
@@ -414,7 +414,7 @@ def _fit_section(result: Result) -> Section:
     for name, each in experiments.items():
         if each.notes:
             lines.append(f"also estimated for '{name}': {'; '.join(each.notes)}")
-    return Section("Fit", tuple(lines))
+    return TitledParts("Fit", tuple(lines))
 
 
 def _elapsed_text(elapsed: Elapsed) -> str:
@@ -526,9 +526,9 @@ def _forces_text(*sizes: float | None) -> str:
     return ", ".join(f"{short(size)} {unit}" for size, unit in pairs if size)
 
 
-def _notes_section(result: Result) -> Section:
+def _notes_section(result: Result) -> TitledParts:
     """Return the notes of a run as a section."""
-    return Section("Notes", tuple(f"note: {note}" for note in result.notes))
+    return TitledParts("Notes", tuple(f"note: {note}" for note in result.notes))
 
 
 # What the page alone has --------------------------------------------------------------------------
@@ -578,7 +578,7 @@ def _error_bars(result: Result) -> Iterator[Shown]:
         yield budget_table(result)
 
 
-def _marker_place_sections(result: Result) -> Iterator[Section]:
+def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
     """Yield for each experiment a table of the estimated places of its markers [mm]."""
     explanation = (
         "On the undeformed body, in millimetres, each with its standard error. Those that were not "
@@ -597,10 +597,10 @@ def _marker_place_sections(result: Result) -> Iterator[Section]:
         if rows:
             table = Table("", heads, tuple(rows), texts=1)
             title = f"Places of the markers of '{experiment}'"
-            yield Section(title, (Line(explanation, "quiet"), table))
+            yield TitledParts(title, (Line(explanation, "quiet"), table))
 
 
-def _nuisance_sections(result: Result) -> Iterator[Section]:
+def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
     """Yield for each experiment a table of its other nuisance parameters, in mm, ms or degrees."""
     explanation = (
         "Of this recording alone, estimated beside the parameters with a prior about zero."
@@ -615,7 +615,7 @@ def _nuisance_sections(result: Result) -> Iterator[Section]:
         title = f"Nuisance parameters of '{experiment}'"
         is_part = experiment in (result.fit.symmetry or {})
         loads = " Forces are those of the modelled part." if is_part else ""
-        yield Section(title, (Line(explanation + loads, "quiet"), table))
+        yield TitledParts(title, (Line(explanation + loads, "quiet"), table))
 
 
 def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
