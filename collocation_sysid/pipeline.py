@@ -42,6 +42,7 @@ from .statistics.residual_diagnostics import diagnose_markers
 from .statistics.routine_probes import probed_deviations
 from .statistics.uncertainty import Uncertainty, uncertainty_from_fit
 from .statistics.uncertainty_budget import VarianceSources
+from .step_counting import StepUnit, counted_phase
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes a while to import
@@ -225,10 +226,13 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
     if not solution.status.converged:
         return Run(problem, solution, rollouts, None), None
     say("finding the error bars")
+    rows = _row_count(solution)
     try:
-        fit = linearise_fit(solution.collocation, solution.z)
+        with counted_phase(StepUnit.TIME_STEP, rows):
+            fit = linearise_fit(solution.collocation, solution.z)
         say("finding what noise of the poses does")
-        fit, noises = with_pose_noise(fit, solution.collocation, solution.z)
+        with counted_phase(StepUnit.TIME_STEP, rows):
+            fit, noises = with_pose_noise(fit, solution.collocation, solution.z)
     except SimulationError as error:
         return Run(problem, solution, rollouts, None, notes=(f"no error bars: {error}",)), None
     answer = Run(problem, solution, rollouts, None, diagnose_markers(fit))
@@ -249,7 +253,14 @@ def _changes(answer: Run, say: Log) -> ResidualChanges:
     say("finding what is assumed is worth")
     solution = answer.solution
     deviations = probed_deviations(answer.problem.uncertainty.considered)
-    return changes_of_assumptions(solution.collocation, solution.z, deviations)
+    # One sweep for the assumptions, and one for the nuisance parameters that are not estimated.
+    with counted_phase(StepUnit.TIME_STEP, 2 * _row_count(solution)):
+        return changes_of_assumptions(solution.collocation, solution.z, deviations)
+
+
+def _row_count(solution: Solution) -> int:
+    """Return the number of time steps in one sweep over all experiments."""
+    return sum(s.grid_times - s.dynamics.first_row for s in solution.collocation.transcriptions)
 
 
 def _sources(

@@ -291,6 +291,19 @@ def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(tiny, monkeypatc
     assert json.loads(run_command("solve", "problem.toml", "--json").out)["elapsed_s"]["checks"] > 0
 
 
+def test_the_answer_is_shown_even_if_its_folder_cannot_be_written(tiny, monkeypatch):
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device", "run")
+
+    monkeypatch.setattr(run_record, "_write_all_frames", fail)
+    outcome = run_command("solve", "problem.toml", "--out", "run")
+    assert outcome.code == 2
+    assert "Verdict: check" in outcome.out
+    assert "written to" not in outcome.out
+    assert "No space left on device" in outcome.err
+    assert not (tiny / "run").exists()
+
+
 def test_an_interrupt_while_the_folder_is_written_loses_nothing(tiny, monkeypatch):
     monkeypatch.setattr(
         run_record, "_write_all_frames", lambda *_: signal.raise_signal(signal.SIGTERM)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,6 +30,7 @@ from ..statistics.discretisation_error import (
 )
 from ..statistics.estimates import Estimate
 from ..statistics.linearised import LinearisedFit, parameter_values
+from ..step_counting import StepUnit, complete_steps, counted_phase
 from .prediction import (
     CopyError,
     InstrumentMisfit,
@@ -107,19 +108,36 @@ def simulate_experiments(
     `simulate_experiment`.
     """
     threads = solution.collocation.threads
-    rollouts = map_experiments(
-        lambda e: simulate_experiment(problem, e, solution), problem.experiments, threads
-    )
+
+    def simulate_counted(experiment: Experiment) -> ForwardSimulation | str:
+        """Simulate an experiment, and report its completed share."""
+        completed = 0.0
+
+        def report(share: float) -> None:
+            nonlocal completed
+            complete_steps(StepUnit.SIMULATION, share - completed)
+            completed = share
+
+        return simulate_experiment(problem, experiment, solution, report)
+
+    with counted_phase(StepUnit.SIMULATION, len(problem.experiments)):
+        rollouts = map_experiments(simulate_counted, problem.experiments, threads)
     return {e.name: each for e, each in zip(problem.experiments, rollouts, strict=True)}
 
 
 def simulate_experiment(
-    problem: Problem, experiment: Experiment, solution: Solution
+    problem: Problem,
+    experiment: Experiment,
+    solution: Solution,
+    report: Callable[[float], None] | None = None,
 ) -> ForwardSimulation | str:
-    """Simulate an experiment with a solution's parameters; return the reason if that fails."""
+    """Simulate an experiment with a solution's parameters; return the reason if that fails.
+
+    `report` is called with the completed share of the simulation, from 0 to 1.
+    """
     try:
         segment, phi = _transcription_and_nuisance(experiment, solution)
-        trajectory = _simulate(problem, segment, phi, solution)
+        trajectory = _simulate(problem, segment, phi, solution, report)
     except (InputError, SimulationError) as error:
         # A density that leaves a node without mass is input of who simulates, but found here.
         return str(error)
@@ -153,9 +171,15 @@ def simulate_experiment(
 
 
 def _simulate(
-    problem: Problem, segment: Transcription, phi: Array, solution: Solution
+    problem: Problem,
+    segment: Transcription,
+    phi: Array,
+    solution: Solution,
+    report: Callable[[float], None] | None = None,
 ) -> Trajectory:
     """Simulate a recording with its nuisance parameters φ (k,) and a solution's parameters.
+
+    `report` is called with the completed share, from 0 to 1.
 
     Raises
     ------
@@ -169,6 +193,7 @@ def _simulate(
         integrator,
         timestep_s=_step_s(problem, segment),
         substeps=segment.substeps,
+        progress=report,
     )
 
 
