@@ -28,7 +28,7 @@ LAYERS = (
     {"problem"},
     {"runs"},
     {"result"},
-    {"pipeline"},
+    {"pipeline", "installation_check"},
     {"live"},
     {"plan"},
     {"cli"},

@@ -37,6 +37,7 @@ FAMILIES = (
     "run_commands",
     "stream_commands",
     "texts",
+    "installation_commands",
 )
 
 
