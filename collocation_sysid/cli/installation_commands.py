@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated
 
 import typer
 
@@ -30,6 +32,47 @@ def doctor(options: DoctorCommand) -> None:
         report = check_installation()
     options.print_result(report, installation_sections(report))
     raise typer.Exit(0 if report.is_working else EXIT_BAD_INPUT)
+
+
+class Shell(StrEnum):
+    """Shells with completion."""
+
+    BASH = "bash"
+    ZSH = "zsh"
+    FISH = "fish"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompletionCommand:
+    """Options of `completion`.
+
+    Attributes
+    ----------
+    shell : SHELL
+        bash, zsh or fish.
+    """
+
+    shell: Annotated[Shell, typer.Argument()]
+
+
+@command(
+    commands,
+    "completion bash > ~/.local/share/bash-completion/completions/collocation-sysid",
+    "completion zsh > ~/.zfunc/_collocation-sysid",
+    "completion fish > ~/.config/fish/completions/collocation-sysid.fish",
+)
+def completion(options: CompletionCommand) -> None:
+    """Print a script that completes commands, options and values in a shell.
+
+    New shells read it from the files of the examples; ~/.zfunc has to be in zsh's fpath before
+    compinit. Print it again after an upgrade.
+    """
+    from typer.main import get_command
+
+    from . import app
+    from .shell_completion import completion_script
+
+    typer.echo(completion_script(options.shell.value, get_command(app)))
 
 
 def installation_sections(report: InstallationReport) -> list[Shown]:
