@@ -23,7 +23,9 @@ class DoctorCommand(OutputOptions):
 
 @command(commands, "doctor", "doctor --json")
 def doctor(options: DoctorCommand) -> None:
-    """Check the installation: dependencies, solvers, kernel cache, extras, and a self test.
+    """Check the installation, with a self test.
+
+    Versions of the dependencies, solvers, the kernel cache, threads and extras are listed.
 
     The self test identifies the stiffness of a small simulated block. The exit code is 0 if all
     required packages are there and the test passes, and 2 otherwise; missing extras do not matter.
@@ -62,7 +64,9 @@ class CompletionCommand:
     "completion fish > ~/.config/fish/completions/collocation-sysid.fish",
 )
 def completion(options: CompletionCommand) -> None:
-    """Print a script that completes commands, options and values in a shell.
+    """Print a script for completion in bash, zsh or fish.
+
+    It completes commands, options, values and files.
 
     New shells read it from the files of the examples; ~/.zfunc has to be in zsh's fpath before
     compinit. Print it again after an upgrade.
