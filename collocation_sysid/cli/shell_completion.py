@@ -80,13 +80,13 @@ def named_values() -> dict[str, dict[str, tuple[str, ...]]]:
     """Return the possible values of texts, by command and parameter."""
     from ..methods import METHODS
     from ..pages import page_files
-    from ..result.export import TARGETS
+    from ..result.export import TARGETS, rerun_recording
 
     return {
         "solve": {"method": tuple(METHODS)},
         "methods": {"name": tuple(METHODS)},
         "explain": {"topics": tuple(page_files())},
-        "export": {"to": tuple(TARGETS)},
+        "export": {"to": (*TARGETS, rerun_recording.TARGET)},
     }
 
 
