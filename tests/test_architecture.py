@@ -32,6 +32,7 @@ LAYERS = (
     {"live"},
     {"plan"},
     {"cli"},
+    {"__main__"},
 )
 
 

@@ -414,6 +414,13 @@ def test_a_real_process_keeps_its_streams_apart(tiny):
     assert json.loads(done.stdout)["jacobian_error"] < 1e-6
 
 
+def test_the_module_is_the_command_line():
+    program = [sys.executable, "-m", "collocation_sysid", "--version"]
+    done = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.strip() == cs.__version__
+
+
 # Progress -----------------------------------------------------------------------------------------
 
 
