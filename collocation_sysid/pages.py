@@ -69,7 +69,20 @@ def explain_command(*topics: str) -> str:
 def page_url(topic: str) -> str | None:
     """Return the address of a page on the web; None if the project states none.
 
-    The base is the address that `project.urls` of pyproject.toml calls "Documentation".
+    The base is the address that `documentation_url` returns.
+    """
+    base = documentation_url()
+    if base is None:
+        return None
+    page = page_files()[topic].relative_to(_folder()).with_suffix(".html")
+    return f"{base}/{page.as_posix()}"
+
+
+def documentation_url() -> str | None:
+    """Return the address of the documentation without a final slash; None if the project states
+    none.
+
+    It is the address that `project.urls` of pyproject.toml calls "Documentation".
     """
     from importlib.metadata import PackageNotFoundError, metadata  # slow
 
@@ -78,7 +91,4 @@ def page_url(topic: str) -> str | None:
     except PackageNotFoundError:
         return None
     urls = dict(each.split(", ", 1) for each in project_urls)
-    if "Documentation" not in urls:
-        return None
-    page = page_files()[topic].relative_to(_folder()).with_suffix(".html")
-    return f"{urls['Documentation'].rstrip('/')}/{page.as_posix()}"
+    return urls["Documentation"].rstrip("/") if "Documentation" in urls else None

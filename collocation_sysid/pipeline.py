@@ -42,8 +42,10 @@ from .statistics.residual_diagnostics import diagnose_markers
 from .statistics.routine_probes import probed_deviations
 from .statistics.uncertainty import Uncertainty, uncertainty_from_fit
 from .statistics.uncertainty_budget import VarianceSources
+from .step_counting import StepUnit, counted_phase
 
 if TYPE_CHECKING:
+    from ipywidgets import Widget  # an extra
     from matplotlib.figure import Figure  # which takes a while to import
 
 Log = Callable[[str], None]
@@ -106,6 +108,32 @@ class Run(SolvedProblem):
         replay = experiment_named(replays(self), experiment)
         bodies = {each.name: each.body for each in self.problem.experiments}
         return field_shapes(replay, bodies[replay.name], self.parameters, field, count)
+
+    def interactive(self, experiment: str | None = None) -> Widget:
+        """Return sliders over the estimated parameters beside the recording, for a notebook.
+
+        Whenever a slider is released, the experiment is simulated forward with its values, and the
+        result is drawn over the measurements and the fit. Nothing of the run is changed.
+
+        Parameters
+        ----------
+        experiment : str, optional
+            Name; the first experiment by default.
+
+        Returns
+        -------
+        Widget
+            A box of ipywidgets, which a notebook displays.
+
+        Raises
+        ------
+        InputError
+            Without ipywidgets (``pip install 'collocation-sysid[interactive]'``), for an unknown
+            experiment, or if no parameter was estimated.
+        """
+        from .result.parameter_sliders import ParameterSliders  # how it looks is no part of a run
+
+        return ParameterSliders.from_run(self, experiment).widget
 
     def save(self, folder: str | Path, frames: bool = True, pictures: bool = True) -> Path:
         """Write the run folder, completely or not at all, and return it.
@@ -225,10 +253,13 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
     if not solution.status.converged:
         return Run(problem, solution, rollouts, None), None
     say("finding the error bars")
+    rows = _row_count(solution)
     try:
-        fit = linearise_fit(solution.collocation, solution.z)
+        with counted_phase(StepUnit.TIME_STEP, rows):
+            fit = linearise_fit(solution.collocation, solution.z)
         say("finding what noise of the poses does")
-        fit, noises = with_pose_noise(fit, solution.collocation, solution.z)
+        with counted_phase(StepUnit.TIME_STEP, rows):
+            fit, noises = with_pose_noise(fit, solution.collocation, solution.z)
     except SimulationError as error:
         return Run(problem, solution, rollouts, None, notes=(f"no error bars: {error}",)), None
     answer = Run(problem, solution, rollouts, None, diagnose_markers(fit))
@@ -249,7 +280,14 @@ def _changes(answer: Run, say: Log) -> ResidualChanges:
     say("finding what is assumed is worth")
     solution = answer.solution
     deviations = probed_deviations(answer.problem.uncertainty.considered)
-    return changes_of_assumptions(solution.collocation, solution.z, deviations)
+    # One sweep for the assumptions, and one for the nuisance parameters that are not estimated.
+    with counted_phase(StepUnit.TIME_STEP, 2 * _row_count(solution)):
+        return changes_of_assumptions(solution.collocation, solution.z, deviations)
+
+
+def _row_count(solution: Solution) -> int:
+    """Return the number of time steps in one sweep over all experiments."""
+    return sum(s.grid_times - s.dynamics.first_row for s in solution.collocation.transcriptions)
 
 
 def _sources(

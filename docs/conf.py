@@ -9,7 +9,7 @@ from latex2mathml.converter import convert
 from sphinx.ext.napoleon import NumpyDocstring
 
 sys.path.insert(0, str(Path(__file__).parent))
-from reference import write_pages
+from reference import PUBLISHED, write_pages
 
 project = "collocation_sysid"
 author = "collocation_sysid developers"
@@ -28,6 +28,7 @@ source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = ["_build", "gallery"]
 html_theme = "furo"
 html_static_path, html_css_files = ["_static"], ["pages.css"]
+html_extra_path = [f"generated/{PUBLISHED}"]  # the schema of the problem file
 
 # Scripts with a recorded object in them run where its data have been fetched.
 _measured = {

@@ -11,10 +11,13 @@ from typing import Any
 import typer
 
 from collocation_sysid.cli import app
+from collocation_sysid.problem.editor_schema import SCHEMA_FILE, schema_text
 from collocation_sysid.problem.nuisance_schema import KEYS
 from collocation_sysid.problem.schema import ProblemFile
 
 Schema = Mapping[str, Any]
+# Folder of files that are published beside the pages.
+PUBLISHED = "published"
 KINDS = {
     "string": "text",
     "integer": "whole number",
@@ -25,8 +28,10 @@ KINDS = {
 
 
 def write_pages(folder: Path) -> None:
-    """Write both pages into a folder."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write both pages, and the schema of the problem file, into a folder."""
+    published = folder / PUBLISHED
+    published.mkdir(parents=True, exist_ok=True)
+    (published / SCHEMA_FILE).write_text(schema_text(), encoding="utf-8")
     (folder / "problem_file.md").write_text(problem_file(), encoding="utf-8")
     (folder / "command_line.md").write_text(command_line(), encoding="utf-8")
 

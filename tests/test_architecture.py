@@ -18,7 +18,7 @@ PACKAGE = Path(collocation_sysid.__file__).parent
 LAYERS = (
     {"array_files", "array_types", "cluster", "console", "declarations", "display", "errors"}
     | {"files", "isolated_process", "machine", "pages", "schema_tables", "serialisation"}
-    | {"signal_handling", "validated_types", "written_files"},
+    | {"signal_handling", "step_counting", "validated_types", "written_files"},
     {"fem"},
     {"recording"},
     {"model"},
@@ -28,10 +28,11 @@ LAYERS = (
     {"problem"},
     {"runs"},
     {"result"},
-    {"pipeline"},
+    {"pipeline", "installation_check"},
     {"live"},
     {"plan"},
     {"cli"},
+    {"__main__"},
 )
 
 

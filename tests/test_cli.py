@@ -291,6 +291,19 @@ def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(tiny, monkeypatc
     assert json.loads(run_command("solve", "problem.toml", "--json").out)["elapsed_s"]["checks"] > 0
 
 
+def test_the_answer_is_shown_even_if_its_folder_cannot_be_written(tiny, monkeypatch):
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device", "run")
+
+    monkeypatch.setattr(run_record, "_write_all_frames", fail)
+    outcome = run_command("solve", "problem.toml", "--out", "run")
+    assert outcome.code == 2
+    assert "Verdict: check" in outcome.out
+    assert "written to" not in outcome.out
+    assert "No space left on device" in outcome.err
+    assert not (tiny / "run").exists()
+
+
 def test_an_interrupt_while_the_folder_is_written_loses_nothing(tiny, monkeypatch):
     monkeypatch.setattr(
         run_record, "_write_all_frames", lambda *_: signal.raise_signal(signal.SIGTERM)
@@ -399,6 +412,13 @@ def test_a_real_process_keeps_its_streams_apart(tiny):
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")
     assert json.loads(done.stdout)["jacobian_error"] < 1e-6
+
+
+def test_the_module_is_the_command_line():
+    program = [sys.executable, "-m", "collocation_sysid", "--version"]
+    done = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.strip() == cs.__version__
 
 
 # Progress -----------------------------------------------------------------------------------------
@@ -587,7 +607,9 @@ def test_a_new_problem_file_is_valid(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     outcome = run_command("new", name)
     assert outcome.code == 0
-    file, _ = read_problem_file(outcome.out.strip())
+    written, schema = outcome.out.splitlines()
+    assert Path(schema).name == "schema.json"
+    file, _ = read_problem_file(written)
     assert file.title == Path(name).name
     assert file.experiment[0].grasp_list[0].poses == "poses.csv"
 
@@ -633,7 +655,7 @@ def test_help_imports_nothing_that_solves():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-    assert "report    Write one HTML page" in done.stdout
+    assert re.search(r"^  report +Write one HTML page", done.stdout, re.MULTILINE)
 
 
 def test_version_and_help():

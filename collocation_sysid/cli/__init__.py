@@ -37,6 +37,7 @@ FAMILIES = (
     "run_commands",
     "stream_commands",
     "texts",
+    "installation_commands",
 )
 
 
@@ -102,7 +103,7 @@ app = typer.Typer(
     "  collocation-sysid solve my_object/problem.toml     parameters with error bars\n"
     "  collocation-sysid report runs/my_object            everything found, as a page",
     no_args_is_help=True,
-    add_completion=True,
+    add_completion=False,  # see the command `completion`
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )

@@ -107,10 +107,15 @@ def solve(options: SolveCommand) -> None:
                 probe=options.probe,
             )
             until_shown.enter_context(INTERRUPTS.deferred())
-            progress.say("writing the run folder")
+        if not options.as_json:
+            print_result(run_summary(finished.result, budget=options.budget))
+        # Notes of the problem were shown before.
+        with SolveProgress(
+            error_console, None, options.verbose, options.quiet, "writing the run folder"
+        ):
             finished.save(folder, pictures=False)
         if not options.as_json:
-            print_result(run_summary(finished.result, folder, options.budget))
+            print_result(f"written to {folder}")
     result = _draw_pictures(finished, folder, options) if options.pictures else finished.result
     if options.as_json:
         typer.echo(as_json(result))
@@ -172,7 +177,9 @@ def simulate(options: SimulateCommand) -> None:
 
     problem = options.read_problem(simulation=True)
     require_possible(options.out)
-    with SolveProgress(error_console, problem, quiet=options.quiet) as progress:
+    with SolveProgress(
+        error_console, problem, quiet=options.quiet, activity="simulating"
+    ) as progress:
         try:
             written = write_data(problem, options.out, options.recipe, progress.share)
         except SimulationError as error:

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
+from ..errors import InputError
 from ..files import require_possible, write_text_file
 from ..serialisation import as_json, content
 from .command_options import (
@@ -73,7 +74,7 @@ class ExportCommand(RunFolderOptions):
     Attributes
     ----------
     to : TARGET
-        mujoco, usd, newton, sofa, febio, calculix or json.
+        mujoco, usd, newton, sofa, febio, calculix or json; rerun for a viewer.
     verify : bool
         Simulate the exported body in the target, and compare.
     """
@@ -93,7 +94,11 @@ def export(options: ExportCommand) -> None:
     """Write the identified body for another simulator: mesh, material, damping, grasp.
 
     What the target cannot express is printed. The files go to export-TARGET in the run folder.
+    The target rerun is a recording of the motion, of all experiments or one, for the Rerun viewer.
     """
+    if options.to == "rerun":
+        _export_recording(options)
+        return
     from ..result.export import (
         IdentifiedBody,
         comparison_table,
@@ -124,6 +129,22 @@ def export(options: ExportCommand) -> None:
     if options.verify:
         print_result(comparison_table(target.name, compared))
     typer.echo(folder)
+
+
+def _export_recording(options: ExportCommand) -> None:
+    """Write the recording of a run for the Rerun viewer, and print what is missing in it."""
+    from ..result.export.rerun_recording import RECORDING_FILE, write_rerun
+
+    if options.verify:
+        raise InputError("a recording predicts nothing; leave it out", None, "--verify")
+    folder = options.out or options.run_folder / f"export-{options.to}"
+    require_possible(folder)
+    missing = write_rerun(options.run_folder, folder, options.experiment)
+    if options.as_json:
+        typer.echo(as_json({"folder": str(folder), "not_expressed": missing}))
+        return
+    print_result(f"not expressed: {each}" for each in missing)
+    typer.echo(folder / RECORDING_FILE)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -69,10 +69,10 @@ def methods(options: MethodsCommand) -> None:
 
 @commands.command()
 def schema() -> None:
-    """Print the JSON schema of the problem file."""
-    from ..problem.schema import ProblemFile
+    """Print the JSON schema of the problem file, with which editors complete and check keys."""
+    from ..problem.editor_schema import schema_text
 
-    typer.echo(json.dumps(ProblemFile.model_json_schema(), indent=1))
+    typer.echo(schema_text(), nl=False)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,6 +29,7 @@ from ..model.parameters import Parameter, Parameters
 from ..program.collocation import Collocation, ExperimentIterate
 from ..program.newton_solver import NewtonOptions
 from ..program.transcription import Transcription
+from ..step_counting import StepUnit, complete_steps, counted_phase
 from .initial_trajectories import simulate_trajectories
 from .method_options import SHARES, samples_in_share
 
@@ -195,7 +196,8 @@ def scan_stiffness(
     )
     trials = _ScanState(trial)
     step = (SOFTEST_PA / STIFFEST_PA) ** (1 / (STEPS - 1))
-    trials.try_sequence([STIFFEST_PA * step**k for k in range(STEPS)])
+    with counted_phase(StepUnit.STIFFNESS, STEPS):
+        trials.try_sequence([STIFFEST_PA * step**k for k in range(STEPS)])
     if trials.is_best_at_end(softest=True):
         trials.extend_range(min(trials.misfits), step)
     if trials.is_best_at_end(softest=False):
@@ -549,4 +551,5 @@ class _ScanState:
         misfit, warm = self.trial.evaluate_at(young_pa, self.last_trajectories)
         self.last_trajectories = warm or self.last_trajectories
         self.misfits[young_pa] = misfit
+        complete_steps(StepUnit.STIFFNESS)
         return misfit

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..files import replaced_file, require_possible, write_text_file
+from .editor_schema import SCHEMA_FILE, schema_text, schema_url, with_schema_reference
 
 # A folder for each kind, see scripts/make_templates.py.
 TEMPLATES = Path(__file__).parent / "templates"
@@ -15,6 +16,9 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
     """Write problem.toml, and data for it, to a folder; the title is the folder's name.
+
+    The first line of problem.toml names the JSON schema for editors: its address if the project
+    publishes it, or else a file schema.json that is written, too.
 
     Parameters
     ----------
@@ -27,7 +31,7 @@ def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
     Returns
     -------
     list of Path
-        The problem file, followed by its data files.
+        The problem file, followed by its data files and the schema.
 
     Raises
     ------
@@ -38,13 +42,18 @@ def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
     template = TEMPLATES / (kind or "swing")
     require_possible(folder)
     data = sorted(each for each in template.iterdir() if kind and each.name != file.name)
-    for each in (file, *(folder / each.name for each in data)):
+    url = schema_url()
+    schema = [] if url else [folder / SCHEMA_FILE]
+    for each in (file, *(folder / each.name for each in data), *schema):
         if each.exists():
             raise InputError("it is there already; choose another name", each)
     title = json.dumps(folder.resolve().name, ensure_ascii=False)  # quoted as TOML quotes
     text = (template / file.name).read_text(encoding="utf-8")
+    text = with_schema_reference(text, url or SCHEMA_FILE)
     write_text_file(file, text.replace('title = ""', f"title = {title}", 1))
     for each in data:
         with replaced_file(folder / each.name) as draft:
             shutil.copyfile(each, draft)
-    return [file, *(folder / each.name for each in data)]
+    for each in schema:
+        write_text_file(each, schema_text())
+    return [file, *(folder / each.name for each in data), *schema]

@@ -37,6 +37,7 @@ from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.force_internal_variables import ForceForwardColumns
 from ..model.internal_variables import AnyHistory
 from ..model.viscoelasticity import MemoryForwardColumns
+from ..step_counting import StepUnit, complete_steps
 from .block_band import Submatrix
 from .factorisation import Choice, Factor, Factoriser
 from .lapack import one_blas_thread
@@ -728,6 +729,7 @@ class ForwardSubstitution:
                 solution = np.zeros(self.shape) if out is None else out[step.t]
                 with solver.stopwatch.solving():
                     self.solve_step(step, right, force, solution)
+                complete_steps(StepUnit.TIME_STEP)
                 yield solution
 
     def _residual(self, step: FactorisedStep, acceleration: Array) -> Array:

@@ -60,12 +60,12 @@ def export_page(
     with damaged_run_refused(Path(run)):
         text = run_headline(result)
     colouring = (
-        None if field is None else Colouring.by_field(field, _field_on_faces(run, replay, field))
+        None if field is None else Colouring.by_field(field, field_on_faces(run, replay, field))
     )
     return write_page(replay, file, text, colouring)
 
 
-def _field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
+def field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
     """Return a field (T, F) on the boundary triangles, at each sample that of the nearest frame.
 
     Point data are averaged over the corners of a triangle; of vectors the norm is taken.

@@ -1,10 +1,15 @@
-"""Progress of a solve: a live table of iterations on a terminal, occasional lines elsewhere."""
+"""Progress of a solve: a live table of iterations on a terminal, occasional lines elsewhere.
+
+The remaining time is shown for phases whose work can be counted, see `step_counting`. A search has
+none: the number of its iterations is not known.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 
 from rich.console import Console, Group
 from rich.text import Text
@@ -14,12 +19,17 @@ from ..display import Shown, Table, on_terminal
 from ..fem.constants import symbol_of
 from ..methods.solution import Iteration
 from ..problem import Problem
+from ..step_counting import listen_to_shares
 
 SHOWN_ITERATIONS = 12
 # Time until the first line.
 FIRST_LINE_S = 10.0
 # Growth of the elapsed time until each further line.
 ELAPSED_GROWTH = 0.5
+# Time after which a phase has a remaining time [s]; an estimate from less is too rough.
+FIRST_REMAINING_S = 1.0
+# Least time between two updates by completed shares [s]; a sweep completes thousands of steps.
+SHARE_INTERVAL_S = 0.1
 
 
 class Heartbeat:
@@ -86,6 +96,8 @@ class SolveProgress(Watched):
         Print a line for every iteration.
     quiet : bool
         Show nothing but notes.
+    activity : str
+        The first activity.
     """
 
     def __init__(
@@ -94,12 +106,18 @@ class SolveProgress(Watched):
         problem: Problem | None = None,
         verbose: bool = False,
         quiet: bool = False,
+        activity: str = "finding a start",
     ) -> None:
         super().__init__(console, quiet, live=not verbose)
         self.verbose = verbose
         self._notes = problem.notes if problem else ()
         self._lines: list[Iteration] = []
-        self._doing = "finding a start"
+        self._doing = activity
+        self._remaining = ""
+        self._phase_began_s = time.monotonic()
+        self._last_share = 0.0
+        self._share_shown_s = 0.0
+        self._contexts = ExitStack()
         silent = not (console.is_terminal or quiet)
         self._heartbeat = Heartbeat(self._activity_with_iterations, self.line) if silent else None
 
@@ -107,11 +125,14 @@ class SolveProgress(Watched):
         for note in self._notes:
             self.line(f"note: {note}")
         super().__enter__()
+        self._contexts.enter_context(listen_to_shares(self.share))
+        self._phase_began_s = time.monotonic()
         if self._heartbeat is not None:
             self._heartbeat.start()
         return self
 
     def __exit__(self, *error: object) -> None:
+        self._contexts.close()
         super().__exit__(*error)
         if self._heartbeat is not None:
             self._heartbeat.stop()
@@ -125,22 +146,67 @@ class SolveProgress(Watched):
         """Show what is being done now, as a sentence."""
         self._update_activity(what, what)
 
-    def share(self, done: float) -> None:
-        """Show the completed share of a simulation, from 0 to 1."""
-        self._update_activity(f"simulating: {done:.0%}")
+    def share(self, done: float | None) -> None:
+        """Show the completed share of the current phase, with the remaining time.
+
+        Parameters
+        ----------
+        done : float or None
+            Share from 0 to 1; a smaller one than before begins a phase, and None ends it.
+        """
+        now_s = time.monotonic()
+        if done is None:
+            self._remaining = ""
+            self._redraw()
+            return
+        if done == 0 or done < self._last_share:
+            self._phase_began_s = now_s
+        self._last_share = done
+        if now_s - self._share_shown_s < SHARE_INTERVAL_S:
+            return
+        self._share_shown_s = now_s
+        self._remaining = f": {done:.0%}{_remaining_time(now_s - self._phase_began_s, done)}"
+        self._redraw()
 
     def _update_activity(self, activity: str, line: str = "") -> None:
         """Update the display with the current activity, and print `line` if verbose."""
         self._doing = activity
         if self.verbose and line:
             self.console.print(Text(line), soft_wrap=True)
+        self._redraw()
+
+    def _redraw(self) -> None:
+        """Show the last iterations and the current activity on a terminal."""
         table = on_terminal(_iteration_table(self._lines))
-        self.update(Group(table, Text(self._doing, style="dim")))
+        self.update(Group(table, Text(self._doing + self._remaining, style="dim")))
 
     def _activity_with_iterations(self) -> str:
         """Return the current activity with the number of iterations so far, for the `Heartbeat`."""
         done = f", {len(self._lines)} iterations" if self._lines else ""
-        return f"{self._doing}{done}"
+        return f"{self._doing}{self._remaining}{done}"
+
+
+def _remaining_time(elapsed_s: float, share: float) -> str:
+    """Return the remaining time of an activity in words.
+
+    Parameters
+    ----------
+    elapsed_s : float
+        Time since the activity began [s].
+    share : float
+        Completed share, from 0 to 1.
+
+    Returns
+    -------
+    str
+        Empty within the first second, and before anything is completed.
+    """
+    if elapsed_s < FIRST_REMAINING_S or share <= 0:
+        return ""
+    remaining_s = elapsed_s * (1 - share) / share
+    if remaining_s < 90:
+        return f", about {remaining_s:.0f} s left"
+    return f", about {remaining_s / 60:.0f} min left"
 
 
 def _iteration_table(lines: list[Iteration]) -> Shown:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,6 +30,7 @@ from ..statistics.discretisation_error import (
 )
 from ..statistics.estimates import Estimate
 from ..statistics.linearised import LinearisedFit, parameter_values
+from ..step_counting import StepUnit, complete_steps, counted_phase
 from .prediction import (
     CopyError,
     InstrumentMisfit,
@@ -107,37 +108,46 @@ def simulate_experiments(
     `simulate_experiment`.
     """
     threads = solution.collocation.threads
-    rollouts = map_experiments(
-        lambda e: simulate_experiment(problem, e, solution), problem.experiments, threads
-    )
+
+    def simulate_counted(experiment: Experiment) -> ForwardSimulation | str:
+        """Simulate an experiment, and report its completed share."""
+        completed = 0.0
+
+        def report(share: float) -> None:
+            nonlocal completed
+            complete_steps(StepUnit.SIMULATION, share - completed)
+            completed = share
+
+        return simulate_experiment(problem, experiment, solution, report)
+
+    with counted_phase(StepUnit.SIMULATION, len(problem.experiments)):
+        rollouts = map_experiments(simulate_counted, problem.experiments, threads)
     return {e.name: each for e, each in zip(problem.experiments, rollouts, strict=True)}
 
 
 def simulate_experiment(
-    problem: Problem, experiment: Experiment, solution: Solution
+    problem: Problem,
+    experiment: Experiment,
+    solution: Solution,
+    report: Callable[[float], None] | None = None,
 ) -> ForwardSimulation | str:
-    """Simulate an experiment with a solution's parameters; return the reason if that fails."""
+    """Simulate an experiment with a solution's parameters; return the reason if that fails.
+
+    `report` is called with the completed share of the simulation, from 0 to 1.
+    """
     try:
-        segment, phi = _transcription_and_nuisance(experiment, solution)
-        trajectory = _simulate(problem, segment, phi, solution)
+        segment, phi = transcription_and_nuisance(experiment, solution)
+        rollout = simulate_with_parameters(
+            problem,
+            experiment,
+            segment=segment,
+            phi=phi,
+            parameters=solution.parameters,
+            report=report,
+        )
     except (InputError, SimulationError) as error:
         # A density that leaves a node without mass is input of who simulates, but found here.
         return str(error)
-    predicted, surfaces = _predict_instruments(segment, trajectory, phi)
-    error = prediction_error(experiment, predicted)
-    rollout = ForwardSimulation(
-        rms_m=error.rms_m or 0.0,
-        max_m=error.max_m or 0.0,
-        trajectory=replace(trajectory, markers_m=predicted.markers_m),
-        nuisance={},
-        places_m={},
-        wrenches=predicted.wrenches,
-        wrench_rms=(error.wrench_rms_n, error.wrench_rms_nm),
-        readings=predicted.readings,
-        reading_rms=error.reading_rms or {},
-        depth_surfaces=surfaces,
-        misfits=tuple(instrument_misfits(experiment, predicted)),
-    )
     if not experiment.validation:
         return rollout
     nuisance = segment.nuisance
@@ -152,10 +162,70 @@ def simulate_experiment(
     )
 
 
+def simulate_with_parameters(
+    problem: Problem,
+    experiment: Experiment,
+    *,
+    segment: Transcription,
+    phi: Array,
+    parameters: Mapping[str, float],
+    report: Callable[[float], None] | None = None,
+) -> ForwardSimulation:
+    """Simulate a recording with given parameters, and compare it with the measurements.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its integrator and step are used.
+    experiment : Experiment
+        The recording, with which the simulation is compared.
+    segment : Transcription
+        The recording as it was fitted, see `transcription_and_nuisance`.
+    phi : (k,) array
+        Nuisance parameters of the recording.
+    parameters : mapping of name to value
+        All parameters of the problem.
+    report : callable, optional
+        Called with the completed share, from 0 to 1.
+
+    Returns
+    -------
+    ForwardSimulation
+        Without what concerns validation.
+
+    Raises
+    ------
+    InputError, SimulationError
+        Where the simulation fails.
+    """
+    trajectory = _simulate(problem, segment, phi, parameters, report)
+    predicted, surfaces = _predict_instruments(segment, trajectory, phi)
+    error = prediction_error(experiment, predicted)
+    return ForwardSimulation(
+        rms_m=error.rms_m or 0.0,
+        max_m=error.max_m or 0.0,
+        trajectory=replace(trajectory, markers_m=predicted.markers_m),
+        nuisance={},
+        places_m={},
+        wrenches=predicted.wrenches,
+        wrench_rms=(error.wrench_rms_n, error.wrench_rms_nm),
+        readings=predicted.readings,
+        reading_rms=error.reading_rms or {},
+        depth_surfaces=surfaces,
+        misfits=tuple(instrument_misfits(experiment, predicted)),
+    )
+
+
 def _simulate(
-    problem: Problem, segment: Transcription, phi: Array, solution: Solution
+    problem: Problem,
+    segment: Transcription,
+    phi: Array,
+    parameters: Mapping[str, float],
+    report: Callable[[float], None] | None = None,
 ) -> Trajectory:
-    """Simulate a recording with its nuisance parameters φ (k,) and a solution's parameters.
+    """Simulate a recording with its nuisance parameters φ (k,) and the parameters of the problem.
+
+    `report` is called with the completed share, from 0 to 1.
 
     Raises
     ------
@@ -165,10 +235,11 @@ def _simulate(
     integrator = problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
     return simulate(
         with_contact_energy(segment.corrected_experiment(phi)),
-        segment.body.theta_from_values(solution.parameters),
+        segment.body.theta_from_values(parameters),
         integrator,
         timestep_s=_step_s(problem, segment),
         substeps=segment.substeps,
+        progress=report,
     )
 
 
@@ -218,14 +289,14 @@ def _blind_error(
     """Predict a recording with the nuisance parameters of the fitted ones; None if that fails."""
     phi = nuisance_of_fitted_recordings(segment, solution)
     try:
-        trajectory = _simulate(problem, segment, phi, solution)
+        trajectory = _simulate(problem, segment, phi, solution.parameters)
     except (InputError, SimulationError):
         return None
     predicted, _ = _predict_instruments(segment, trajectory, phi)
     return prediction_error(segment.experiment, predicted)
 
 
-def _transcription_and_nuisance(
+def transcription_and_nuisance(
     experiment: Experiment, solution: Solution
 ) -> tuple[Transcription, Array]:
     """Return an experiment's transcription and its nuisance parameters φ (k,).

@@ -236,6 +236,20 @@ def store_object(key: str, code: bytes) -> None:
             unfinished.replace(folder / unfinished.name)
 
 
+def cache_fault() -> str | None:
+    """Return why kernels are not stored, or None if they are; the folder is created if missing."""
+    folder = cache_folder()
+    try:
+        for missing in [p for p in (folder, *folder.parents) if not p.exists()][::-1]:
+            missing.mkdir(mode=0o700, exist_ok=True)
+        if (fault := _folder_fault(folder.resolve())) is not None:
+            return fault
+        with tempfile.TemporaryFile(dir=folder):
+            return None
+    except OSError as error:
+        return f"{folder} cannot be written: {error.strerror or error}"
+
+
 def _file_name(key: str) -> str:
     """Return the file name of a key."""
     return f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.o"

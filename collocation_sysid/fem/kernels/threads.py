@@ -11,6 +11,7 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from functools import cache
 from itertools import pairwise
 from typing import Any, TypeVar
@@ -82,9 +83,12 @@ def map_experiments(run: Callable[[T], R], items: Sequence[T], threads: int) -> 
         _alone.stop = stop
         return run_single_threaded(run, item)
 
+    # Each item needs a copy of its own: a context cannot be entered by two threads.
+    contexts = [copy_context() for _ in items]
+
     with ThreadPoolExecutor(count) as pool:
         try:
-            return list(pool.map(passed, items))
+            return list(pool.map(lambda context, item: context.run(passed, item), contexts, items))
         except BaseException:
             stop.set()  # only the main thread hears of Ctrl-C, and it waits for the others
             raise

@@ -4,7 +4,7 @@
 compares its prediction with that of this package. One module per simulator: `mujoco`, `newton`,
 `usd`, `sofa`, `febio` and `calculix`. For all of them, `identified` reads the body from a run
 folder, `export_target` describes what a simulator can express, and `obstacle_shapes` converts
-obstacles.
+obstacles. `rerun_recording` writes the motion of a run for a viewer instead.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ...errors import InputError, hint_at
 from ...recording import write_poses_csv
 from ...serialisation import as_json
 from ..run_writers import replaced_folder
-from . import calculix, febio, mujoco, newton, sofa, usd
+from . import calculix, febio, mujoco, newton, rerun_recording, sofa, usd
 from .export_target import ExportedFiles, ExportTarget, PredictionComparison
 from .identified import IdentifiedBody
 
@@ -116,8 +116,8 @@ def target_named(name: str) -> ExportTarget:
         If there is no target of that name.
     """
     if name not in TARGETS:
-        known = ", ".join(TARGETS)
-        raise InputError(f"no target {name!r}; available: {known}{hint_at(name, TARGETS)}")
+        known = (*TARGETS, rerun_recording.TARGET)
+        raise InputError(f"no target {name!r}; available: {', '.join(known)}{hint_at(name, known)}")
     return TARGETS[name]
 
 

@@ -13,6 +13,7 @@ from ...array_types import Array
 from ...files import replaced_file, safe_name
 from ...recording.measured_wrench import COMPONENTS, UNITS
 from ...runs.result_content import Result
+from ...step_counting import StepUnit, complete_steps, counted_phase
 from ..figure_style import RESOLUTION_DPI
 from ..replay import MotionRecord, damaged_run_refused, read_run
 from .confidence import Confidence, budget_picture, confidence_ellipses, correlation_matrix
@@ -121,14 +122,16 @@ def save_pictures(
         Called before each picture with a sentence that has its number, counted from 1.
     """
     files = []
-    for k, (name, figure) in enumerate(pictures.items(), start=1):
-        file = Path(folder) / f"{safe_name(name)}.png"
-        if say is not None:
-            say(f"drawing picture {k} of {len(pictures)}: {file.name}")
-        # Harder compression takes longer than drawing, for a tenth of the size.
-        with replaced_file(file) as draft:
-            figure.savefig(draft, dpi=RESOLUTION_DPI, pil_kwargs={"compress_level": 2})
-        files.append(file)
+    with counted_phase(StepUnit.PICTURE, len(pictures)):
+        for k, (name, figure) in enumerate(pictures.items(), start=1):
+            file = Path(folder) / f"{safe_name(name)}.png"
+            if say is not None:
+                say(f"drawing picture {k} of {len(pictures)}: {file.name}")
+            # Harder compression takes longer than drawing, for a tenth of the size.
+            with replaced_file(file) as draft:
+                figure.savefig(draft, dpi=RESOLUTION_DPI, pil_kwargs={"compress_level": 2})
+            complete_steps(StepUnit.PICTURE)
+            files.append(file)
     return files
 
 

@@ -1,0 +1,174 @@
+"""Commands about the installation: its check, and completion in shells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from ..display import Line, Shown, Table, labelled, number
+from ..installation_check import Dependency, InstallationReport, check_installation
+from .command_options import OutputOptions, command
+from .common import EXIT_BAD_INPUT, error_console
+
+commands = typer.Typer()
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorCommand(OutputOptions):
+    """Options of `doctor`, all of which are shared."""
+
+
+@command(commands, "doctor", "doctor --json")
+def doctor(options: DoctorCommand) -> None:
+    """Check the installation, with a self test.
+
+    Versions of the dependencies, solvers, the kernel cache, threads and extras are listed.
+
+    The self test identifies the stiffness of a small simulated block. The exit code is 0 if all
+    required packages are there and the test passes, and 2 otherwise; missing extras do not matter.
+    """
+    with error_console.status("checking the installation"):
+        report = check_installation()
+    options.print_result(report, installation_sections(report))
+    raise typer.Exit(0 if report.is_working else EXIT_BAD_INPUT)
+
+
+class Shell(StrEnum):
+    """Shells with completion."""
+
+    BASH = "bash"
+    ZSH = "zsh"
+    FISH = "fish"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompletionCommand:
+    """Options of `completion`.
+
+    Attributes
+    ----------
+    shell : SHELL
+        bash, zsh or fish.
+    """
+
+    shell: Annotated[Shell, typer.Argument()]
+
+
+@command(
+    commands,
+    "completion bash > ~/.local/share/bash-completion/completions/collocation-sysid",
+    "completion zsh > ~/.zfunc/_collocation-sysid",
+    "completion fish > ~/.config/fish/completions/collocation-sysid.fish",
+)
+def completion(options: CompletionCommand) -> None:
+    """Print a script for completion in bash, zsh or fish.
+
+    It completes commands, options, values and files.
+
+    New shells read it from the files of the examples; ~/.zfunc has to be in zsh's fpath before
+    compinit. Print it again after an upgrade.
+    """
+    from typer.main import get_command
+
+    from . import app
+    from .shell_completion import completion_script
+
+    typer.echo(completion_script(options.shell.value, get_command(app)))
+
+
+def installation_sections(report: InstallationReport) -> list[Shown]:
+    """Return the state of an installation as tables and a conclusion."""
+    return [
+        labelled(
+            "Installation",
+            {
+                "collocation_sysid": f"{report.version}, {report.location}",
+                "Python": f"{report.python}, {report.platform}",
+                **_solver_rows(report),
+                **_kernel_rows(report),
+                **_thread_rows(report),
+            },
+        ),
+        Table(
+            "Required packages",
+            (),
+            tuple(
+                (f"  {each.name} ", each.installed or "missing", _requirement_text(each))
+                for each in report.dependencies
+            ),
+            names=2,
+            texts=1,
+        ),
+        labelled(
+            "Extras",
+            {
+                each.name: f"missing: {', '.join(each.missing)}; {each.install}"
+                if each.missing
+                else "installed"
+                for each in report.extras
+            },
+        ),
+        _conclusion(report),
+    ]
+
+
+def _requirement_text(dependency: Dependency) -> str:
+    """Return the required versions, with the remedy where the installed one is not suitable."""
+    if dependency.is_suitable:
+        return dependency.required
+    package = f"{dependency.name}{dependency.required}"
+    return f'needed: {dependency.required or "any version"}; pip install "{package}"'
+
+
+def _solver_rows(report: InstallationReport) -> dict[str, str]:
+    """Return the table rows of the solvers."""
+    if report.solvers is None:
+        return {"solvers": "unknown, because CasADi cannot be imported"}
+    linear = ", ".join(report.solvers.ipopt_linear) or "none that works"
+    mkl = "available" if report.solvers.supernodal else "not available (extra: large)"
+    return {
+        "nonlinear solvers": ", ".join(report.solvers.nonlinear) or "none",
+        "IPOPT's linear solvers": linear,
+        "supernodal factorisation": mkl,
+    }
+
+
+def _kernel_rows(report: InstallationReport) -> dict[str, str]:
+    """Return the table rows of the compiler and the cache of kernels."""
+    kernels = report.kernels
+    if kernels is None:
+        return {
+            "compiler": "none, as llvmlite cannot be imported: CasADi evaluates, which is slower"
+        }
+    stored = f"{kernels.count} kernels, {number(kernels.size_mb, 3)} MB"
+    state = "writable" if kernels.fault is None else f"not used: {kernels.fault}"
+    return {
+        "compiler": kernels.compiler,
+        "C compiler": f"{kernels.c_compiler or 'none'} (not needed)",
+        "kernel cache": f"{kernels.folder}: {stored}, {state}",
+    }
+
+
+def _thread_rows(report: InstallationReport) -> dict[str, str]:
+    """Return the table rows of threads and memory."""
+    threads = report.threads
+    memory = number(threads.memory_mb and threads.memory_mb / 1e3, 3)
+    return {
+        "threads": f"{threads.count} of {threads.cores} cores ({threads.source})",
+        "memory": f"{memory} GB",
+    }
+
+
+def _conclusion(report: InstallationReport) -> Line:
+    """Return the outcome of the self test and of the whole check."""
+    test = report.self_test
+    outcome = "passed" if test.is_passed else "FAILED"
+    text = f"Self test {outcome} in {test.time_s:.1f} s: {test.message}."
+    if report.is_working:
+        return Line(f"{text} The installation works.", "good")
+    unsuitable = [each.name for each in report.dependencies if not each.is_suitable]
+    remedy = f" Install {', '.join(unsuitable)}." if unsuitable else ""
+    return Line(f"{text} The installation does not work.{remedy}", "doubtful")

@@ -1,0 +1,334 @@
+"""Sliders over the estimated parameters of a run, with a forward simulation beside the recording.
+
+For notebooks, with the widgets of ipywidgets (extra ``interactive``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..array_types import Array
+from ..display import number
+from ..errors import InputError, SimulationError, require_among
+from ..fem.constants import is_field_coefficient, symbol_with_unit
+from ..model.parameters import Parameters
+from ..problem import Problem
+from ..program.transcription import Transcription
+from ..recording import Experiment
+from ..recording.measured_wrench import COMPONENTS, UNITS
+from ..runs.forward_simulation import (
+    ForwardSimulation,
+    simulate_with_parameters,
+    transcription_and_nuisance,
+)
+from ..runs.result_content import ReportedEstimate
+from ..runs.solved_problem import SolvedProblem
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure  # which takes a while to import
+
+MISSING = "run.interactive() needs ipywidgets: pip install 'collocation-sysid[interactive]'"
+# Least ratio of the ends of a slider to its middle; an interval may be too short to see an effect.
+LEAST_RATIO = 1.5
+# Ends of a slider beyond the ends of the combined interval, in half widths of that interval.
+WIDENING = 2.0
+# Steps of a slider.
+STEPS = 200
+# Resolution of the pictures [pixels per inch]: a notebook redraws them for every value.
+PICTURE_DPI = 90
+
+
+@dataclass(frozen=True)
+class SliderRange:
+    """Values that a slider can take.
+
+    Attributes
+    ----------
+    low, value, high : float
+        Ends and first value.
+    is_logarithmic : bool
+    """
+
+    low: float
+    value: float
+    high: float
+    is_logarithmic: bool
+
+    @classmethod
+    def from_estimate(
+        cls, estimate: ReportedEstimate, *, linear: bool, bounds: tuple[float, float]
+    ) -> SliderRange:
+        """Return a range around an estimate.
+
+        It reaches three half widths of the combined interval to either side, at least a factor of
+        1.5, and not beyond the bounds.
+
+        Parameters
+        ----------
+        estimate : ReportedEstimate
+        linear : bool
+            Whether the parameter is estimated on a linear scale.
+        bounds : (lower, upper)
+        """
+        value = estimate.value
+        interval = estimate.combined95 or (value, value)
+        if linear or value <= 0:
+            margin = (1 + WIDENING) * max(value - interval[0], interval[1] - value)
+            margin = max(margin, (LEAST_RATIO - 1) * abs(value)) or 1.0
+            low = value - margin
+            high = value + margin
+        else:
+            ratio = max(interval[1] / value, value / max(interval[0], 1e-12 * value))
+            factor = max(ratio ** (1 + WIDENING), LEAST_RATIO)
+            low = value / factor
+            high = value * factor
+        is_logarithmic = not linear and value > 0
+        low = max(low, bounds[0])
+        high = min(high, bounds[1])
+        return cls(low, float(np.clip(value, low, high)), high, is_logarithmic)
+
+
+class ParameterSliders:
+    """Sliders and pictures of one experiment of a run.
+
+    Parameters
+    ----------
+    problem : Problem
+    experiment : Experiment
+        The recording.
+    segment : Transcription
+        The recording as it was fitted.
+    phi : (k,) array
+        Nuisance parameters of the recording, which stay as estimated.
+    parameters : Parameters
+        Parameters of the problem, with the optimum as guesses.
+    ranges : mapping of name to SliderRange
+        Parameters that get a slider.
+    fitted_markers_m : (T, M, 3) array or None
+        Fitted markers; None for a validation experiment.
+
+    Attributes
+    ----------
+    sliders : dict of name to widget
+        Their `value` is the value of the parameter.
+    picture : widget
+        PNG of measurements, fit and simulation.
+    message : widget
+        Misfit of the simulation, or why it failed.
+    reset_button : widget
+        Sets all sliders to the estimates.
+    widget : widget
+        Box with all of them.
+    simulation : ForwardSimulation or None
+        The last simulation; None if it failed.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        experiment: Experiment,
+        *,
+        segment: Transcription,
+        phi: Array,
+        parameters: Parameters,
+        ranges: Mapping[str, SliderRange],
+        fitted_markers_m: Array | None,
+    ) -> None:
+        widgets: Any = import_module("ipywidgets")
+        self._problem = problem
+        self._experiment = experiment
+        self._segment = segment
+        self._phi = phi
+        self._parameters = parameters
+        self._ranges = ranges
+        self._fitted_markers_m = fitted_markers_m
+        self._is_resetting = False
+        self.simulation: ForwardSimulation | None = None
+        self.sliders = {name: _slider(widgets, name, each) for name, each in ranges.items()}
+        self.picture = widgets.Image(format="png")
+        self.message = widgets.Label()
+        self.reset_button = widgets.Button(description="estimates")
+        controls = widgets.VBox([*self.sliders.values(), self.reset_button, self.message])
+        self.widget = widgets.HBox([controls, self.picture])
+        for slider in self.sliders.values():
+            slider.observe(self._on_change, names="value")
+        self.reset_button.on_click(self.reset)
+        self.update()
+
+    @classmethod
+    def from_run(cls, run: SolvedProblem, experiment: str | None = None) -> ParameterSliders:
+        """Return the sliders of a run, see `pipeline.Run.interactive`.
+
+        Raises
+        ------
+        InputError
+            Without ipywidgets, for an unknown experiment, or if no parameter was estimated.
+        """
+        if find_spec("ipywidgets") is None:
+            raise InputError(MISSING)
+        by_name = {each.name: each for each in run.problem.experiments}
+        name = next(iter(by_name)) if experiment is None else experiment
+        require_among(name, by_name)
+        names = [
+            each.name for each in run.start_parameters.free if not is_field_coefficient(each.name)
+        ]
+        if not names:
+            raise InputError("no parameter was estimated, so that there is nothing to slide")
+        ranges = {}
+        for each in names:
+            linear, bounds = run.start_parameters.scale_and_bounds(each)
+            ranges[each] = SliderRange.from_estimate(
+                run.estimates[each], linear=linear, bounds=bounds
+            )
+        segment, phi = transcription_and_nuisance(by_name[name], run.solution)
+        fitted = zip(run.solution.parts, run.solution.readings_m, strict=True)
+        markers_m = {part.segment.experiment.name: readings for part, readings in fitted}
+        return cls(
+            run.problem,
+            by_name[name],
+            segment=segment,
+            phi=phi,
+            parameters=run.start_parameters.with_guess(
+                {
+                    each.name: run.solution.parameters[each.name]
+                    for each in run.start_parameters.free
+                }
+            ),
+            ranges=ranges,
+            fitted_markers_m=markers_m.get(name),
+        )
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All parameters by name: those of the sliders, what is tied to them, and the others."""
+        chosen = {name: each.value for name, each in self.sliders.items()}
+        return self._parameters.with_guess(chosen).guesses
+
+    def reset(self, _: object = None) -> None:
+        """Set all sliders to the estimates, and simulate once."""
+        self._is_resetting = True
+        try:
+            for name, slider in self.sliders.items():
+                slider.value = self._ranges[name].value
+        finally:
+            self._is_resetting = False
+        self.update()
+
+    def update(self) -> None:
+        """Simulate with the values of the sliders, and show the result.
+
+        If the simulation fails, the message says why, and the last picture stays.
+        """
+        self.message.value = "simulating"
+        try:
+            self.simulation = simulate_with_parameters(
+                self._problem,
+                self._experiment,
+                segment=self._segment,
+                phi=self._phi,
+                parameters=self.values,
+            )
+        except (InputError, SimulationError) as error:
+            self.simulation = None
+            self.message.value = f"not simulated: {error}"
+            return
+        self.message.value = self._misfit_text(self.simulation)
+        self.picture.value = _png(self._figure(self.simulation))
+
+    def _on_change(self, _: Mapping[str, Any]) -> None:
+        """Simulate again, unless all sliders are being reset."""
+        if not self._is_resetting:
+            self.update()
+
+    def _misfit_text(self, simulation: ForwardSimulation) -> str:
+        """Return the differences from the measurements in a sentence."""
+        texts = []
+        if len(self._experiment.markers.names):
+            rms_mm = number(1e3 * simulation.rms_m, 3)
+            max_mm = number(1e3 * simulation.max_m, 3)
+            texts.append(f"markers: {rms_mm} mm RMS, at most {max_mm} mm")
+        if simulation.wrench_rms[0] is not None:
+            texts.append(f"force: {number(simulation.wrench_rms[0], 3)} N RMS")
+        texts += [f"{name}: {number(rms, 3)} RMS" for name, rms in simulation.reading_rms.items()]
+        texts += [
+            f"{name}: {number(1e3 * each.rms_m, 3)} mm RMS"
+            for name, each in simulation.depth.items()
+            if each.rms_m is not None
+        ]
+        return "; ".join(texts) or "no measurement to compare with"
+
+    def _figure(self, simulation: ForwardSimulation) -> Figure:
+        """Return the picture of the first kind of measurements that the recording has."""
+        from .pictures.over_time import marker_tracks, sensor_picture
+
+        experiment = self._experiment
+        if len(experiment.markers.names):
+            return marker_tracks(
+                experiment.t_s,
+                experiment.markers.names,
+                experiment.markers.positions_m,
+                self._fitted_markers_m,
+                simulation.trajectory.markers_m,
+            )
+        if experiment.wrenches:
+            sensor = experiment.wrenches[0]
+            columns = _sensor_columns(sensor.t_s, sensor.values, simulation.wrenches[0])
+            columns[:, 1:] *= sensor.symmetry
+            return sensor_picture(columns, COMPONENTS, UNITS)
+        if experiment.readings:
+            gauge = experiment.readings[0]
+            predicted = simulation.readings[gauge.name]
+            columns = _sensor_columns(gauge.sample_times_s, gauge.measured_values, predicted)
+            count = gauge.measured_values.shape[1]
+            return sensor_picture(columns, [f"{gauge.name} {k + 1}" for k in range(count)])
+        return self._shapes_figure(simulation)
+
+    def _shapes_figure(self, simulation: ForwardSimulation) -> Figure:
+        """Return the picture of the simulated shapes."""
+        from .pictures.shapes import shapes_picture
+        from .replay import MotionRecord
+
+        trajectory = simulation.trajectory
+        simulated = trajectory.positions_m, trajectory.markers_m
+        return shapes_picture(MotionRecord.from_experiment(self._experiment, simulated=simulated))
+
+
+def _slider(widgets: Any, name: str, values: SliderRange) -> Any:
+    """Return the slider of a parameter, which reports its value when it is released."""
+    common = {
+        "description": symbol_with_unit(name),
+        "continuous_update": False,
+        "readout_format": ".4g",
+    }
+    if values.is_logarithmic:
+        low = float(np.log10(values.low))
+        high = float(np.log10(values.high))
+        return widgets.FloatLogSlider(
+            value=values.value, base=10, min=low, max=high, step=(high - low) / STEPS, **common
+        )
+    step = (values.high - values.low) / STEPS
+    return widgets.FloatSlider(
+        value=values.value, min=values.low, max=values.high, step=step, **common
+    )
+
+
+def _sensor_columns(t_s: Array, measured: Array, simulated: Array) -> Array:
+    """Return the columns of `sensor_picture`, without a fit.
+
+    `t_s` is (S,), `measured` and `simulated` are (S, m).
+    """
+    return np.column_stack([t_s, measured, np.full_like(measured, np.nan), simulated])
+
+
+def _png(figure: Figure) -> bytes:
+    """Return a figure as PNG."""
+    png = BytesIO()
+    figure.savefig(png, dpi=PICTURE_DPI)
+    return png.getvalue()
