@@ -132,6 +132,36 @@ def test_a_terminal_shows_the_remaining_time(monkeypatch):
     assert "drawing the pictures: 25%, about 0 s left" in screen.getvalue()
 
 
+def test_a_terminal_shows_the_elapsed_time_of_a_phase_without_a_share(monkeypatch):
+    now_s = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    progress = solve_progress.SolveProgress(Console(file=io.StringIO()), quiet=True)
+    progress.say("looking for causes of the misfit")
+    now_s = 101.0
+    assert progress._activity_with_time() == "looking for causes of the misfit"
+    now_s = 104.0
+    assert progress._activity_with_time() == "looking for causes of the misfit (4 s so far)"
+    progress.say("looking for causes of the misfit")  # the same activity goes on
+    now_s = 105.0
+    assert progress._activity_with_time() == "looking for causes of the misfit (5 s so far)"
+    progress.say("finding the error bars")
+    assert progress._activity_with_time() == "finding the error bars"
+    progress.share(0.5)
+    now_s = 109.0
+    assert progress._activity_with_time() == "finding the error bars: 50%, about 5 s left"
+
+
+def test_a_live_display_is_refreshed_without_a_new_message(monkeypatch):
+    monkeypatch.setattr(solve_progress, "FIRST_ELAPSED_S", 0.0)
+    screen = io.StringIO()
+    console = Console(file=screen, force_terminal=True, width=100)
+    with solve_progress.SolveProgress(console) as progress:
+        progress.say("looking for causes of the misfit")
+        progress._activity_began_s -= 7
+        progress._live.refresh()
+    assert "looking for causes of the misfit (7 s so far)" in screen.getvalue()
+
+
 def test_the_share_of_a_long_phase_is_reported_often_enough():
     shares = []
     with listen_to_shares(shares.append), counted_phase(StepUnit.TIME_STEP, 10):

@@ -1,7 +1,7 @@
 """Progress of a solve: a live table of iterations on a terminal, occasional lines elsewhere.
 
-The remaining time is shown for phases whose work can be counted, see `step_counting`. A search has
-none: the number of its iterations is not known.
+The remaining time is shown for phases whose work can be counted, see `step_counting`, and the
+elapsed time for all others, such as a search: the number of its iterations is not known.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass
 
 from rich.console import Console, Group
 from rich.text import Text
@@ -28,6 +29,8 @@ FIRST_LINE_S = 10.0
 ELAPSED_GROWTH = 0.5
 # Time after which a phase has a remaining time [s]; an estimate from less is too rough.
 FIRST_REMAINING_S = 1.0
+# Time after which a phase without a share has an elapsed time [s].
+FIRST_ELAPSED_S = 2.0
 # Least time between two updates by completed shares [s]; a sweep completes thousands of steps.
 SHARE_INTERVAL_S = 0.1
 
@@ -114,7 +117,8 @@ class SolveProgress(Watched):
         self._lines: list[Iteration] = []
         self._doing = activity
         self._remaining = ""
-        self._phase_began_s = time.monotonic()
+        self._activity_began_s = time.monotonic()
+        self._phase_began_s = self._activity_began_s
         self._last_share = 0.0
         self._share_shown_s = 0.0
         self._contexts = ExitStack()
@@ -126,7 +130,8 @@ class SolveProgress(Watched):
             self.line(f"note: {note}")
         super().__enter__()
         self._contexts.enter_context(listen_to_shares(self.share))
-        self._phase_began_s = time.monotonic()
+        self._activity_began_s = time.monotonic()
+        self._phase_began_s = self._activity_began_s
         if self._heartbeat is not None:
             self._heartbeat.start()
         return self
@@ -170,6 +175,8 @@ class SolveProgress(Watched):
 
     def _update_activity(self, activity: str, line: str = "") -> None:
         """Update the display with the current activity, and print `line` if verbose."""
+        if activity != self._doing:
+            self._activity_began_s = time.monotonic()
         self._doing = activity
         if self.verbose and line:
             self.console.print(Text(line), soft_wrap=True)
@@ -178,12 +185,36 @@ class SolveProgress(Watched):
     def _redraw(self) -> None:
         """Show the last iterations and the current activity on a terminal."""
         table = on_terminal(_iteration_table(self._lines))
-        self.update(Group(table, Text(self._doing + self._remaining, style="dim")))
+        self.update(Group(table, _RefreshedText(self._activity_with_time)))
+
+    def _activity_with_time(self) -> str:
+        """Return the current activity with its share and remaining time, or its elapsed time."""
+        if self._remaining:
+            return f"{self._doing}{self._remaining}"
+        elapsed_s = time.monotonic() - self._activity_began_s
+        elapsed = f" ({elapsed_s:.0f} s so far)" if elapsed_s >= FIRST_ELAPSED_S else ""
+        return f"{self._doing}{elapsed}"
 
     def _activity_with_iterations(self) -> str:
         """Return the current activity with the number of iterations so far, for the `Heartbeat`."""
         done = f", {len(self._lines)} iterations" if self._lines else ""
         return f"{self._doing}{self._remaining}{done}"
+
+
+@dataclass(frozen=True)
+class _RefreshedText:
+    """Text of a live display that is computed whenever the display is refreshed.
+
+    Attributes
+    ----------
+    text : callable
+        Returns the text.
+    """
+
+    text: Callable[[], str]
+
+    def __rich__(self) -> Text:
+        return Text(self.text(), style="dim")
 
 
 def _remaining_time(elapsed_s: float, share: float) -> str:
