@@ -297,8 +297,10 @@ def test_a_sign_that_only_displacement_or_load_has_is_named(tmp_path):
     ):
         both = said(wrong)
         assert [sentence.partition(":")[0] for sentence in both] == ["'second'"]
-        assert "along z grasp 2 and the force that it gives go opposite ways" in both[0]
-        assert "set sign = -1 of its displacement or of its wrench" in both[0]
+        assert (
+            "along z the displacement of grasp 2 and its force on the body have opposite signs"
+        ) in both[0]
+        assert "set sign = -1 for the displacement or for the wrench" in both[0]
 
 
 def test_a_part_of_a_default_is_overridden_for_one_experiment(tmp_path):

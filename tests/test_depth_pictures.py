@@ -72,7 +72,7 @@ def test_an_inverted_pose_is_told_with_what_to_state():
     (mistake,) = camera_hypotheses(seeing(INVERTED))
     assert mistake.message.endswith(
         "hardly any points are near the body; they would be if camera.pose were inverted (state "
-        "the motion from the camera's frame to the world)"
+        "the transform from the camera's frame to the world)"
     )
 
 

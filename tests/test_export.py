@@ -421,7 +421,10 @@ def test_doubts_about_the_run_go_along(run_folder, tmp_path, to):
     ended = run_command("export", run, "--to", to, "--out", tmp_path / "out")
     assert ended.code == 0, ended.err
     written = "".join(file.read_text() for file in (tmp_path / "out").iterdir())
-    for said in ("'doubtful': the residuals are not noise", "mu_pa = 300 ended at a bound"):
+    for said in (
+        "'doubtful': the residuals are not independent noise",
+        "mu_pa = 300 ended at a bound",
+    ):
         assert "warning: " in ended.out
         assert said in ended.out
         assert said in written

@@ -163,7 +163,7 @@ def test_of_three_that_are_known_well_each_no_combination_is_told(deviation, tol
 
 def test_the_other_elastic_pair_is_told_where_it_is_known_better():
     found = uncertainty(spread([0.7, 0.02, 0.02, 0.02]))
-    (sentence,) = [s for s in identifiability_sentences(found) if "other elastic pair" in s]
+    (sentence,) = [s for s in identifiability_sentences(found) if "other elastic constants" in s]
     assert "young_pa to ±" in sentence
     assert "poisson" in sentence
 

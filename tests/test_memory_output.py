@@ -63,7 +63,7 @@ def test_a_branch_slower_than_the_recordings_is_told():
     assert "slower than the longest recording of 2 s" in note
     assert not memory_notes(slow, 8.0)
     (note,) = memory_notes(slow | {"prony_1.share": Estimate(0.0, at_bound=True)}, 8.0)
-    assert note.startswith("no memory found: the share of prony_1 ended at 0")
+    assert note.startswith("no memory was found: the share of prony_1 ended at 0")
 
 
 def test_constants_of_a_branch_have_symbols():

@@ -60,7 +60,7 @@ def test_a_skewed_loss_gives_a_skewed_interval():
     assert upper is not None
     assert np.log(upper / BEST) == pytest.approx(np.log1p(np.sqrt(THRESHOLD)) / 5, rel=0.03)
     assert "at most" in found.message
-    assert "downwards the data do not limit it" in found.message
+    assert "the data give no lower limit" in found.message
 
 
 def test_a_flat_loss_is_called_not_identifiable():

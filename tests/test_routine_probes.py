@@ -208,8 +208,8 @@ def test_the_concern_names_the_assumption_and_every_corrected_estimate():
     assert Assessment.from_concerns([concern]).verdict == "check"
     assert concern.message == (
         "the data contradict the assumption that the stiffness is constant during a recording: "
-        "with stiffness drift = -0.05 ± 0.01 χ² falls by 20, and the estimates are "
-        "E = 8181 ± 40 Pa and ν not determined; less well also by clock rate (12)"
+        "with stiffness drift = -0.05 ± 0.01 χ² decreases by 20, and the estimates become E = "
+        "8181 ± 40 Pa and ν not determined; alternatives that decrease χ² less: clock rate (12)"
     )
     assert probe_concerns([probe(0.0)], {"young_pa": 1.0}) == []
 
