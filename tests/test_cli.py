@@ -428,7 +428,9 @@ def test_elsewhere_long_work_leaves_a_line_now_and_then(monkeypatch):
     with progress_shown.SolveProgress(Console(file=Log())) as progress:
         progress.say("simulating the first samples")
         assert told.wait(30.0)
-    assert "finding a start" in lines[0] or "simulating the first samples" in lines[0]
+    assert (
+        "searching for an initial guess" in lines[0] or "simulating the first samples" in lines[0]
+    )
     assert "s so far)" in lines[0]
     with progress_shown.SolveProgress(Console(file=Log()), quiet=True) as progress:
         assert progress._heartbeat is None
@@ -507,7 +509,7 @@ def test_a_simulation_beside_the_problem_keeps_what_others_wrote(tiny: Path):
     recording.write_text("precious")
     refusal = run_command(*simulate)
     assert refusal.code == 2
-    assert "swing_markers.csv: is there and was not written by this program" in refusal.err
+    assert "swing_markers.csv: this file exists and was not written by this program" in refusal.err
     assert recording.read_text() == "precious"
 
 

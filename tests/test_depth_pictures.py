@@ -94,7 +94,7 @@ def test_a_frame_of_no_convention_is_not_told_as_two_at_once():
 def test_a_camera_that_is_somewhere_else_is_told_to_see_nothing():
     elsewhere = moved(np.zeros(3), np.array([0.0, 0.0, 0.7]))
     (mistake,) = camera_hypotheses(seeing(elsewhere))
-    assert "only 0 % of the surface" in mistake.message
+    assert "only 0 % of the body's visible surface" in mistake.message
 
 
 def test_a_camera_that_is_20_mm_and_10_degrees_off_is_none_that_sees_nothing():
@@ -173,7 +173,7 @@ def test_a_solve_in_which_no_point_of_a_camera_counts_is_saved_with_its_pictures
         solved.save(tmp_path / "run", frames=False)
     assert (tmp_path / "run" / "depth_experiment_front.png").is_file()
     (text,) = depth_picture(np.zeros((0, 8))).axes[0].texts
-    assert text.get_text() == "no point is near enough to the body to count"
+    assert text.get_text() == "no point is near enough to the body to be compared"
 
 
 def test_cameras_whose_names_meet_in_one_file_name_have_a_picture_each(tmp_path):

@@ -82,7 +82,7 @@ def test_residuals_at_the_start_tell_of_the_release():
 def test_a_drift_is_not_called_an_oscillation():
     drift = np.zeros((len(T_S), 3))
     drift[:, 2] = np.linspace(-10, 10, len(T_S))
-    assert "slow drift: creep" in diagnosis(noise() + drift).sentence
+    assert "slow drift: the model lacks creep" in diagnosis(noise() + drift).sentence
 
 
 def test_a_slow_walk_without_a_peak_is_named_too():

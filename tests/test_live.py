@@ -186,7 +186,7 @@ def test_it_settles_at_the_batch_of_what_was_not_left_out():
     settled = live.finish()
     whole = replace(problem, experiments=[cs.with_markers(seen, tracks)])
     batch = cs.run(whole, seek_causes=False)
-    assert "8 % of the marker samples are outliers" in settled.trust.reasons
+    assert any("8 % of the marker samples are outliers" in why for why in settled.trust.reasons)
     for name, estimate in settled.estimates.items():
         assert estimate.value == pytest.approx(batch.parameters[name], rel=1e-6)
 

@@ -128,7 +128,7 @@ def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
     assert {cost.method for cost in findings.costs} == {"reduced-space", "interior-point"}
     monkeypatch.setattr("collocation_sysid.runs.check.derivatives.MOST_LIFTED_NONZEROS", 0)
     checked = run_command("check", tiny / "problem.toml", *settings(GUESSED))
-    assert f"{findings.overstresses:,} more variables and constraints" in checked.out
+    assert f"{findings.overstresses:,} additional variables and constraints" in checked.out
     assert "τ prony_1" in checked.out
 
 

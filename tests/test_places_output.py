@@ -161,7 +161,7 @@ def test_the_page_has_places_and_nuisance_parameters_in_their_units(folder: Path
     page = folder / "page.html"
     assert run_command("report", folder / "run", "--to", page).code == 0
     text = page.read_text()
-    assert "Places of the markers of &#39;swing&#39;" in text or "markers of 'swing'" in text
+    assert "Positions of the markers of &#39;swing&#39;" in text or "markers of 'swing'" in text
     assert "not given" in text
     assert ">3 mm<" in text
     assert ">5 ms<" in text
@@ -175,10 +175,10 @@ def test_pictures_have_what_was_given_and_what_was_found(folder: Path):
     assert seen.marker_places_m[1] == pytest.approx(PLACES_M["mid"], abs=1e-3)
     assert seen.given_places_m[1] == pytest.approx([0.03, 0.024, 0.03], abs=1e-9)
     assert legend_of(seen.marker_places_m, seen.given_places_m, seen) >= {
-        "no place given", "place given",
+        "position not given", "place given",
     }  # fmt: skip
     same = legend_of(seen.marker_places_m, seen.marker_places_m, seen)
-    assert not same & {"no place given", "place given"}
+    assert not same & {"position not given", "place given"}
 
 
 def legend_of(places_m: np.ndarray, given_m: np.ndarray, seen) -> set[str]:

@@ -232,7 +232,7 @@ def test_a_prediction_stands_beside_the_copy_of_a_fitted_recording():
     assert copied.copied == "fitted"
     assert copied.error.rms_m == pytest.approx(np.sqrt(6) * 2e-4, rel=0.1)  # the noise of both
     assert stored(alike)["rollout"]["new"]["copied"]["copied"] == "fitted"
-    assert "the measurements of 'fitted' copied: " in shown(alike)
+    assert "the measurements of 'fitted' as the prediction: " in shown(alike)
 
 
 def test_the_nearest_recording_is_copied_or_the_output_says_why_none_is():

@@ -167,8 +167,9 @@ def test_a_solve_makes_two_probes_and_all_of_them_where_asked_to(tmp_path):
     assert not any(p.routine for p in deep)
     assert {p.kind for p in deep} == {"window", "assumption"}
     assert "solve --probe" not in probing.out
-    assert "in half widths of the statistical and of the combined interval" in " ".join(
-        probing.out.split()
+    assert (
+        "relative to the half widths of the statistical and of the combined interval"
+        in " ".join(probing.out.split())
     )
 
 

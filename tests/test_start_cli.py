@@ -70,7 +70,7 @@ def test_the_scan_is_drawn_in_the_run_folder_and_on_the_page(folder):
     assert image[..., :3].std() > 0.05
     page = folder / "page.html"
     assert run_command("report", folder / "run", "--to", page).code == 0
-    assert "Scan of the stiffness for a start" in page.read_text()
+    assert "Scan of the stiffness for an initial guess" in page.read_text()
     assert run_command("plot", folder / "run", "--out", folder / "again").code == 0
     assert np.array_equal(imread(folder / "again" / "scan.png"), image)
 

@@ -459,7 +459,7 @@ def test_a_test_bench_without_markers_is_checked(tmp_path):
     assert not findings.motions
     said = plain_text(full_check_tables(findings))
     assert "Modes" not in said
-    assert "markers are missed" not in said
+    assert "deviates from the markers" not in said
 
 
 def test_a_run_without_markers_speaks_of_forces(tmp_path):

@@ -79,7 +79,7 @@ def test_the_gravest_concern_gives_the_verdict():
 def test_a_concern_keeps_its_code_and_its_numbers_in_files():
     found = Assessment.from_concerns(nuisance_concerns(["time"], [4.0], [-9.0], [9.0]))
     stored = json.loads(as_json(found))
-    assert stored["reasons"] == ["time is 4.0 deviations of its prior away from zero"]
+    assert stored["reasons"] == ["time is 4.0 standard deviations of its prior away from zero"]
     (concern,) = stored["concerns"]
     assert concern["code"] == "nuisance/far"
     assert concern["data"] == {"name": "time", "deviations": 4.0}
@@ -122,7 +122,7 @@ def test_persistent_residuals_are_to_be_checked_and_gross_ones_doubtful():
         errors = autoregressive(RNG(seed), 80, 3, 0.8)
         found = verdict_of_fit(1.2 * errors)
         assert found.verdict == "check"
-        assert "persist" in found.reasons[0]
+        assert "consecutive samples are correlated" in found.reasons[0]
         assert verdict_of_fit(5 * errors).verdict == "doubtful"
         assert verdict_of_fit(0.02 * errors).verdict != "doubtful"
 
@@ -269,7 +269,7 @@ def test_the_verdict_is_shown_stored_and_fed():
     assert lines[1] == "Verdict: good"
     assert "γ_r refers to the damping law rayleigh, which also brakes rotation" in lines
     (markers,) = [line for line in lines if line.startswith("markers: ")]
-    assert "mm from noise alone" in markers
+    assert "mm expected from noise alone" in markers
     noise_mm = float(markers.partition("RMS, ")[2].partition(" mm")[0])
     assert noise_mm == pytest.approx(1e3 * np.sqrt(3) * NOISE_M, rel=0.1)
     caused = replace(found, causes=(Hypothesis("wrench-tare", "the wrench", strength=9.0),))

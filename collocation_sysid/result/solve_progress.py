@@ -99,7 +99,7 @@ class SolveProgress(Watched):
         self.verbose = verbose
         self._notes = problem.notes if problem else ()
         self._lines: list[Iteration] = []
-        self._doing = "finding a start"
+        self._doing = "searching for an initial guess"
         silent = not (console.is_terminal or quiet)
         self._heartbeat = Heartbeat(self._activity_with_iterations, self.line) if silent else None
 

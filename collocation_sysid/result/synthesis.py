@@ -294,13 +294,13 @@ def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> Non
         if file.exists() and file.resolve() in read:
             raise InputError(
                 f"{problem.path} reads this file, so it is not overwritten; choose another "
-                "folder, or move it away",
+                "folder, or move the file",
                 file,
             )
         if (file.exists() or file.is_symlink()) and not is_written_here(file):
             raise InputError(
-                "is there and was not written by this program, or was changed since, so it is "
-                "not overwritten; choose another folder, or move it away",
+                "this file exists and was not written by this program, or was changed since, so "
+                "it is not overwritten; choose another folder, or move the file",
                 file,
             )
     at_home = problem.path is not None and problem.path.resolve().parent == place.resolve()
@@ -358,7 +358,7 @@ def _require_separate_files(problem: Problem, names: Sequence[Mapping[str, str]]
         for name in files.values():
             if name in owners:
                 raise InputError(
-                    f"is read by '{owners[name]}' too, and a simulation gives each its own; "
+                    f"is read by '{owners[name]}' too, but a simulation writes a file for each; "
                     f"expected another file than {name}",
                     problem.path,
                     f"experiment '{experiment.name}': file",

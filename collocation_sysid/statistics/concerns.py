@@ -278,15 +278,15 @@ TOPICS: Mapping[str, Topic] = {
             "first mode of '{experiment}'",
             "period": "the scheme changes the first period of '{experiment}' by {change:+.1%}",
             "adds": "{scheme} at {step_ms:.3g} ms adds a damping ratio of {ratio:.2g} to "
-            f"{MODE}, so that the estimated damping will be too low by as much: {{remedy}}",
-            "takes": "{scheme} at {step_ms:.3g} ms removes a damping ratio of {ratio:.2g} from "
-            f"{MODE}, so that the estimated damping will be too high by as much: {{remedy}}",
+            f"{MODE}, which makes the estimated damping too low: {{remedy}}",
+            "takes": "{scheme} at {step_ms:.3g} ms removes a damping ratio of {ratio:.2g} "
+            f"from {MODE}, which makes the estimated damping too high: {{remedy}}",
             "coarse": f"{MODE} has only {{steps:.1f}} time steps per period, which makes its "
             "period {error:.0%} too long: {remedy}",
             "turn": TURN,
-            "turns": f"{TURN} at t = {{time_s:.4g}} s ({{rate_rad_s:.3g}} rad/s). Time steps "
-            "follow the chord of a rotation instead of its arc, which biases the estimates, most "
-            "of all that of the damping: {remedy}",
+            "turns": f"{TURN} at t = {{time_s:.4g}} s ({{rate_rad_s:.3g}} rad/s). Steps follow "
+            "the chord of a rotation instead of its arc, which biases the estimates, especially "
+            "damping: {remedy}",
         },
     ),
     "stability": Topic(

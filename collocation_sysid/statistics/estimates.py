@@ -375,7 +375,7 @@ def noise_notes(requested: str, kind: Noise, level: NoiseLevel, errors: str) -> 
         most = f"{level.factors[high]:.2g} ({high})"
         size = f"between {least} and {most} times as large as expected from {stated}"
     elif factor > NOTEWORTHY:
-        size = f"{factor:.2g} times as large as {stated} says"
+        size = f"{factor:.2g} times as large as expected from {stated}"
     elif factor < 1 / NOTEWORTHY:
         size = (
             f"only {factor:.2g} times as large as expected from {stated}, which seems "

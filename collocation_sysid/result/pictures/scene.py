@@ -284,7 +284,7 @@ def legend_handles(*entries: str) -> list[Line2D]:
     styles = {
         "grasped": {**_GRASPED_STYLE, "ms": 3.0},
         "behind the body": {**_MARKER_STYLE, "mfc": "none"},
-        "seen in depth": {**_DEPTH_POINT_STYLE, "ms": 4.0},
+        "depth image": {**_DEPTH_POINT_STYLE, "ms": 4.0},
     }
     return [
         Line2D([], [], label=name, **styles.get(name, {**_MARKER_STYLE, "mfc": VERMILION}))
