@@ -88,7 +88,7 @@ def test_a_driven_box_is_read_solved_and_shown(driven):
     assert done.code == 0, done.err
     said = " ".join(done.out.split())
     assert "tendon_1, more than stated by" in said
-    assert "(prior 10)" in said
+    assert "(prior ±10 %)" in said
     assert "air, lost" in said
     result = json.loads((driven / "run" / "result.json").read_text())
     assert result["parameters"]["mu_pa"]["optimum"] == pytest.approx(TRUTH["mu_pa"], rel=1e-3)

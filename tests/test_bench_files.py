@@ -272,7 +272,7 @@ def test_loads_of_a_part_are_reported_for_the_whole_specimen(tmp_path):
     assert words in said
     assert "specimen" not in plain_text(run_summary(alone.result, tmp_path / "part"))
     priors_n = [
-        float(re.search(r"tare up to \S+ N \(prior (\S+)\)", said)[1])
+        float(re.search(r"tare: up to \S+ N \(prior ±(\S+) N\)", said)[1])
         for each in (found.result, alone.result)
         if (said := each.fit.experiments["first"].beside[-1])
     ]

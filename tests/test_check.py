@@ -380,7 +380,7 @@ def test_a_long_simulation_is_left_out_and_told_unless_asked_for(tiny: Path, mon
     problem, told = Problem.read(tiny / "problem.toml"), []
     short = check_problem(problem, told.append)
     assert short.rms_at_guess_m is None
-    assert any("but for their first samples" in n and "check --full" in n for n in short.notes)
+    assert any("only the first samples" in n and "check --full" in n for n in short.notes)
     assert "deviates from the markers by" not in plain_text(full_check_tables(short))
     assert short.derivatives_agree
     assert not any("simulating the recordings" in each for each in told)

@@ -348,7 +348,7 @@ def test_an_answer_survives_an_interrupted_roll_out(tiny, monkeypatch):
     monkeypatch.setattr(forward_simulation, "simulate", interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
-    assert "Verdict: doubtful\n  interrupted: no forward simulation has checked" in outcome.out
+    assert "Verdict: doubtful\n  interrupted: the result has no error bars" in outcome.out
     result = result_in(tiny / "run")
     assert result["status"] == "converged"
     assert result["rollout"]["rms_m"] is None
@@ -363,7 +363,7 @@ def test_so_do_error_bars_an_interrupt_after_them(tiny, monkeypatch, late):
     monkeypatch.setattr(pipeline, late, interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
-    assert "interrupted: what comes after the error bars is left out" in outcome.out
+    assert "interrupted: the steps after the error bars were skipped" in outcome.out
     result = result_in(tiny / "run")
     assert result["trust"]["verdict"] == "doubtful"
     assert result["rollout"]["rms_m"] is not None

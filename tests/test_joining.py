@@ -169,7 +169,9 @@ def test_a_time_taken_as_exact_biases_the_damping_and_the_run_says_so():
 def test_the_time_is_told_with_its_error(tmp_path: Path):
     found = run(Problem([with_noise(seen(0.0634, 0.06), 1)], GUESS), seek_causes=False)
     said = " ".join(plain_text(run_summary(found.result, tmp_path)).split())
-    assert re.search(r"joining of mass 1 [\d.]+ ± [\d.]+ ms later than 0.06 s \(prior 10\)", said)
+    assert re.search(
+        r"joining of mass 1 [\d.]+ ± [\d.]+ ms later than 0.06 s \(prior ±10 ms\)", said
+    )
     found.save(tmp_path / "run")
     told = json.loads((tmp_path / "run" / "result.json").read_text())["nuisance"]["hung cube"]
     joining = told["joining of mass 1 [s]"]

@@ -246,5 +246,5 @@ def test_a_start_with_inverted_elements_is_refused():
     collocation = collocation_of("hung-cube")
     z, _ = initial_variables(collocation)
     q, (x,) = collocation.unpack(z)
-    with pytest.raises(InputError, match="elements are inverted at the start"):
+    with pytest.raises(InputError, match="elements are inverted at the initial point"):
         NEWTON(collocation, start=collocation.pack(q, [-x]))

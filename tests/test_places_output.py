@@ -148,13 +148,13 @@ def test_a_record_without_places_is_no_start(folder: Path, tmp_path: Path, resul
 
 def test_the_terminal_says_where_markers_are_and_the_priors(folder: Path):
     said = " ".join((folder / "printed.txt").read_text().split())
-    moved = re.search(r"markers sit off their places by up to ([\d.]+) mm \(mid; prior 3\)", said)
+    moved = re.search(r"stated positions: up to ([\d.]+) mm \(mid; prior ±3 mm\)", said)
     assert moved is not None
     assert float(moved[1]) == pytest.approx(4.0, abs=0.2)
-    assert re.search(r"1 marker without a place, found to ±[\d.]+ mm \(prior 124\)", said)
-    assert re.search(r"gravity tilted by [\d.e-]+° \(prior 1\)", said)
-    assert re.search(r"body turned in its grasp by [\d.e-]+° \(prior 0.5\)", said)
-    assert re.search(r"seen [\d.e-]+ ms (later|earlier) than their times say \(prior 5\)", said)
+    assert re.search(r"positions of 1 marker, estimated to ±[\d.]+ mm \(prior ±124 mm\)", said)
+    assert re.search(r"tilt of gravity: [\d.e-]+° \(prior ±1°\)", said)
+    assert re.search(r"rotation of the body in the gripper: [\d.e-]+° \(prior ±0.5°\)", said)
+    assert re.search(r"measured [\d.e-]+ ms (later|earlier) than stated \(prior ±5 ms\)", said)
 
 
 def test_the_page_has_places_and_nuisance_parameters_in_their_units(folder: Path):

@@ -155,7 +155,7 @@ def test_gate_and_rms_of_depth_belong_to_the_same_points():
 def test_notes_of_a_depth_recording_do_not_speak_of_wrenches():
     notes = " ".join(image_predicted(0.3e5).result.notes)
     assert "wrench" not in notes
-    assert "points of depth cameras are missed by" in notes
+    assert "the residuals of the points of depth cameras are" in notes
 
 
 def test_points_that_are_nowhere_near_the_prediction_are_doubtful():
@@ -179,7 +179,7 @@ def test_depth_of_a_validation_recording_is_compared_drawn_and_judged():
     assert predicted.rms_m == pytest.approx(DEPTH_NOISE_M, rel=0.3)
     drawn = {replay.name: replay.seen for replay in replays(finished)}["away"]["front"]
     assert np.isfinite(drawn[:, 4]).sum() == predicted.points
-    assert "points of depth cameras have no counterparts" in shown(finished)
+    assert "points of depth cameras cannot be compared" in shown(finished)
     (concern,) = (c for c in finished.trust.concerns if c.code == "roll-out/predicted")
     assert concern.data["experiment"] == "wrong/front"
 

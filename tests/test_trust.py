@@ -267,7 +267,7 @@ def test_the_verdict_is_shown_stored_and_fed():
     assert content(found.result)["trust"] == {"verdict": "good", "reasons": [], "concerns": []}
     lines = plain_text(run_summary(found.result, Path("runs"))).splitlines()
     assert lines[1] == "Verdict: good"
-    assert "γ_r refers to the damping law rayleigh, which also brakes rotation" in lines
+    assert "γ_r refers to the damping law rayleigh, which also damps rigid rotation" in lines
     (markers,) = [line for line in lines if line.startswith("markers: ")]
     assert "mm expected from noise alone" in markers
     noise_mm = float(markers.partition("RMS, ")[2].partition(" mm")[0])

@@ -157,8 +157,8 @@ def test_a_run_tells_of_the_wrench(tmp_path: Path):
 
     said = plain_text(run_summary(run.result, folder))
     assert "wrench of 'hung cube'" in said
-    assert "tare up to" in said
-    assert "sensor late by" in said
+    assert "tare: up to" in said
+    assert "delay of the sensor:" in said
     assert folder / "wrench_hung_cube.png" in redraw_pictures(folder, folder)
     assert "Wrench of a grasp" in report_html(run_report(folder))
 

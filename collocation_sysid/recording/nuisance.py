@@ -253,7 +253,8 @@ PLACE = NuisanceRow(
     reach=UNLIMITED_REACH,
     step=_largest_place_step_m,
     label="place of {which}, {axis}",
-    said="errors of the places in reference_m without a reference_sigma_m; they turn with the body",
+    said="errors of the positions in reference_m without a reference_sigma_m; they rotate with "
+    "the body",
     same=lambda e: {"body": id(e.body), "kind of places": e.markers.on_surface},
 )
 OFFSET = NuisanceRow(
@@ -266,7 +267,7 @@ OFFSET = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="length",
     label="camera offset of {which}, {axis}",
-    told="camera offsets up to {size}",
+    told="camera offset of markers: up to {size}",
     said="a constant offset of each marker in the cameras' frame",
     reading=_shift_position,
 )
@@ -277,8 +278,8 @@ CALIBRATION_SCALE = NuisanceRow(
     key="calibration_scale",
     considered=2e-3,
     label="scale of the cameras",
-    told="cameras see lengths {signed}",
-    said="a factor on all lengths that the cameras see, how far from one",
+    told="scale error of the cameras: {signed}",
+    said="scale error of all lengths that the cameras measure: the factor minus one",
     applies=_has_markers,
     reading=lambda y, values, t_s, data: y + values * (y - ca.DM(data.pivot_m)),
 )
@@ -290,7 +291,7 @@ CALIBRATION_DISTORTION = NuisanceRow(
     considered=0.02,
     applies=_has_markers,
     label="distortion of the cameras",
-    told="cameras' distortion {signed}",
+    told="distortion of the cameras: {signed}",
     said="radial distortion of first order about the body's middle: a factor 1 + k r²",
     reading=_distort_position,
 )
@@ -302,8 +303,8 @@ TIME = NuisanceRow(
     changes=("clock",),
     applies=_is_motion,
     label="time shift",
-    told="markers seen {size} {way} than their times say{limit}",
-    said="how much later than their times say markers were seen, on the grasps' clock",
+    told="markers measured {size} {way} than stated{limit}",
+    said="how much later than stated the markers were measured, on the grasps' clock",
     same=lambda e: {"time between samples": round(e.timestep_s, 12)},
     clock=lambda values, t_s, data: values,
 )
@@ -316,8 +317,8 @@ CLOCK_RATE = NuisanceRow(
     changes=("clock",),
     applies=lambda experiment: _is_motion(experiment) and _has_markers(experiment),
     label="rate of the markers' clock",
-    told="the markers' clock {signed} slow",
-    said="how much slower than the grasps' clock that of the markers goes",
+    told="the markers' clock is slow by {signed}",
+    said="how much slower than the grasps' clock that of the markers runs",
     clock=lambda values, t_s, data: values * (t_s - data.recorded_s[0]),
 )
 POSE_TURN = NuisanceRow(
@@ -329,9 +330,9 @@ POSE_TURN = NuisanceRow(
     changes=("reading", "gravity"),
     by="length",
     label="turn of the pose, {axis}",
-    told="poses turned by {size}",
-    said="a constant turn of grasps and body in the cameras' frame, which turns gravity in the "
-    "body's",
+    told="rotation of the poses: {size}",
+    said="a constant rotation of grasps and body in the cameras' frame, which rotates gravity in "
+    "the body's frame",
     reading=_rotate_position,
 )
 POSE_SHIFT = NuisanceRow(
@@ -343,8 +344,8 @@ POSE_SHIFT = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="length",
     label="shift of the pose, {axis}",
-    told="poses shifted by {size}",
-    said="a constant shift of both",
+    told="translation of the poses: {size}",
+    said="a constant translation of grasps and body in the cameras' frame",
     reading=_shift_position,
 )
 TILT = NuisanceRow(
@@ -357,7 +358,7 @@ TILT = NuisanceRow(
     applies=lambda experiment: bool(np.any(experiment.gravity_m_s2)),
     by="length",
     label="tilt of gravity, {axis}",
-    told="gravity tilted by {size}",
+    told="tilt of gravity: {size}",
     said="a tilt of the direction of gravity",
     same=lambda e: {"gravity": tuple(e.gravity_m_s2)},
 )
@@ -371,8 +372,8 @@ GRASP_TURN = NuisanceRow(
     applies=_has_observable_hand_eye,
     by="length",
     label="turn in the grasp, {axis}",
-    told="body turned in its grasp by {size}",
-    said="a constant turn of the body in its grasps",
+    told="rotation of the body in the gripper: {size}",
+    said="a constant rotation of the body in its grasps",
     same=_hand_eye_sharing_key,
 )
 GRASP_SHIFT = NuisanceRow(
@@ -385,8 +386,9 @@ GRASP_SHIFT = NuisanceRow(
     applies=_has_observable_hand_eye,
     by="length",
     label="shift in the grasp, {axis}",
-    told="body shifted in its grasp by {size}",
-    said="a constant shift of it there; both where the start is an equilibrium and markers see it",
+    told="translation of the body in the gripper: {size}",
+    said="a constant translation of the body in its grasps; both if the start is an equilibrium "
+    "and markers measure it",
     same=_hand_eye_sharing_key,
 )
 ZERO = NuisanceRow(
@@ -399,7 +401,7 @@ ZERO = NuisanceRow(
     changes=("grasps",),
     by="worst",
     label="zero of grasp {which}, {axis}",
-    told="zero of a displacement off by {size}",
+    told="zero error of a displacement: up to {size}",
     said="a constant offset of each displacement along each of its axes",
 )
 OBSTACLE_OFFSET = NuisanceRow(
@@ -412,9 +414,9 @@ OBSTACLE_OFFSET = NuisanceRow(
     by="worst",
     applies=lambda experiment: bool(experiment.obstacles),
     label="place of {which}",
-    told="an obstacle is off by {size}",
+    told="position error of an obstacle: up to {size}",
     said="a constant offset of each obstacle along its normal, or along the axis of its "
-    "displacement: where contact begins",
+    "displacement, which changes the beginning of the contact",
 )
 OBSTACLE_TILT = NuisanceRow(
     "obstacle_tilt_rad",
@@ -428,8 +430,8 @@ OBSTACLE_TILT = NuisanceRow(
     considered=0.2 * DEGREE,
     applies=lambda experiment: any(each.shape.has_tilt for each in experiment.obstacles),
     label="tilt of {which}, {axis}",
-    told="an obstacle is tilted by {size}",
-    said="a constant tilt of each plane or box that may be touched, about its point or middle",
+    told="tilt of an obstacle: {size}",
+    said="a constant tilt of each obstacle that is a plane or a box, about its point or middle",
 )
 OBSTACLE_TIME = NuisanceRow(
     "obstacle_time_s",
@@ -442,8 +444,8 @@ OBSTACLE_TIME = NuisanceRow(
     considered=1e-3,
     applies=lambda experiment: any(len(each.poses.t_s) > 1 for each in experiment.obstacles),
     label="delay of {which}",
-    told="an obstacle is late by {size}",
-    said="how much later than stated each obstacle moves, to first order",
+    told="delay of an obstacle: up to {size}",
+    said="delay of each obstacle's motion, to first order",
 )
 TENSION_FACTOR = NuisanceRow(
     "tension_factor",
@@ -454,7 +456,7 @@ TENSION_FACTOR = NuisanceRow(
     changes=("drives",),
     label="{which}, more than stated",
     told="{which} by {signed}",
-    said="a factor on the tension of each tendon, how far from one",
+    said="scale error of the tension of each tendon: the factor minus one",
 )
 TENSION_OFFSET = NuisanceRow(
     "tension_lost_n",
@@ -465,7 +467,7 @@ TENSION_OFFSET = NuisanceRow(
     changes=("drives",),
     label="{which}, lost",
     told="{which} {signed}",
-    said="tension of each tendon that friction takes",
+    said="tension of each tendon that is lost by friction",
 )
 PRESSURE_FACTOR = NuisanceRow(
     "pressure_factor",
@@ -476,7 +478,7 @@ PRESSURE_FACTOR = NuisanceRow(
     changes=("drives",),
     label="{which}, more than stated",
     told="{which} by {signed}",
-    said="a factor on each pressure, how far from one",
+    said="scale error of each pressure: the factor minus one",
 )
 PRESSURE_OFFSET = NuisanceRow(
     "pressure_lost_pa",
@@ -487,7 +489,7 @@ PRESSURE_OFFSET = NuisanceRow(
     changes=("drives",),
     label="{which}, lost",
     told="{which} {signed}",
-    said="an offset that each pressure lacks",
+    said="offset by which each pressure is lower than stated",
 )
 JOINING = NuisanceRow(
     "joining_s",
@@ -499,8 +501,8 @@ JOINING = NuisanceRow(
     step=lambda experiment: SAMPLES_A_STEP * experiment.timestep_s,
     label="{which}",
     told="{which} {number}{error}{unit} {way} than {stated}",
-    said="how much later than stated each point mass or force joins or leaves, where it does so "
-    "within the recording",
+    said="delay with which each point mass or force begins or ends, if it does so within the "
+    "recording",
 )
 TARE = NuisanceRow(
     "tare",
@@ -512,8 +514,8 @@ TARE = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="worst",
     label="tare{which} of {axis}",
-    told="tare up to {size}",
-    said="a constant offset of each component of a wrench, in its sigmas",
+    told="tare: up to {size}",
+    said="a constant offset of each component of a wrench, in multiples of its sigma",
 )
 SENSOR_TIME = NuisanceRow(
     "sensor_time_s",
@@ -527,8 +529,8 @@ SENSOR_TIME = NuisanceRow(
     high=3.0,
     by="worst",
     label="time shift of the sensor{which}",
-    told="sensor late by {size}",
-    said="how much later than their times say wrenches were measured; three deviations at most",
+    told="delay of the sensor: {size}",
+    said="delay of the measured wrenches; at most three standard deviations",
 )
 SENSOR_LAG = NuisanceRow(
     "sensor_lag_s",
@@ -542,8 +544,9 @@ SENSOR_LAG = NuisanceRow(
     high=3.0,
     by="worst",
     label="lag of the sensor{which}",
-    told="lag of the sensor {size}",
-    said="time constant of a first-order low-pass in the sensor; from zero to three deviations",
+    told="time constant of the sensor: {size}",
+    said="time constant of a first-order low-pass in the sensor; from zero to three standard "
+    "deviations",
 )
 TOOL_MASS = NuisanceRow(
     "tool_kg",
@@ -555,8 +558,8 @@ TOOL_MASS = NuisanceRow(
     low=0.0,
     by="worst",
     label="mass of the tool{which}",
-    told="tool of {size}",
-    said="a mass between a sensor and the body",
+    told="mass of the tool: {size}",
+    said="mass of the tool between a sensor and the body",
 )
 TOOL_CENTRE = NuisanceRow(
     "tool_m",
@@ -570,8 +573,9 @@ TOOL_CENTRE = NuisanceRow(
     by="worst",
     beside=0.05,
     label="centre of the tool{which}, {axis}",
-    told="its centre off by {size}",
-    said="its centre about the sensor's point; in the world's frame that of the grasped nodes",
+    told="offset of the tool's centre: up to {size}",
+    said="centre of the tool relative to the sensor's point; in the world's frame, relative to "
+    "that of the grasped nodes",
 )
 DEPTH_TURN = NuisanceRow(
     "depth_turn_rad",
@@ -586,8 +590,8 @@ DEPTH_TURN = NuisanceRow(
     high=4.0,
     by="length",
     label="turn of {which}, {axis}",
-    told="a depth camera is turned by {size}",
-    said="a turn of each depth camera about the middle of the body, along its own axes",
+    told="rotation of a depth camera: {size}",
+    said="rotation of each depth camera about the middle of the body, along the camera's axes",
     same=_camera_sharing_key,
 )
 DEPTH_SHIFT = NuisanceRow(
@@ -605,8 +609,9 @@ DEPTH_SHIFT = NuisanceRow(
     step=lambda experiment: CAMERA_SHIFT_A_STEP_M,
     by="length",
     label="shift of {which}, {axis}",
-    told="a depth camera is shifted by {size}",
-    said="a shift of it; where neither is given, the first image is aligned to the body first",
+    told="translation of a depth camera: {size}",
+    said="translation of each depth camera; if neither is given, the first image is first "
+    "aligned with the body",
     same=_camera_sharing_key,
 )
 DEPTH_BIAS = NuisanceRow(
@@ -623,8 +628,8 @@ DEPTH_BIAS = NuisanceRow(
     step=lambda experiment: CAMERA_SHIFT_A_STEP_M,
     by="worst",
     label="bias of {which}",
-    told="depth is off by {size}",
-    said="what is to be added to each depth of an image",
+    told="offset of the depth: {size}",
+    said="offset that is added to each depth of an image",
 )
 DEPTH_SCALE = NuisanceRow(
     "depth_scale",
@@ -639,8 +644,8 @@ DEPTH_SCALE = NuisanceRow(
     reach=4.0,
     by="worst",
     label="scale of {which}",
-    told="depth is off by {size} of itself",
-    said="a factor on each depth of an image, how far from one",
+    told="scale error of the depth: {size}",
+    said="scale error of each depth of an image: the factor minus one",
 )
 DEPTH_TIME = NuisanceRow(
     "depth_time_s",
@@ -654,8 +659,8 @@ DEPTH_TIME = NuisanceRow(
     high=3.0,
     by="worst",
     label="time shift of {which}",
-    told="a depth camera is late by {size}",
-    said="how much later than its times say a depth camera saw; three deviations at most",
+    told="delay of a depth camera: {size}",
+    said="delay of a depth camera; at most three standard deviations",
 )
 DEPTH_EDGE = NuisanceRow(
     "depth_edge_px",
@@ -670,9 +675,9 @@ DEPTH_EDGE = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="worst",
     label="edge of {which}",
-    told="silhouettes end {size} inside the body",
-    said="how many pixels inside the outline of the body its silhouette ends in the images of each "
-    "depth camera, all around",
+    told="silhouettes end {size} inside the body's outline",
+    said="distance by which silhouettes in the images of each depth camera end inside the "
+    "outline of the body, in pixels",
 )
 
 # In the order of φ; neighbours of one component stand together.
@@ -695,7 +700,7 @@ class _NuisanceBase:
         for row in self.kinds:
             value = self.sigma(row)
             if value is not None and not value > 0:
-                raise InputError(f"{row.name} is {value:g}; expected a deviation above 0")
+                raise InputError(f"{row.name} is {value:g}; expected a standard deviation above 0")
         names = [row.name for row in self.kinds]
         for name, word in self.scope.items():
             if name not in names:
@@ -726,7 +731,7 @@ def _check_custom_kind(row: NuisanceRow) -> None:
     if row.of not in ("recording", "marker"):
         raise InputError(f"{row.name} is of a {row.of}; expected of = 'recording' or 'marker'")
     if row.sigma is None:
-        raise InputError(f"{row.name} has no sigma; expected the deviation of its prior")
+        raise InputError(f"{row.name} has no sigma; expected the standard deviation of its prior")
     if (row.reading is None) == (row.clock is None):
         raise InputError(f"{row.name} has to have a reading or a clock, one of both")
 
