@@ -286,7 +286,7 @@ def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(tiny, monkeypatc
     assert "written to run" in out
     assert result == result_in(tiny / "run")
     assert outcome.code == 130
-    assert "the answer is kept in run" in outcome.err
+    assert "the result is kept in run" in outcome.err
     assert "collocation-sysid plot run" in outcome.err
     assert json.loads(run_command("solve", "problem.toml", "--json").out)["elapsed_s"]["checks"] > 0
 
@@ -299,7 +299,7 @@ def test_an_interrupt_while_the_folder_is_written_loses_nothing(tiny, monkeypatc
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
     assert "Verdict: check" in outcome.out
-    assert "the answer is kept in run" in outcome.err
+    assert "the result is kept in run" in outcome.err
     assert result_in(tiny / "run")["status"] == "converged"
 
 

@@ -101,7 +101,7 @@ def test_starts_need_something_to_spread_about(folder):
     command = ("compare", folder / "problem.toml", "--methods", "reduced-space", *UNGUESSED)
     outcome = run_command(*command, "--starts", 2, "--dry-run")
     assert outcome.code == 2
-    assert "parameters.lambda_pa: has neither a guess nor a truth" in outcome.err
+    assert "parameters.lambda_pa: has neither a guess nor a true value" in outcome.err
     alone = run_command(*command, "--dry-run")
     assert (alone.code, "– – – –" in alone.out) == (0, True)
 

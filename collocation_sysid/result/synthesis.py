@@ -58,17 +58,16 @@ class Recipe(Options):
     integrator : str
         newmark, or a scheme: midpoint, backward-euler, bdf2.
     timestep_s : float
-        The step of newmark; chosen so that the motion does not depend on it by default.
+        Time step of newmark [s]; by default so small that the motion does not depend on it.
     noise_m : float
         Standard deviation of the markers' noise.
     noise_n : float
-        Standard deviation of the noise of measured forces, as the sensor measures them: of a
-        modelled
-        quarter, for which the problem states ``symmetry = 4``, that of the whole.
+        Standard deviation of the noise of measured forces [N]. If a quarter of the specimen is
+        modelled (``symmetry = 4``), that of the force on the whole specimen.
     noise_nm : float
         Standard deviation of the noise of measured torques.
     noise_own : float
-        Standard deviation of the noise of custom readings, in their sigmas.
+        Standard deviation of the noise of custom sensors, in multiples of their sigma.
     seed : int
         Seed of the noise.
     frames : --frames/--no-frames
