@@ -155,14 +155,15 @@ BAD = {
     "two": (
         "Time (s),Load (N),Force (N)\n0,1,1\n1,2,2\n",
         {},
-        'Load (N), Force (N) may each be force; expected one, or columns = { force = "…" }',
+        "Load (N), Force (N) could all be force; expected one of them, or columns = { force = "
+        '"…" }',
     ),
     "only stress": ("Time (s),Stress (kPa)\n0,1\n1,2\n", {}, "a stress needs area_m2"),
     "no area": (PLAIN, {"area_m2": 1.0}, "expected t_s and any of stress_pa"),
     "true stress": (
         "Time (s),True Stress (kPa)\n0,1\n1,2\n",
         {"area_m2": 1.0, "columns": {"stress": "True Stress (kPa)"}},
-        "column True Stress (kPa) is of the deformed specimen; expected engineering stress",
+        "column True Stress (kPa) refers to the deformed specimen; expected engineering stress",
     ),
     "not there": (PLAIN, {"columns": {"force": "Forse (N)"}}, "did you mean 'Force (N)'"),
     "no such key": (PLAIN, {"columns": {"load": "Force (N)"}}, "the key 'load'; expected one of t"),
@@ -328,7 +329,7 @@ def test_a_slip_in_what_is_shared_is_named_where_it_stands(tmp_path, old, new, w
     with pytest.raises(InputError) as caught:
         Problem.read(file)
     assert words in str(caught.value)
-    assert "more to mend" not in str(caught.value)
+    assert "more mistakes" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -510,7 +511,7 @@ def test_a_machines_own_file_takes_the_examples_place(tmp_path, monkeypatch):
     ("shape", "words"),
     [
         ("edge_length_m = 1e-5", "object.edge_length_m: makes 4.5e+11 elements; expected at most"),
-        ("mass_kg = 1.0", "edge_length_m belongs to surface, cylinder or box_m"),
+        ("mass_kg = 1.0", "edge_length_m is used only with surface, cylinder or box_m"),
         ('edge_length_m = 0.01\nmesh = "a.vtu"', "found mesh and cylinder; expected exactly one"),
     ],
 )

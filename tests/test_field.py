@@ -376,7 +376,7 @@ def test_bodies_of_other_meshes_do_not_share_a_field():
 
 
 def test_a_field_of_nothing_is_refused():
-    with pytest.raises(cs.InputError, match="all is claimed"):
+    with pytest.raises(cs.InputError, match="but there are none"):
         bar(cs.Field(0.05), np.ones(144, dtype=bool))
 
 

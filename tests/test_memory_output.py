@@ -97,7 +97,7 @@ GUESSED = "parameters.prony_1.tau_s.guess=0.1"
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ('name = "prony_1"', 'name = "prony_1"\nregion = "core"', "is of region 'core'"),
+        ('name = "prony_1"', 'name = "prony_1"\nregion = "core"', "belongs to the region 'core'"),
         ("prony_1.share = 0.2", "prony_1.share = -0.2", "expected a number >= 0"),
         ("prony_1.share = 0.2", "prony_1.share = { lower = -1.0 }", "expected 0 <= lower < upper"),
         ("prony_1.share = 0.2", "", "prony_1.share is missing"),

@@ -129,7 +129,7 @@ def test_without_it_the_answer_is_wrong():
         ({"reading": lambda y, v, t_s, data: y + v.nothing}, "the reading of extra failed"),
         (
             {"reading": lambda y, v, t_s, data: y + ca.sqrt(v)},
-            "the reading of extra or its slopes are not finite at zero",
+            "the reading of extra or its derivatives are not finite at zero",
         ),
         (
             {"reading": None, "clock": lambda v, t_s, data: ca.vertcat(v, v)},

@@ -135,13 +135,13 @@ def test_several_regions_are_scaled_together():
 
 
 def test_a_constant_of_which_nothing_is_known_needs_a_guess():
-    with pytest.raises(InputError, match="stiffening: no guess is given and no usual value"):
+    with pytest.raises(InputError, match="stiffening: there is no guess, and no usual value"):
         Parameters.from_mapping({"stiffening": Unknown()})
     assert Parameters.from_mapping({"bulk_pa": Unknown()}).names_without_guess == ("bulk_pa",)
 
 
 def test_without_a_guess_values_are_refused_by_name():
-    with pytest.raises(InputError, match="lambda_pa: there is no guess of it; expected guess = "):
+    with pytest.raises(InputError, match="lambda_pa: it has no guess; expected guess = "):
         _ = Parameters.from_mapping(NOTHING).guesses
 
 

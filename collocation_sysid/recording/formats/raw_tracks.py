@@ -145,7 +145,7 @@ class Header:
         """
         stated = self.number(key)
         if stated is not None and stated != count:
-            message = f"{key} is {stated:g}, but {count} {what} are there; is the file cut short?"
+            message = f"{key} is {stated:g}, but the file contains {count} {what}; is it truncated?"
             raise InputError(message, where=f"line {line or self.entries[key][1]}")
 
 
