@@ -399,7 +399,7 @@ def bad_messages(of: Messages) -> dict[str, tuple]:
         ("short", "61 bytes in a message; expected 4 rows of 6 times 2"),
         (
             "rvl",
-            "'16UC1; compressedDepth rvl' that is not a PNG .*: use the topic of uncompressed images",
+            "'16UC1; compressedDepth rvl' that is not a PNG .*: use the topic of uncompressed",
         ),
         ("flat", "has the columns u, v, rgb; expected x, y and z among them"),
         ("unknown", "has the columns x of type 11, .*; expected each once, of types 1 to 8"),
