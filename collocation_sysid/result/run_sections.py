@@ -283,14 +283,10 @@ def _coverage_sentence(result: Result) -> str:
     moving = any(not each.static for each in result.fit.experiments.values())
     kinds = ("step", "mesh") if moving else ("mesh",)
     covered = [f"the {kind} error" for kind in kinds if kind in result.discretisation_kinds]
-    missing = [f"the {kind}" for kind in kinds if kind not in result.discretisation_kinds]
+    missing = [f"the {kind} error" for kind in kinds if kind not in result.discretisation_kinds]
     parts = listed(["noise", *covered, "systematic effects"])
     sentence = f"± (standard uncertainty) and intervals combine {parts}"
-    return sentence + (
-        f", but not the error of {listed(missing)}, which the command refine measures"
-        if missing
-        else ""
-    )
+    return sentence + (f", but not {listed(missing)} (measured by refine)" if missing else "")
 
 
 def _largest_contributions(result: Result) -> list[str]:
