@@ -179,7 +179,7 @@ class RecordingReader:
         """Return the file of a displacement or a wrench, its own or that of the experiment."""
         key = "file" if table.file is None and self.section.file else key
         return self._require_existing(
-            self.section.file_of(table), key, "a file here, or of the experiment"
+            self.section.file_of(table), key, "a file here, or a file of the experiment"
         )
 
     @property
@@ -606,11 +606,10 @@ def _implausible_markers(experiment: Experiment) -> str | None:
         name = markers.names[np.flatnonzero(is_measured)[worst]]
         return (
             f"at t = {experiment.t_s[k]:.6g} s marker {name!r} is measured at "
-            f"{point_text(measured[worst])} m, {miss_m[worst]:.3g} m from where the grasp "
-            "carries its "
-            f"place on the body, {point_text(rigid_positions[worst])} m; check length_unit, the "
-            "marker's reference_m, that poses and markers share frame and clock, and that "
-            "the poses map undeformed to current positions"
+            f"{point_text(measured[worst])} m, {miss_m[worst]:.3g} m away from the position that "
+            f"follows from the pose of the grasp, {point_text(rigid_positions[worst])} m; check "
+            "length_unit, the marker's reference_m, that poses and markers share frame and "
+            "clock, and that the poses map undeformed to current positions"
         )
     return None
 

@@ -434,8 +434,8 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
             moving.append("nuisance.time_shift")
         if moving:
             raise ValueError(
-                f'found {moving[0]} beside kind = "static"; expected none, because each sample is '
-                "a separate equilibrium"
+                f'found {moving[0]} together with kind = "static"; expected none, because each '
+                "sample is a separate equilibrium"
             )
         return self
 

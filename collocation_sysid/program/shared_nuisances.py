@@ -110,7 +110,9 @@ def _require_same_prior(
     label = second.label
     if not np.isclose(first.sigma, second.sigma, rtol=1e-9):
         difference = f"'{leader.name}', where the {label} has the prior {first.sigma:g}"
-        raise _sharing_error(experiment, row, difference, f"the one here, {second.sigma:g}")
+        raise _sharing_error(
+            experiment, row, difference, f"the same prior as here, {second.sigma:g}"
+        )
     if row == PLACE:
         given = [_stated_place(*one), _stated_place(*other)]
         if not np.allclose(*given, rtol=0, atol=1e-9, equal_nan=True):

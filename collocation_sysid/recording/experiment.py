@@ -492,8 +492,8 @@ class Experiment:
             distance_s = np.abs(depth.sample_times_s[:, None] - self.t_s).min(axis=1)
             if self.is_static and distance_s.max() > TIME_TOLERANCE_S:
                 raise InputError(
-                    f"{what} sees at {depth.sample_times_s[distance_s.argmax()]:g} s, but the "
-                    "static experiment has no sample then; expected times of its samples"
+                    f"{what} has an image at {depth.sample_times_s[distance_s.argmax()]:g} s, but "
+                    "the static experiment has no sample then; expected times of its samples"
                 )
 
     def _require_measurements(self) -> None:

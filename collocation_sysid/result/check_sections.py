@@ -103,7 +103,14 @@ def _motion_section(findings: CheckResult) -> list[Shown]:
         return []
     motion, *others = findings.motions
     title = f"Modes of '{motion.experiment}' about its {motion.about} (they depend on the guess)"
-    heads = ("  Hz", "samples/period", "steps/period", "damping", "scheme adds", "period error")
+    heads = (
+        "  Hz",
+        "samples/period",
+        "steps/period",
+        "damping",
+        "numerical damping",
+        "period error",
+    )
     rows = tuple(
         (
             f"{mode.frequency_hz:.3g}",

@@ -74,7 +74,7 @@ PICTURE_CAPTIONS = {
     "shapes": "The fitted body at several times of the recording; orange: measured markers.",
     "field": "Spatially varying constant between the ends of its 95 % interval; below, a cut "
     "through the body. Pale colours: the data add little to the prior.",
-    "mesh": "The mesh, its grasped nodes and the estimated places of the markers.",
+    "mesh": "The mesh, its grasped nodes and the estimated positions of the markers.",
     "pressure": "Contact pressure of obstacles on the body.",
     "gap": "Gap between the body's surface and obstacles.",
     "tracks": "Measured, fitted and simulated markers, the residual below.",
@@ -645,7 +645,7 @@ def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
             )
             for each in result.residuals
         )
-        yield Table("", ("marker", "RMS", "samples", "suggests"), rows, texts=1)
+        yield Table("", ("marker", "RMS", "samples", "diagnosis"), rows, texts=1)
     if worst := _largest_errors(run):
         rows = tuple((w, f"{number(t_s, 4)} s", millimetres(m)) for m, t_s, w in worst)
         yield from ("Largest errors:", Table("", ("marker", "time", "error"), rows))

@@ -265,8 +265,7 @@ def _best_of_second_start(solver: Method, first: Solution, watch: Watch | None) 
         return first
     note = (
         f"Poisson's ratio ended near one half; a second start, from the usual {USUAL_POISSON}, "
-        "found an "
-        f"answer that fits better (χ² lower by {gain:.3g})"
+        f"found a better fit (χ² lower by {gain:.3g})"
     )
     return replace(second, notes=(note, *second.notes))
 

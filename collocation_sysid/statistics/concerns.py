@@ -236,7 +236,7 @@ TOPICS: Mapping[str, Topic] = {
     "markers": Topic(
         "The markers",
         "motion_capture",
-        "Check the markers' labels, unit, frame and places, and when each is visible.",
+        "Check labels, unit, frame and positions of the markers, and when each marker is visible.",
         {
             "off": "marker '{marker}' of '{experiment}' lies {by_mm:.3g} mm outside the body, so "
             "that its motion is extrapolated: give its reference_m, or check the frame and "

@@ -185,7 +185,7 @@ REFUSED: dict[str, str] = {
     "ipopt": 'its own method is "interior-point"',
     "alpaqa": "it derives an augmented Lagrangian from expressions, and the NLP has only callbacks",
     "blocksqp": "it derives its Hessian's structure from expressions, and the NLP has only "
-    "callbacks; its QP solver wants MA27",
+    "callbacks; its QP solver needs MA27",
     "fatrop": "it uses dense factorisations unless the problem consists of stages, and continues "
     "although an evaluation failed or the user interrupted it",
     "feasiblesqpmethod": "its feasible start within bounds does not exist for this NLP",

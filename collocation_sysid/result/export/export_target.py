@@ -137,7 +137,7 @@ class TargetCapabilities:
     has_viscoelasticity: bool = False
     has_moving_grasps: bool = False
     has_moving_obstacles: bool = False
-    node_forces: str = "forces on nodes are left out"
+    node_forces: str = "forces on nodes are not exported"
     has_quadratic_elements: bool = False
     obstacle_shapes: tuple[str, ...] = ("plane", "sphere", "box", "cylinder", "capsule")
     has_rounded_edges: bool = True

@@ -42,7 +42,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         _material_xml(k, region, limits) for k, region in enumerate(body.regions, 1)
     )
     if body.node_loads_n.any():
-        limits.append("point masses and forces on nodes are left out")
+        limits.append("point masses and forces on nodes are not exported")
     xml = '<?xml version="1.0" encoding="UTF-8"?>\n' + comment_lines(body, limits, "<!-- ", " -->")
     xml += '<febio_spec version="4.0">\n<Module type="solid"/>\n'
     xml += (

@@ -58,7 +58,7 @@ REGIONS = (
     "regions are subsets of tetrahedra, each with its material; a simulator with one material "
     "per body, such as Newton 1.8, uses that of the largest"
 )
-POINT_MASSES = "point masses on nodes are left out"
+POINT_MASSES = "point masses on nodes are not exported"
 TILT = (
     "gravity points {degrees:.3g}° away from −z of the stage, as estimated from the recording; a "
     "simulator that uses its magnitude only, along −z, ignores this"
