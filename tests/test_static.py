@@ -477,8 +477,12 @@ def test_a_run_without_markers_speaks_of_forces(tmp_path):
     ("old", "new", "message"),
     [
         ('kind = "static"', 'kind = "slow"', "experiment 'press'"),
-        ('kind = "static"', 'kind = "static"\nstart = "undeformed"', 'beside kind = "static"'),
-        ('kind = "static"', 'kind = "static"\nresample_hz = 10.0', "found resample_hz beside"),
+        (
+            'kind = "static"',
+            'kind = "static"\nstart = "undeformed"',
+            'together with kind = "static"',
+        ),
+        ('kind = "static"', 'kind = "static"\nresample_hz = 10.0', "found resample_hz together"),
         ("displacement_zero =", "time_shift = { prior_s = 1.0 }  #", "found nuisance.time_shift"),
         ('displacement = "', 'poses = "p.csv"\ndisplacement = "', "poses and displacement"),
         ('displacement = "', 'length_unit = "mm"\ndisplacement = "', "length_unit without poses"),

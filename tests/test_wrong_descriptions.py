@@ -385,5 +385,5 @@ def test_a_refusal_names_the_likeliest_cause(tiny: Path):
     outcome = run_command("check", "problem.toml")
     assert outcome.code == 2
     said = " ".join(outcome.err.split())
-    assert "from where the grasp carries its place" in said
+    assert "from the pose of the grasp" in said
     assert "likely 'swing': the poses would fit if they were 0.001 times as large" in said
