@@ -387,7 +387,8 @@ def test_the_likeliest_of_several_lengths_is_taken():
     found = run.result.fields["young_pa"]
     assert found.shapes.length_m == 0.05
     assert found.likelier["0.05"] == 0.0 > found.likelier["0.005"]
-    assert "length 0.05 m; relative log evidence of other lengths: 0.005 m -" in str(run)
+    said = " ".join(str(run).split())
+    assert "length 0.05 m; relative log evidence of the lengths: 0.005 m -" in said
 
 
 def _of_lengths(*lengths_m: float) -> cs.Experiment:

@@ -461,7 +461,7 @@ def test_a_grasp_that_is_lost_for_a_moment_is_bridged_and_for_long_it_is_told():
     assert "grasp is lost" in update.trust.reasons[0]
     known = live.first_pass.measured_information.triangle
     update = live.process_frame(frames[30])
-    assert "begun anew" in update.notes[0]
+    assert "restarted after a gap" in update.notes[0]
     assert live.first_pass.rows == 1
     np.testing.assert_array_equal(live.first_pass.prior.triangle, known)
     assert update.trust.verdict != "good"

@@ -164,7 +164,7 @@ def test_slack_left_is_not_convergence():
     assert solution.status is Status.STALLED
     assert "raise rho_max" in solution.message
     assert "N (" in solution.message
-    assert "of the largest force) is left" in solution.message
+    assert "of the largest force)." in solution.message
 
 
 @pytest.mark.parametrize("schedule", ["geometric", "progress"])

@@ -63,7 +63,7 @@ def test_a_prediction_is_judged_by_its_misfit_over_sigma(softer, verdict):
     for concern in concerns:
         rms_mm = 1e3 * finished.rollouts["hung cube"].rms_m
         assert concern.grade == verdict
-        assert "misses the markers by" in concern.message
+        assert "deviates from the markers by" in concern.message
         assert f"{rms_mm:.3g} mm RMS" in concern.message
         assert concern.data["sigmas"] == pytest.approx(rms_mm / np.sqrt(3), rel=0.01)
 
@@ -134,7 +134,7 @@ def test_predicted_depth_is_compared_with_the_image_and_graded():
     assert good.rms_m == pytest.approx(DEPTH_NOISE_M, rel=0.25)
     assert good.share_beyond_gate == 0.0
     assert wrong.trust.verdict == "doubtful"
-    assert "misses the depth of front by" in wrong.trust.reasons[0]
+    assert "deviates from the depth of front by" in wrong.trust.reasons[0]
     assert bad.rms_m > 0.008
     found = stored(wrong)
     assert found["rollout"]["experiment"]["depth"]["front"]["rms_m"] == bad.rms_m

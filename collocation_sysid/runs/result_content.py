@@ -185,8 +185,8 @@ class FieldResult:
         if len(self.likelier) > 1:
             each = ", ".join(f"{length} m {gain:+.1f}" for length, gain in self.likelier.items())
             details.append(
-                f"correlation length {self.shapes.length_m:g} m; relative log evidence "
-                f"of other lengths: {each}"
+                f"correlation length {self.shapes.length_m:g} m; relative log evidence of the "
+                f"lengths: {each}"
             )
         return f"{sentence}: the data determine {shapes} and {share} ({'; '.join(details)})"
 

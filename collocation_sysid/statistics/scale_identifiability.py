@@ -164,6 +164,6 @@ def static_concerns(experiments: Iterable[Experiment], parameters: Parameters) -
         return []
     code = "static" if all(experiment.is_static for experiment in fitted) else "still"
     names = [f"'{e.name}'" for e in fitted]
-    verb = "the value assumes" if len(fitted) == 1 else "the values assume"
+    verb = "is" if len(fitted) == 1 else "are"
     data = {"names": names, "verb": verb, "damping": damping}
     return [Concern(f"information/{code}", data=data)]

@@ -279,7 +279,7 @@ def legend_handles(*entries: str) -> list[Line2D]:
 
     Parameters
     ----------
-    *entries : {"grasped", "markers", "measured", "behind the body", "seen in depth"}
+    *entries : {"grasped", "markers", "measured", "behind the body", "depth image"}
     """
     styles = {
         "grasped": {**_GRASPED_STYLE, "ms": 3.0},
