@@ -268,7 +268,8 @@ def test_loads_of_a_part_are_reported_for_the_whole_specimen(tmp_path):
     np.testing.assert_allclose(arrays[0][:, 1:], 4 * arrays[1][:, 1:], rtol=1e-6)
     said = plain_text(run_summary(found.result, tmp_path / "whole"))
     words = (
-        "loads of 'first' and 'second' are those of the whole specimen, 4 times those of the modelled part"
+        "loads of 'first' and 'second' are those of the whole specimen, 4 times those of the "
+        "modelled part"
     )
     assert words in said
     assert "specimen" not in plain_text(run_summary(alone.result, tmp_path / "part"))

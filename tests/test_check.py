@@ -358,7 +358,7 @@ def test_a_glance_needs_no_simulation_and_no_guess(tiny: Path, monkeypatch):
 def test_the_command_shows_it_before_anything_is_simulated(tiny: Path, monkeypatch):
     monkeypatch.setattr("collocation_sysid.runs.check.initial_variables", no_simulation)
     shown = []
-    show = "collocation_sysid.cli.problem_commands.show"
+    show = "collocation_sysid.cli.problem_commands.print_result"
     monkeypatch.setattr(show, lambda content: shown.append(plain_text(content)))
     with pytest.raises(AssertionError, match="simulated"):
         run_command("check", "problem.toml")

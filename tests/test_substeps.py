@@ -267,7 +267,7 @@ def test_every_view_has_value_interval_verdict_and_what_the_interval_holds():
         assert f"{coarse.parameters['mu_pa']:.5g}" in said
         assert f"{low:.5g} … {high:.5g}" in said
         assert "Verdict: good" in said
-        assert "combine noise, the step error and systematic effects, but not the mesh error" in said
+        assert "noise, the step error and systematic effects, but not the mesh error" in said
     assert coarse.result.parameters["mu_pa"].combined95 == (low, high)
     assert f"[{low:.5g}, {high:.5g}]" in repr(coarse)
     assert ", good: " in repr(coarse)

@@ -222,7 +222,7 @@ def _solve_section(findings: CheckResult) -> Table:
         )
         rows[cost.method] = f"about {duration(cost.time_s)} and {memory}{chosen}"
     rows["derivatives"] = (
-        f"Jacobian and Hessian differ by {findings.jacobian_error:.0e} and "
-        f"{findings.hessian_error:.0e} from finite differences"
+        f"relative errors of Jacobian and Hessian: {findings.jacobian_error:.0e}, "
+        f"{findings.hessian_error:.0e}"
     )
     return labelled("Solve", rows)
