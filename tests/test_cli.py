@@ -635,7 +635,7 @@ def test_help_imports_nothing_that_solves():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-    assert "report    Write one HTML page" in done.stdout
+    assert "report    Write a report of a run or a study" in done.stdout
 
 
 def test_version_and_help():
