@@ -33,8 +33,8 @@ def __getattr__(name: str) -> _Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     home = _import_module(_HOMES[name], __name__)
-    found = home if _HOMES[name] == f".{name}" else getattr(home, name)
-    return globals().setdefault(name, found)
+    attribute = home if _HOMES[name] == f".{name}" else getattr(home, name)
+    return globals().setdefault(name, attribute)
 
 
 def __dir__() -> list[str]:

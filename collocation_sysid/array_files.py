@@ -71,19 +71,20 @@ def _require_size(content: IO[bytes], size: int, compressed: int, name: str) -> 
     if version not in _HEADERS:  # for names of columns that are not Latin
         return
     shape, _, dtype = _HEADERS[version](content)
-    stated = math.prod(shape) * dtype.itemsize
-    array = f"the array {name or 'in it'} {shape} takes {stated / 1e9:.3g} GB"
-    if stated > size:
+    stored_bytes = math.prod(shape) * dtype.itemsize
+    array = f"the array {name or 'in it'} {shape} takes {stored_bytes / 1e9:.3g} GB"
+    if stored_bytes > size:
         raise InputError(f"{array} by its header, but the file has {size:,} bytes of it")
-    if stated <= SMALL_BYTES:
+    if stored_bytes <= SMALL_BYTES:
         return
-    if stated > LARGEST_COMPRESSION * compressed:
+    if stored_bytes > LARGEST_COMPRESSION * compressed:
         raise InputError(
-            f"{array} and is compressed {stated / compressed:.0f}-fold, as no measurement is; "
+            f"{array} and is compressed {stored_bytes / compressed:.0f}-fold, "
+            "as no measurement is; "
             "expected an array with data"
         )
     memory_mb = machine_memory_mb()
-    if memory_mb is not None and stated > MEMORY_SHARE * 1e6 * memory_mb:
+    if memory_mb is not None and stored_bytes > MEMORY_SHARE * 1e6 * memory_mb:
         raise InputError(
             f"{array}, and this machine has {memory_mb / 1e3:.3g} GB of memory; expected at most "
             f"{MEMORY_SHARE:.0%} of that: cut or thin the recording"

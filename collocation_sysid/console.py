@@ -56,7 +56,7 @@ class Watched:
         elif line:
             self.line(line)
 
-    def line(self, said: str) -> None:
+    def line(self, text: str) -> None:
         """Print a line that stays; nothing if the display is quiet."""
         if not self.quiet:
-            self.console.print(Text(said), soft_wrap=True)
+            self.console.print(Text(text), soft_wrap=True)

@@ -1,6 +1,6 @@
 """Declaration of classes that users state in Python or in a problem file.
 
-`stated` makes a frozen dataclass whose fields are converted and checked on construction;
+`declaration` makes a frozen dataclass whose fields are converted and checked on construction;
 `legend_handles` declares the conversion of a field and the form that it has in a problem file. A
 field without a converter is checked against that form.
 """
@@ -38,7 +38,7 @@ class Key:
         values of a table.
     constant : str, optional
         For a key that names a file with a table: the field whose key states a constant instead.
-    said : str, optional
+    description : str, optional
         Description, if it differs from that of the field.
     default : object
         Value if the file does not state the key; the key is required if there is none.
@@ -50,12 +50,12 @@ class Key:
     form: Any
     read: Callable[[Any], Any] | None = None
     constant: str | None = None
-    said: str | None = None
+    description: str | None = None
     default: Any = None
     tables: type | None = None
 
 
-def as_given(value: Any) -> Any:
+def identity(value: Any) -> Any:
     """Return the value unchanged; converter of fields that are converted later, with more
     information.
     """
@@ -86,7 +86,7 @@ def key(
 
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(key, field))
-def stated(kind: type[T]) -> type[T]:
+def declaration(kind: type[T]) -> type[T]:
     """Return the class as a frozen dataclass that converts its fields before ``__post_init__``.
 
     Messages begin with the `description` of an instance if it has one; otherwise they contain its
@@ -112,7 +112,7 @@ def stated(kind: type[T]) -> type[T]:
     return made
 
 
-def _converted(field: Field[Any], owner: Any, value: Any) -> Any:
+def _converted(field: Field[Any], instance: Any, value: Any) -> Any:
     """Return the converted value of a field; without a converter, the default or a value of its
     form.
     """
@@ -124,19 +124,19 @@ def _converted(field: Field[Any], owner: Any, value: Any) -> Any:
         return _adapter(field.metadata["form"]).validate_python(value)
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
-        called = re.sub("(?<!^)(?=[A-Z])", " ", type(owner).__name__).lower()
+        called = re.sub("(?<!^)(?=[A-Z])", " ", type(instance).__name__).lower()
         what = field.name
-        word = getattr(owner, "description_name", called)
+        word = getattr(instance, "description_name", called)
         for part in fault["loc"]:
             if isinstance(value, Mapping) and part in value:
                 what = f"{what}.{part}"
                 value = value[part]
-        whose = f"the {word} {owner.name!r}" if hasattr(owner, "name") else f"a {word}"
-        of = what if hasattr(owner, "description") else f"{what} of {whose}"
+        whose = f"the {word} {instance.name!r}" if hasattr(instance, "name") else f"a {word}"
+        of = what if hasattr(instance, "description") else f"{what} of {whose}"
         shown = f"{value:g}" if isinstance(value, float) else repr(value)
         choices = fault["type"] == "literal_error" and get_args(field.metadata["form"])
-        wanted = f"one of {', '.join(choices)}" if choices else expected(fault)
-        raise InputError(f"{of} is {shown}; expected {wanted}") from error
+        expectation = f"one of {', '.join(choices)}" if choices else expected(fault)
+        raise InputError(f"{of} is {shown}; expected {expectation}") from error
 
 
 @cache
@@ -146,15 +146,15 @@ def _adapter(form: Any) -> TypeAdapter[Any]:
 
 def keys_of(kind: type) -> Iterator[tuple[str, Key]]:
     """Yield the name of each field that a problem file may state, with its key."""
-    said = documented(kind)
+    descriptions = documented(kind)
     for each in fields(kind):
         form = each.metadata.get("form")
         if isinstance(form, Key):
-            text = form.said or said.get(each.name, "")
+            text = form.description or descriptions.get(each.name, "")
             if form.tables is not None:
                 word = f"{kind.__name__.lower()}.{form.name}"
                 text = f"[[{word}]] tables: {text[:1].lower()}{text[1:]}"
-            yield each.name, replace(form, said=text)
+            yield each.name, replace(form, description=text)
         elif form is not None:
             usual = ... if each.default is MISSING else each.default
             usual = usual if each.default_factory is MISSING else each.default_factory()
@@ -165,7 +165,7 @@ def keys_of(kind: type) -> Iterator[tuple[str, Key]]:
                     each.name,
                     form,
                     read=each.metadata["read"],
-                    said=said.get(each.name),
+                    description=descriptions.get(each.name),
                     default=default,
                 ),
             )
@@ -180,18 +180,20 @@ def tables_of(kind: type) -> Iterator[tuple[str, str, type]]:
 
 def attributes(kind: type) -> dict[str, tuple[str, str]]:
     """Return type and description of each documented field or option of a class, by name."""
-    said: dict[str, tuple[str, str]] = {}
+    descriptions: dict[str, tuple[str, str]] = {}
     for base in reversed(kind.__mro__):
         text = inspect.cleandoc(base.__doc__ or "")
         section = re.split("^(?:Attributes|Parameters)\n-+\n", text, maxsplit=1, flags=re.M)[-1]
         for names, form, text in re.findall(
             r"^(\w[\w, ]*) : (.*)\n((?: +.*(?:\n|$))+)", section, re.M
         ):
-            said |= dict.fromkeys(names.split(", "), (form, " ".join(text.split())))
-    return said
+            descriptions |= dict.fromkeys(names.split(", "), (form, " ".join(text.split())))
+    return descriptions
 
 
 def documented(kind: type) -> dict[str, str]:
     """Return the descriptions of the fields of a class, or of the options of a method, by name."""
-    said = attributes(kind)
-    return {each.name: said[each.name][1] for each in fields(kind) if each.name in said}
+    descriptions = attributes(kind)
+    return {
+        each.name: descriptions[each.name][1] for each in fields(kind) if each.name in descriptions
+    }

@@ -86,7 +86,7 @@ class Table:
         Number of name columns at the beginning, and of text columns at the end.
     faint : tuple of int
         Indices of rows that are shown with less emphasis.
-    aside : int
+    note_column : int
         Number of columns at the end that are omitted in terminals.
     """
 
@@ -97,7 +97,7 @@ class Table:
     texts: int | None = optional()
     faint: tuple[int, ...] | None = optional()
     style: str | None = optional()
-    aside: int | None = optional()
+    note_column: int | None = optional()
 
     def __post_init__(self) -> None:
         columns = {len(row) for row in self.rows} | ({len(self.heads)} if self.heads else set())
@@ -134,7 +134,7 @@ class Listing:
 
 
 @dataclass(frozen=True)
-class Section:
+class TitledParts:
     """Group of parts with a title and optionally a style."""
 
     title: str
@@ -143,13 +143,13 @@ class Section:
     style: str = ""
 
 
-Shown = str | Line | Items | Table | Cards | Picture | Listing | Section
+Shown = str | Line | Items | Table | Cards | Picture | Listing | TitledParts
 
 
-def flat(parts: Iterable[Shown]) -> Iterator[Shown]:
+def flattened_parts(parts: Iterable[Shown]) -> Iterator[Shown]:
     """Yield the parts of all sections without their titles, for terminals."""
     for part in parts:
-        yield from flat(part.parts) if isinstance(part, Section) else (part,)
+        yield from flattened_parts(part.parts) if isinstance(part, TitledParts) else (part,)
 
 
 def own_pictures(folder: Path) -> list[Path]:
@@ -221,13 +221,13 @@ def _on_terminal(part: Shown) -> RenderableType:
         case Table():
             return _titled(part.title, TerminalTable(part))
         case Cards():
-            rows = tuple((what, f"{value} ({beside})") for what, value, beside in part.items)
+            rows = tuple((what, f"{value} ({note})") for what, value, note in part.items)
             return TerminalTable(Table("", (), rows, texts=1))
         case Picture():
             return _text(f"{part.caption} {part.file}")
         case Listing():
             return Group(_text(part.title, "bold"), _text(part.text))
-        case Section():
+        case TitledParts():
             return _titled(part.title, *map(_on_terminal, part.parts))
 
 
@@ -279,7 +279,7 @@ class TerminalTable:
 def _rich_table(table: Table, *, parted: bool) -> RichTable:
     # Rows that speak for themselves are nearer to what they say.
     shown = RichTable(box=None, pad_edge=False) if table.heads else RichTable.grid(padding=(0, 1))
-    columns = (len(table.heads) or max(map(len, table.rows), default=0)) - (table.aside or 0)
+    columns = (len(table.heads) or max(map(len, table.rows), default=0)) - (table.note_column or 0)
     for place, head in enumerate((table.heads or ("",) * columns)[:columns]):
         number = table.is_number(place)
         cells = [row[place] for row in table.rows if place < len(row)]
@@ -289,10 +289,10 @@ def _rich_table(table: Table, *, parted: bool) -> RichTable:
             head = head.replace("-", "-\n")
         elif not number:  # dotted keys may take two lines
             head = head.replace(".", ".\n", 1)
-        whole = place == 0 and (table.texts or 0) > (table.aside or 0)
+        fills_width = place == 0 and (table.texts or 0) > (table.note_column or 0)
         side = "right" if number else "left"
         longest_word = max(map(cell_len, " ".join((head, *cells)).split()), default=0)
-        shown.add_column(head, justify=side, min_width=longest_word, no_wrap=whole)
+        shown.add_column(head, justify=side, min_width=longest_word, no_wrap=fills_width)
     for row in table.rows:
         cells = row[:columns] if parted else (cell.replace("\n", "; ") for cell in row[:columns])
         shown.add_row(*(Text(cell, style=_colour(table.style or "")) for cell in cells))
@@ -319,8 +319,8 @@ def as_html(part: Shown) -> str:
         case Cards():
             cards = (
                 f'<div class="card"><span>{escape(what)}</span><b>{escape(value)}</b>'
-                f"<span>{escape(beside)}</span></div>\n"
-                for what, value, beside in part.items
+                f"<span>{escape(note)}</span></div>\n"
+                for what, value, note in part.items
             )
             return f'<div class="cards">\n{"".join(cards)}</div>\n'
         case Picture():
@@ -336,7 +336,7 @@ def as_html(part: Shown) -> str:
             title = escape(part.title)
             text = escape(part.text)
             return f"<details><summary>{title}</summary><pre>{text}</pre></details>\n"
-        case Section():
+        case TitledParts():
             inner = "".join(map(as_html, part.parts))
             if part.style:
                 return f"<div{_class(part.style)}>\n{inner}</div>\n"
@@ -403,14 +403,14 @@ def _markdown(part: Shown) -> str:
             table = "\n".join(f"| {' | '.join(line)} |" for line in (head, rule, *rows))
             return f"## {escape_markdown(part.title)}\n\n{table}" if part.title else table
         case Cards():
-            cards = (f"{what}: {value} ({beside})" for what, value, beside in part.items)
+            cards = (f"{what}: {value} ({note})" for what, value, note in part.items)
             return "\n".join(f"- {escape_markdown(card)}" for card in cards)
         case Picture():
             return f"![{escape_markdown(part.caption)}]({quote(part.file.name)})"
         case Listing():
             fence = _longer_than_any("```", part.text)
             return f"{escape_markdown(part.title)}:\n\n{fence}\n{printable(part.text)}\n{fence}"
-        case Section():
+        case TitledParts():
             heading = f"{'#' * part.level} {escape_markdown(part.title)}"
             title = heading if part.title else ""
             return "\n\n".join(filter(None, (title, *map(_markdown, part.parts))))
@@ -425,15 +425,16 @@ def escape_markdown(text: str) -> str:
 def _markdown_span(span: Span) -> str:
     text = span.text.strip()
     if not text or span.style not in ("strong", "code"):
-        return _around(span.text, escape_markdown(text))
+        return _enclosing_ticks(span.text, escape_markdown(text))
     if span.style == "strong":
-        return _around(span.text, f"**{escape_markdown(text)}**")
-    fence, pad = _longer_than_any("`", text), " " if "`" in text else ""
+        return _enclosing_ticks(span.text, f"**{escape_markdown(text)}**")
+    fence = _longer_than_any("`", text)
+    pad = " " if "`" in text else ""
     code = " ".join(printable(text).split())
-    return _around(span.text, f"{fence}{pad}{code}{pad}{fence}")
+    return _enclosing_ticks(span.text, f"{fence}{pad}{code}{pad}{fence}")
 
 
-def _around(text: str, shown: str) -> str:
+def _enclosing_ticks(text: str, shown: str) -> str:
     """Keep the spaces with which a piece of a sentence begins and ends."""
     before = " " if text[:1].isspace() else ""
     after = " " if text[-1:].isspace() else ""

@@ -69,8 +69,8 @@ class InputError(ValueError):
         self.message = message
         self.source = source
         self.where = where
-        said = ": ".join(str(part) for part in (source, where, message) if part)
-        line = printable(said).replace("\n", "␊")
+        text = ": ".join(str(part) for part in (source, where, message) if part)
+        line = printable(text).replace("\n", "␊")
         super().__init__(excerpt(_ENDLESS_WORD.sub(r"\1…", line), LONGEST))
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str | Path | None, str | None]]:
@@ -135,12 +135,12 @@ class SimulationError(RuntimeError):
 
     Attributes
     ----------
-    lost_stability : LostStability or None
-        Mode in which the body lost its stability, see `program.find_lost_stability`; None for other
+    stability_loss : StabilityLoss or None
+        Mode in which the body lost its stability, see `program.find_stability_loss`; None for other
         causes and for errors that were passed to another process.
     """
 
-    lost_stability: Any = None
+    stability_loss: Any = None
 
     def __init__(
         self,

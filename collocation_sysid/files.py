@@ -107,9 +107,11 @@ def read_json(file: Path, what: str) -> dict[str, Any]:
         raise InputError(f"{file.name} is damaged ({reason(error)}){AGAIN}", file.parent) from error
     if not isinstance(content, dict):
         raise InputError(f"{file.name} is damaged: it holds no object{AGAIN}", file.parent)
-    if (found := content.get("schema")) != SCHEMA:
-        said = f"{file.name} has schema {str(found)[:20]}; expected {SCHEMA}, this version's{AGAIN}"
-        raise InputError(said, file.parent)
+    if (schema := content.get("schema")) != SCHEMA:
+        message = (
+            f"{file.name} has schema {str(schema)[:20]}; expected {SCHEMA}, this version's{AGAIN}"
+        )
+        raise InputError(message, file.parent)
     return content
 
 
@@ -136,7 +138,7 @@ def safe_name(text: str) -> str:
 
 
 @contextmanager
-def whole_file(path: str | Path) -> Iterator[Path]:
+def replaced_file(path: str | Path) -> Iterator[Path]:
     """Give a file of the same ending beside `path` to write, and name it `path` at the end.
 
     So nobody ever sees half of it, and what was there is kept until then. A link is replaced and
@@ -164,9 +166,9 @@ def whole_file(path: str | Path) -> Iterator[Path]:
             draft.unlink()
 
 
-def write_whole(path: str | Path, text: str) -> None:
-    """Write a text as UTF-8 by `whole_file`."""
-    with whole_file(path) as draft:
+def write_text_file(path: str | Path, text: str) -> None:
+    """Write a text as UTF-8 by `replaced_file`."""
+    with replaced_file(path) as draft:
         draft.write_text(text, encoding="utf-8")
 
 

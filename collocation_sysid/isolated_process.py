@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-_AROUND = """
+_WRAPPER = """
 import sys, numpy
 with numpy.load("given.npz") as given:
     given = dict(given)
@@ -83,15 +83,15 @@ READING_MB = 1000.0
 READING_MB_PER_MB = 60.0
 
 
-def computed_apart(
-    code: str, *words: str, limits: ProcessLimits | None = None, **given: ArrayLike
+def run_isolated(
+    code: str, *words: str, limits: ProcessLimits | None = None, **arrays: ArrayLike
 ) -> dict[str, NDArray]:
     """Arrays that Python code makes in another process.
 
     Parameters
     ----------
     code : str
-        Reads the arrays `given` by name and the words in `sys.argv`, and leaves arrays in `found`.
+        Reads the `arrays` by name and the words in `sys.argv`, and leaves arrays in `found`.
     words : str
     limits : ProcessLimits, optional
         None by default.
@@ -111,10 +111,10 @@ def computed_apart(
     )
     with tempfile.TemporaryDirectory(prefix="collocation-sysid-") as place:
         folder = Path(place)
-        np.savez(folder / "given.npz", allow_pickle=False, **given)
+        np.savez(folder / "given.npz", allow_pickle=False, **arrays)
         try:
             done = subprocess.run(
-                [sys.executable, "-c", _AROUND.format(limit=limit, code=code), *words],
+                [sys.executable, "-c", _WRAPPER.format(limit=limit, code=code), *words],
                 cwd=folder,
                 capture_output=True,
                 text=True,
@@ -126,10 +126,10 @@ def computed_apart(
         if done.returncode:
             if limits is not None and done.returncode == -getattr(signal, "SIGXCPU", 0):
                 raise Failed(f"it was not finished after {limits.time_s:.3g} s of processor time")
-            said = (done.stderr.strip().splitlines() or ["no message"])[-1]
-            raise Failed(killed_by(done.returncode) or said)
-        with np.load(folder / "found.npz") as found:
-            return dict(found)
+            last_line = (done.stderr.strip().splitlines() or ["no message"])[-1]
+            raise Failed(killed_by(done.returncode) or last_line)
+        with np.load(folder / "found.npz") as stored:
+            return dict(stored)
 
 
 def killed_by(code: int) -> str:

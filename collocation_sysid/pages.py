@@ -74,10 +74,10 @@ def page_url(topic: str) -> str | None:
     from importlib.metadata import PackageNotFoundError, metadata  # slow
 
     try:
-        stated = metadata("collocation-sysid").get_all("Project-URL") or []
+        project_urls = metadata("collocation-sysid").get_all("Project-URL") or []
     except PackageNotFoundError:
         return None
-    urls = dict(each.split(", ", 1) for each in stated)
+    urls = dict(each.split(", ", 1) for each in project_urls)
     if "Documentation" not in urls:
         return None
     page = page_files()[topic].relative_to(_folder()).with_suffix(".html")

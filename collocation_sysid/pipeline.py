@@ -194,10 +194,10 @@ def run(
         if problem.substeps == "auto":
             answer, fit = _fine_enough(answer, fit, problem.solver(method), watch, say, scheduler)
         substeps = answer.solution.collocation.substeps
-        turns = (
+        refits = (
             c.message for e in problem.experiments for c in rotation_step_concerns(e, substeps)
         )
-        answer = replace(answer, notes=(*turns, *answer.notes))
+        answer = replace(answer, notes=(*refits, *answer.notes))
         if answer.uncertainty is not None and fit is not None:
             profiles = _profiles(answer, fit, say)
             changes = _changes(answer, say)
@@ -260,9 +260,9 @@ def _sources(
 ) -> VarianceSources:
     """Return the systematic contributions to the uncertainty, without effects stated as exact."""
     solution = answer.solution
-    stated = answer.problem.uncertainty.assumptions.deviations
+    deviations = answer.problem.uncertainty.assumptions.deviations
     parameters = solution.collocation.parameters
-    budgeted = changes.without(name for name, deviation in stated.items() if deviation is None)
+    budgeted = changes.without(name for name, deviation in deviations.items() if deviation is None)
     means = answer.problem.uncertainty.assumptions.means
     return VarianceSources.from_fit(fit, budgeted, parameters, solution.q, known, means)
 
@@ -276,7 +276,7 @@ def _probes(
     deviations = probed_deviations(options.considered)
     collocation = solution.collocation
     z = solution.z
-    answered = SolvedFit(
+    solved_fit = SolvedFit(
         collocation=collocation,
         z=z,
         fit=fit,
@@ -287,9 +287,9 @@ def _probes(
         changes=probed_changes(collocation, z, deviations, changes),
     )
     if not deep:
-        return routine_probes_with_steps(answered)
+        return routine_probes_with_steps(solved_fit)
     say("refitting parts of the data, and with assumptions relaxed")
-    return deep_probes(answered)
+    return deep_probes(solved_fit)
 
 
 def _profiles(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
@@ -369,5 +369,5 @@ def _fine_enough(
         note = f"{why}; the solve with {substeps} failed: {message}"
         return replace(coarse, notes=(note, *coarse.notes)), fit
     most = ", the largest number that is chosen automatically" if substeps == MOST_SUBSTEPS else ""
-    said = f"{why}; therefore it was solved again with {substeps}{most}"
-    return _checked(problem, finer.after(first, said), say)
+    reason = f"{why}; therefore it was solved again with {substeps}{most}"
+    return _checked(problem, finer.after(first, reason), say)

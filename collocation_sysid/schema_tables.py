@@ -66,9 +66,9 @@ class Section(BaseModel):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        for name, (_, said) in attributes(cls).items():
+        for name, (_, description) in attributes(cls).items():
             if name in cls.model_fields:
-                cls.model_fields[name].description = said
+                cls.model_fields[name].description = description
         cls.__doc__ = inspect.cleandoc(cls.__doc__ or "").partition("\n\nAttributes\n")[0]
 
 
@@ -78,7 +78,7 @@ def section_of(kind: type, title: str, base: type[Section] = Section) -> Any:
     Parameters
     ----------
     kind : type
-        A class decorated with `stated`, whose keys are used, or a dataclass of options, all of
+        A class decorated with `declaration`, whose keys are used, or a dataclass of options, all of
         whose
         fields become keys. Its docstring provides the descriptions.
     title : str
@@ -86,13 +86,14 @@ def section_of(kind: type, title: str, base: type[Section] = Section) -> Any:
     base : type
         Base model with further keys of the table.
     """
-    stated = [key for _, key in keys_of(kind)]
+    declared_keys = [key for _, key in keys_of(kind)]
     keys: dict[str, Any] = {
-        key.name: (key.form, Field(key.default, description=key.said)) for key in stated
+        key.name: (key.form, Field(key.default, description=key.description))
+        for key in declared_keys
     }
     checks: dict[str, Any] = {
         f"_{key.name}_or": model_validator(mode="after")(_either(key.constant, key.name))
-        for key in stated
+        for key in declared_keys
         if key.constant is not None
     }
     doc = inspect.cleandoc(kind.__doc__ or "").partition("\n")[0]
@@ -120,14 +121,14 @@ def _options(kind: Any) -> dict[str, Any]:
     return keys
 
 
-def stated_in(section: Section, kind: type, where: str) -> dict[str, Any]:
+def declared_in(section: Section, kind: type, where: str) -> dict[str, Any]:
     """Return the fields of a class that a table states, by name; tables in files are not read yet.
 
     Parameters
     ----------
     section : Section
     kind : type
-        Class decorated with `stated`.
+        Class decorated with `declaration`.
     where : str
         Location of the table, for messages.
 
@@ -153,14 +154,14 @@ def _either(*names: str) -> Callable[[Any], Any]:
     return check
 
 
-def given_keys(section: Section, *names: str) -> list[str]:
+def used_keys(section: Section, *names: str) -> list[str]:
     """Return those of the keys that the file states."""
     return [name for name in names if getattr(section, name) is not None]
 
 
 def require_one(section: Section, *names: str) -> None:
     """Raise ValueError unless the section states exactly one of the keys."""
-    there = given_keys(section, *names)
+    there = used_keys(section, *names)
     if len(there) != 1:
         which = " and ".join(there) or f"no {' or '.join(names)}"
         raise ValueError(f"found {which}; expected exactly one of {', '.join(names)}")

@@ -34,8 +34,8 @@ def content(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         own = {f.name: getattr(value, f.name) for f in fields(value)}
         own |= {name: getattr(value, name) for name in getattr(value, "SERIALISED_PROPERTIES", ())}
-        left_out = {f.name for f in fields(value) if _is_optional(f) and own[f.name] is None}
-        return {name: content(each) for name, each in own.items() if name not in left_out}
+        omitted = {f.name for f in fields(value) if _is_optional(f) and own[f.name] is None}
+        return {name: content(each) for name, each in own.items() if name not in omitted}
     if isinstance(value, Mapping):
         return {key: content(each) for key, each in value.items()}
     if isinstance(value, (np.ndarray, np.generic)):
@@ -52,7 +52,7 @@ def as_json(value: Any) -> str:
     return json.dumps(content(value), indent=1, allow_nan=False)
 
 
-def alike(kind: type[T], of: Any, **others: Any) -> T:
+def copy_fields(kind: type[T], of: Any, **others: Any) -> T:
     """Return an instance of a dataclass with attributes copied by name from another object.
 
     Parameters
@@ -68,14 +68,14 @@ def alike(kind: type[T], of: Any, **others: Any) -> T:
     return kind(**{name: getattr(of, name) for name in names}, **others)
 
 
-def read(kind: Any, found: Any) -> Any:
+def read(kind: Any, content: Any) -> Any:
     """Return a value of a given type from parsed JSON.
 
     Parameters
     ----------
     kind : type
         A dataclass, or the annotation of a field: numbers, texts, tuples, mappings, arrays.
-    found : object
+    content : object
         Output of `json.load_object`; None is NaN where a number is expected.
 
     Raises
@@ -85,30 +85,30 @@ def read(kind: Any, found: Any) -> Any:
     """
     if is_dataclass(kind):
         hints = _hints(kind)
-        there = (f for f in fields(kind) if not _is_optional(f) or f.name in found)
-        return kind(**{f.name: read(hints[f.name], found[f.name]) for f in there})  # type: ignore
+        there = (f for f in fields(kind) if not _is_optional(f) or f.name in content)
+        return kind(**{f.name: read(hints[f.name], content[f.name]) for f in there})  # type: ignore
     origin = get_origin(kind)
     inner = get_args(kind)
     if origin in (Union, types.UnionType):
         (some,) = (each for each in inner if each is not type(None))
-        return None if found is None else read(some, found)
+        return None if content is None else read(some, content)
     if origin is np.ndarray:
-        return np.array(found, dtype=float)
+        return np.array(content, dtype=float)
     if origin is tuple:
-        kinds = [inner[0]] * len(found) if inner[-1] is ... else inner
-        return tuple(read(one, each) for one, each in zip(kinds, found, strict=True))
+        kinds = [inner[0]] * len(content) if inner[-1] is ... else inner
+        return tuple(read(one, each) for one, each in zip(kinds, content, strict=True))
     if origin in (dict, Mapping):
-        return {key: read(inner[1], each) for key, each in found.items()}
+        return {key: read(inner[1], each) for key, each in content.items()}
     if origin is Sequence:
-        return [read(inner[0], each) for each in found]
-    wrong = origin is Literal and found not in inner
-    wrong |= kind in (str, bool, int) and type(found) is not kind
+        return [read(inner[0], each) for each in content]
+    wrong = origin is Literal and content not in inner
+    wrong |= kind in (str, bool, int) and type(content) is not kind
     if kind is float:
-        found = nan if found is None else found
-        wrong = type(found) not in (int, float) or abs(found) == float("inf")
+        content = nan if content is None else content
+        wrong = type(content) not in (int, float) or abs(content) == float("inf")
     if wrong:
-        raise TypeError(f"found {str(found)[:40]!r}; expected {kind}")
-    return float(found) if kind is float else found
+        raise TypeError(f"found {str(content)[:40]!r}; expected {kind}")
+    return float(content) if kind is float else content
 
 
 def _is_optional(field: Field[Any]) -> bool:

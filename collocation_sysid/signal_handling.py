@@ -18,7 +18,7 @@ from typing import NoReturn
 
 COMMAND = "collocation-sysid"
 # Name of a thread that is left in a library's code, which no signal reaches.
-LEFT = "left behind"
+LEFT_BEHIND = "left behind"
 # File of the frames of an import, and how often a deferred signal tries again [s].
 IMPORTING = "<frozen importlib._bootstrap>"
 RETRY_S = 0.05
@@ -92,9 +92,9 @@ def heed_interrupts() -> Callable[[], None]:
     callable
         Function that restores the previous signal handlers.
     """
-    numbers = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
+    signal_numbers = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
     usual = (signal.SIG_DFL, signal.default_int_handler)
-    before = {n: handler for n in numbers if (handler := signal.getsignal(n)) in usual}
+    before = {n: handler for n in signal_numbers if (handler := signal.getsignal(n)) in usual}
     for number in before:
         signal.signal(number, INTERRUPTS)
 
@@ -117,7 +117,7 @@ def leave(code: object) -> NoReturn:
     If a thread is still inside library code that would crash at exit, streams are flushed and the
     process ends without cleaning up.
     """
-    if not any(thread.name == LEFT for thread in threading.enumerate()):
+    if not any(thread.name == LEFT_BEHIND for thread in threading.enumerate()):
         sys.exit(code if isinstance(code, int) else 1)
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError):

@@ -35,7 +35,7 @@ NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0), _U
 AboveOne = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=1), _Usual]
 OneOrMore = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1), _Usual]
 Boundless = Annotated[float, Field(strict=True)]
-Whole = Annotated[int, Field(strict=True)]
+StrictInteger = Annotated[int, Field(strict=True)]
 Count = Annotated[int, Field(strict=True, ge=0)]
 AtLeastOne = Annotated[int, Field(strict=True, ge=1)]
 Flag = Annotated[bool, Field(strict=True)]
@@ -85,15 +85,15 @@ class Options:
 
     name: ClassVar[str]
     # Whether a method can only start from parameters with which everything can be simulated.
-    needs_whole_start: ClassVar[bool] = False
+    needs_complete_start: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         for name, adapter in _adapters(type(self)).items():
-            found = getattr(self, name)
+            value = getattr(self, name)
             try:
-                object.__setattr__(self, name, adapter.validate_python(found))
+                object.__setattr__(self, name, adapter.validate_python(value))
             except ValidationError as error:
-                raise _refusal(name, found, error.errors(include_url=False)[0]) from error
+                raise _refusal(name, value, error.errors(include_url=False)[0]) from error
 
 
 @cache
@@ -102,14 +102,14 @@ def _adapters(kind: type[Options]) -> dict[str, TypeAdapter[Any]]:
     return {field.name: TypeAdapter(types[field.name]) for field in fields(kind)}
 
 
-def _refusal(name: str, found: Any, fault: Mapping[str, Any]) -> InputError:
+def _refusal(name: str, value: Any, fault: Mapping[str, Any]) -> InputError:
     """Return the error for an invalid value; it names the entry if the value is a table."""
     for part in fault["loc"]:
-        if isinstance(found, Mapping) and part in found:
+        if isinstance(value, Mapping) and part in value:
             name = f"{name}.{part}"
-            found = found[part]
+            value = value[part]
     if fault["type"] == "value_error":
         return InputError(str(fault["ctx"]["error"]), None, name)
     choices = re.findall("'(.*?)'", fault["ctx"]["expected"] if "literal" in fault["type"] else "")
-    hint = hint_at(str(found), choices)
-    return InputError(f"found {found!r}; expected {expected(fault)}{hint}", None, name)
+    hint = hint_at(str(value), choices)
+    return InputError(f"found {value!r}; expected {expected(fault)}{hint}", None, name)

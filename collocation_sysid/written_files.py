@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 LIST_FILE = ".collocation-sysid.json"
-# Nobody's data: drafts of a process that was killed, see `files.whole_file`, and what file managers
-# leave in folders that they show.
+# Nobody's data: drafts of a process that was killed, see `files.replaced_file`, and what file
+# managers leave in folders that they show.
 IGNORED_NAME = re.compile(r"\..+\.[0-9a-f]{8}\.partial(\.\w+)?|\.DS_Store|Thumbs\.db|desktop\.ini")
 
 

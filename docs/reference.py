@@ -123,7 +123,7 @@ def nuisances() -> str:
     """The table of what may be unknown of a recording, as the page on motion capture has it."""
     lines = ["| key of `[experiment.nuisance]` | what | by default |", "|---|---|---|"]
     for key, rows in KEYS.items():
-        said = "; ".join(row.said for row in rows)
+        said = "; ".join(row.description for row in rows)
         priors = ", ".join(f"{row.prior} = {row.sigma:.4g}" for row in rows if row.sigma)
         usual = ", ".join(row.usual for row in rows if row.unit != "σ")
         default = f"`{{ {priors} }}` {usual}".strip() if priors else '"none"'

@@ -14,7 +14,7 @@ import numpy as np
 
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.files import write_whole
+from collocation_sysid.files import write_text_file
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, PoseSequence, Wrench
@@ -70,7 +70,7 @@ def write(place: int, force_n: np.ndarray) -> None:
         f"{t},{1e3 * d:.3f},{f:.5f}" for t, (d, f) in enumerate(zip(DEPTHS_M, force_n, strict=True))
     ]
     table = "\n".join(["Time (s),Displacement (mm),Force (N)", *rows, ""])
-    write_whole(FOLDER / f"place_{place:02d}.csv", table)
+    write_text_file(FOLDER / f"place_{place:02d}.csv", table)
 
 
 def main() -> None:

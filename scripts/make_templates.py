@@ -14,7 +14,7 @@ from collocation_sysid.array_types import Array
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import cylinder_of_edge
-from collocation_sysid.files import write_whole
+from collocation_sysid.files import write_text_file
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.new_problem import TEMPLATES
 from collocation_sysid.program.simulation import simulate
@@ -77,7 +77,7 @@ def benched(folder: Path, names: str, t_s: Array, moved: Array, noise: float, sc
 
     def write(measured: Array) -> None:
         rows = [f"{t:.1f},{m:.4f},{f:.4f}" for t, m, f in zip(t_s, moved, measured, strict=True)]
-        write_whole(file, "\n".join([names, *rows, ""]))
+        write_text_file(file, "\n".join([names, *rows, ""]))
 
     write(np.zeros(len(t_s)))
     at_truth = [f"parameters.young_pa.guess={YOUNG_PA}"]

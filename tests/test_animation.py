@@ -73,7 +73,7 @@ def test_a_run_stores_what_is_needed_to_look_at_it(run):
     assert nod.positions_m is None
     assert nod.rolled_out_positions_m.shape == (7, NODES, 3)
     assert swing.surface.max() < NODES
-    assert swing.held.sum(axis=1).tolist() == [9] * 9
+    assert swing.is_prescribed.sum(axis=1).tolist() == [9] * 9
     assert (np.diff(swing.natural_hz) >= 0).all()
     np.testing.assert_allclose(swing.up, [0, 0, 1])
 

@@ -276,7 +276,7 @@ def test_loads_of_a_part_are_reported_for_the_whole_specimen(tmp_path):
     priors_n = [
         float(re.search(r"tare: up to \S+ N \(prior ±(\S+) N\)", said)[1])
         for each in (found.result, alone.result)
-        if (said := each.fit.experiments["first"].beside[-1])
+        if (said := each.fit.experiments["first"].notes[-1])
     ]
     assert priors_n[0] == pytest.approx(4 * priors_n[1])
     assert "Forces are those of the modelled part." in as_markdown([run_report(tmp_path / "whole")])

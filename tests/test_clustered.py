@@ -139,8 +139,8 @@ def test_what_a_lost_worker_had_is_done_again(there):
 
 def assert_best_is_kept(solution: cs.Solution, why: str) -> None:
     """The answer is the last line of the history, simulated here."""
-    assert solution.status is Status.CLUSTER_LOST
-    assert solution.message == f"{Status.CLUSTER_LOST.sentence} {why}"
+    assert solution.status is Status.CLUSTER_DISCONNECTED
+    assert solution.message == f"{Status.CLUSTER_DISCONNECTED.sentence} {why}"
     assert solution.parameters == solution.history[-1].parameters
     collocation, z = solution.collocation, solution.z
     alike, failure = simulate_trajectories(collocation, collocation.unpack(z)[0])
@@ -248,8 +248,8 @@ def apart(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen]]]:
     ("ended", "status", "said"),
     [
         (slice(1, 2), Status.CONVERGED, "1 of 2 workers were lost during the solve"),
-        (slice(1, 3), Status.CLUSTER_LOST, "No worker is left."),
-        (slice(0, 1), Status.CLUSTER_LOST, "Its scheduler no longer responds."),
+        (slice(1, 3), Status.CLUSTER_DISCONNECTED, "No worker is left."),
+        (slice(0, 1), Status.CLUSTER_DISCONNECTED, "Its scheduler no longer responds."),
     ],
     ids=["a worker", "all workers", "the scheduler"],
 )

@@ -249,7 +249,7 @@ def test_a_sweep_tabulates_estimates_against_the_swept_values(tiny, stand_in):
     assert max(map(len, outcome.out.splitlines())) <= 80
     assert drawn(tiny / "out") == {"sweep"}
     content = json.loads((tiny / "out" / "summary.json").read_text())
-    assert content["swept"] == ["parameters.mu_pa.guess", "transcription.substeps"]
+    assert content["varied_values"] == ["parameters.mu_pa.guess", "transcription.substeps"]
     assert "| mu_pa.guess | substeps |" in (tiny / "out" / "summary.md").read_text()
 
 

@@ -114,7 +114,7 @@ ARRAYS = [
     of_result("huge", array("markers_m", lambda x: x + 1e300)),
     of_result("foreign nodes", array("surface", lambda x: x + 1000)),
     of_result("standing time", array("t_s", np.zeros_like)),
-    of_result("no samples", array("held", lambda x: x[:0])),
+    of_result("no samples", array("is_prescribed", lambda x: x[:0])),
 ]
 
 

@@ -11,7 +11,7 @@ from test_depth import MATRIX, NOISE_M, POSE, SHAPE, TRUTH, bar
 
 import collocation_sysid as cs
 from collocation_sysid.methods.continuation import first_samples
-from collocation_sysid.plan.model_choice import hold_out
+from collocation_sysid.plan.model_choice import reserve_test_data
 from collocation_sysid.program.visible_surface import VisibleSurface
 from collocation_sysid.result.run_record import replays
 from collocation_sysid.runs.check import check_problem
@@ -65,7 +65,7 @@ def test_the_interval_holds_the_truth_beside_what_the_step_does(run):
 
 def test_all_images_are_kept_for_pictures_and_four_of_them_with_outlines(run):
     (replay,) = replays(run)
-    rows = replay.seen["front"]
+    rows = replay.visible_points["front"]
     points = rows[np.isfinite(rows[:, 4])]
     np.testing.assert_array_equal(np.unique(points[:, 0]), replay.t_s[SEEN])
     assert len(np.unique(rows[np.isnan(rows[:, 3]), 0])) == 4
@@ -88,7 +88,7 @@ def test_first_samples_have_the_images_of_their_time():
 
 
 def test_images_that_are_held_out_are_not_fitted():
-    known, start_s = hold_out(problem(), "swing")
+    known, start_s = reserve_test_data(problem(), "swing")
     (whole,), (left,) = problem().experiments, known.experiments
     np.testing.assert_array_equal(left.depths[0].sample_times_s, times(SAMPLES)[[2, 5, 8]])
     assert left.depths[0].sample_times_s[-1] <= start_s < whole.depths[0].sample_times_s[3]

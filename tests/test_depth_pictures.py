@@ -187,7 +187,10 @@ def test_cameras_whose_names_meet_in_one_file_name_have_a_picture_each(tmp_path)
     assert [file.name for file in drawn] == ["depth_a_b_c.png", "depth_a_b_c_2.png"]
     shape_m = bar().nodes_m[None], np.zeros((1, 0, 3))
     shown = [
-        replace(MotionRecord.from_experiment(each, shape_m), seen={each.depths[0].name: rows})
+        replace(
+            MotionRecord.from_experiment(each, shape_m),
+            visible_points={each.depths[0].name: rows},
+        )
         for each in twins
     ]
     assert {"depth_a_b_c", "depth_a_b_c_2"} <= all_pictures(shown, a_result()).keys()
@@ -222,8 +225,8 @@ def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(f
     assert (points[used, 1:3] < high + 1).all()
     # Where points are in the world they are on the surface, to what they are apart.
     skin, x = reading.correspondences.surface, reading.surface_shapes(part.x, part.phi)[0]
-    _, places = skin.nearest_points(x, points[used, 5:], np.arange(len(skin.flat_triangles)))
-    faces, _ = skin.nearest_points(x, points[used, 5:], np.arange(len(skin.flat_triangles)))
+    _, places = skin.nearest_points(x, points[used, 5:], np.arange(len(skin.plane_triangles)))
+    faces, _ = skin.nearest_points(x, points[used, 5:], np.arange(len(skin.plane_triangles)))
     _, feet, _ = skin.evaluate(x, faces, places)
     away = np.linalg.norm(points[used, 5:] - feet, axis=1)
     assert np.median(np.abs(away - np.abs(points[used, 4]))) < 1e-6
@@ -244,15 +247,15 @@ def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(found)
     replay = replace(
         replay,
         t_s=np.array([0.0, 0.1, 0.2]),
-        held=np.repeat(replay.held, 3, axis=0),
+        is_prescribed=np.repeat(replay.is_prescribed, 3, axis=0),
         measured_m=np.zeros((3, 0, 3)),
         positions_m=x,
         markers_m=np.zeros((3, 0, 3)),
-        seen={"front": np.vstack([rows, later])},
+        visible_points={"front": np.vstack([rows, later])},
     )
     count = reading.correspondences.is_compared.sum()
     assert [len(replay.depth_points_m(t)) for t in range(3)] == [count, 0, count]
-    sparse = replace(replay, seen={"front": rows})
+    sparse = replace(replay, visible_points={"front": rows})
     assert [len(sparse.depth_points_m(t)) > 0 for t in range(3)] == [True, False, False]
     film = FilmFigure(sparse)
     ((_, _, _, drawn, _),) = film.drawings

@@ -350,7 +350,7 @@ def test_the_poses_turn_the_body_about_its_hand():
     coordinates[:, 4] = np.linspace(0, 1, len(coordinates))
     poses = recording.poses_from_coordinates(coordinates)
     assert np.allclose(
-        poses.carried_positions(recording.hand_m[None], poses.t_s)[:, 0], recording.hand_m
+        poses.moved_positions(recording.hand_m[None], poses.t_s)[:, 0], recording.hand_m
     )
 
 

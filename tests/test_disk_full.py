@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from problem_files import Outcome, contents, run_command, settings, write_problem
 
-from collocation_sysid.files import whole_file, write_whole
+from collocation_sysid.files import replaced_file, write_text_file
 from collocation_sysid.result.run_writers import replaced_folder
 
 resource = pytest.importorskip("resource", reason="limits of POSIX")
@@ -110,7 +110,7 @@ def test_an_answer_that_finds_no_room_leaves_the_earlier_run(tiny: Path):
 
 
 def test_a_file_keeps_its_ending_while_it_is_written(tmp_path: Path):
-    with whole_file(tmp_path / "deep" / "a.tar.png") as draft:
+    with replaced_file(tmp_path / "deep" / "a.tar.png") as draft:
         assert draft.suffix == ".png"
         draft.write_text("x")
     assert [file.name for file in (tmp_path / "deep").iterdir()] == ["a.tar.png"]
@@ -123,7 +123,7 @@ def test_into_a_pipe_is_written_directly(tmp_path: Path):
         target=lambda: got.append((tmp_path / "pipe").read_text()), daemon=True
     )
     reader.start()
-    write_whole(tmp_path / "pipe", "a page")
+    write_text_file(tmp_path / "pipe", "a page")
     reader.join(10)
     assert got == ["a page"]
     assert (tmp_path / "pipe").is_fifo()
@@ -135,7 +135,7 @@ def test_the_message_names_the_folder_and_not_the_passing_one(tmp_path: Path):
         pytest.raises(ValueError, match="run: cannot be written") as caught,
         replaced_folder(tmp_path / "run") as place,
     ):
-        write_whole(place / "table.csv", 100 * "x")
+        write_text_file(place / "table.csv", 100 * "x")
     assert ".partial" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 

@@ -81,7 +81,7 @@ def test_held_positions_follow_the_order_of_held_dofs():
 def test_rigid_positions_carry_the_whole_body_with_the_first_grasp():
     swing = experiment(grasps=(lifted([0, 1, 2]), lifted([3], speed_m_s=-2.0)))
     np.testing.assert_allclose(
-        swing.rigid_positions(TIMES), swing.grasps[0].poses.carried_positions(NODES, TIMES)
+        swing.rigid_positions(TIMES), swing.grasps[0].poses.moved_positions(NODES, TIMES)
     )
 
 
@@ -288,11 +288,11 @@ def test_several_grasps_are_cut_to_the_time_they_share():
 def test_a_grasp_that_has_let_go_needs_no_poses_any_more():
     t = 0.01 * np.arange(100)
     sequence = moving_poses(0.005 * np.arange(104))  # 0.515 s
-    found = align([sequence], moving_table(t), hold_s=[(-np.inf, 0.513)])
+    found = align([sequence], moving_table(t), grasp_intervals_s=[(-np.inf, 0.513)])
     assert found.notes == ()
     assert len(found.t_s) == 100
     assert found.poses[0].at([0.513])[1][0, 0] == pytest.approx(0.513)
-    still_held = align([sequence], moving_table(t), hold_s=[(-np.inf, 0.6)])
+    still_held = align([sequence], moving_table(t), grasp_intervals_s=[(-np.inf, 0.6)])
     assert still_held.t_s[-1] == pytest.approx(0.51)
 
 

@@ -55,7 +55,7 @@ def waving(t_s):
 
 
 def carried(poses, t_s):
-    return poses.carried_positions(POINTS, t_s)
+    return poses.moved_positions(POINTS, t_s)
 
 
 def truly_carried(t_s):
@@ -163,8 +163,8 @@ def test_after_moves_by_the_matrix_first():
     body = gripper.after(of_body)
     in_gripper = POINTS @ of_body[:3, :3].T + of_body[:3, 3]
     np.testing.assert_allclose(
-        body.carried_positions(POINTS, gripper.t_s),
-        gripper.carried_positions(in_gripper, gripper.t_s),
+        body.moved_positions(POINTS, gripper.t_s),
+        gripper.moved_positions(in_gripper, gripper.t_s),
         atol=1e-14,
     )
     quaternion = Rotation.from_matrix(of_body[:3, :3]).as_quat()
@@ -197,7 +197,7 @@ def test_hold_is_not_fooled_by_rounding_of_the_time():
 
 def test_carry_rotates_then_moves_undeformed_points():
     poses = turning_poses()
-    carried = poses.carried_positions(POINTS, [0.0, 0.4])
+    carried = poses.moved_positions(POINTS, [0.0, 0.4])
     assert carried.shape == (2, 2, 3)
     np.testing.assert_allclose(carried[0], POINTS)
     np.testing.assert_allclose(carried[1], [[0.4, 0.1, 0.0], [0.2, 0.0, 0.3]], atol=1e-14)
@@ -206,7 +206,7 @@ def test_carry_rotates_then_moves_undeformed_points():
 def test_fixed_leaves_points_alone_at_any_time():
     poses = PoseSequence.fixed()
     np.testing.assert_array_equal(
-        poses.carried_positions(POINTS, [-1.0, 0.0, 9.0]), np.stack([POINTS] * 3)
+        poses.moved_positions(POINTS, [-1.0, 0.0, 9.0]), np.stack([POINTS] * 3)
     )
 
 
@@ -215,7 +215,7 @@ def test_a_single_pose_holds_for_all_time():
         np.array([2.0]), np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, 1.0, 0.0]])
     )
     expected = POINTS * [-1, -1, 1] + [0, 0, 1]
-    np.testing.assert_allclose(poses.carried_positions(POINTS, [0.0, 5.0])[1], expected, atol=1e-15)
+    np.testing.assert_allclose(poses.moved_positions(POINTS, [0.0, 5.0])[1], expected, atol=1e-15)
 
 
 @pytest.mark.parametrize(("interpolation", "off"), [("linear", 1e-12), ("smooth", 1e-3)])

@@ -73,7 +73,7 @@ def test_nodes_beside_a_face_that_cuts_elements_are_counted(
     region, moves, nearly_held, nearly_free
 ):
     found = held(region, *moves)
-    assert (found.nearly_held, found.nearly_free) == (nearly_held, nearly_free)
+    assert (found.nearly_grasped, found.nearly_free) == (nearly_held, nearly_free)
     (said, *more) = [each.message for each in grasp_concerns(found)] or [""]
     assert not more
     assert ("enlarged by a tenth of an element's edge" in said) == bool(nearly_held + nearly_free)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from problem_files import replace_cell, replace_text, run_command, settings
+from problem_files import REFERENCES, replace_cell, replace_text, run_command, settings
 
 from collocation_sysid import machine
 from collocation_sysid.errors import InputError
@@ -27,7 +27,7 @@ from collocation_sysid.fem.structured import (
     count_cylinder_elements,
     cylinder_of_edge,
 )
-from collocation_sysid.isolated_process import Failed, ProcessLimits, computed_apart
+from collocation_sysid.isolated_process import Failed, ProcessLimits, run_isolated
 from collocation_sysid.problem import Problem, loading, problem_size
 from collocation_sysid.recording import read_markers, read_poses, write_markers_csv
 from collocation_sysid.recording.formats.depth_files import read_depth
@@ -89,10 +89,10 @@ ENDLESS = {
 }
 READ_ENDLESS = """
 import sys
-from collocation_sysid import apart
+from collocation_sysid import isolated_process
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.mesh import TetMesh
-apart.READING_S = 3
+isolated_process.READING_S = 3
 for name in sys.argv[1:]:
     try:
         TetMesh.read(name)
@@ -120,9 +120,9 @@ def test_readers_that_do_not_find_the_end_of_a_mesh_are_stopped(tmp_path: Path):
 def test_readers_have_a_limit_of_memory():
     take = "found = {'a': numpy.ones(int(sys.argv[1]))}"
     limits = ProcessLimits(time_s=60, memory_mb=300)
-    assert len(computed_apart(take, "1000", limits=limits)["a"]) == 1000
+    assert len(run_isolated(take, "1000", limits=limits)["a"]) == 1000
     with pytest.raises(Failed, match="MemoryError"):
-        computed_apart(take, "100000000", limits=limits)
+        run_isolated(take, "100000000", limits=limits)
 
 
 @pytest.mark.parametrize("content", ["ply\nformat ascii 1.0\nelement vertex 3\n", "ply\n", "x"])
@@ -282,6 +282,17 @@ def test_a_problem_that_memory_cannot_hold_is_refused_when_it_is_read(
     assert not (tiny / "run").exists()
 
 
+def test_unknown_positions_of_more_markers_than_memory_can_hold_are_refused(
+    tiny: Path, monkeypatch: pytest.MonkeyPatch
+):
+    replace_text(f"reference_m = {REFERENCES}\n", "")(tiny)
+    monkeypatch.setattr(problem_size, "MANY_MARKERS", 2)
+    monkeypatch.setattr(problem_size, "machine_memory_mb", lambda: 0.7)
+    message = refused("check", "problem.toml")
+    assert "markers of unknown position take about" in message
+    assert "expected fewer markers (markers.names), their positions (reference_m)" in message
+
+
 def test_a_generated_mesh_that_memory_cannot_hold_is_refused_before_it_is_made(
     tiny: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -377,8 +388,8 @@ DEAF = """
 import os, signal, sys, threading, time
 from collocation_sysid import cli
 from collocation_sysid.methods import nlpsol
-from collocation_sysid.result import record
-record._write_pictures = lambda *_: None
+from collocation_sysid.result import run_record
+run_record._write_pictures = lambda *_: None
 sys.argv = ["collocation-sysid", "solve", "problem.toml", "--out", "run", "-q"]
 def end():
     for _ in range({times}):

@@ -31,7 +31,7 @@ from wrenches_small import sensed, wristed_cube
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.moduli import engineering_constants
 from collocation_sysid.methods.condensed_program import condense
-from collocation_sysid.methods.initial_point import NEAR, adjoint_multipliers
+from collocation_sysid.methods.initial_point import LARGEST_CORRECTION, adjoint_multipliers
 from collocation_sysid.methods.initial_trajectories import (
     associated_at_guess,
     initial_variables,
@@ -211,7 +211,7 @@ def note_of(solution: Solution) -> str:
 def test_ipopt_starts_near_the_optimum_and_the_notes_tell_how():
     seen: list[Iteration] = []
     solution = PRECISE(cube(), watch=seen.append)
-    sweeps = len(ReducedSpace(tolerance=NEAR)(cube()).history)
+    sweeps = len(ReducedSpace(tolerance=LARGEST_CORRECTION)(cube()).history)
     assert re.fullmatch(
         r"initial point: \d+ sweeps of reduced space, which determined the parameters to 0.1 %; "
         "IPOPT solved the complete program from there",
@@ -228,7 +228,7 @@ def test_ipopt_starts_near_the_optimum_and_the_notes_tell_how():
 def test_the_initial_point_is_not_the_answer():
     solution = InteriorPoint(max_iterations=1, tolerance=1e-15)(cube())
     assert solution.status is Status.ITERATION_LIMIT
-    coarse = ReducedSpace(tolerance=NEAR)(cube())
+    coarse = ReducedSpace(tolerance=LARGEST_CORRECTION)(cube())
     assert not np.array_equal(solution.z, coarse.z)
 
 

@@ -54,6 +54,18 @@ def packed_names(function: ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
     }
 
 
+def test_class_and_module_names_occur_once():
+    """A reader who searches for a name finds one definition."""
+    modules = Counter(path.stem for path in FILES if path.stem != "__init__")
+    classes = Counter(
+        node.name
+        for _, tree in trees()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef)
+    )
+    assert [name for name, count in (modules + classes).items() if count > 1] == []
+
+
 @pytest.mark.parametrize("pattern", [WITHOUT_SUBJECT, CAPITAL_SYMBOL])
 def test_every_docstring_begins_with_a_subject(pattern):
     assert [f"{place} {text}" for place, text in summaries() if pattern.match(text)] == []

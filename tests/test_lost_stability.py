@@ -10,7 +10,7 @@ import pytest
 
 import collocation_sysid as cs
 from collocation_sysid.errors import SimulationError
-from collocation_sysid.program.loss_of_stability import BIOT_RATIO, LostStability, _on_surface
+from collocation_sysid.program.loss_of_stability import BIOT_RATIO, StabilityLoss, _on_surface
 
 LAW = {"young_pa": 2e4, "poisson": 0.45, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 SIZE_M = (0.08, 0.01, 0.06)
@@ -61,8 +61,8 @@ def failure(divisions: tuple[int, int, int], size_m: tuple[float, float, float])
 
 def test_a_compressed_surface_that_wrinkles_is_named_with_its_stretch():
     error = failure((8, 1, 6), SIZE_M)
-    lost = error.lost_stability
-    assert isinstance(lost, LostStability)
+    lost = error.stability_loss
+    assert isinstance(lost, StabilityLoss)
     assert lost.is_surface_instability
     assert lost.critical_stretch == pytest.approx(np.sqrt(BIOT_RATIO), rel=1e-6)
     assert 0.3 < lost.smaller_stretch < 0.56
@@ -75,8 +75,8 @@ def test_a_compressed_surface_that_wrinkles_is_named_with_its_stretch():
 
 def test_a_slender_body_buckles_and_does_not_wrinkle():
     error = failure((12, 1, 1), (0.12, 0.01, 0.01))
-    assert error.lost_stability is not None
-    assert not error.lost_stability.is_surface_instability
+    assert error.stability_loss is not None
+    assert not error.stability_loss.is_surface_instability
     assert "buckles" in str(error)
 
 
@@ -102,7 +102,7 @@ def test_critical_stretches_are_biots(stretch, across, critical):
 def test_a_picture_shows_the_mode():
     from collocation_sysid.result.pictures.instability import instability_picture
 
-    figure = instability_picture(failure((8, 1, 6), SIZE_M).lost_stability)
+    figure = instability_picture(failure((8, 1, 6), SIZE_M).stability_loss)
     assert "wavelength" in figure.axes[0].texts[0].get_text()
 
 

@@ -58,7 +58,7 @@ def disturbed(part: ExperimentIterate, size_m: float = 1e-4) -> np.ndarray:
     change[:, segment.free_dofs] = np.random.default_rng(0).standard_normal(free)
     first = segment.dynamics.first_row
     x = part.x.copy()
-    x[first:] += size_m * segment.dynamics.zero_held_forces(change)[first:]
+    x[first:] += size_m * segment.dynamics.zero_prescribed_forces(change)[first:]
     return x
 
 
@@ -106,7 +106,7 @@ def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
     step = Sweep(segment).forward(x, setting).step
     residual = setting.dynamics.residual(x)
     residual[:, segment.prescribed_dofs] = 0
-    residual = setting.dynamics.zero_held_forces(residual)
+    residual = setting.dynamics.zero_prescribed_forces(residual)
     expected = float(np.sum(gradient[:, segment.free_dofs] * step[:, segment.free_dofs]))
     assert float(np.sum(y * residual)) == pytest.approx(expected, rel=1e-9)
 

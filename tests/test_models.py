@@ -29,9 +29,9 @@ from collocation_sysid.plan.model_choice import (
     advice,
     evidence_from_fit,
     fit_record,
-    hold_out,
     law_disagreements,
     model_rows,
+    reserve_test_data,
 )
 from collocation_sysid.plan.model_variants import (
     as_inline_toml,
@@ -87,7 +87,8 @@ def compared(file: Path) -> list[dict]:
     """The rows of a comparison, its runs done here."""
     planned = plan_models(Problem.read(file), variants(file, (), BOTH, (), TIMES_S))
     records = {
-        run.key: {"model": fit_record(read(run), run.method, run.held_out or "")} for run in planned
+        run.key: {"model": fit_record(read(run), run.method, run.test_name or "")}
+        for run in planned
     }
     return model_rows(planned, json.loads(json.dumps(records)))
 
@@ -182,7 +183,7 @@ def test_forces_rank_the_platens_where_there_are_no_markers():
 
 def test_of_one_pressing_the_end_of_its_load_is_held_out():
     pressing = pressed_block("xyz", "a", np.linspace(0.0, -0.03, 9), np.zeros(9))
-    left, start_s = hold_out(Problem([pressing], TRUTH), "a")
+    left, start_s = reserve_test_data(Problem([pressing], TRUTH), "a")
     wrench = left.experiments[0].grasps[1].wrench
     np.testing.assert_array_equal(np.isnan(wrench.values[:, 2]), wrench.t_s > start_s)
     assert 0 < np.isnan(wrench.values[:, 2]).sum() < 9
@@ -208,14 +209,14 @@ def test_files_with_other_data_are_no_models_of_one_another(tmp_path: Path):
 
 def test_of_two_recordings_one_is_held_out(tmp_path: Path):
     several = Problem.read(write_problem(tmp_path, {"a": 6, "b": 7}))
-    left, start_s = hold_out(several, "b")
+    left, start_s = reserve_test_data(several, "b")
     assert [(e.name, e.validation) for e in left.experiments] == [("a", False), ("b", True)]
     assert start_s == -np.inf
 
 
 def test_of_one_recording_the_last_third_is_held_out(tiny: Path):
     alone = Problem.read(tiny / "problem.toml")
-    left, start_s = hold_out(alone, "swing")
+    left, start_s = reserve_test_data(alone, "swing")
     (kept,), (whole,) = left.experiments, alone.experiments
     later = kept.t_s > start_s
     assert later.sum() == 3  # of 9
@@ -480,7 +481,9 @@ def rows_of(*models: dict) -> list[dict]:
         for held_out, found in each["found"].items():
             key = f"{each['model']}/{held_out}"
             swept = {"model": each["model"]}
-            planned.append(PlannedRun(key, "problem.toml", "m", swept=swept, held_out=held_out))
+            planned.append(
+                PlannedRun(key, "problem.toml", "m", varied_values=swept, test_name=held_out)
+            )
             records[key] = {"model": found}
     return model_rows(planned, records)
 

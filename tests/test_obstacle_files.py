@@ -218,4 +218,6 @@ def test_recordings_with_other_obstacles_are_of_one_body():
     fewer = replace(cube, grasps=cube.grasps[:2], name="fewer")
     both = [MotionRecord.from_experiment(each).to_arrays(f"{each.name}/") for each in (cube, fewer)]
     stored = both[0] | both[1]
-    assert MotionRecord.from_arrays("fewer", stored).held.shape[1] == len(cube.body.mesh.points_m)
+    assert MotionRecord.from_arrays("fewer", stored).is_prescribed.shape[1] == len(
+        cube.body.mesh.points_m
+    )

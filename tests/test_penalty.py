@@ -83,9 +83,9 @@ def test_held_nodes_of_the_answer_are_where_their_grasps_are(rng):
         -1, problem.nlp.transcriptions[0].dof_count
     )
     (segment,) = problem.nlp.transcriptions
-    assert segment.dynamics.is_temporarily_held.any()
+    assert segment.dynamics.is_temporarily_prescribed.any()
     np.testing.assert_allclose(rows[:, segment.prescribed_dofs], 0, atol=1e-12)
-    np.testing.assert_allclose(rows[segment.dynamics.is_temporarily_held], 0, atol=1e-12)
+    np.testing.assert_allclose(rows[segment.dynamics.is_temporarily_prescribed], 0, atol=1e-12)
 
 
 # The answer

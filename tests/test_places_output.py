@@ -77,7 +77,7 @@ def test_exact_places_have_no_error(folder: Path):
         "experiment.swing.markers.reference_m={ low = [0.0, 0.0, 0.0] }",
     )[1::2]
     place = places_at_the_guess(folder, tuple(exact))["low"]
-    assert (place.prior_m, place.given) == (0.0, True)
+    assert (place.prior_m, place.is_declared) == (0.0, True)
     assert place.std_error_m is not None
     assert not place.std_error_m.any()
     assert place.displacement_m == 0.0
@@ -171,10 +171,10 @@ def test_the_page_has_places_and_nuisance_parameters_in_their_units(folder: Path
 
 def test_pictures_have_what_was_given_and_what_was_found(folder: Path):
     _, (seen,) = read_run(folder / "run")
-    assert np.isnan(seen.given_places_m).any(axis=1).tolist() == [False, False, True]
+    assert np.isnan(seen.declared_places_m).any(axis=1).tolist() == [False, False, True]
     assert seen.marker_places_m[1] == pytest.approx(PLACES_M["mid"], abs=1e-3)
-    assert seen.given_places_m[1] == pytest.approx([0.03, 0.024, 0.03], abs=1e-9)
-    assert legend_of(seen.marker_places_m, seen.given_places_m, seen) >= {
+    assert seen.declared_places_m[1] == pytest.approx([0.03, 0.024, 0.03], abs=1e-9)
+    assert legend_of(seen.marker_places_m, seen.declared_places_m, seen) >= {
         "position not given", "position given",
     }  # fmt: skip
     same = legend_of(seen.marker_places_m, seen.marker_places_m, seen)
@@ -182,11 +182,11 @@ def test_pictures_have_what_was_given_and_what_was_found(folder: Path):
 
 
 def legend_of(places_m: np.ndarray, given_m: np.ndarray, seen) -> set[str]:
-    figure = mesh_picture(replace(seen, marker_places_m=places_m, given_places_m=given_m))
+    figure = mesh_picture(replace(seen, marker_places_m=places_m, declared_places_m=given_m))
     keys = [child for child in figure.axes[0].get_children() if isinstance(child, Legend)]
     return {text.get_text() for each in keys for text in each.get_texts()}
 
 
 def test_a_place_that_was_not_given_has_not_moved():
     place = MarkerPlace(np.zeros(3), None, 0.1, None)
-    assert (place.given, place.displacement_m) == (False, None)
+    assert (place.is_declared, place.displacement_m) == (False, None)

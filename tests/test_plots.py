@@ -551,7 +551,7 @@ def test_an_experiment_can_be_read_back_from_its_arrays():
     assert arrays["hung cube/rolled_out_positions_m"].dtype == np.float32
     again = MotionRecord.from_arrays("hung cube", arrays)
     np.testing.assert_array_equal(again.positions_m, seen.positions_m)
-    np.testing.assert_array_equal(again.held, seen.held)
+    np.testing.assert_array_equal(again.is_prescribed, seen.is_prescribed)
     assert again.marker_names == list(seen.marker_names)
 
 
@@ -559,7 +559,7 @@ def test_drawing_needs_no_display_and_leaves_pyplot_alone():
     code = (
         "import sys, collocation_sysid as c; assert 'matplotlib' not in sys.modules;"
         "import collocation_sysid.result.animation; from results_small import a_result;"
-        "from collocation_sysid.result.pictures import album; album([], a_result());"
+        "from collocation_sysid.result.pictures import all_pictures; all_pictures([], a_result());"
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     here = Path(__file__).parent

@@ -177,7 +177,7 @@ def test_depth_of_a_validation_recording_is_compared_drawn_and_judged():
     (predicted,) = finished.rollouts["away"].depth.values()
     assert isinstance(predicted, DepthError)
     assert predicted.rms_m == pytest.approx(DEPTH_NOISE_M, rel=0.3)
-    drawn = {replay.name: replay.seen for replay in replays(finished)}["away"]["front"]
+    drawn = {replay.name: replay.visible_points for replay in replays(finished)}["away"]["front"]
     assert np.isfinite(drawn[:, 4]).sum() == predicted.points
     assert "points of depth cameras cannot be compared" in shown(finished)
     (concern,) = (c for c in finished.trust.concerns if c.code == "roll-out/predicted")

@@ -79,14 +79,14 @@ def named(solved: Run, name: str) -> Probe:
 
 def told(solved: Run) -> list[str]:
     """Freed assumptions that are told, the best first."""
-    freed = [p for p in solved.probes if p.kind == "assumption" and p.told]
+    freed = [p for p in solved.probes if p.kind == "assumption" and p.sentences]
     return [p.name for p in sorted(freed, key=lambda p: -p.chi_squared)]
 
 
 def test_nothing_is_told_of_what_is_as_described():
     faultless = probed()
     assert [p.name for p in faultless.probes if p.kind == "window"] == list(WINDOWS)
-    assert not any(p.told for p in faultless.probes)
+    assert not any(p.sentences for p in faultless.probes)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_each_of_several_recordings_says_what_it_has_alone():
     assert set(alone) == {"swing 0", "swing 1"}
     less, more = (alone[f"swing {k}"].moves["gamma_r_s"].value for k in range(2))
     assert less < solved.parameters["gamma_r_s"] < more
-    assert all("gamma_r_s" in p.told and p.chi_squared > 10 for p in alone.values())
+    assert all("gamma_r_s" in p.sentences and p.chi_squared > 10 for p in alone.values())
 
 
 def test_shares_of_both_intervals_stand_beside_every_change():

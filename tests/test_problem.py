@@ -227,7 +227,7 @@ def test_a_second_hand_without_poses_stays_where_it_is(tiny):
     experiment = experiment_of(tiny)
     assert len(experiment.prescribed_dofs) == 54
     nodes = experiment.grasps[1].nodes
-    still = experiment.grasps[1].poses.carried_positions(
+    still = experiment.grasps[1].poses.moved_positions(
         experiment.body.nodes_m[nodes], experiment.t_s
     )
     np.testing.assert_allclose(still - experiment.body.nodes_m[nodes], 0.0, atol=1e-15)
@@ -538,7 +538,7 @@ def test_masses_and_forces_are_read(loaded):
     assert experiment.moving_node_mass_kg([0.0, 0.04]).sum(axis=1) == pytest.approx(
         [experiment.body.mass_kg, experiment.body.mass_kg + 0.002]
     )
-    total = experiment.stated_node_forces_n([0.025]).sum(axis=1)[0]
+    total = experiment.declared_node_forces_n([0.025]).sum(axis=1)[0]
     np.testing.assert_allclose(total, [0.0, 0.1, 0.1], atol=1e-12)
 
 

@@ -109,8 +109,8 @@ def test_loads_keep_their_size():
             bar.moving_node_mass_kg([t_s]).sum()
         )
         np.testing.assert_allclose(
-            finer.stated_node_forces_n([t_s]).sum(axis=1),
-            bar.stated_node_forces_n([t_s]).sum(axis=1),
+            finer.declared_node_forces_n([t_s]).sum(axis=1),
+            bar.declared_node_forces_n([t_s]).sum(axis=1),
         )
 
 

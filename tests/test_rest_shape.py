@@ -59,7 +59,7 @@ def test_the_forward_equilibrium_of_the_stress_free_shape_is_the_mesh(element):
     stress_free = body.inverse_equilibrium.solve(theta).positions_m
     sag_m = np.abs(stress_free - body.nodes_m).max()
     assert sag_m > 0.01
-    held = body.scan_conditions.held_nodes(body.nodes)
+    held = body.scan_conditions.grasped_nodes(body.nodes)
     np.testing.assert_array_equal(stress_free[held], body.nodes_m[held])
     # From halfway between both, under the weight of the scan.
     start = ((stress_free + body.nodes_m) / 2).ravel()
@@ -386,7 +386,7 @@ def test_a_finer_mesh_keeps_what_is_stated():
 
     body = scanned_body()
     finer = refine_body(body)
-    held = finer.scan_conditions.held_nodes(finer.nodes)
+    held = finer.scan_conditions.grasped_nodes(finer.nodes)
     assert np.abs(finer.nodes.points_m[held, 0]).max() < 1e-9
     assert len(held) == 25
     assert UncertaintyOptions().assumptions.deviations["rest_shape"] == 0.58

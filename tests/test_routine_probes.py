@@ -112,7 +112,7 @@ def named(finished: Run, name: str) -> Probe:
 def test_a_faultless_solve_has_both_probes_and_no_alarm():
     faultless = solved()
     assert [probe.name for probe in faultless.probes] == [DRIFT, CLOCK]
-    assert not any(probe.told for probe in faultless.probes)
+    assert not any(probe.sentences for probe in faultless.probes)
     assert faultless.trust.verdict == "good"
     assert not is_deeper_check_worthwhile(faultless.result)
     assert "solve --probe" not in plain_text(run_summary(faultless.result, Path("runs")))
@@ -123,7 +123,7 @@ def test_a_faultless_solve_has_both_probes_and_no_alarm():
 def test_a_drift_and_a_wrong_clock_rate_mean_check_with_corrected_estimates(fault, off, size):
     wrongly = solved(fault, off)
     probe = named(wrongly, fault)
-    assert probe.told
+    assert probe.sentences
     assert abs(probe.size - size) < 3 * probe.size_error
     assert probe.chi_squared > 15
     assert wrongly.trust.verdict == "check"
@@ -174,7 +174,7 @@ def test_faultless_fits_have_no_significant_probe():
         here = replace(at, fit=fit)
         of_fit = here.uncertainty_of_refit(fit, here.parameters)
         here = replace(here, statistical={**of_fit.estimates, **of_fit.derived})
-        alarms += any(probe.told for probe in routine_probes(here))
+        alarms += any(probe.sentences for probe in routine_probes(here))
     assert FALSE_ALARMS == 1e-4
     assert alarms == 0
 
@@ -197,7 +197,7 @@ def probe(relevance: float, told: bool = True, name: str = DRIFT, fall: float = 
 def test_a_probe_alarms_if_it_is_significant_and_relevant():
     assert is_alarming(probe(2 * RELEVANT))
     assert not is_alarming(probe(0.5 * RELEVANT))
-    assert not is_alarming(probe(2 * RELEVANT, told=False))
+    assert not is_alarming(probe(2 * RELEVANT, sentences=False))
     assert not is_alarming(replace(probe(2.0), kind="window"))
 
 

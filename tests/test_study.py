@@ -28,7 +28,7 @@ from collocation_sysid.plan import (
     run_execution,
     run_worker,
 )
-from collocation_sysid.plan.study_arguments import parse_methods, parse_swept_keys, read_truth
+from collocation_sysid.plan.study_arguments import parse_methods, parse_varied_keys, read_truth
 from collocation_sysid.plan.study_planning import shortened_keys
 from collocation_sysid.plan.study_progress import remaining_time_s
 from collocation_sysid.plan.study_rows import (
@@ -112,7 +112,7 @@ def planned_runs(count: int) -> list[PlannedRun]:
     ],
 )
 def test_swept_values_are_lists_or_ranges(text, values):
-    assert parse_swept_keys([text]) == {"a.b": tuple(values)}
+    assert parse_varied_keys([text]) == {"a.b": tuple(values)}
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_swept_values_are_lists_or_ranges(text, values):
 )
 def test_swept_values_that_cannot_be_read_are_quoted(texts, message):
     with pytest.raises(InputError, match=message) as refused:
-        parse_swept_keys(texts)
+        parse_varied_keys(texts)
     assert refused.value.where == "--over"
 
 
@@ -240,9 +240,9 @@ def test_other_data_are_other_runs(tiny):
 
 
 def test_a_sweep_has_every_combination(tiny):
-    over = parse_swept_keys(["parameters.mu_pa.guess=100:400:log:3", "transcription.substeps=1,2"])
+    over = parse_varied_keys(["parameters.mu_pa.guess=100:400:log:3", "transcription.substeps=1,2"])
     planned = plan_sweep(Path("problem.toml"), over, method="reduced-space")
-    assert [tuple(run.swept.values()) for run in planned] == [
+    assert [tuple(run.varied_values.values()) for run in planned] == [
         (mu, m) for mu in ("100", "200", "400") for m in ("1", "2")
     ]
     assert [run.guess["mu_pa"] for run in planned] == [100, 100, 200, 200, 400, 400]
@@ -251,7 +251,7 @@ def test_a_sweep_has_every_combination(tiny):
 
 
 def test_a_sweep_can_be_over_methods(tiny):
-    over = parse_swept_keys(["solver.method=interior-point,reduced-space"])
+    over = parse_varied_keys(["solver.method=interior-point,reduced-space"])
     planned = plan_sweep(Path("problem.toml"), over)
     assert [run.method for run in planned] == ["interior-point", "reduced-space"]
 
@@ -266,7 +266,7 @@ def test_a_sweep_can_be_over_methods(tiny):
 )
 def test_swept_keys_the_problem_has_not_are_refused(tiny, over, message):
     with pytest.raises(InputError, match=message):
-        plan_sweep(Path("problem.toml"), parse_swept_keys([over]))
+        plan_sweep(Path("problem.toml"), parse_varied_keys([over]))
 
 
 def test_keys_are_shortened_while_they_differ():
@@ -501,10 +501,10 @@ def test_success_needs_convergence_and_the_truth():
 
 def test_the_time_left_follows_from_each_methods_runs():
     walls = {"fast": [1.0, 3.0], "slow": [10.0]}
-    assert remaining_time_s(["fast", "fast", "slow"], walls, slots=1) == pytest.approx(14.0)
-    assert remaining_time_s(["fast"] * 8, walls, slots=2) == pytest.approx(8.0)
-    assert remaining_time_s(["slow"], walls, slots=8) == pytest.approx(10.0)
-    assert remaining_time_s(["unknown"], {"fast": [2.0]}, slots=1) == pytest.approx(2.0)
+    assert remaining_time_s(["fast", "fast", "slow"], walls, worker_count=1) == pytest.approx(14.0)
+    assert remaining_time_s(["fast"] * 8, walls, worker_count=2) == pytest.approx(8.0)
+    assert remaining_time_s(["slow"], walls, worker_count=8) == pytest.approx(10.0)
+    assert remaining_time_s(["unknown"], {"fast": [2.0]}, worker_count=1) == pytest.approx(2.0)
     assert remaining_time_s(["fast"], {}, 1) is None
     assert remaining_time_s([], walls, 1) is None
 

@@ -45,7 +45,7 @@ def disturbed(
         x = simulate_scheme(segment.experiment, segment.dynamics.with_theta(as_theta(TRUTH)))
         change = np.zeros_like(x)
         change[:, segment.free_dofs] = rng.standard_normal((len(x), len(segment.free_dofs)))
-        change = segment.dynamics.zero_held_forces(change)
+        change = segment.dynamics.zero_prescribed_forces(change)
         x[segment.dynamics.first_row :] += size_m * change[segment.dynamics.first_row :]
         positions.append(x)
     return collocation.pack(some_parameters(collocation), positions), positions

@@ -46,7 +46,7 @@ def change_tracks(folder: Path, change) -> None:
 def tracked(tiny):
     """The tiny problem with four more markers, tied to the gripper."""
     poses, table = read_poses(tiny / POSES), read_markers(tiny / MARKERS)
-    base = poses.carried_positions(list(BASE_M.values()), table.t_s)
+    base = poses.moved_positions(list(BASE_M.values()), table.t_s)
     tracks = np.concatenate([base, table.positions_m], axis=1)
     write_markers_csv(tiny / MARKERS, table.t_s, (*BASE_M, *table.names), tracks)
     return tiny
@@ -189,7 +189,7 @@ def filmed(tracked):
     labels = [f"Cam {name}" for name in table.names]
     expected = load(tracked, "experiment.0.markers.names=['low', 'mid', 'side']").experiments[0]
     write_markers_csv(tracked / MARKERS, table.t_s, labels, seen_mm)
-    start = poses.carried_positions(list(BASE_M.values()), [0.0])[0].tolist()
+    start = poses.moved_positions(list(BASE_M.values()), [0.0])[0].tolist()
     driven_by_markers(tracked)
     markers = {
         "labels": {f"Cam {name}": name for name in table.names},

@@ -13,7 +13,7 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import element_named
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.files import write_whole
+from collocation_sysid.files import write_text_file
 from collocation_sysid.result.element_fields import ElementFields
 from collocation_sysid.result.run_writers import replaced_folder, write_frames, write_pvd, write_vtu
 from collocation_sysid.written_files import LIST_FILE, list_files
@@ -240,8 +240,8 @@ def test_an_edited_file_keeps_an_earlier_run_from_being_replaced(tmp_path):
 
 def test_what_is_written_into_a_run_later_may_be_replaced_with_it(tmp_path):
     target = earlier_run(tmp_path / "run")
-    write_whole(target / "report.html", "a page")
-    write_whole(target / "old.png", "drawn again")
+    write_text_file(target / "report.html", "a page")
+    write_text_file(target / "old.png", "drawn again")
     with replaced_folder(target / "export-json", marker_file="identified.json") as folder:
         (folder / "identified.json").write_text("{}")
     (target / ".DS_Store").write_text("of a file manager")

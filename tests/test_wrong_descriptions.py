@@ -308,7 +308,7 @@ def replace_points(body: Body, points_m: np.ndarray) -> Body:
 
 def test_a_layer_is_held_for_sure():
     (hold,) = check_grasps(soft("block").experiments[0], 0.03)
-    assert (hold.nodes, hold.nearly_held, hold.nearly_free) == (9, 0, 0)
+    assert (hold.nodes, hold.nearly_grasped, hold.nearly_free) == (9, 0, 0)
     assert hold.share == pytest.approx(9 / 36)
     assert grasp_concerns(hold) == []
 
@@ -319,7 +319,7 @@ def test_nodes_at_the_edge_of_the_box_are_warned_of():
     points_m[top[:3], 2] -= 6e-4
     missed = held_of(points_m, 0.0895)
     (hold,) = check_grasps(missed, 0.03)
-    assert (hold.nodes, hold.nearly_held) == (6, 3)
+    assert (hold.nodes, hold.nearly_grasped) == (6, 3)
     assert "enlarged by a tenth of an element's edge" in grasp_concerns(hold)[0].message
 
 

@@ -22,12 +22,12 @@ UNBROKEN_WIDTH = 100_000
 EXIT_DOUBTFUL = EXIT_NOT_CONVERGED
 
 
-def interruption_exit(kept_results: str) -> typer.Exit:
+def interruption_exit(saved_results: str) -> typer.Exit:
     """Print what is kept after an interrupt and the command that continues; return the exit to
     raise.
     """
     again = shlex.join(["collocation-sysid", *sys.argv[1:]])
-    error_console.print(Text(f"interrupted: {kept_results}; go on with: {again}"), soft_wrap=True)
+    error_console.print(Text(f"interrupted: {saved_results}; go on with: {again}"), soft_wrap=True)
     return typer.Exit(EXIT_INTERRUPTED)
 
 

@@ -13,7 +13,7 @@ import typer
 from rich.text import Text
 
 from ..errors import SimulationError
-from ..files import require_possible, run_name, whole_file
+from ..files import replaced_file, require_possible, run_name
 from ..methods import require_method
 from ..methods.solution import Status
 from ..pipeline import Run, run
@@ -138,8 +138,8 @@ def _draw_pictures(finished: Run, folder: Path, options: SolveCommand) -> Result
             return draw_run(finished, folder, progress.say)
     except KeyboardInterrupt:
         again = shlex.join(["collocation-sysid", "plot", str(folder)])
-        kept = f"interrupted: the result is kept in {folder}, but some pictures are missing"
-        error_console.print(Text(f"{kept}; draw them with: {again}"), soft_wrap=True)
+        message = f"interrupted: the result is kept in {folder}, but some pictures are missing"
+        error_console.print(Text(f"{message}; draw them with: {again}"), soft_wrap=True)
         return finished.result
 
 
@@ -176,7 +176,7 @@ def simulate(options: SimulateCommand) -> None:
         try:
             written = write_data(problem, options.out, options.recipe, progress.share)
         except SimulationError as error:
-            if error.lost_stability is not None:
+            if error.stability_loss is not None:
                 _draw_instability(error, options.out)
             raise
     if options.as_json:
@@ -196,8 +196,8 @@ def _draw_instability(error: SimulationError, folder: Path) -> None:
 
     file = folder / "instability.png"
     folder.mkdir(parents=True, exist_ok=True)
-    with whole_file(file) as draft:
-        instability_picture(error.lost_stability).savefig(draft, dpi=RESOLUTION_DPI)
+    with replaced_file(file) as draft:
+        instability_picture(error.stability_loss).savefig(draft, dpi=RESOLUTION_DPI)
     error_console.print(f"the mode is drawn in {file}")
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from ..files import require_possible, write_whole
+from ..files import require_possible, write_text_file
 from ..serialisation import as_json, content
 from .command_options import (
     AllowCode,
@@ -180,7 +180,7 @@ def report(options: ReportCommand) -> None:
     study = (folder / "summary.json").is_file()
     page = comparison_report(folder) if study else run_report(folder)
     require_possible(file.parent)
-    write_whole(file, report_text(page, file))
+    write_text_file(file, report_text(page, file))
     typer.echo(file)
 
 

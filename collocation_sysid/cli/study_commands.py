@@ -22,7 +22,7 @@ from ..plan import (
     run_all,
 )
 from ..plan.model_variants import models, parse_branches, parse_dampings, parse_materials
-from ..plan.study_arguments import parse_methods, parse_swept_keys, read_truth
+from ..plan.study_arguments import parse_methods, parse_varied_keys, read_truth
 from ..plan.study_rows import SuccessCriterion
 from ..problem import Problem
 from ..validated_types import Positive
@@ -182,7 +182,7 @@ class SweepCommand(StudyOptions):
 def sweep(options: SweepCommand) -> None:
     """Solve the problem for every combination of the values of some keys."""
     method = parse_methods(options.method, "--method")[0] if options.method else None
-    over = parse_swept_keys(options.over)
+    over = parse_varied_keys(options.over)
     overrides = options.set_ or ()
     planned = plan_sweep(options.problem, over, overrides, method, options.allow_code)
     # A missing file would fail every run.

@@ -160,7 +160,7 @@ class Body(Discretisation):
         Lumped masses with the stated densities [kg].
     pattern : SymmetricPattern
         Sparsity pattern of K.
-    has_stated_mass : bool
+    has_declared_mass : bool
         Whether `total_node_mass_kg` was given.
 
     Raises
@@ -204,7 +204,7 @@ class Body(Discretisation):
         super().__init__(parts, tuple(forces), mesh, element, evaluator, threads)
         # Lumped volume of every dof (3n,) for each part.
         self._lumped_m3 = [np.repeat(self._lumped_volume(part), 3) for part in self.parts]
-        self.has_stated_mass = mass_kg is not None
+        self.has_declared_mass = mass_kg is not None
         self.node_mass: Array = self._masses_with_densities([p.density_kg_m3 for p in self.parts])[
             ::3
         ]

@@ -121,10 +121,10 @@ class Discretisation(ConstantsModel):
     @cached_property
     def part_of_cells(self) -> Index:
         """Index of the part to which each cell belongs (E,)."""
-        numbers = np.zeros(len(self.cells), dtype=np.int64)
+        part_numbers = np.zeros(len(self.cells), dtype=np.int64)
         for k, part in enumerate(self.parts):
-            numbers[part.cells] = k
-        return numbers
+            part_numbers[part.cells] = k
+        return part_numbers
 
     def law(self, number: int, memory: bool = False) -> PointLaw:
         """Return the law of the quadrature points of a part.
@@ -454,26 +454,28 @@ class Discretisation(ConstantsModel):
                     positions[output], field_positions, output, part.point_constant_count
                 )
         destinations = np.hstack(list(positions.values()))
-        carried = np.zeros((count, geometry.shape[1], 0), dtype=np.int64)
+        internal_columns = np.zeros((count, geometry.shape[1], 0), dtype=np.int64)
         width = 0
         if memory:
             places_of = self.memory.part_columns(number)
             width = self.memory.width
             sets = 2 if name == "curvature" else 1
-            carried = np.concatenate([places_of + k * width for k in range(sets)], axis=-1)
+            internal_columns = np.concatenate([places_of + k * width for k in range(sets)], axis=-1)
             width *= sets
         if part.stress_field is not None:
-            logs = np.broadcast_to(width + np.arange(count)[:, None, None], (*carried.shape[:2], 1))
-            carried = np.concatenate([carried, logs], axis=-1)
+            logs = np.broadcast_to(
+                width + np.arange(count)[:, None, None], (*internal_columns.shape[:2], 1)
+            )
+            internal_columns = np.concatenate([internal_columns, logs], axis=-1)
         if self.inverse_equilibrium is not None:
-            carried = self.inverse_equilibrium.point_data_columns(number)
+            internal_columns = self.inverse_equilibrium.point_data_columns(number)
         return KernelBatch(
             kernel,
             cells,
             geometry,
             destinations,
             self._width(name),
-            data_columns=carried if carried.shape[-1] else None,
+            data_columns=internal_columns if internal_columns.shape[-1] else None,
         )
 
 

@@ -170,5 +170,5 @@ def reference_geometry(points_m: Array, cells: NDArray[np.int64], element: Eleme
     gradients = np.einsum(
         "qal,elj->eqaj", element.shape_gradients(element.points), barycentric_gradients
     )
-    flat = gradients.reshape(len(cells), len(element.points), 3 * element.nodes)
-    return np.concatenate([flat, (volumes[:, None] * element.weights)[..., None]], axis=2)
+    gradient_rows = gradients.reshape(len(cells), len(element.points), 3 * element.nodes)
+    return np.concatenate([gradient_rows, (volumes[:, None] * element.weights)[..., None]], axis=2)

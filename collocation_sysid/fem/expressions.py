@@ -297,11 +297,11 @@ def curvature_kernel(element: Element, law: PointLaw) -> ElementKernel:
     point = quadrature_point(
         element, law, "x", "v", "w", internal_variable_count=2 * law.internal_variable_count
     )
-    power = -point.derivative_along_weights(_potential(point, law))
+    power = -point.weighted_derivative(_potential(point, law))
     if law.has_memory:
         power += ca.dot(point.internal_variables[6:], second_piola(point, law))
     if damping := _damping(point, law):
-        power -= ca.dot(damping[0], point.material_gradient_along_weights)
+        power -= ca.dot(damping[0], point.weighted_material_gradient)
     mixed = Derivative(power, ("x", "v"), "symmetric" if damping else "whole")
     outputs: Outputs = {
         "position_position": (Derivative(power, ("x", "x")),),

@@ -83,8 +83,10 @@ class ForcePoints:
         chosen : array of int, optional
             Indices of the instances; all by default.
         """
-        flat = forces.transpose(2, 0, 1).reshape(len(forces) * forces.shape[2], forces.shape[1])
-        return (self._operator_for("transposed operator", chosen) @ flat).T
+        force_rows = forces.transpose(2, 0, 1).reshape(
+            len(forces) * forces.shape[2], forces.shape[1]
+        )
+        return (self._operator_for("transposed operator", chosen) @ force_rows).T
 
     def add_matrices(
         self,

@@ -418,12 +418,12 @@ class QuadraturePoint:
         )
 
     @property
-    def material_gradient_along_weights(self) -> ca.SX:
+    def weighted_material_gradient(self) -> ca.SX:
         """Derivative of `material_gradient` along w, stacked (9,)."""
         weights = ca.vertcat(self.gradients["w"], *self.stretches[2:3])
         return ca.jtimes(ca.vec(self.material_gradient), self.strain_symbols, weights)
 
-    def derivative_along_weights(self, scalar: ca.SX) -> ca.SX:
+    def weighted_derivative(self, scalar: ca.SX) -> ca.SX:
         """Return the derivative of a scalar of x and v by x along w."""
         inputs = ca.vertcat(self.gradients["x"], *self.stretches[:2])
         return ca.jtimes(scalar, inputs, ca.vertcat(self.gradients["w"], *self.stretches[2:]))

@@ -68,10 +68,10 @@ def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> Ele
     if order:
         slopes = {chain.sum_name("slopes"): ("none", chain.by_stretch) for chain in chains.values()}
     sums = ca.vertcat(shape.volume, shape.volumes)
-    earlier = [point.make_phase("volumes", shape.volume_pieces(order))]
+    previous_phases = [point.make_phase("volumes", shape.volume_pieces(order))]
     coupled = slopes
     if order > 1:
-        earlier.append(point.make_phase("slopes", shape.with_stretches(slopes), sums))
+        previous_phases.append(point.make_phase("slopes", shape.with_stretches(slopes), sums))
         sums = ca.vertcat(sums, *(chain.slopes for chain in chains.values()))
         coupled = {
             key: p
@@ -83,7 +83,7 @@ def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> Ele
         last.pieces,
         tuple(point.fields),
         {key: last.contractions[key] for key in output_pieces},
-        tuple(earlier),
+        tuple(previous_phases),
         {key: last.contractions[key] for key in coupled},
         _coupling(shape, chains, outputs, order) if order else None,
     )

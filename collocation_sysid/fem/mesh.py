@@ -300,8 +300,8 @@ def boundary_of(tetrahedra: Index) -> tuple[Index, Index]:
     _, first, count = np.unique(
         np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
     )
-    outer = np.sort(first[count == 1])
-    return faces[outer], outer // 4
+    boundary_faces = np.sort(first[count == 1])
+    return faces[boundary_faces], boundary_faces // 4
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:

@@ -295,11 +295,11 @@ def straightening_notes(points_m: np.ndarray, cells: np.ndarray) -> tuple[str, .
             f"most {LARGEST_SIDE_CURVATURE:.0%} of that ({len(bad)} such in all), because sides "
             "are assumed to be straight: refine the mesh, or save it with linear tetrahedra"
         )
-    curved = offset > ROUND_OFF * length
-    if not curved.any():
+    is_curved = offset > ROUND_OFF * length
+    if not is_curved.any():
         return ()
-    largest = (offset[curved] / length[curved]).max()
-    count = len(np.unique(cells[:, 4:][curved]))
+    largest = (offset[is_curved] / length[is_curved]).max()
+    count = len(np.unique(cells[:, 4:][is_curved]))
     return (
         f"Curved sides were straightened: {count} mid nodes lie off the middle of their edges, "
         f"by up to {largest:.2g} of the edge's length.",

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..isolated_process import Failed, ProcessLimits, computed_apart
+from ..isolated_process import Failed, ProcessLimits, run_isolated
 
 # Largest file that is read in this process [bytes]. Zlib compresses at most 1032-fold, so that the
 # content takes up to 200 MB.
@@ -118,7 +118,7 @@ def read_content(path: str | Path) -> MeshContent:
         return _read_in_process(path)
     try:
         absolute = str(Path(path).resolve())
-        arrays = computed_apart(_WORKER, absolute, limits=ProcessLimits.for_file(path))
+        arrays = run_isolated(_WORKER, absolute, limits=ProcessLimits.for_file(path))
     except Failed as error:
         raise InputError(str(error)) from error
     head = json.loads(arrays["head"].tobytes())

@@ -110,11 +110,11 @@ def find_source(
         available = {own for own in ELASTIC if name_of(own) is not None}
         fitting = [c for c in elastic if set(c) <= available and specific <= set(c)]
         if len(fitting) != 1:
-            given_names = (
+            source_names = (
                 ", ".join(str(name_of(own)) for own in ELASTIC if own in available) or "none"
             )
             raise InputError(
-                f"the elastic parameters of {where} are {given_names}; {subject} expects "
+                f"the elastic parameters of {where} are {source_names}; {subject} expects "
                 f"{_alternatives(elastic)}"
             )
         names |= {own: str(name_of(own)) for own in fitting[0]}

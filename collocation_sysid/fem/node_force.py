@@ -251,11 +251,13 @@ class NodeForce:
             force, after = self._evaluate_law(x, v, before, at, named)
             _ = self._symbols
         except (Exception, SystemExit) as error:
-            carried = " and the new internal variables" if self.internal_variable_count else ""
+            internal_text = (
+                " and the new internal variables" if self.internal_variable_count else ""
+            )
             raise InputError(
                 f"force {self.name!r} cannot be evaluated ({reason(error)}); expected a function "
                 "of x, v, at and named constants in CasADi operations that returns three forces"
-                + carried
+                + internal_text
             ) from error
         if force.shape != (3, 1):
             raise InputError(f"force {self.name!r} has the shape {force.shape}; expected (3, 1)")

@@ -68,9 +68,9 @@ class SymmetricPattern:
         low = np.minimum(row, column)
         high = np.maximum(row, column)
         codes = self.columns * self.size + self.rows
-        wanted_codes = low * self.size + high
-        positions = np.searchsorted(codes, wanted_codes)
-        if (positions >= len(codes)).any() or (codes[positions] != wanted_codes).any():
+        requested_codes = low * self.size + high
+        positions = np.searchsorted(codes, requested_codes)
+        if (positions >= len(codes)).any() or (codes[positions] != requested_codes).any():
             raise IndexError("an entry lies outside the mesh graph")
         return positions
 
@@ -160,5 +160,7 @@ def with_ascending_nodes(cells: Index, geometry: Array) -> tuple[Index, Array]:
     order = np.argsort(cells, axis=1)
     gradients = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3)
     sorted_gradients = np.take_along_axis(gradients, order[:, None, :, None], axis=2)
-    flat = sorted_gradients.reshape(*geometry.shape[:2], -1)
-    return np.take_along_axis(cells, order, axis=1), np.append(flat, geometry[..., -1:], axis=2)
+    gradient_rows = sorted_gradients.reshape(*geometry.shape[:2], -1)
+    return np.take_along_axis(cells, order, axis=1), np.append(
+        gradient_rows, geometry[..., -1:], axis=2
+    )

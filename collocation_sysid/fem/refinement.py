@@ -115,8 +115,8 @@ def _refined_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["st
     if isinstance(body.scan_conditions.nodes, (Box, Ball)):
         return body.scan_conditions
     corners = len(body.mesh.points_m)
-    is_held = np.isin(np.arange(corners), body.scan_conditions.held_nodes(body.nodes))
-    chosen = np.concatenate([is_held, is_held[body.mesh.edges].all(axis=1)])
+    is_prescribed = np.isin(np.arange(corners), body.scan_conditions.grasped_nodes(body.nodes))
+    chosen = np.concatenate([is_prescribed, is_prescribed[body.mesh.edges].all(axis=1)])
     return replace(body.scan_conditions, nodes=Indices(np.flatnonzero(chosen).tolist()))
 
 

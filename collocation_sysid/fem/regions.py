@@ -232,13 +232,13 @@ def _densities(
         volumes = [float(mesh.volumes_m3[cells].sum()) for cells in claimed]
         known = [(r.density_kg_m3, v) for r, v in zip(regions, volumes, strict=True)]
         known_kg = sum(density * v for density, v in known if density is not None)
-        left_m3 = mesh.volume_m3 - sum(v for density, v in known if density is not None)
-        if left_m3 <= 1e-12 * mesh.volume_m3:
+        remaining_m3 = mesh.volume_m3 - sum(v for density, v in known if density is not None)
+        if remaining_m3 <= 1e-12 * mesh.volume_m3:
             raise InputError(
                 "every cell is in a region with a density of its own, so mass_kg has no effect; "
                 "omit one of the densities"
             )
-        default_density = (float(mass_kg or 0.0) - known_kg) / left_m3
+        default_density = (float(mass_kg or 0.0) - known_kg) / remaining_m3
         key = "mass_kg"
     else:
         default_density = density_kg_m3
@@ -260,7 +260,7 @@ def _densities(
 
 def _cells_of_regions(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
     """Return the cells of each region, ascending; raise an `InputError` if regions overlap."""
-    owner = np.full(len(mesh.tetrahedra), -1)
+    region_of_cell = np.full(len(mesh.tetrahedra), -1)
     claimed: list[Index] = []
     for k, region in enumerate(regions):
         if region.name in [other.name for other in regions[:k]]:
@@ -269,13 +269,13 @@ def _cells_of_regions(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
             cells = _resolve_cells(mesh, region.cells)
         except InputError as error:
             raise error.located(None, f"region '{region.name}'") from error
-        if (overlap := cells[owner[cells] >= 0]).size:
-            other = regions[int(owner[overlap[0]])].name
+        if (overlap := cells[region_of_cell[cells] >= 0]).size:
+            other = regions[int(region_of_cell[overlap[0]])].name
             raise InputError(
                 f"cell {overlap[0]} is in the regions {other!r} and {region.name!r}; expected "
                 "every cell in one at most"
             )
-        owner[cells] = k
+        region_of_cell[cells] = k
         claimed.append(cells)
     return claimed
 

@@ -133,7 +133,7 @@ class UnderGravity:
         gravity.setflags(write=False)
         object.__setattr__(self, "gravity_m_s2", gravity)
 
-    def held_nodes(self, nodes: ElementNodes) -> Index:
+    def grasped_nodes(self, nodes: ElementNodes) -> Index:
         """Return the indices of the held nodes, sorted.
 
         Raises
@@ -358,9 +358,9 @@ class InverseEquilibrium:
         self.points_m: Array = body.nodes.points_m
         self.gravity_m_s2 = np.asarray(body.scan_conditions.gravity_m_s2, dtype=float)
         size = self.points_m.size
-        held_nodes = body.scan_conditions.held_nodes(body.nodes)
+        grasped_nodes = body.scan_conditions.grasped_nodes(body.nodes)
         self.free: Index = np.setdiff1d(
-            np.arange(size), (3 * held_nodes[:, None] + np.arange(3)).ravel()
+            np.arange(size), (3 * grasped_nodes[:, None] + np.arange(3)).ravel()
         )
         self.places: Index = np.array(
             [*body.elastic_indices, *body.density_indices], dtype=np.int64

@@ -66,8 +66,8 @@ class Box(_PositionSelection):
     high_m: Sequence[float]
 
     def __post_init__(self) -> None:
-        low = _three_numbers(self.low_m, "box: low_m")
-        high = _three_numbers(self.high_m, "box: high_m")
+        low = _vector(self.low_m, "box: low_m")
+        high = _vector(self.high_m, "box: high_m")
         for axis, below, above in zip("xyz", low, high, strict=True):
             if below > above:
                 raise InputError(
@@ -105,7 +105,7 @@ class Ball(_PositionSelection):
     radius_m: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center_m", _three_numbers(self.center_m, "ball: center_m"))
+        object.__setattr__(self, "center_m", _vector(self.center_m, "ball: center_m"))
         if not _is_number(self.radius_m) or not self.radius_m > 0:
             raise InputError(f"ball: radius_m must be a positive number, not {self.radius_m!r}")
 
@@ -375,10 +375,12 @@ def _is_number(value: object) -> bool:
     return isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
 
 
-def _three_numbers(values: Iterable[float], what: str) -> tuple[float, float, float]:
+def _vector(values: Iterable[float], what: str) -> tuple[float, float, float]:
     """Return three numbers as floats, or raise an `InputError` that begins with `what`."""
-    numbers = list(values) if isinstance(values, Iterable) and not isinstance(values, str) else []
-    if len(numbers) != 3 or not all(_is_number(x) and not np.isnan(x) for x in numbers):
+    components = (
+        list(values) if isinstance(values, Iterable) and not isinstance(values, str) else []
+    )
+    if len(components) != 3 or not all(_is_number(x) and not np.isnan(x) for x in components):
         raise InputError(f"{what} must be three numbers [x, y, z] in metres, not {values!r}")
-    x, y, z = (float(value) for value in numbers)
+    x, y, z = (float(value) for value in components)
     return x, y, z

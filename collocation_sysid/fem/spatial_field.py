@@ -27,7 +27,7 @@ from annotated_types import MinLen
 from scipy.sparse.linalg import eigsh, splu
 
 from ..array_types import Array, Index
-from ..declarations import key, stated
+from ..declarations import declaration, key
 from ..errors import InputError
 from ..schema_tables import ByForm
 from ..validated_types import AtLeastOne, Positive, Text
@@ -47,7 +47,7 @@ Prior = Literal["smooth", "two-phase"]
 Lengths = Annotated[Positive | Annotated[tuple[Positive, ...], MinLen(1)], ByForm((int, float))]
 
 
-@stated
+@declaration
 class Field:
     """Stiffness, density or another constant that varies in space within a material.
 
@@ -354,8 +354,8 @@ class FieldAssembly:
         cells, dofs_per_cell = self.dofs.shape
         rows = self.dofs.ravel()
         columns = np.repeat(np.arange(cells), dofs_per_cell)
-        numbers = np.arange(1, rows.size + 1)
-        return sp.csr_array((numbers, (rows, columns)), shape=(self.size, cells))
+        entry_codes = np.arange(1, rows.size + 1)
+        return sp.csr_array((entry_codes, (rows, columns)), shape=(self.size, cells))
 
     def assemble_nodal(self, values: Array, slopes: Array, out: Array) -> None:
         """Write derivatives of nodal values by the coefficients of the field to `out`.

@@ -96,8 +96,8 @@ KERNELS: dict[str, tuple[Expression, tuple[str, ...], int, Contraction]] = {
 
 def stress_kernel(name: str, element: Element, law: PointLaw) -> ElementKernel:
     """Return the kernel of a line of `KERNELS` for an element and a law."""
-    expression, fields, carried, contraction = KERNELS[name]
-    point = quadrature_point(element, law, *fields, internal_variable_count=carried)
+    expression, fields, has_internal_variables, contraction = KERNELS[name]
+    point = quadrature_point(element, law, *fields, internal_variable_count=has_internal_variables)
     piece = expression(point, law)
     if not ca.depends_on(piece, point.point_data):  # H has gone from what is linear in it
         point = replace(point, stretches=(), point_data=ca.SX(0, 1), scaled_indices=())
@@ -276,7 +276,7 @@ class StressEvaluator:
                 self._evaluators[key] = body.make_evaluator(self._batch(name, number))
         first = body.starts[number]
         values = np.array(theta[first : first + body.parts[number].law_constant_count], dtype=float)
-        brought = body.point_data(number, theta, point_data)
+        part_point_data = body.point_data(number, theta, point_data)
         threads = body.threads if len(out) > SINGLE_THREAD_STATES else 1
         self._evaluators[key](
             [np.ascontiguousarray(field) for field in fields],
@@ -284,7 +284,7 @@ class StressEvaluator:
             out,
             threads,
             add,
-            None if brought is None else np.ascontiguousarray(brought),
+            None if part_point_data is None else np.ascontiguousarray(part_point_data),
         )
 
     def _batch(self, name: str, number: int) -> KernelBatch:
@@ -301,8 +301,8 @@ class StressEvaluator:
             # 3n for each of what the points carry, part after part.
             per_number = dofs_of(cells).shape[1]
             length = len(self.jacobian_entries.points)
-            numbers = np.arange(per_number * places.size).reshape(len(cells), -1)
-            destinations = per_number * places[0, 0, 0] + numbers
+            point_numbers = np.arange(per_number * places.size).reshape(len(cells), -1)
+            destinations = per_number * places[0, 0, 0] + point_numbers
         elif "nodes" in kernel.contractions.values():
             destinations = dofs_of(cells)
             length = body.pattern.size
@@ -316,13 +316,15 @@ class StressEvaluator:
         else:
             destinations = point_columns.reshape(len(cells), 6)
             length = self.width
-        carried = point_columns if KERNELS[name][2] else point_columns[..., :0]
+        internal_columns = point_columns if KERNELS[name][2] else point_columns[..., :0]
         if part.stress_field:
             width = self.width if KERNELS[name][2] else 0
             logs = width + np.repeat(np.arange(len(part.cells)), points)
-            carried = np.concatenate([carried, logs[:, None, None]], axis=-1)
-        carried = carried[..., : kernel.point_data_count] if kernel.point_data_count else None
-        return KernelBatch(kernel, cells, geometry, destinations, length, carried)
+            internal_columns = np.concatenate([internal_columns, logs[:, None, None]], axis=-1)
+        internal_columns = (
+            internal_columns[..., : kernel.point_data_count] if kernel.point_data_count else None
+        )
+        return KernelBatch(kernel, cells, geometry, destinations, length, internal_columns)
 
 
 # Number of states up to which one thread is faster than several.

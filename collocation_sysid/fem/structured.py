@@ -53,13 +53,17 @@ def cylinder_of_edge(
     _require_element_limit(3 * _SECTORS * float(rings**2 * layers))
     corners = _SECTORS * rings
     radius_m = diameter_m / 2 * sqrt(2 * pi / corners / sin(2 * pi / corners))
-    whole = cylinder_mesh(radius_m, height_m, int(rings), int(layers), _SECTORS)
+    full_cylinder = cylinder_mesh(radius_m, height_m, int(rings), int(layers), _SECTORS)
     if not quarter:
-        return whole
-    points_m = np.where(np.abs(whole.points_m) < 1e-12 * diameter_m, 0.0, whole.points_m)
-    is_in_quarter = (points_m[whole.tetrahedra][..., :2] >= 0).all(axis=(1, 2))
-    corners_kept, tetrahedra = np.unique(whole.tetrahedra[is_in_quarter], return_inverse=True)
-    return TetMesh(points_m[corners_kept], tetrahedra.reshape(-1, 4), is_generated=True)
+        return full_cylinder
+    points_m = np.where(
+        np.abs(full_cylinder.points_m) < 1e-12 * diameter_m, 0.0, full_cylinder.points_m
+    )
+    is_in_quarter = (points_m[full_cylinder.tetrahedra][..., :2] >= 0).all(axis=(1, 2))
+    quarter_corners, tetrahedra = np.unique(
+        full_cylinder.tetrahedra[is_in_quarter], return_inverse=True
+    )
+    return TetMesh(points_m[quarter_corners], tetrahedra.reshape(-1, 4), is_generated=True)
 
 
 def count_box_elements(size_m: ArrayLike, edge_length_m: float) -> tuple[int, int]:
@@ -227,8 +231,8 @@ def _disc(rings: int, sectors: int) -> tuple[np.ndarray, np.ndarray]:
     for k in range(1, rings + 1):
         for s in range(sectors):
             for i in range(k):
-                outer_node = node(k, s, i + 1)
-                triangles.append((node(k - 1, s, i), node(k, s, i), outer_node))
+                rim_node = node(k, s, i + 1)
+                triangles.append((node(k - 1, s, i), node(k, s, i), rim_node))
                 if i < k - 1:
-                    triangles.append((node(k - 1, s, i), outer_node, node(k - 1, s, i + 1)))
+                    triangles.append((node(k - 1, s, i), rim_node, node(k - 1, s, i + 1)))
     return np.concatenate([np.zeros((1, 2)), *circles]), np.array(triangles)

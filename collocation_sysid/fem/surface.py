@@ -13,8 +13,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from ..errors import InputError
-from ..files import whole_file
-from ..isolated_process import Failed, computed_apart
+from ..files import replaced_file
+from ..isolated_process import Failed, run_isolated
 from .mesh_checks import clean_mesh
 from .mesh_files import read_tetrahedra, write_tetrahedra
 
@@ -86,7 +86,7 @@ def tetrahedralize_surface(
     digest.update(points.astype("<f8").tobytes() + faces.astype("<i8").tobytes())
     cached = Path(cache_dir) / f"mesh-{digest.hexdigest()[:16]}.vtu"
     if not cached.exists():
-        with whole_file(cached) as draft:
+        with replaced_file(cached) as draft:
             # A mesh that is refused must not be kept.
             nodes, tetrahedra, *_ = clean_mesh(*_run_ftetwild(points, faces, edge_length_m))
             write_tetrahedra(draft, nodes, tetrahedra)
@@ -104,8 +104,8 @@ def merge_coincident(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndar
     label = connected_components(links, directed=False)[1]
     _, first = np.unique(label, return_index=True)
     merged = label[triangles].astype(np.int64)
-    flat = (merged == np.roll(merged, 1, axis=1)).any(axis=1)
-    return points[first], merged[~flat]
+    is_degenerate = (merged == np.roll(merged, 1, axis=1)).any(axis=1)
+    return points[first], merged[~is_degenerate]
 
 
 def _checked_surface(points_m: ArrayLike, triangles: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -182,7 +182,7 @@ def _run_ftetwild(
     lengths = (ASKED_LENGTH * edge_length_m, TOLERANCE * edge_length_m / diagonal)
     words = [repr(float(length)) for length in lengths]
     try:
-        mesh = computed_apart(_WORKER, *words, points_m=points, triangles=triangles.astype("i4"))
+        mesh = run_isolated(_WORKER, *words, points_m=points, triangles=triangles.astype("i4"))
     except Failed as error:
         raise InputError(f"pytetwild could not fill the surface ({error})") from error
     if not len(mesh["tetrahedra"]):

@@ -206,11 +206,15 @@ class LiveEstimator:
         self.model = LiveModel.from_problem(problem)
         model = self.model
         self.names = self.model.experiment.markers.names
-        far_m = REACH_BODY_SIZES * model.body_size_m
+        most_motion_m = REACH_BODY_SIZES * model.body_size_m
         neighbours = model.neighbouring_samples
-        self._reach_m = far_m + float(np.linalg.norm(model.segment.body.nodes_m.mean(axis=0)))
+        self._reach_m = most_motion_m + float(
+            np.linalg.norm(model.segment.body.nodes_m.mean(axis=0))
+        )
         stencils = [each.stencil for each in model.instruments]
-        self.intake = FrameBuffer(model.interval_s, model.substeps, neighbours, far_m, stencils)
+        self.intake = FrameBuffer(
+            model.interval_s, model.substeps, neighbours, most_motion_m, stencils
+        )
         self.counts = self.intake.counts
         self.samples = 0
         self.budget_s = options.budget_s or BUDGET_FRACTION * model.interval_s
@@ -222,8 +226,8 @@ class LiveEstimator:
         self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
         self.prior = SquareRootInformation.empty(model.parameter_count)
         self.first_pass: WindowPass | None = None
-        self._joined = CombinedPasses(self.prior, [], [])
-        self._held_m = np.full((1, 3), np.nan)
+        self._combined = CombinedPasses(self.prior, [], [])
+        self._last_positions_m = np.full((1, 3), np.nan)
         self.second_pass: WindowPass | None = None
         self.log: list[LoggedRow] = []
         self.search = self._new_search() if problem.parameters.names_without_guess else None
@@ -309,7 +313,7 @@ class LiveEstimator:
         notes += self._add_samples(readings, squares)
         self._update_estimate()
         if self.first_pass is not None and not self.first_pass.has_failed and self.search is None:
-            self._relinearise_if_far(
+            self._relinearise_if_moved(
                 self.first_pass, self.first_pass, began, RELINEARISE_DISTANCE_FIRST
             )
         self.budget.frame_s = self.clock() - before
@@ -352,10 +356,10 @@ class LiveEstimator:
         else:
             rows = len(batch_run.solution.history) * len(self.log)
             estimates = {name: batch_run.estimates[name] for name in last.estimates}
-            left_out = Assessment.from_concerns(
+            unassessed = Assessment.from_concerns(
                 data_concerns(ResidualScatter(), self.counts, self.samples)
             )
-            trust = batch_run.trust.combined_with(left_out)
+            trust = batch_run.trust.combined_with(unassessed)
             last = replace(last, marker_rms_m=batch_run.solution.rms_m)
         return replace(
             last,
@@ -396,8 +400,8 @@ class LiveEstimator:
             if self.counts["with a wrench"] == 1:
                 notes.append("wrenches are ignored: no grasp of the problem has a sensor")
         if frame.pose is not None:
-            self._held_m = frame.pose[0]
-        distances_m = np.linalg.norm(frame.tracks_m[:, None] - self._held_m, axis=2)
+            self._last_positions_m = frame.pose[0]
+        distances_m = np.linalg.norm(frame.tracks_m[:, None] - self._last_positions_m, axis=2)
         self.samples += int(np.isfinite(frame.tracks_m[:, 0]).sum())
         is_implausible = (distances_m > self._reach_m).all(axis=1)
         if is_implausible.any():
@@ -424,7 +428,7 @@ class LiveEstimator:
             if track is None:
                 self._start_pass(rows[0])
             elif not track.has_failed:
-                done = track.add_rows([row.poses for row in rows[: track.rows_left_in_block]])
+                done = track.add_rows([row.poses for row in rows[: track.remaining_rows_of_block]])
         except SimulationError as error:
             if track is None:
                 self.intake.reset()
@@ -559,7 +563,7 @@ class LiveEstimator:
             track = WindowPass(self.model, self.p, self.prior, self._block_rows)
             track.add_rows([row.poses], guesses)
         self.first_pass = track
-        self._joined = CombinedPasses.from_passes(track, None)
+        self._combined = CombinedPasses.from_passes(track, None)
 
     def _restart(self) -> None:
         """Keep the information so far as a prior, and wait for a new start."""
@@ -580,7 +584,7 @@ class LiveEstimator:
         """
         if self.first_pass is None or self.first_pass.has_failed:
             return np.inf
-        return self._largest_distance(self.first_pass, self.p, self._joined.points)
+        return self._largest_distance(self.first_pass, self.p, self._combined.points)
 
     def _largest_distance(self, track: WindowPass, p: Array, points: Sequence[Array]) -> float:
         """Return the largest distance of p from some points, in the standard errors of a pass."""
@@ -591,8 +595,8 @@ class LiveEstimator:
     def _update_estimate(self) -> None:
         """Update the estimate p from the joint information of both passes."""
         if self.first_pass is not None and not self.first_pass.has_failed:
-            self._joined = CombinedPasses.from_passes(self.first_pass, self.second_pass)
-            self.p = self._constrained_minimum(self.first_pass, self._joined.information)
+            self._combined = CombinedPasses.from_passes(self.first_pass, self.second_pass)
+            self.p = self._constrained_minimum(self.first_pass, self._combined.information)
 
     def _constrained_minimum(self, track: WindowPass, known: SquareRootInformation) -> Array:
         """Return the minimum of a quadratic loss within bounds and the trust region about a
@@ -613,7 +617,7 @@ class LiveEstimator:
         samples = len(self.log) / self.model.substeps
         deviation = POINT_PRIOR_DEVIATION * max(1.0, samples / TRIAL_SAMPLES)
         slopes = np.diag(1 / (deviation * self.model.collocation.reach_p * track.sweep.rates))
-        information = self._joined.information.with_rows(
+        information = self._combined.information.with_rows(
             np.zeros(size), slopes, track.sweep.transformed
         )
         return self._constrained_minimum(track, information)
@@ -637,9 +641,9 @@ class LiveEstimator:
             }
             return estimates_only, Assessment.from_concerns(grave)
         if self.counts["looked"] % SCATTER_INTERVAL_FRAMES == 0:
-            self.scatter = self._joined.scatter(self.model.transformed(self.p))
+            self.scatter = self._combined.scatter(self.model.transformed(self.p))
         self.counts["looked"] += 1
-        estimates = self._estimates_at(self._joined.information, self.p)
+        estimates = self._estimates_at(self._combined.information, self.p)
         grave += data_concerns(self.scatter, self.counts, self.samples)
         grave += estimate_concerns(estimates, self.linearisation_distance)
         return estimates, Assessment.from_concerns(grave)
@@ -687,7 +691,7 @@ class LiveEstimator:
             if again is None:
                 break
             if not done and again.base is not None:
-                self._relinearise_if_far(self.first_pass, again, began, RELINEARISE_DISTANCE)
+                self._relinearise_if_moved(self.first_pass, again, began, RELINEARISE_DISTANCE)
             affordable = min(
                 self._affordable_rows(done, self.clock() - began), again.repeatable_rows
             )
@@ -767,7 +771,7 @@ class LiveEstimator:
                 return None
         return WindowPass(self.model, p, track.prior, self._block_rows, base)
 
-    def _relinearise_if_far(
+    def _relinearise_if_moved(
         self, track: WindowPass, pass_to_move: WindowPass, began: float, distance: float
     ) -> None:
         """Move the linearisation point of a pass to the estimate if it is far and there is time.
@@ -805,13 +809,15 @@ class LiveEstimator:
         points = [*track.linearisation_points, again.linearisation_points[0]]
         expected = max(track.information.loss(point) for point in points)
         # Of a pass that turned the sum of squares is not that of a simulation.
-        is_near = (
+        is_within_trust_region = (
             track.last_relinearised_row
             and self._largest_distance(track, track.linearisation_point, again.linearisation_points)
             <= REPEAT_DISTANCE
         )
         fits = (
-            track.has_failed or is_near or again.loss <= ACCEPTED_RATIO * expected + ACCEPTED_EXCESS
+            track.has_failed
+            or is_within_trust_region
+            or again.loss <= ACCEPTED_RATIO * expected + ACCEPTED_EXCESS
         )
         if not again.has_failed and fits:
             again.base = None

@@ -111,8 +111,10 @@ class GraspReactions:
     def zeros(cls, rows: int, dofs: int, columns: int, grasps: int) -> GraspReactions:
         """Return zero arrays for a number of rows, dofs, columns and grasps."""
         moved = np.zeros((rows, dofs, columns))
-        turns = np.zeros((rows, grasps, 3, 3))
-        return cls(GraspForces.zeros(rows, dofs, columns), moved, turns, turns[..., 0].copy())
+        rotations = np.zeros((rows, grasps, 3, 3))
+        return cls(
+            GraspForces.zeros(rows, dofs, columns), moved, rotations, rotations[..., 0].copy()
+        )
 
     @property
     def arrays(self) -> tuple[Array, ...]:
@@ -161,9 +163,9 @@ class GraspReactions:
             Factors of the columns, whose parameters change their scale.
         """
         force = self.forces.force + self.forces.changes[..., 1:] @ step
-        held = GraspForces(force, self.forces.changes * grown)
+        grasp_forces = GraspForces(force, self.forces.changes * grown)
         return GraspReactions(
-            held, self.position_columns * grown, self.rotations.copy(), self.shifts.copy()
+            grasp_forces, self.position_columns * grown, self.rotations.copy(), self.shifts.copy()
         )
 
     def wrenches(

@@ -13,7 +13,7 @@ from ..array_types import Array
 from ..display import Shown, Table, millimetres
 from ..errors import InputError
 from ..fem.constants import unit_of
-from ..files import whole_file
+from ..files import replaced_file
 from ..result.figure_style import BLUE, ORANGE, new_figure, style_axes, symbol_as_mathtext
 from ..result.run_sections import verdict_section
 from .estimator import LiveUpdate
@@ -95,7 +95,7 @@ def write_film(updates: Sequence[LiveUpdate], file: str | Path) -> Path:
     ]
     step = max(1, round(len(t_s) / max(1.0, (t_s[-1] - t_s[0]) * FRAMES_A_SECOND)))
     writer = PillowWriter(fps=FRAMES_A_SECOND)
-    with whole_file(path) as draft, writer.saving(figure, str(draft), DPI):
+    with replaced_file(path) as draft, writer.saving(figure, str(draft), DPI):
         for stop in [*range(1, len(t_s), step), len(t_s)]:
             for line, values in lines:
                 for part, each in zip(line, values, strict=True):

@@ -215,9 +215,9 @@ class LiveModel:
         itself.
         """
         places, guesses = self._mass_damping
-        flat = p.copy()
-        flat[places] = np.exp(p[places] - guesses)
-        return flat
+        transformed_values = p.copy()
+        transformed_values[places] = np.exp(p[places] - guesses)
+        return transformed_values
 
     def physical(self, transformed: Array) -> Array:
         """Return the parameters p of transformed variables: the inverse of `transformed`."""
@@ -239,13 +239,13 @@ class LiveModel:
         """
         residual, slopes = self.collocation.prior_residuals(p)
         nq = self.collocation.nq
-        flat = self.transformed(p)
+        transformed_values = self.transformed(p)
         from_guess = (p[:nq] - self.collocation.parameters.guess_q) / WEAK_PRIOR_DEVIATION
         rows = np.vstack(
             [np.diag(slopes), np.eye(nq, self.parameter_count) / WEAK_PRIOR_DEVIATION]
-        ) / self.transformation_derivatives(flat)
+        ) / self.transformation_derivatives(transformed_values)
         empty = SquareRootInformation.empty(self.parameter_count)
-        return empty.with_rows(np.concatenate([residual, from_guess]), rows, flat)
+        return empty.with_rows(np.concatenate([residual, from_guess]), rows, transformed_values)
 
     @cached_property
     def neighbouring_samples(self) -> int:
@@ -268,7 +268,7 @@ class LiveModel:
         rows = np.arange(2 * neighbours + 1)
         segment = self.segment
         return MarkerResidual.from_markers(
-            origin, rows, segment.nuisance, segment.association, earlier_times=neighbours
+            origin, rows, segment.nuisance, segment.association, preceding_times=neighbours
         )
 
     @cached_property
@@ -379,10 +379,10 @@ class LiveModel:
         poses : sequence of Poses
             K poses of all grasps.
         """
-        turns = np.array([[turn for turn, _ in each] for each in poses])[:, *self._axes]
+        rotations = np.array([[turn for turn, _ in each] for each in poses])[:, *self._axes]
         shifts = np.array([[shift for _, shift in each] for each in poses])[:, *self._axes]
-        goal = np.einsum("kgj,gj->kg", turns, displaced_nodes[0]) + shifts
-        return goal, np.einsum("kgj,gjm->kgm", turns, displaced_nodes[1])
+        goal = np.einsum("kgj,gj->kg", rotations, displaced_nodes[0]) + shifts
+        return goal, np.einsum("kgj,gjm->kgm", rotations, displaced_nodes[1])
 
     @cached_property
     def _axes(self) -> tuple[Index, Index]:
@@ -437,8 +437,8 @@ def _unsupported_features(experiment: Experiment) -> Iterator[tuple[str, object,
     grasps = experiment.grasps
     nuisance = experiment.nuisance
     yield "a static experiment", experiment.is_static, "a motion"
-    has_given_start = experiment.start == "given"
-    yield 'start = "given"', has_given_start, 'start = "equilibrium" or "undeformed"'
+    has_declared_start = experiment.start == "given"
+    yield 'start = "given"', has_declared_start, 'start = "equilibrium" or "undeformed"'
     yield "a material with memory", body.has_memory, "one without Prony branches"
     yield "a mesh made under gravity", body.scan_conditions is not None, "a stress-free one"
     has_internal_variables = any(
@@ -471,7 +471,7 @@ def _unsupported_features(experiment: Experiment) -> Iterator[tuple[str, object,
     yield "an experiment whose grasps never move", not moves, "a pose that moves"
     loads = (
         each(experiment.t_s)
-        for each in (experiment.point_mass_at_nodes_kg, experiment.stated_node_forces_n)
+        for each in (experiment.point_mass_at_nodes_kg, experiment.declared_node_forces_n)
     )
     changing = not all(np.allclose(each, each[:1]) for each in loads)
     yield "a load that changes in time", changing, "constant loads"
@@ -511,7 +511,7 @@ def _still_wrench(wrench: Wrench, t_s: NDArray) -> Wrench:
 def _first_poses(experiment: Experiment) -> Poses:
     """Return the poses of all grasps at the start of a recording."""
     poses = (grasp.poses.at(grasp.poses.t_s[:1]) for grasp in experiment.grasps)
-    return tuple((turns[0], shifts[0]) for turns, shifts in poses)
+    return tuple((rotations[0], shifts[0]) for rotations, shifts in poses)
 
 
 def _grasps_at(experiment: Experiment, poses: Poses) -> list:

@@ -113,9 +113,9 @@ def paced_frames(
     """
     began = clock()
     for number, frame in enumerate(frames):
-        left_s = began + number / rate_hz - clock()
-        if left_s > 0:
-            wait(left_s)
+        waiting_s = began + number / rate_hz - clock()
+        if waiting_s > 0:
+            wait(waiting_s)
         yield frame
 
 

@@ -210,7 +210,7 @@ class StreamingSweep:
             self.shape_functions,
             *(points.shape_functions(self.phi) for points in model.observed_points),
         ]
-        self._looked = tuple(
+        self._observables = tuple(
             np.concatenate(part)
             for part in zip(*((nodes, at.weights) for nodes, at in points_and_weights), strict=True)
         )
@@ -236,18 +236,20 @@ class StreamingSweep:
         rows = self.model.template_rows
         dofs = self.segment.dof_count
         empty = np.zeros((rows, dofs))
-        given = np.zeros((rows, len(self.grasped), self.count))
-        felt = GraspReactions.zeros(rows, len(self.sensed), self.count, len(self.model.first_poses))
-        return SweepState(0, 0, empty, empty, given, felt, None, ())
+        node_loads = np.zeros((rows, len(self.grasped), self.count))
+        reactions = GraspReactions.zeros(
+            rows, len(self.sensed), self.count, len(self.model.first_poses)
+        )
+        return SweepState(0, 0, empty, empty, node_loads, reactions, None, ())
 
     def _moved_state(self, state: SweepState, at: Array) -> SweepState:
         """Return a state moved from the linearisation point `at` to p, to first order."""
         if state.last_rows is None or (at == self.p).all():
             return state
         moving = self.moving
-        flat = self.model.transformed(at)
-        old_rates = self.model.transformation_derivatives(flat)
-        change = (self.transformed - flat)[moving]
+        transformed = self.model.transformed(at)
+        old_rates = self.model.transformation_derivatives(transformed)
+        change = (self.transformed - transformed)[moving]
         step = change / old_rates[moving]
         factors = np.ones(self.count)
         factors[1:] = (self.rates / old_rates)[moving]
@@ -275,12 +277,14 @@ class StreamingSweep:
             for w, k in zip(columns_of_rows, stored, strict=True)
         ]
         all_wrenches = np.array([wrenches for *_, wrenches in state.observed_rows])
-        all_wrenches[..., 0] += all_wrenches[..., 1:] @ ((self.transformed - flat) / old_rates)
+        all_wrenches[..., 0] += all_wrenches[..., 1:] @ (
+            (self.transformed - transformed) / old_rates
+        )
         all_wrenches[..., 1:] *= self.rates / old_rates
         read = tuple(zip(stored_rows, point_columns, all_wrenches, strict=True))
-        felt = state.reactions.moved_to(step, factors)
+        reactions = state.reactions.moved_to(step, factors)
         return replace(
-            state, x=x, force=force, reactions=felt, last_rows=memory, observed_rows=read
+            state, x=x, force=force, reactions=reactions, last_rows=memory, observed_rows=read
         )
 
     def _resume(self, state: SweepState) -> None:
@@ -289,14 +293,16 @@ class StreamingSweep:
         self.end = state.end
         self.x = state.x.copy()
         self.force = state.force.copy()
-        self.given = state.prescribed_columns.copy()
+        self.prescribed_columns = state.prescribed_columns.copy()
         grasped = None
         if self.segment.nuisance.affects_grasps:
-            grasped = PrescribedColumns.from_columns(self.solver, self.grasped, self.given)
+            grasped = PrescribedColumns.from_columns(
+                self.solver, self.grasped, self.prescribed_columns
+            )
         self.columns = SweepColumns(self.setting, self.count, has_step=True, prescribed=grasped)
-        self.felt = state.reactions.copy()
+        self.reactions = state.reactions.copy()
         self.forward = ForwardSubstitution(
-            self.solver, self.columns, state.last_rows, self.felt.forces
+            self.solver, self.columns, state.last_rows, self.reactions.forces
         )
         most = (
             (2 * self.model.neighbouring_samples + LARGEST_SAMPLE_DELAY + 2) * self.model.substeps
@@ -319,8 +325,8 @@ class StreamingSweep:
             end=self.end,
             x=self.x.copy(),
             force=self.force.copy(),
-            prescribed_columns=self.given.copy(),
-            reactions=self.felt.copy(),
+            prescribed_columns=self.prescribed_columns.copy(),
+            reactions=self.reactions.copy(),
             last_rows=self.forward.state,
             observed_rows=tuple(self.read),
         )
@@ -354,8 +360,8 @@ class StreamingSweep:
         first = self._make_room(len(poses))
         count = len(poses)
         goals, slopes = self.model.prescribed_positions(self.displaced_nodes, poses)
-        self.felt.set_poses(first, poses)
-        self.given[first : first + count, :, 1 + self.segment.nq :] = slopes
+        self.reactions.set_poses(first, poses)
+        self.prescribed_columns[first : first + count, :, 1 + self.segment.nq :] = slopes
         if first < self.dynamics.first_row:
             self.x[first] = self._start_positions(poses[0])
             self._count_rows(1)
@@ -401,7 +407,7 @@ class StreamingSweep:
         """Shift the template if necessary for more rows; return the index of the next row in it."""
         surplus = self.end + count - self.model.template_rows
         if surplus > 0:
-            for each in (self.x, self.force, self.given, *self.felt.arrays):
+            for each in (self.x, self.force, self.prescribed_columns, *self.reactions.arrays):
                 each[:-surplus] = each[surplus:]
             self.end -= surplus
         return self.end
@@ -496,7 +502,9 @@ class StreamingSweep:
                 return solved, np.nan
             length = float(np.abs(row_columns[:, 0]).max(initial=0.0))
             if not length <= limit:
-                self.forward = ForwardSubstitution(solver, self.columns, before, self.felt.forces)
+                self.forward = ForwardSubstitution(
+                    solver, self.columns, before, self.reactions.forces
+                )
                 return solved, length
             self.longest_m = max(self.longest_m, length)
             self.x[t] += row_columns[:, 0]
@@ -513,10 +521,10 @@ class StreamingSweep:
         rows = slice(self.end - len(columns), self.end)
         all_columns = np.array(columns)
         all_columns[:, :, 0] = self.x[rows]
-        by_flat = (all_columns[:, :, 1:] / self.rates[self.moving]).astype(np.float32)
-        pairs = zip(self.x[rows].copy(), by_flat, strict=True)
+        by_transformed = (all_columns[:, :, 1:] / self.rates[self.moving]).astype(np.float32)
+        pairs = zip(self.x[rows].copy(), by_transformed, strict=True)
         stored_rows = [StoredRow(self.transformed, *pair) for pair in pairs]
-        self.felt.apply_correction(rows, all_columns[:, self.sensed])
+        self.reactions.apply_correction(rows, all_columns[:, self.sensed])
         self.read.extend(
             zip(
                 stored_rows,
@@ -543,7 +551,7 @@ class StreamingSweep:
         *_, w, s = self.model.stencils
         x = self.x[: here.stop, self.sensed]
         rows = np.arange(first, here.stop)
-        reactions, channels = self.felt.wrenches(sensors, self.setting, x, (w, s), rows)
+        reactions, channels = self.reactions.wrenches(sensors, self.setting, x, (w, s), rows)
         motion = ObservedMotion(x, lambda: reactions)
         for k, channel in enumerate(channels):
             value, slopes = channel.linearise(motion, self.phi, self.moving, size)
@@ -554,7 +562,7 @@ class StreamingSweep:
 
     def _at_points(self, columns: Array) -> Array:
         """Return the values at observed points (…, 3M + …, k) of columns (…, 3n, k) of the body."""
-        nodes, weights = self._looked
+        nodes, weights = self._observables
         *rows, dofs, count = columns.shape
         at = columns.reshape(*rows, dofs // 3, 3, count)[..., nodes, :, :]
         return np.einsum("ma,...maik->...mik", weights, at).reshape(*rows, -1, count)

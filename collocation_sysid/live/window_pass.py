@@ -95,7 +95,7 @@ class WindowPass:
             model, p, prior.with_problem(model.prior_information(p)), *self.start
         )
         self.blocks: list[WindowBlock] = []
-        self._turns = [(0, self.sweep.transformed)]
+        self._base_changes = [(0, self.sweep.transformed)]
         self.has_failed = False
         self.rows = 0
         self._off: list[Array] = []
@@ -136,7 +136,7 @@ class WindowPass:
         rows_of_base = self._rows_of_base(len(poses))
         computed = self.sweep.advance(poses, guesses or self._initial_guesses(rows_of_base))
         last_rows = list(zip(computed, rows_of_base, strict=False))[-2:]
-        errors = [kept.x - self._predicted_positions(base) for kept, base in last_rows]
+        errors = [stored.x - self._predicted_positions(base) for stored, base in last_rows]
         self._off = [*self._off, *errors][-2:]
         self.blocks[-1].stored_rows += computed
         self.rows += len(computed)
@@ -147,7 +147,7 @@ class WindowPass:
         self.sweep = StreamingSweep(
             self.model, p, self.information, self.sweep.state, self.linearisation_point
         )
-        self._turns.append((self.rows, self.sweep.transformed))
+        self._base_changes.append((self.rows, self.sweep.transformed))
 
     @property
     def last_relinearised_row(self) -> int:
@@ -155,7 +155,7 @@ class WindowPass:
 
         0 if never.
         """
-        return self._turns[-1][0]
+        return self._base_changes[-1][0]
 
     @property
     def linearisation_points(self) -> list[Array]:
@@ -164,8 +164,11 @@ class WindowPass:
 
     def linearisation_points_from(self, row: int) -> list[Array]:
         """Return the transformed parameters at which the rows from an index on are linearised."""
-        before = [flat for first, flat in self._turns if first <= row]
-        return [*before[-1:], *[flat for first, flat in self._turns if first > row]]
+        before = [transformed for first, transformed in self._base_changes if first <= row]
+        return [
+            *before[-1:],
+            *[transformed for first, transformed in self._base_changes if first > row],
+        ]
 
     def add_residuals(self, residuals: Sequence[LinearisedResidual]) -> None:
         """Add the linearised residuals of samples after the last rows."""
@@ -175,7 +178,7 @@ class WindowPass:
     @property
     def residuals(self) -> list[LinearisedResidual]:
         """Linearised residuals of all samples in the window."""
-        return [said for block in self.blocks for said in block.residuals]
+        return [residual for block in self.blocks for residual in block.residuals]
 
     def repeat_rows(self, rows: Sequence[LoggedRow]) -> None:
         """Compute logged rows and add their samples, as many as possible at once."""
@@ -184,15 +187,15 @@ class WindowPass:
         self.add_residuals(self.sweep.linearise_samples(pairs))
 
     @property
-    def rows_left_in_block(self) -> int:
+    def remaining_rows_of_block(self) -> int:
         """Largest number of rows that can be computed at once: those left in the block."""
         return min(ROWS_PER_CHUNK, self.block_rows - self.rows % self.block_rows)
 
     @property
     def repeatable_rows(self) -> int:
         """Largest number of rows that can be repeated at once; 1 without an initial guess."""
-        ahead = 0 if self.base is None else self.base.rows - self.rows
-        return max(1, min(ahead, self.rows_left_in_block))
+        rows_of_base = 0 if self.base is None else self.base.rows - self.rows
+        return max(1, min(rows_of_base, self.remaining_rows_of_block))
 
     def _rows_of_base(self, count: int) -> list[StoredRow]:
         """Return the next rows of the repeated pass; an empty list if it has too few."""
@@ -230,8 +233,14 @@ class WindowPass:
         """
         block = self.blocks.pop(0)
         self.rows -= len(block.stored_rows)
-        turns = [(max(0, row - len(block.stored_rows)), flat) for row, flat in self._turns]
-        self._turns = [*[turn for turn in turns if not turn[0]][-1:], *[t for t in turns if t[0]]]
+        changes = [
+            (max(0, row - len(block.stored_rows)), transformed)
+            for row, transformed in self._base_changes
+        ]
+        self._base_changes = [
+            *[turn for turn in changes if not turn[0]][-1:],
+            *[t for t in changes if t[0]],
+        ]
         self.prior = self.sweep.with_residuals(self.prior, block.residuals)
         self.start = (self.blocks[0].start, self.blocks[0].linearisation_point)
         return len(block.stored_rows)
@@ -292,5 +301,9 @@ class CombinedPasses(NamedTuple):
         order.
         """
         return ResidualScatter.from_residuals(
-            [said.evaluate_at(transformed) for said in self.residuals if not said.instrument]
+            [
+                residual.evaluate_at(transformed)
+                for residual in self.residuals
+                if not residual.instrument
+            ]
         )

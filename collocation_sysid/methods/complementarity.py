@@ -81,7 +81,7 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
         f"further solves reduced pressure times gap to {share:g} κδ²"
     )
     # Multipliers that balance pressures which follow from gaps: the solver's leave its rounding.
-    return replace(solution, given_multipliers=None, notes=(*solution.notes, note))
+    return replace(solution, initial_multipliers=None, notes=(*solution.notes, note))
 
 
 def reachable_obstacles(experiment: Experiment, x: Array) -> list[Obstacle]:
@@ -105,8 +105,8 @@ def reachable_obstacles(experiment: Experiment, x: Array) -> list[Obstacle]:
         surface = contact.law_of_contact.surface
         faces = mesh.surface[surface.faces]
         gaps = smallest_gaps(contact, x).reshape(-1, surface.points_per_face).min(axis=1)
-        if len(near_faces := np.unique(faces[gaps < REACH * surface.edge_m])):
-            obstacle = replace(obstacle, faces=Indices(mesh.file_index[near_faces].tolist()))
+        if len(reachable_faces := np.unique(faces[gaps < REACH * surface.edge_m])):
+            obstacle = replace(obstacle, faces=Indices(mesh.file_index[reachable_faces].tolist()))
         obstacles.append(obstacle)
     return obstacles
 

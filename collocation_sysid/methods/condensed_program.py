@@ -178,7 +178,7 @@ class CondensedPattern:
     ----------
     structure : tuple of two arrays of int
         Column pointers and row indices.
-    kept : array of int
+    remaining : array of int
         Indices of the complete matrix's values that remain.
     targets : sequence of arrays of int
         Indices in the condensed values: first of the remaining values, then of the contributions by
@@ -188,7 +188,7 @@ class CondensedPattern:
     """
 
     structure: tuple[Index, Index]
-    kept: Index
+    remaining: Index
     targets: Sequence[Index]
     eliminated: Sequence[EliminatedColumns]
 
@@ -196,7 +196,7 @@ class CondensedPattern:
     def from_pairs(
         cls,
         shape: tuple[int, int],
-        kept: Index,
+        remaining: Index,
         pairs: Sequence[tuple[Index, Index]],
         eliminated: Sequence[EliminatedColumns],
     ) -> CondensedPattern:
@@ -206,7 +206,7 @@ class CondensedPattern:
         ----------
         shape : (rows, columns)
             Shape of the condensed matrix.
-        kept : array of int
+        remaining : array of int
             Indices of the complete matrix's values that remain.
         pairs : sequence of (rows, columns)
             Entries: first those that remain, then those of `eliminated`.
@@ -217,7 +217,7 @@ class CondensedPattern:
         unique_codes = np.unique(np.concatenate(codes))
         indptr = np.searchsorted(unique_codes, np.arange(shape[1] + 1) * shape[0])
         places = [np.searchsorted(unique_codes, each) for each in codes]
-        return cls((indptr, unique_codes % shape[0]), kept, places, eliminated)
+        return cls((indptr, unique_codes % shape[0]), remaining, places, eliminated)
 
 
 class CondensedCollocation(Collocation):
@@ -248,7 +248,7 @@ class CondensedCollocation(Collocation):
         )
 
     @cached_property
-    def _kept(self) -> tuple[Index, Index]:
+    def _remaining(self) -> tuple[Index, Index]:
         """Indices of the variables and of the constraints that remain."""
         variables = np.arange(self.complete.variable_count)
         rows = np.arange(self.complete.constraint_count)
@@ -262,25 +262,25 @@ class CondensedCollocation(Collocation):
         others.
         """
         sizes = self.complete.variable_count, self.complete.constraint_count
-        numbers = np.full(sizes[0], -1), np.full(sizes[1], -1)
-        for number, kept in zip(numbers, self._kept, strict=True):
-            number[kept] = np.arange(len(kept))
-        return numbers
+        indices = np.full(sizes[0], -1), np.full(sizes[1], -1)
+        for number, remaining in zip(indices, self._remaining, strict=True):
+            number[remaining] = np.arange(len(remaining))
+        return indices
 
     @property
     def variable_count(self) -> int:
         """Length of z."""
-        return len(self._kept[0])
+        return len(self._remaining[0])
 
     @property
     def constraint_count(self) -> int:
         """Length of g."""
-        return len(self._kept[1])
+        return len(self._remaining[1])
 
     @property
-    def kept_rows(self) -> Index:
+    def remaining_rows(self) -> Index:
         """Indices of the complete program's constraints that remain."""
-        return self._kept[1]
+        return self._remaining[1]
 
     @property
     def phi_columns(self) -> slice:
@@ -299,7 +299,7 @@ class CondensedCollocation(Collocation):
         """Return variables z (variables,) from parameters p and positions, without the
         eliminated dofs.
         """
-        return self.complete.pack(p, positions)[self._kept[0]]
+        return self.complete.pack(p, positions)[self._remaining[0]]
 
     def unpack(self, z: Array) -> tuple[Array, list[Array]]:
         """Return parameters p and the positions (N, 3n) of each experiment [m]."""
@@ -308,12 +308,12 @@ class CondensedCollocation(Collocation):
     def bounds(self) -> tuple[Array, Array]:
         """Return lower and upper bounds (variables,) of z; they are equal for known variables."""
         lower, upper = self.complete.bounds()
-        return lower[self._kept[0]], upper[self._kept[0]]
+        return lower[self._remaining[0]], upper[self._remaining[0]]
 
     def complete_variables(self, z: Array) -> Array:
         """Return the variables of the complete program from z."""
         variables = np.empty(self.complete.variable_count)
-        variables[self._kept[0]] = z
+        variables[self._remaining[0]] = z
         for each, (positions, _) in zip(self.eliminated, self._prescribed(z), strict=True):
             variables[each.variables] = positions
         return variables
@@ -332,7 +332,7 @@ class CondensedCollocation(Collocation):
         """
         variables = self.complete_variables(z)
         complete = np.zeros(self.complete.constraint_count)
-        complete[self._kept[1]] = multipliers
+        complete[self._remaining[1]] = multipliers
         slope = (
             loss_weight * self.complete.gradient(variables)
             + self.complete.jacobian(variables).T @ complete
@@ -359,11 +359,11 @@ class CondensedCollocation(Collocation):
         slope = self.complete.gradient(self.complete_variables(z))
         for each, (_, by_phi) in zip(self.eliminated, self._prescribed(z), strict=True):
             slope[each.phi] += by_phi.T @ slope[each.variables]
-        return slope[self._kept[0]]
+        return slope[self._remaining[0]]
 
     def constraint_values(self, z: Array) -> Array:
         """Return the scaled constraints g (constraints,)."""
-        return self.complete.constraint_values(self.complete_variables(z))[self._kept[1]]
+        return self.complete.constraint_values(self.complete_variables(z))[self._remaining[1]]
 
     # Matrices -----------------------------------------------------------------------------------
 
@@ -373,8 +373,8 @@ class CondensedCollocation(Collocation):
         of_variable, of_row = self._condensed_indices
         rows, columns = _entries(self.complete.jacobian_structure)
         remaining = np.flatnonzero(of_row[rows] >= 0)
-        kept = remaining[of_variable[columns[remaining]] >= 0]
-        pairs = [(of_row[rows[kept]], of_variable[columns[kept]])]
+        of_free_variables = remaining[of_variable[columns[remaining]] >= 0]
+        pairs = [(of_row[rows[of_free_variables]], of_variable[columns[of_free_variables]])]
         through = []
         for each in self.eliminated:
             through.append(
@@ -388,7 +388,7 @@ class CondensedCollocation(Collocation):
             )
             pairs.append((through[-1].rows[:, None], of_variable[each.phi]))
         return CondensedPattern.from_pairs(
-            (self.constraint_count, self.variable_count), kept, pairs, through
+            (self.constraint_count, self.variable_count), of_free_variables, pairs, through
         )
 
     @property
@@ -410,20 +410,20 @@ class CondensedCollocation(Collocation):
         values = np.empty(len(layout.structure[1])) if out is None else out
         values[:] = 0
         rows, complete_values = self.complete.constraints_and_jacobian(self.complete_variables(z))
-        values[layout.targets[0]] = complete_values[layout.kept]
+        values[layout.targets[0]] = complete_values[layout.remaining]
         parts = zip(layout.targets[1:], layout.eliminated, self._prescribed(z), strict=True)
         for places, through, (_, slopes) in parts:
             values[places] += through.times(complete_values, slopes).ravel()
-        return rows[self._kept[1]], values
+        return rows[self._remaining[1]], values
 
     @cached_property
     def _hessian(self) -> CondensedPattern:
         """Pattern of the upper triangle of the Hessian."""
         number, _ = self._condensed_indices
         rows, columns = _entries(self.complete.hessian_structure)
-        are_kept = (number[rows] >= 0) & (number[columns] >= 0)
-        kept = np.flatnonzero(are_kept & ~self._is_loss_coupling(rows, columns))
-        pairs = [(number[rows[kept]], number[columns[kept]])]
+        are_remaining = (number[rows] >= 0) & (number[columns] >= 0)
+        remaining = np.flatnonzero(are_remaining & ~self._is_loss_coupling(rows, columns))
+        pairs = [(number[rows[remaining]], number[columns[remaining]])]
         through = []
         # Of the lower triangle too, whose diagonal is that of the upper one.
         below = np.flatnonzero(rows != columns)
@@ -437,7 +437,7 @@ class CondensedCollocation(Collocation):
             j = number[each.phi]
             pairs.append((np.minimum(i, j)[i[:, 0] >= 0], np.maximum(i, j)[i[:, 0] >= 0]))
         size = self.variable_count
-        return CondensedPattern.from_pairs((size, size), kept, pairs, through)
+        return CondensedPattern.from_pairs((size, size), remaining, pairs, through)
 
     def _is_loss_coupling(self, rows: Index, columns: Index) -> NDArray[np.bool_]:
         """Return a mask (entries,) of positions that are coupled by the loss, but by no
@@ -464,7 +464,7 @@ class CondensedCollocation(Collocation):
         positions.
         """
         places = np.full(len(self.complete.hessian_structure[1]), -1)
-        places[self._hessian.kept] = self._hessian.targets[0]
+        places[self._hessian.remaining] = self._hessian.targets[0]
         of_q, of_x = (places[each] for each in self.complete.hessian_diagonals)
         return of_q, of_x[of_x >= 0]
 
@@ -493,7 +493,7 @@ class CondensedCollocation(Collocation):
         complete_values = self._complete_hessian(
             self.complete_variables(z), loss_weight, multipliers
         )
-        values[layout.targets[0]] = complete_values[layout.kept]
+        values[layout.targets[0]] = complete_values[layout.remaining]
         parts = zip(
             self.eliminated, layout.targets[1:], layout.eliminated, self._prescribed(z), strict=True
         )

@@ -111,7 +111,7 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
         Number of samples; it is increased to the first sample with a marker, or with a depth image.
     """
     markers = experiment.markers
-    stop = min(len(experiment.t_s), max(count, markers.first_seen_sample + 1, 3))
+    stop = min(len(experiment.t_s), max(count, markers.first_visible_sample + 1, 3))
     fewest = 1 if experiment.is_static else FEWEST_SHARED_SAMPLES
     stop, depths = until_all_cameras_see(experiment.depths, experiment.t_s, stop, fewest)
     shorter = replace(markers, t_s=markers.t_s[:stop], positions_m=markers.positions_m[:stop])
@@ -172,7 +172,7 @@ class _ContinuationState:
         last = self.last
         recorder = self.recorder
         z = last.z
-        multipliers = last.given_multipliers
+        multipliers = last.initial_multipliers
         if last.collocation is not recorder.collocation:
             z = _continue_variables(recorder.collocation, *self.known)
             multipliers = None

@@ -33,7 +33,7 @@ T = TypeVar("T")
 # How often it is looked whether there are workers at all.
 LOOK_EVERY_S = 10
 # glibc's M_TRIM_THRESHOLD and M_MMAP_THRESHOLD, and the most that it raises them to by itself.
-KEPT_BYTES = {-1: 64 * 2**20, -3: 32 * 2**20}
+MALLOC_LIMITS_BYTES = {-1: 64 * 2**20, -3: 32 * 2**20}
 
 
 class ExperimentExecutor(Protocol):
@@ -121,7 +121,7 @@ class DaskExecutor:
     def store_segments(self, collocation: Collocation) -> list[Any]:
         """See `ExperimentExecutor`; each body and experiment is sent only once."""
         segments = collocation.transcriptions
-        with self._end_search_if_lost():
+        with self._end_search_if_disconnected():
             known = all(segment.experiment in self._sent for segment in segments)
             if not known or len(self._homes) != len(segments):
                 costs = [segment.variable_count for segment in segments]
@@ -133,7 +133,7 @@ class DaskExecutor:
     def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
         """See `ExperimentExecutor`."""
         rows = zip(self._homes, *columns, strict=True)
-        with self._end_search_if_lost():
+        with self._end_search_if_disconnected():
             return [self._submit(home, run, *row) for home, *row in rows]
 
     def fetch(self, stored: Sequence[Any]) -> list[Any]:
@@ -145,16 +145,18 @@ class DaskExecutor:
             If the scheduler or all workers are lost, or an experiment terminates every worker that
             processes it.
         """
-        with self._end_search_if_lost():
+        with self._end_search_if_disconnected():
             return [self._result(future) for future in stored]
 
     def notes(self) -> list[str]:
         """See `ExperimentExecutor`."""
-        with self._end_search_if_lost():
-            lost_workers = self._first - self.client.nthreads().keys()
-        said = f"{len(lost_workers)} of {len(self._first)} workers were lost during the solve: "
+        with self._end_search_if_disconnected():
+            failed_workers = self._first - self.client.nthreads().keys()
+        note = f"{len(failed_workers)} of {len(self._first)} workers were lost during the solve: "
         return (
-            [f"{said}their recordings were computed again by other workers"] if lost_workers else []
+            [f"{note}their recordings were computed again by other workers"]
+            if failed_workers
+            else []
         )
 
     def _result(self, future: Any) -> Any:
@@ -166,13 +168,13 @@ class DaskExecutor:
                 _require_workers(self.client.nthreads())
 
     @contextmanager
-    def _end_search_if_lost(self) -> Iterator[None]:
+    def _end_search_if_disconnected(self) -> Iterator[None]:
         """Context that raises `SearchEnded` instead of Dask's exceptions if the cluster is lost."""
         dask = distributed()
         try:
             yield
         except dask.scheduler.KilledWorker as error:
-            raise _cluster_lost(
+            raise _disconnection(
                 "A recording terminated every worker that computed it: check the workers' memory."
             ) from error
         except (Exception, dask.client.CancelledError) as error:
@@ -181,7 +183,7 @@ class DaskExecutor:
                 self.client.status == "running" and not is_disconnected
             ):
                 raise
-            raise _cluster_lost("Its scheduler no longer responds.") from error
+            raise _disconnection("Its scheduler no longer responds.") from error
 
     def _submit(self, home: str, run: Callable[..., Any], *arguments: Any) -> Any:
         """Return a future of a function on a worker; Dask may choose another worker if that is
@@ -198,11 +200,11 @@ class DaskExecutor:
     def _send_segment(self, transcription: Transcription, home: str) -> Any:
         """Return a future of a transcription on a worker."""
 
-        def send_once(thing: T, make: Callable[[T], Any]) -> Any:
+        def send_once(value: T, make: Callable[[T], Any]) -> Any:
             """Return the future of an object, which is made at the first call."""
-            if thing not in self._sent:
-                self._sent[thing] = make(thing)
-            return self._sent[thing]
+            if value not in self._sent:
+                self._sent[value] = make(value)
+            return self._sent[value]
 
         def experiment(options: Experiment) -> Any:
             return self._submit(
@@ -212,7 +214,7 @@ class DaskExecutor:
         def body(options: Body) -> Any:
             return self._submit(home, _identity, options)
 
-        def whole(options: Transcription) -> Any:
+        def complete_segment(options: Transcription) -> Any:
             sent = send_once(options.experiment, experiment)
             chart = _with_fields(options.association)
             rest = {
@@ -222,7 +224,7 @@ class DaskExecutor:
             }
             return self._submit(home, _restore_segment, sent, chart, rest)
 
-        return send_once(transcription, whole)
+        return send_once(transcription, complete_segment)
 
 
 @contextmanager
@@ -247,8 +249,8 @@ def _assign_workers(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
     The experiment with the highest cost is assigned first, each to the thread with the least work.
     """
     _require_workers(threads)
-    slots = [(address, k) for address, count in threads.items() for k in range(count)]
-    loads = dict.fromkeys(slots, 0)
+    threads_of_workers = [(address, k) for address, count in threads.items() for k in range(count)]
+    loads = dict.fromkeys(threads_of_workers, 0)
     homes = [""] * len(costs)
     for number in sorted(range(len(costs)), key=lambda k: -costs[k]):
         slot = min(loads, key=lambda slot: (loads[slot], slot[1]))
@@ -288,12 +290,14 @@ def _refusal(message: str) -> InputError:
 def _require_workers(threads: dict[str, int]) -> None:
     """Raise `SearchEnded` if no worker is left."""
     if not threads:
-        raise _cluster_lost("No worker is left.")
+        raise _disconnection("No worker is left.")
 
 
-def _cluster_lost(reason: str) -> SearchEnded:
+def _disconnection(reason: str) -> SearchEnded:
     """Return the exception that ends the search because the cluster is lost."""
-    return SearchEnded(Status.CLUSTER_LOST, f"{Status.CLUSTER_LOST.sentence} {reason}")
+    return SearchEnded(
+        Status.CLUSTER_DISCONNECTED, f"{Status.CLUSTER_DISCONNECTED.sentence} {reason}"
+    )
 
 
 # On the workers -----------------------------------------------------------------------------------
@@ -318,22 +322,22 @@ def _retain_freed_memory() -> None:
     system; each sweep would then wait for new memory pages. No effect with other C libraries.
     """
     if mallopt := getattr(ctypes.pythonapi, "mallopt", None):  # glibc's only
-        for option, size in KEPT_BYTES.items():
+        for option, size in MALLOC_LIMITS_BYTES.items():
             mallopt(option, size)
 
 
-def _identity(thing: T) -> T:
+def _identity(value: T) -> T:
     """Return the argument; workers run it to store an object."""
-    return thing
+    return value
 
 
-def _with_fields(thing: T, body: Body | None = None) -> T:
+def _with_fields(instance: T, body: Body | None = None) -> T:
     """Return a copy of an experiment or an association with another body; None removes it
     for transfer.
     """
-    stated = {field.name: getattr(thing, field.name) for field in fields(thing)}  # pyright: ignore[reportArgumentType]
-    other = object.__new__(type(thing))
-    vars(other).update(stated | {"body": body})
+    field_values = {field.name: getattr(instance, field.name) for field in fields(instance)}  # pyright: ignore[reportArgumentType]
+    other = object.__new__(type(instance))
+    vars(other).update(field_values | {"body": body})
     return other
 
 

@@ -23,7 +23,7 @@ from .solution import Iteration, Solution, Status, constraint_multipliers
 from .solve_recorder import Recorder, SearchEnded
 
 # Longest last step of a parameter's logarithm: Newton's method converges quadratically from there.
-NEAR = 1e-3
+LARGEST_CORRECTION = 1e-3
 # Sweeps after which the best point so far is taken: the work of a few iterations of IPOPT.
 MAX_SWEEPS = 100
 # How a coarse solve may end without a point that is worth starting from.
@@ -41,15 +41,15 @@ class InitialPoint:
         estimates.
     is_usable : bool
         Whether its variables satisfy the equations of motion to the end of the recordings.
-    is_near : bool
-        Whether the optimum is within about `NEAR`, so that Newton's method converges.
+    is_close : bool
+        Whether the optimum is within about `LARGEST_CORRECTION`, so that Newton's method converges.
     note : str
         Explanation for the user how the point was computed.
     """
 
     coarse: Solution
     is_usable: bool
-    is_near: bool
+    is_close: bool
     note: str
 
 
@@ -74,12 +74,12 @@ def compute_initial_point(
         if recorder.elapsed_s > max_time_s:
             raise SearchEnded(Status.TIME_LIMIT)
 
-    method = ReducedSpace(tolerance=NEAR, max_iterations=MAX_SWEEPS)
+    method = ReducedSpace(tolerance=LARGEST_CORRECTION, max_iterations=MAX_SWEEPS)
     coarse = method(recorder.collocation, record, start)
     # Reduced space gives multipliers only where a part of the trajectory was not simulated.
-    reached_end = coarse.given_multipliers is None
+    reached_end = coarse.initial_multipliers is None
     is_usable = reached_end and coarse.status not in UNUSABLE and bool(np.isfinite(coarse.z).all())
-    is_near = is_usable and coarse.status is Status.CONVERGED
+    is_close = is_usable and coarse.status is Status.CONVERGED
     count = coarse.iterations
     sweeps = (
         f"{count} sweep{'s' * (count != 1)} of reduced space"
@@ -87,16 +87,16 @@ def compute_initial_point(
         else ("the given initial values")
     )
     continuation = "IPOPT solved the complete program from there"
-    if is_near:
+    if is_close:
         note = (
-            f"initial point: {sweeps}, which determined the parameters to {100 * NEAR:g} %; "
-            f"{continuation}"
+            f"initial point: {sweeps}, which determined the parameters to "
+            f"{100 * LARGEST_CORRECTION:g} %; {continuation}"
         )
     elif is_usable:
         note = f"initial point: {sweeps} ({coarse.status.value}); {continuation}"
     else:
         note = f"initial point: the method reduced-space found none ({coarse.message.rstrip('.')})"
-    return InitialPoint(coarse, is_usable, is_near, note)
+    return InitialPoint(coarse, is_usable, is_close, note)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +150,7 @@ def adjoint_multipliers(
         lifted_jacobian = jacobian[-added:, -added:].T.tocsc()
         constraints[-added:] = -spla.spsolve(lifted_jacobian, slope[-added:])
     if isinstance(program, CondensedCollocation):
-        constraints = constraints[program.kept_rows]
+        constraints = constraints[program.remaining_rows]
         variables = convert_variables(z, collocation, program)
         gradient = program.gradient(variables)
         jacobian = program.jacobian(variables)

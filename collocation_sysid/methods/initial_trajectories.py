@@ -155,7 +155,7 @@ def continue_trajectory(
         iterate.x if len(iterate.x) else None,
         options,
         stopwatch=stopwatch,
-        near_solution=guess,
+        approximate_solution=guess,
     )
 
 
@@ -205,7 +205,7 @@ def rigid_trajectory(transcription: Transcription, theta: Array) -> Array:
         x0 = experiment.rigid_positions(t_s[:1]).ravel()
     rotations, translations = experiment.rigid_motion(t_s)
     shape = (x0.reshape(-1, 3) - translations[0]) @ rotations[0]  # in the grasp's frame
-    carried = np.einsum("tij,nj->tni", rotations, shape) + translations[:, None]
+    positions = np.einsum("tij,nj->tni", rotations, shape) + translations[:, None]
     return transcription.with_prescribed_positions(
-        carried.reshape(len(t_s), -1), transcription.guess_phi
+        positions.reshape(len(t_s), -1), transcription.guess_phi
     )

@@ -18,7 +18,7 @@ from ..array_types import Array
 from ..errors import located
 from ..program.collocation import Collocation
 from ..recording.experiment import Experiment
-from ..validated_types import Count, Finite, NotNegative, Options, Positive, Text, Whole
+from ..validated_types import Count, Finite, NotNegative, Options, Positive, StrictInteger, Text
 from . import nlpsol
 from .callbacks import NlpFunctions
 from .complementarity import require_frictionless, solve_complementarity
@@ -38,7 +38,7 @@ def _require_ipopt_value(value: Any) -> Any:
     return value
 
 
-IpoptValue = Annotated[Text | Whole | Finite, BeforeValidator(_require_ipopt_value)]
+IpoptValue = Annotated[Text | StrictInteger | Finite, BeforeValidator(_require_ipopt_value)]
 
 IPOPT_STATUS = {
     "Solve_Succeeded": Status.CONVERGED,
@@ -197,7 +197,7 @@ class InteriorPoint(Options):
                 coarse.status,
                 coarse.status.sentence,
                 z=coarse.z,
-                multipliers=coarse.given_multipliers,
+                multipliers=coarse.initial_multipliers,
                 iterations=0,
                 evaluations=coarse.evaluations,
             )
@@ -225,7 +225,7 @@ class InteriorPoint(Options):
         multipliers = None
         with recorder.stopwatch.building():
             program = condense(recorder.collocation.with_lifted_variables())
-            if initial is not None and initial.is_near:
+            if initial is not None and initial.is_close:
                 multipliers = adjoint_multipliers(program, recorder.collocation, initial.coarse.z)
             is_warm = multipliers is not None
             hessian = _DampedHessian(program, replace(self, warm_up=0.0) if is_warm else self)

@@ -39,19 +39,19 @@ def secant_update(curvature: Array, previous: Iterate, after: Iterate) -> Array:
     step = after.p - previous.p
     change = after.fit.score - previous.fit.score
     curvature_step = after.fit.score - after.previous_slopes_residual  # B · step
-    change_along_step = float(change @ step)
-    if change_along_step <= 0:
+    change_dot_step = float(change @ step)
+    if change_dot_step <= 0:
         return curvature
     previous_curvature = float(step @ curvature @ step)
     if previous_curvature != 0:  # a B that has become too large shrinks to what this step saw
         curvature = curvature * min(1.0, abs(float(step @ curvature_step) / previous_curvature))
     missing = curvature_step - curvature @ step
-    rank_two = np.outer(missing, change) / change_along_step
+    rank_two = np.outer(missing, change) / change_dot_step
     return (
         curvature
         + rank_two
         + rank_two.T
-        - (missing @ step) / change_along_step**2 * np.outer(change, change)
+        - (missing @ step) / change_dot_step**2 * np.outer(change, change)
     )
 
 

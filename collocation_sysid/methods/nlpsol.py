@@ -17,7 +17,7 @@ import numpy as np
 from ..array_types import Array
 from ..errors import InputError
 from ..program.collocation import Collocation, convert_variables
-from ..signal_handling import LEFT, raises_interrupt
+from ..signal_handling import LEFT_BEHIND, raises_interrupt
 from .callbacks import HessianValues, IterationMonitor, NlpFunctions
 from .condensed_program import complete_multipliers
 from .initial_point import InitialMultipliers
@@ -85,10 +85,10 @@ def solve(
     collocation = recorder.collocation
     watch = recorder.stopwatch
     errors: list[BaseException] = []
-    earlier_evaluations_s = watch.evaluations
-    earlier_linear_algebra_s = watch.linear_algebra
+    previous_evaluations_s = watch.evaluations
+    previous_linear_algebra_s = watch.linear_algebra
     unaccounted_s = (
-        recorder.elapsed_s - watch.build - earlier_evaluations_s - earlier_linear_algebra_s
+        recorder.elapsed_s - watch.build - previous_evaluations_s - previous_linear_algebra_s
     )
     with watch.building():
         start = recorder.initial_variables(start)
@@ -102,10 +102,10 @@ def solve(
     )
     if errors and not isinstance(errors[0], _SolverAbandoned):
         raise errors[0]
-    watch.evaluations = earlier_evaluations_s + functions.seconds
+    watch.evaluations = previous_evaluations_s + functions.seconds
     # What is neither set-up nor callback.
     accounted_s = watch.build + watch.evaluations + monitor.seconds + unaccounted_s
-    watch.linear_algebra = max(earlier_linear_algebra_s, recorder.elapsed_s - accounted_s)
+    watch.linear_algebra = max(previous_linear_algebra_s, recorder.elapsed_s - accounted_s)
     status = statuses.get(return_status, Status.NUMERICAL_FAILURE)
     if monitor.stop or (recorder.is_late and not status.converged):
         status = Status.INTERRUPTED if monitor.stop else Status.TIME_LIMIT
@@ -208,7 +208,7 @@ def _run_on_thread(search: Callable[[], None], monitor: IterationMonitor) -> Non
                 remaining_s -= LOOK_EVERY_S if monitor.stop else 0.0
         finally:
             if thread.is_alive():
-                thread.name = LEFT
+                thread.name = LEFT_BEHIND
                 monitor.errors.append(_SolverAbandoned())
 
 

@@ -55,11 +55,11 @@ WIDEST = 4.0
 # Largest trust region with depth cameras, whose associations are valid only nearby.
 SEEING = 0.25
 # With depth cameras, a rejected step shorter than this ends the search.
-SEEN = 1e-3
+LEAST_DETERMINED_SHARE = 1e-3
 # Smallest share of the associated depth points that a step must keep.
-STILL_SEEN = 0.97
+LEAST_VISIBLE_SHARE = 0.97
 # Largest increase of the mean loss of a depth point by a new association.
-AS_NEAR = 1.01
+EQUAL_MISFIT_RATIO = 1.01
 # Largest step from which the curvature at the solution is learned.
 LOCAL = 0.1
 # Largest number of new associations of the measurements.
@@ -339,7 +339,7 @@ class ReducedSearch:
                 continue
             if is_short and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
                 return Status.CONVERGED  # rounding keeps it from getting better
-            if self.has_depth_cameras and length <= SEEN:
+            if self.has_depth_cameras and length <= LEAST_DETERMINED_SHARE:
                 return Status.CONVERGED  # what is seen changes by more than such a step gains
             if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
                 return Status.STALLED
@@ -501,7 +501,10 @@ class ReducedSearch:
         each = after.loss / max(1, measurements)
         before_each = point.loss / max(1, before.measurement_count)
         self._set_collocation(horizon, before, point.p)
-        return measurements >= STILL_SEEN * self.most_measurements and each <= AS_NEAR * before_each
+        return (
+            measurements >= LEAST_VISIBLE_SHARE * self.most_measurements
+            and each <= EQUAL_MISFIT_RATIO * before_each
+        )
 
     def _accept(self, horizon: Horizon, point: Iterate) -> Iterate:
         """Make a point the best so far, associate its measurements, record it, and return it."""

@@ -115,10 +115,10 @@ def memory_mb(collocation: Collocation) -> float:
     """Estimate the memory of a solve [MB]; it increases linearly with the number of time steps."""
     # Two points with positions, p and Z; positions of the answer and of its gradients.
     columns = 2 * (2 + collocation.nq) + 6
-    numbers = columns * collocation.variable_count
+    values = columns * collocation.variable_count
     chunks = sorted(Sweep(segment).chunk_bytes for segment in collocation.transcriptions)
     concurrent = concurrent_count(len(chunks), collocation.threads)
-    return (8 * numbers + sum(chunks[-concurrent:])) / 1e6
+    return (8 * values + sum(chunks[-concurrent:])) / 1e6
 
 
 def _main_measurement(collocation: Collocation) -> tuple[str, str]:

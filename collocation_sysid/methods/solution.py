@@ -38,7 +38,7 @@ class Status(Enum):
     DIVERGED = "diverged"
     NUMERICAL_FAILURE = "numerical-failure"
     INTERRUPTED = "interrupted"
-    CLUSTER_LOST = "cluster-lost"
+    CLUSTER_DISCONNECTED = "cluster-lost"
     REFUSED = "refused"
     NOT_SIMULABLE = "not-simulable"
 
@@ -70,8 +70,8 @@ _SENTENCES = {
     Status.NUMERICAL_FAILURE: "A step could not be computed or a function was not finite; another "
     "guess or linear solver may help.",
     Status.INTERRUPTED: "Interrupted; this is the best iterate so far.",
-    Status.CLUSTER_LOST: "The cluster was lost; this is the best iterate so far, simulated on "
-    "this machine. Continue from it with --start.",
+    Status.CLUSTER_DISCONNECTED: "The cluster was lost; this is the best iterate so far, "
+    "simulated on this machine. Continue from it with --start.",
     Status.NOT_SIMULABLE: "The body cannot be simulated at the guess; start from stiffer or less "
     "damped parameters or without a guess, or use interior-point, which needs no simulation.",
     Status.REFUSED: "The solver refused the problem or one of its options.",
@@ -169,7 +169,7 @@ class Solution:
         Problem that was solved.
     z : (variables,) array
         Final variables, see `program.collocation`.
-    given_multipliers : (constraints,) array or None
+    initial_multipliers : (constraints,) array or None
         Multipliers of the constraints g in the scaling of the NLP; None if the method computes
         none, see `multipliers`.
     iterations : int
@@ -193,7 +193,7 @@ class Solution:
     method: str
     collocation: Collocation
     z: Array
-    given_multipliers: Array | None
+    initial_multipliers: Array | None
     iterations: int
     history: Sequence[Iteration]
     timing: Timing
@@ -249,8 +249,8 @@ class Solution:
         stationary in the positions (one backward sweep); zeros if the equations of a time step are
         singular.
         """
-        if self.given_multipliers is not None:
-            return self.given_multipliers
+        if self.initial_multipliers is not None:
+            return self.initial_multipliers
         try:
             return constraint_multipliers(self.collocation, self.z)
         except SimulationError:
@@ -290,7 +290,7 @@ class Solution:
         InputError
             If none, or several with different values, are called so.
         """
-        found: dict[str, float] = {}
+        estimates: dict[str, float] = {}
         known: list[str] = []
         for part in self.parts:
             nuisance = part.segment.nuisance
@@ -302,11 +302,11 @@ class Solution:
                 if entry.row == GAUGE:
                     names.add([*readings[entry.number].unknowns][entry.axis])
                 if name in names:
-                    found[full] = value
-        if len(found) == 1:
-            return next(iter(found.values()))
-        which = f"{name!r} is ambiguous" if found else f"no nuisance parameter {name!r}"
-        expected = ", ".join(map(repr, found or dict.fromkeys(known)))
+                    estimates[full] = value
+        if len(estimates) == 1:
+            return next(iter(estimates.values()))
+        which = f"{name!r} is ambiguous" if estimates else f"no nuisance parameter {name!r}"
+        expected = ", ".join(map(repr, estimates or dict.fromkeys(known)))
         raise InputError(f"{which}; expected one of {expected or '(none)'}{hint_at(name, known)}")
 
     def part_of(self, experiment: str) -> ExperimentIterate | None:

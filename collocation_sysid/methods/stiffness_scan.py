@@ -45,7 +45,7 @@ SOFT_PA = 1e4
 # Tolerance of simulations that are only compared.
 LOOSE = NewtonOptions(tolerance=1e-4)
 # Number of failures in a row that end the scan.
-LOST = 2
+LOST_MARKERS = 2
 # Misfit over the best one that counts as a failure.
 WORSE = 3.0
 # The scan continues beyond an end as long as the misfit decreases by this share.
@@ -54,7 +54,7 @@ BETTER = 0.01
 # next to the best in all twins.
 MORE_STARTS = 2
 # Largest misfit of another start over the best one.
-ALIKE = 4.0
+EQUIVALENT_LOSS_RATIO = 4.0
 NO_GUESS = "no guess"
 
 
@@ -249,7 +249,11 @@ def _other_starts(misfit: Array, best: int) -> tuple[int, ...]:
     padded = np.concatenate([[np.inf], known, [np.inf]])
     is_minimum = (known < padded[:-2]) & (known <= padded[2:])
     candidates = {best - 1, best + 1, *np.flatnonzero(is_minimum).tolist()} - {best}
-    possible = [k for k in candidates if 0 <= k < len(known) and known[k] <= ALIKE * known[best]]
+    possible = [
+        k
+        for k in candidates
+        if 0 <= k < len(known) and known[k] <= EQUIVALENT_LOSS_RATIO * known[best]
+    ]
     return tuple(sorted(possible, key=lambda k: known[k])[:MORE_STARTS])
 
 
@@ -372,12 +376,12 @@ def _compared_samples(transcription: Transcription) -> int:
     measurement.
     """
     t_s = transcription.experiment.t_s
-    seen = [transcription.experiment.markers.first_seen_sample]
+    first_samples = [transcription.experiment.markers.first_visible_sample]
     for reading in transcription.residuals[1:]:
-        seen.append(
+        first_samples.append(
             int(np.searchsorted(t_s, reading.first_needed_s)) + reading.observable.delay_steps
         )
-    return min(len(t_s), max(samples_in_share(len(t_s), SHARES[0]), max(seen) + 1))
+    return min(len(t_s), max(samples_in_share(len(t_s), SHARES[0]), max(first_samples) + 1))
 
 
 class _TrialSimulation:
@@ -506,7 +510,7 @@ class _ScanState:
             finite_misfits = [m for m in self.misfits.values() if np.isfinite(m)]
             is_failure = bool(finite_misfits) and not misfit <= WORSE * min(finite_misfits)
             failures = failures + 1 if is_failure else 0
-            if failures == LOST:
+            if failures == LOST_MARKERS:
                 self.is_ended_early = True
                 return
 

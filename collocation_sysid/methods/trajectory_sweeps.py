@@ -241,7 +241,7 @@ def sweep_after_step(
             dynamics.truncated_to(len(x)),
             options=SETTLED,
             stopwatch=solver.stopwatch,
-            near_solution=x,
+            approximate_solution=x,
         )
         x = equilibria if failure is None else x
     return sweep(solver, transcription, huber, p, x, previous=previous)

@@ -243,8 +243,8 @@ class ContactLaw:
         The time step is 0 here; `Contact.data_of` inserts it.
         """
         relaxed = (self.obstacle.relaxed or 0.0) * self.widths_m**2
-        is_stated = self.obstacle.stiffness_pa_m is not None
-        per_unit = np.ones_like(self.edges_m) if is_stated else 1 / self.edges_m
+        has_stiffness = self.obstacle.stiffness_pa_m is not None
+        per_unit = np.ones_like(self.edges_m) if has_stiffness else 1 / self.edges_m
         step_s = np.zeros_like(self.edges_m)
         return np.array([self.surface.area_m2, relaxed, self.widths_m, per_unit, step_s])
 
@@ -551,9 +551,9 @@ class Contact(Pointwise):
         y = self.points.vectors(states.xi)
         if self.is_complementarity:
             return None, y
-        is_near = np.any(self._least_gaps(states, y) < self.law_of_contact.widths_m, axis=0)
-        is_near[np.flatnonzero(~is_near)[: -is_near.sum() % POINT_BATCH]] = True
-        chosen = np.flatnonzero(is_near)
+        is_active = np.any(self._least_gaps(states, y) < self.law_of_contact.widths_m, axis=0)
+        is_active[np.flatnonzero(~is_active)[: -is_active.sum() % POINT_BATCH]] = True
+        chosen = np.flatnonzero(is_active)
         return chosen, y[..., chosen]
 
     def _least_gaps(self, states: States, y: Array) -> Array:

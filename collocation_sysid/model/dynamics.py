@@ -29,7 +29,7 @@ from ..fem.pattern import SymmetricPattern
 from ..recording.experiment import Experiment
 from .force_internal_variables import ForceHistory
 from .forces import Forces
-from .internal_variables import AnyHistory, histories_along, insert_histories
+from .internal_variables import AnyHistory, histories_of_trajectory, insert_histories
 from .schemes import QUASI_STATIC, SLIDING, Scheme, as_scheme
 from .weight import DofMasses
 
@@ -89,7 +89,7 @@ class Dynamics:
         Forces at the N evaluations.
     prescribed_m : (N, 3n)
         Prescribed positions; NaN where a dof is free.
-    is_temporarily_held : (N, 3n) bool
+    is_temporarily_prescribed : (N, 3n) bool
         True where a grasp holds a dof that is free at other times. The forces at such a dof are
         balanced by the reaction force and omitted from all rows, so that a released dof starts like
         the first step, from its velocity.
@@ -110,7 +110,7 @@ class Dynamics:
     mass: DofMasses
     forces: Forces
     prescribed_m: Array
-    is_temporarily_held: NDArray[np.bool_]
+    is_temporarily_prescribed: NDArray[np.bool_]
     evaluated_s: Array
     start_velocity_m_s: Array
     loaded_since_s: float = np.inf
@@ -149,8 +149,8 @@ class Dynamics:
             averaged_s = experiment.timestep_s / substeps
         forces = Forces.from_experiment(experiment, evaluated_s, step_s=averaged_s)
         goals = experiment.prescribed_displacements(t_s)[1].reshape(rows, -1)
-        taken = ~np.isnan(goals)
-        taken[:, experiment.prescribed_dofs] = False
+        is_prescribed = ~np.isnan(goals)
+        is_prescribed[:, experiment.prescribed_dofs] = False
         return cls(
             body=experiment.body,
             tables=tables,
@@ -159,7 +159,7 @@ class Dynamics:
             mass=_row_masses(tables, forces.mass),
             forces=forces,
             prescribed_m=goals,
-            is_temporarily_held=taken,
+            is_temporarily_prescribed=is_prescribed,
             evaluated_s=evaluated_s,
             start_velocity_m_s=np.zeros(dofs) if velocity is None else np.array(velocity).ravel(),
             loaded_since_s=experiment.loaded_since_s,
@@ -212,7 +212,7 @@ class Dynamics:
             mass=self.mass.at_times(slice(rows)),
             forces=self.forces.at_times(slice(rows)),
             prescribed_m=self.prescribed_m[:rows],
-            is_temporarily_held=self.is_temporarily_held[:rows],
+            is_temporarily_prescribed=self.is_temporarily_prescribed[:rows],
             evaluated_s=self.evaluated_s[:rows],
         )
 
@@ -292,7 +292,7 @@ class Dynamics:
             return ()
         first_rows = slice(len(x))
         states = self.all_evaluation_states(x)
-        return histories_along(
+        return histories_of_trajectory(
             self.forces.at_times(first_rows),
             states,
             until_next_s=self.interval_to_next_s[first_rows],
@@ -300,7 +300,7 @@ class Dynamics:
             previous_states=previous_states or {},
         )
 
-    def contact_with_given_pressures(
+    def contact_with_pressures(
         self, x: Array, scaled_pressures: Mapping[int, Array]
     ) -> tuple[AnyHistory, ...]:
         """Return contact forces at given pressures b, in the form of histories.
@@ -386,9 +386,8 @@ class Dynamics:
     def force(self, x: Array, histories: Sequence[AnyHistory] = ()) -> Array:
         """Return the forces F (N − first_row, 3n) [N] at the evaluation states of x (N, 3n).
 
-        `histories_along` are the internal variables of the motion; computed from x where the
-        sequence is
-        empty.
+        `histories_of_trajectory` are the internal variables of the motion; computed from x where
+        the sequence is empty.
         """
         return self.forces_with_histories(histories or self.histories(x)).total(
             *self.evaluation_states(x)
@@ -407,17 +406,17 @@ class Dynamics:
         total = np.zeros_like(x)
         total[self.first_row :] = force
         inertia = self.mass.inertia_kg * self.acceleration(x)
-        return self.combine(self.tables.w, self.zero_held_forces(total)) - inertia
+        return self.combine(self.tables.w, self.zero_prescribed_forces(total)) - inertia
 
-    def zero_held_forces(self, rows: Array) -> Array:
-        """Set the forces at dofs of `is_temporarily_held` to zero, in place, and return the array.
+    def zero_prescribed_forces(self, rows: Array) -> Array:
+        """Set the forces at temporarily prescribed dofs to zero, in place, and return the array.
 
         Parameters
         ----------
         rows : (N, 3n, …)
             Forces at the evaluations, or their derivatives; modified.
         """
-        rows[self.is_temporarily_held] = 0
+        rows[self.is_temporarily_prescribed] = 0
         return rows
 
     def acceleration(self, x: Array) -> Array:

@@ -80,11 +80,11 @@ class ForceHistory:
         """
         term = forces.pointwise_term(number)[0]
         shape = term.internal_variable_count, len(xi), term.points.count
-        brought = PreviousState(np.zeros(shape) if before is None else before, since_s)
-        history = cls(forces, number, xi, nu, brought)
+        previous = PreviousState(np.zeros(shape) if before is None else before, since_s)
+        history = cls(forces, number, xi, nu, previous)
         if before is None:
             for k in range(len(xi) - 1):
-                brought.before[:, k + 1] = history.internal_variables(slice(k, k + 1))[:, 0]
+                previous.before[:, k + 1] = history.internal_variables(slice(k, k + 1))[:, 0]
         return history
 
     def internal_variables(self, rows: slice) -> Array:
@@ -233,20 +233,20 @@ class ForcePreviousState:
 
     def insert_at_same_time(self, forces: Forces) -> Forces:
         """Return forces in the same state, with the internal variables before it."""
-        brought = self.term.previous_state
-        if brought is None:
+        previous = self.term.previous_state
+        if previous is None:
             return forces
         return forces.with_term(
-            self.number, forces.pointwise_term(self.number)[0].with_previous_state(brought)
+            self.number, forces.pointwise_term(self.number)[0].with_previous_state(previous)
         )
 
     def insert_after_interval(self, forces: Forces, interval_s: float) -> Forces:
         """Return forces in a state one interval later, with the internal variables `after`
         inserted.
         """
-        brought = PreviousState(self.after, np.array([interval_s]))
+        previous = PreviousState(self.after, np.array([interval_s]))
         return forces.with_term(
-            self.number, forces.pointwise_term(self.number)[0].with_previous_state(brought)
+            self.number, forces.pointwise_term(self.number)[0].with_previous_state(previous)
         )
 
     def advance(self, forces: Forces, x: Array, v: Array, interval_s: float) -> ForcePreviousState:

@@ -148,7 +148,7 @@ class GraspConstraint:
             if row == OBSTACLE_TIME:
                 places_m = self.experiment.body.nodes_m[obstacle.nodes]
                 after, before = (
-                    obstacle.poses.carried_positions(places_m, self.t_s + s)
+                    obstacle.poses.moved_positions(places_m, self.t_s + s)
                     for s in (half_interval_s, -half_interval_s)
                 )
                 rate = (before - after).reshape(len(self.t_s), -1) / (2 * half_interval_s)

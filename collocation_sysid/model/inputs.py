@@ -170,21 +170,21 @@ def inputs_from_experiment(
                 smooth_ramp((since_s - late_s) / interval_s) - smooth_ramp(since_s / interval_s)
             )
 
-        return Input(1, change, evaluated_s[None] - timed.stated_s)
+        return Input(1, change, evaluated_s[None] - timed.declared_s)
 
     def amplitude(number: int, actuator: Actuator) -> Input:
         """Return the input of the amplitude of a tendon or pressure."""
-        stated_calibration = nuisance.stated_calibration[number].tolist()
+        declared_calibration = nuisance.declared_calibration[number].tolist()
         places = nuisance.actuator_calibration_indices(number)
 
         def driven(p: ca.SX, course: ca.SX) -> ca.SX:
             calibration = (
                 nominal + value(p, phi)
-                for nominal, phi in zip(stated_calibration, places, strict=True)
+                for nominal, phi in zip(declared_calibration, places, strict=True)
             )
             return actuator.energy_amplitude(course, *calibration)
 
-        return Input(1, driven, actuator.stated_values.values_at(evaluated_s)[None])
+        return Input(1, driven, actuator.declared_values.values_at(evaluated_s)[None])
 
     groups = [Input(len(experiment.body.constants), theta, no_data)]
     if len(nuisance.gravity_indices):

@@ -2,8 +2,8 @@
 
 A history holds the internal variables at all evaluations of a motion. It inserts them into the
 forces, and provides their derivatives forward and backward in time. A previous state holds them at
-one time and advances them step by step, in time-marching methods. Use `histories_along` for a whole
-motion; use `start_states` and `advance_states` for time marching.
+one time and advances them step by step, in time-marching methods. Use `histories_of_trajectory` for
+a whole motion; use `start_states` and `advance_states` for time marching.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ AnyHistory = MemoryHistory | ForceHistory
 PreviousState = MemoryState | ForcePreviousState
 
 
-def histories_along(
+def histories_of_trajectory(
     forces: Forces,
     states: tuple[Array, Array],
     until_next_s: Array,

@@ -86,7 +86,7 @@ class TimedLoad(NamedTuple):
     change: LoadTime
 
     @property
-    def stated_s(self) -> float:
+    def declared_s(self) -> float:
         """Time given by the user [s]."""
         return getattr(self.load, self.change)
 
@@ -145,7 +145,7 @@ class NuisanceMap:
         Pivot c of the rigid motion in the frame of the markers.
     grasp_pivot_m : (3,)
         Pivot c_h of the motion of the body in its grasp.
-    stated_calibration : (A, 2)
+    declared_calibration : (A, 2)
         Factor f and loss b of each tension and pressure, as stated.
     timed_loads : tuple of TimedLoad
         Loads with an estimated time, in the order of their parameters.
@@ -162,7 +162,7 @@ class NuisanceMap:
     gravity_m_s2: Array
     pivot_m: Array
     grasp_pivot_m: Array
-    stated_calibration: Array
+    declared_calibration: Array
     timed_loads: tuple[TimedLoad, ...]
     recorded_s: tuple[float, float]
 
@@ -189,7 +189,9 @@ class NuisanceMap:
         scope = experiment.nuisance.scope
         middle_m = experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0)
         scales = np.array([entry.sigma for entry in entries], dtype=float)
-        steps = {e.row.name: e.row.step(experiment) for e in entries if e.row.step is not None}
+        # Of each kind once: a body may carry thousands of markers.
+        rows = {entry.row.name: entry.row for entry in entries}
+        steps = {name: row.step(experiment) for name, row in rows.items() if row.step is not None}
         reach = [min(e.row.reach, steps.get(e.row.name, np.inf) / e.sigma) for e in entries]
         grasped_nodes = prescribed_nodes(experiment.body_grasps)
         nuisance_map = cls(
@@ -287,7 +289,7 @@ class NuisanceMap:
 
     def actuator_calibration(self, phi: Array) -> Array:
         """Return factor f and loss b (A, 2) of each tension and pressure at φ."""
-        calibration = self.stated_calibration.copy()
+        calibration = self.declared_calibration.copy()
         values = phi * self.scales
         for number in range(len(calibration)):
             for column, place in enumerate(self.actuator_calibration_indices(number)):
@@ -423,7 +425,7 @@ class NuisanceMap:
             low[k] = max(middle_s - range_s, -largest_s) / unit
             high[k] = min(middle_s + range_s, largest_s) / unit
         for k, timed in zip(self.indices_of_rows(JOINING), self.timed_loads, strict=True):
-            margins = (np.array(self.recorded_s) - timed.stated_s) / self.scales[k]
+            margins = (np.array(self.recorded_s) - timed.declared_s) / self.scales[k]
             low[k], high[k] = np.clip(
                 INSIDE_RECORDING_FACTOR * margins,
                 -LARGEST_JOINING_DELAY_SIGMAS,
@@ -439,7 +441,7 @@ class NuisanceMap:
 
         def moved(load: Load) -> Load:
             times = {
-                timed.change: timed.stated_s + float(late)
+                timed.change: timed.declared_s + float(late)
                 for timed, late in zip(self.timed_loads, late_s, strict=True)
                 if timed.load is load
             }

@@ -435,8 +435,8 @@ class MemoryState:
     def insert_after_interval(self, forces: Forces, interval_s: float) -> Forces:
         """Return forces in a state one interval later, with the memory inserted."""
         past = self.body.memory.relaxed(1)
-        brought, c = self._after_interval(interval_s)
-        past.overstress[0] = self.body.memory.sum_over_branches(brought)
+        previous, c = self._after_interval(interval_s)
+        past.overstress[0] = self.body.memory.sum_over_branches(previous)
         for branch, own in zip(self.body.memory.branches, c, strict=True):
             past.stiffening[0, branch.part] += own
         return replace(forces, memory_state=past)
@@ -447,9 +447,9 @@ class MemoryState:
         Forces and velocity are not used.
         """
         memory = self.body.memory
-        brought, c = self._after_interval(interval_s)
+        previous, c = self._after_interval(interval_s)
         stress = self.body.stresses.stress(x[None], self.theta)[0]
-        overstress = brought + memory.repeat_over_points(c) * memory.to_branches(stress)
+        overstress = previous + memory.repeat_over_points(c) * memory.to_branches(stress)
         return MemoryState(self.body, self.theta, stress, overstress)
 
     def _after_interval(self, interval_s: float) -> tuple[Array, Array]:

@@ -133,7 +133,7 @@ class Weight(ForceTerm):
     @classmethod
     def from_experiment(cls, experiment: Experiment, t_s: ArrayLike) -> Weight:
         """Return the weight and loads of an experiment at the times `t_s` (T,)."""
-        applied = experiment.stated_node_forces_n(t_s)
+        applied = experiment.declared_node_forces_n(t_s)
         body = experiment.body
         tied = np.repeat(experiment.point_mass_at_nodes_kg(t_s), 3, axis=1)
         air_kg = experiment.air_density_kg_m3 * body.dof_volume_m3

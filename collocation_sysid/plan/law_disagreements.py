@@ -21,7 +21,7 @@ from ..statistics.uncertainty_budget import BudgetLine
 from .study_rows import Row
 
 # Ratio of what alike models find beyond which they disagree.
-APART = 1.05
+LEAST_DISAGREEMENT_RATIO = 1.05
 # Moduli at small strain, which every law has; with dampings what means the same by any.
 MODULI = ("young_pa", "poisson")
 
@@ -91,7 +91,7 @@ def find_disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
             v and v > 0 for v in values.values()
         ):
             estimates = {model: float(value or 0.0) for model, value in values.items()}
-            if max(estimates.values()) > APART * min(estimates.values()):
+            if max(estimates.values()) > LEAST_DISAGREEMENT_RATIO * min(estimates.values()):
                 result.append(_disagreement(name, estimates, chosen["budget"].get(name)))
     return result
 

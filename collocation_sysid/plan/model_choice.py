@@ -53,7 +53,7 @@ from .study_planning import PlannedRun, fitted_recordings
 from .study_rows import Row
 
 # Predictions closer than this, as a logarithm, are considered equal.
-ALIKE = 0.01
+EQUIVALENT_ERROR = 0.01
 # ΔAIC beyond which a model has hardly any support (Burnham & Anderson 2002, section 2.6).
 NO_SUPPORT = 10.0
 # ΔAIC below which it has substantial support.
@@ -82,7 +82,7 @@ def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> 
     of_model: dict[str, dict[str, Any]] = {}
     for run in planned:
         fit = (records.get(run.key) or {}).get("model") or {}
-        of_model.setdefault(run.swept["model"], {})[run.held_out or ""] = fit
+        of_model.setdefault(run.varied_values["model"], {})[run.test_name or ""] = fit
     rows = [_model_row(label, fits) for label, fits in of_model.items()]
     _add_criterion(rows)
     _add_ratios(rows)
@@ -199,7 +199,7 @@ def _equally_good(rows: Sequence[Row], errors: float) -> list[Row]:
         for row in rows
         if row["converged"]
         and row["log_ratio"] is not None
-        and row["log_ratio"] <= max(ALIKE, errors * row["log_ratio_error"])
+        and row["log_ratio"] <= max(EQUIVALENT_ERROR, errors * row["log_ratio_error"])
     ]
 
 
@@ -310,7 +310,7 @@ def _certainty(chosen: Row, rival: Row) -> str:
 def model_notes(rows: Sequence[Row]) -> list[str]:
     """Return notes that explain the table and list failures."""
     names = rows[0]["predictions"]
-    kept = "each recording in turn" if len(names) > 1 else "the last third of the recording"
+    test_data = "each recording in turn" if len(names) > 1 else "the last third of the recording"
     counted = rows[0]["independent"]
     evidence = next((row["evidence"] for row in rows if row["evidence"]), None)
     equivalent = ""
@@ -321,7 +321,7 @@ def model_notes(rows: Sequence[Row]) -> list[str]:
         )
         equivalent += "independent ones."
     return [
-        f"Held out: {kept}; ±: standard error of the ratio to the best.{equivalent}",
+        f"Held out: {test_data}; ±: standard error of the ratio to the best.{equivalent}",
         *(f"{row['model']}: {row['status']}" for row in rows if not row["converged"]),
         *(
             f"{row['model']} without '{name}': {why}"
@@ -399,7 +399,7 @@ FITTED = 2 / 3
 BLOCKS = 8
 
 
-def fit_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]:
+def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
     """Fit a model to all recordings, or to all but the held-out one, and return its fit and
     prediction.
 
@@ -409,7 +409,7 @@ def fit_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]:
         Problem with the model.
     method : str
         Name of the method.
-    held_out : str
+    test_name : str
         Recording that is predicted; "" to fit all.
 
     Returns
@@ -418,7 +418,7 @@ def fit_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]:
         Status, parameters and RMS; with converged fits also "evidence" and "budget" if all are
         fitted, else "prediction", which is None with a "failure" if the simulation failed.
     """
-    known, start_s = hold_out(problem, held_out) if held_out else (problem, np.inf)
+    known, start_s = reserve_test_data(problem, test_name) if test_name else (problem, np.inf)
     solution = solve(known, method)
     record: dict[str, Any] = {
         "status": solution.status.value,
@@ -430,7 +430,7 @@ def fit_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]:
     }
     if not solution.status.converged:
         return record
-    if not held_out:
+    if not test_name:
         try:
             fit = linearise_fit(solution.collocation, solution.z)
         except SimulationError as error:
@@ -439,14 +439,14 @@ def fit_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]:
             "evidence": asdict(evidence_from_fit(fit)),
             "budget": _budget_record(problem, solution, fit),
         }
-    experiment = next(e for e in known.experiments if e.name == held_out)
+    experiment = next(e for e in known.experiments if e.name == test_name)
     # With the scheme that was fitted: what is compared are models, not integrators.
     rollout = simulate_experiment(
         replace(known, rollout=RolloutOptions("scheme")), experiment, solution
     )
     if not isinstance(rollout, ForwardSimulation):
         return record | {"prediction": None, "failure": rollout}
-    complete_experiment = next(e for e in problem.experiments if e.name == held_out)
+    complete_experiment = next(e for e in problem.experiments if e.name == test_name)
     return record | {"prediction": _prediction_error(complete_experiment, rollout, start_s)}
 
 
@@ -467,7 +467,7 @@ def _budget_record(problem: Problem, solution: Solution, fit: LinearisedFit) -> 
     return {name: asdict(line) for name, line in budget(sources, known, {}, parameters).items()}
 
 
-def hold_out(problem: Problem, name: str) -> tuple[Problem, float]:
+def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
     """Return the problem without a recording, or without its end, and the time of the first
     held-out sample [s].
 
@@ -521,9 +521,9 @@ def _prediction_error(
         t_s = t_s[order]
         residuals = residuals[order, None]
         is_counted = np.asarray(np.isfinite(residuals).any(axis=2))
-    is_held_out = t_s > start_s
-    squares = np.where(is_counted, np.nansum(residuals**2, axis=2), 0.0)[is_held_out]
-    samples = int(is_counted[is_held_out].sum())
+    is_test_sample = t_s > start_s
+    squares = np.where(is_counted, np.nansum(residuals**2, axis=2), 0.0)[is_test_sample]
+    samples = int(is_counted[is_test_sample].sum())
     blocks = [float(np.sum(each)) for each in np.array_split(squares, BLOCKS)]
     rms = float(np.sqrt(squares.sum() / samples)) if samples else None
     return {"rms": rms, "unit": unit, "samples": samples, "blocks": blocks}

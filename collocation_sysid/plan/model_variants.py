@@ -143,7 +143,7 @@ def models(
             "--damping": (dampings, "kelvin-voigt,material"),
             "--prony": (branches or (0,), "0,1"),
         }
-        option, example = next((o, e) for o, (stated, e) in options.items() if stated)
+        option, example = next((o, e) for o, (is_declared, e) in options.items() if is_declared)
         raise InputError(
             f"found the model {compared[0].label} alone; expected two or more to compare, such as "
             f"{example}",
@@ -214,8 +214,8 @@ def variants(
             parameters = _with_memory(parameters, old, tables, times_s)
         changes["parameters"] = parameters
         settings = tuple(f"{key}={as_inline_toml(value)}" for key, value in changes.items())
-        said = f"{region}: " * (region is not None) + ", ".join(label)
-        varied.append(ModelVariant(said, (*overrides, *settings), path))
+        label_text = f"{region}: " * (region is not None) + ", ".join(label)
+        varied.append(ModelVariant(label_text, (*overrides, *settings), path))
     return varied
 
 
@@ -259,7 +259,7 @@ def _measured_counts(problem: Problem) -> dict[str, int]:
 
 def _measured_text(measured: Mapping[str, int]) -> str:
     """Return the recordings with their numbers in words."""
-    return " and ".join(f"'{name}' ({numbers} numbers)" for name, numbers in measured.items())
+    return " and ".join(f"'{name}' ({count} numbers)" for name, count in measured.items())
 
 
 def _require_region(
@@ -274,9 +274,11 @@ def _require_region(
         require_among(region, names, path, "--region")
     owners = {each.get("region") for each in body.get("prony", [])}
     if branches and owners - {region}:
-        owner = next(iter(owners - {region}))
-        whose = "all parts without their own" if owner is None else f"region '{owner}'"
-        expected = "none with --region" if owner is None else f"--region {owner}"
+        other_region = next(iter(owners - {region}))
+        whose = (
+            "all parts without their own" if other_region is None else f"region '{other_region}'"
+        )
+        expected = "none with --region" if other_region is None else f"--region {other_region}"
         raise InputError(f"found branches of {whose}; expected {expected}", path, "object.prony")
 
 
@@ -322,14 +324,16 @@ def _with_part_material(
     own = [constant.name for constant in MATERIALS[material].constants]
     possible = {*own, *elastic_names(MATERIALS[material])}
     mine = {prefix + name for name in of_any}
-    kept = {n: v for n, v in parameters.items() if n not in mine or without_region(n) in possible}
+    unchanged = {
+        n: v for n, v in parameters.items() if n not in mine or without_region(n) in possible
+    }
     alone = any(name in mine for name in parameters)
-    elastic = {without_region(name) for name in kept if name in (mine if alone else of_any)}
+    elastic = {without_region(name) for name in unchanged if name in (mine if alone else of_any)}
     shear_pa = _shear_pa(parameters, prefix)
     if "mu_pa" in own and not elastic & {"mu_pa", "young_pa"}:
-        kept[f"{prefix}mu_pa"] = _starting_guess("mu_pa", shear_pa)
-    needed = [name for name in own if name not in ELASTIC and prefix + name not in kept]
-    return kept | {prefix + name: _starting_guess(name, shear_pa) for name in needed}
+        unchanged[f"{prefix}mu_pa"] = _starting_guess("mu_pa", shear_pa)
+    needed = [name for name in own if name not in ELASTIC and prefix + name not in unchanged]
+    return unchanged | {prefix + name: _starting_guess(name, shear_pa) for name in needed}
 
 
 def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
@@ -337,10 +341,10 @@ def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
 
     def guess(name: str) -> float:
         """Return the guess or fixed value of a constant; NaN if it has none."""
-        stated = parameters.get(prefix + name, parameters.get(name))
-        if isinstance(stated, Mapping):
-            stated = stated.get("fixed", stated.get("guess"))
-        return float("nan") if stated is None else float(stated)
+        value = parameters.get(prefix + name, parameters.get(name))
+        if isinstance(value, Mapping):
+            value = value.get("fixed", value.get("guess"))
+        return float("nan") if value is None else float(value)
 
     linear = 0.0 if math.isnan(guess("c01_pa")) else guess("c01_pa")
     poisson = USUAL_POISSON if math.isnan(guess("poisson")) else guess("poisson")
@@ -363,10 +367,10 @@ def _branch_tables(
 ) -> list[dict[str, Any]]:
     """Return the first `count` branches of the file, followed by new ones if there are fewer."""
     tables = [dict(each) for each in own[:count]]
-    taken = {each["name"] for each in tables} | others
-    names = (f"prony_{k}" for k in range(1, count + len(taken) + 1))
-    owner = {} if region is None else {"region": region}
-    new = [{"name": name, **owner} for name in names if name not in taken]
+    used_names = {each["name"] for each in tables} | others
+    names = (f"prony_{k}" for k in range(1, count + len(used_names) + 1))
+    region_key = {} if region is None else {"region": region}
+    new = [{"name": name, **region_key} for name in names if name not in used_names]
     return [*tables, *new[: count - len(tables)]]
 
 
@@ -391,7 +395,7 @@ def _with_memory(
     """
     names = [each["name"] for each in tables]
     removed_names = {name for name in old if name not in names}
-    kept = {
+    unchanged = {
         n: v
         for n, v in parameters.items()
         if n.removesuffix(f".{without_region(n)}") not in removed_names
@@ -399,9 +403,9 @@ def _with_memory(
     shortest, longest = times_s
     for k, name in enumerate(names, start=1):
         tau_s = shortest * (longest / shortest) ** (k / (len(names) + 1))
-        kept.setdefault(f"{name}.share", {"guess": SHARE})
-        kept.setdefault(f"{name}.tau_s", {"guess": float(f"{tau_s:.3g}")})
-    return kept
+        unchanged.setdefault(f"{name}.share", {"guess": SHARE})
+        unchanged.setdefault(f"{name}.tau_s", {"guess": float(f"{tau_s:.3g}")})
+    return unchanged
 
 
 def as_inline_toml(value: Any) -> str:

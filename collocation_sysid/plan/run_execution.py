@@ -27,7 +27,7 @@ from typing import IO, Any
 from ..cluster import connected, distributed
 from ..errors import InputError
 from ..fem.kernels import available_threads
-from ..files import write_whole
+from ..files import write_text_file
 from ..isolated_process import killed_by
 from ..serialisation import as_json
 from ..validated_types import AtLeastOne, Options, Positive
@@ -189,7 +189,7 @@ class RunStore:
 
     def save(self, record: Record) -> None:
         """Write the record of a run."""
-        write_whole(self._file(record["key"]), as_json(record) + "\n")
+        write_text_file(self._file(record["key"]), as_json(record) + "\n")
 
     def load(self, key: str) -> Record | None:
         """Return the record of a run; None if it does not exist or cannot be read."""
@@ -254,14 +254,14 @@ class RunExecutor:
     ----------
     submit : callable
         Function of a planned run that returns the future of its record.
-    slots : int
+    worker_count : int
         Number of runs at once.
     stop : callable
         Function that ends the running runs.
     """
 
     submit: Callable[[PlannedRun], Future]
-    slots: int
+    worker_count: int
     stop: Callable[[], Any]
 
 
@@ -269,7 +269,7 @@ def run_all(
     planned: Sequence[PlannedRun],
     store: RunStore,
     options: RunOptions,
-    on_record: Callable[[Record, int], None] = lambda record, slots: None,
+    on_record: Callable[[Record, int], None] = lambda record, worker_count: None,
 ) -> None:
     """Execute the runs of a study and store their records, each as soon as it has ended.
 
@@ -300,7 +300,7 @@ def run_all(
                 record = _result_record(future, futures[future], options)
                 if record["outcome"] != STOPPED:
                     store.save(record)
-                    on_record(record, pool.slots)
+                    on_record(record, pool.worker_count)
         except BaseException:
             for future in futures:
                 future.cancel()
@@ -326,15 +326,15 @@ def _result_record(future: Future, planned: PlannedRun, limits: RunOptions) -> R
 @contextmanager
 def _thread_executor(limits: RunOptions) -> Iterator[RunExecutor]:
     """Context with an executor of threads, which wait for processes on this machine."""
-    slots = limits.workers or available_threads()
+    worker_count = limits.workers or available_threads()
     stop = threading.Event()
-    with ThreadPoolExecutor(slots) as executor:
+    with ThreadPoolExecutor(worker_count) as executor:
 
         def submit(run: PlannedRun) -> Future:
             """Start a run and return the future of its record."""
             return executor.submit(execute, run.as_dict(), limits.time_limit_s, stop.is_set)
 
-        yield RunExecutor(submit, slots, stop.set)
+        yield RunExecutor(submit, worker_count, stop.set)
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, SimulationError
-from ..files import write_whole
+from ..files import write_text_file
 from ..pipeline import Run, run
 from ..problem import Problem
 from ..recording.grasp import prescribed_nodes
@@ -33,7 +33,7 @@ def main() -> None:
     heed_interrupts()
     planned = json.loads(sys.stdin.buffer.readline())
     threading.Thread(target=_end_with_study, daemon=True).start()
-    write_whole(Path(sys.argv[1]), as_json(record_of_run(planned)))
+    write_text_file(Path(sys.argv[1]), as_json(record_of_run(planned)))
     leave(0)
 
 
@@ -47,9 +47,9 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
     """
     try:
         problem = Problem.read(planned["problem"], planned["overrides"], planned["allow_code"])
-        held_out = planned.get("held_out")
-        if held_out is not None:
-            fit = fit_record(problem, planned["method"], held_out)
+        test_name = planned.get("test_name")
+        if test_name is not None:
+            fit = fit_record(problem, planned["method"], test_name)
             return {"outcome": FINISHED, "message": fit["status"], "model": fit}
         finished = run(problem, planned["method"])
         return {

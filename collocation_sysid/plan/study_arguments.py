@@ -117,7 +117,7 @@ def _positive_value(name: str, value: Any, source: Path | None) -> float:
 # Swept keys ---------------------------------------------------------------------------------------
 
 
-def parse_swept_keys(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
+def parse_varied_keys(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Return the values of each swept key, as text for `--set`.
 
     Parameters

@@ -10,9 +10,9 @@ from math import exp
 from pathlib import Path
 from typing import Any
 
-from ..display import Items, Line, Section, Shown, Table, as_markdown
+from ..display import Items, Line, Shown, Table, TitledParts, as_markdown
 from ..fem.constants import symbol_of, symbol_with_unit, unit_of
-from ..files import SCHEMA, whole_file, write_whole
+from ..files import SCHEMA, replaced_file, write_text_file
 from ..serialisation import as_json
 from .law_disagreements import law_table
 from .model_choice import advice, display_unit, law_disagreements, model_notes, model_rows
@@ -85,9 +85,9 @@ class StudyReport:
         if self.kind == "compare":
             return comparison_views(method_rows(self.rows))
         if self.kind == "models":
-            told = law_disagreements(self.rows)
-            return [*model_views(self.rows), *([law_table(told)] if told else [])]
-        return sweep_views(self.rows, list(self.planned[0].swept))
+            disagreements = law_disagreements(self.rows)
+            return [*model_views(self.rows), *([law_table(disagreements)] if disagreements else [])]
+        return sweep_views(self.rows, list(self.planned[0].varied_values))
 
     @property
     def headline(self) -> list[str]:
@@ -118,10 +118,13 @@ class StudyReport:
     def notes(self) -> list[str]:
         """Notes that explain the tables."""
         missing = len(self.planned) - len(self.records)
-        kept = [f"{missing} of {len(self.planned)} runs remain to be done."] if missing else []
+        notes = [f"{missing} of {len(self.planned)} runs remain to be done."] if missing else []
         if self.kind == "models":
-            return [*model_notes(self.rows), *kept]
-        return [*((self.yardstick.sentence, MEDIANS_NOTE) if self.kind == "compare" else ()), *kept]
+            return [*model_notes(self.rows), *notes]
+        return [
+            *((self.yardstick.sentence, MEDIANS_NOTE) if self.kind == "compare" else ()),
+            *notes,
+        ]
 
 
 def load_report(
@@ -174,19 +177,19 @@ def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
 def write_report(report: StudyReport, folder: Path) -> None:
     """Write ``runs.csv``, ``summary.csv``, ``summary.json``, ``summary.md`` and the plots."""
     rows = report.rows
-    write_whole(folder / "runs.csv", as_csv(rows))
+    write_text_file(folder / "runs.csv", as_csv(rows))
     if report.kind == "compare":
-        write_whole(folder / "summary.csv", as_csv(method_rows(rows)))
-    write_whole(folder / "summary.json", as_json(report_json(report)) + "\n")
-    write_whole(folder / "summary.md", as_markdown([report_section(report)]))
+        write_text_file(folder / "summary.csv", as_csv(method_rows(rows)))
+    write_text_file(folder / "summary.json", as_json(report_json(report)) + "\n")
+    write_text_file(folder / "summary.md", as_markdown([report_section(report)]))
     if report.kind == "models":
         figures = {}
     elif report.kind == "compare":
         figures = comparison_plots(rows, report.records, report.yardstick)
     else:
-        figures = sweep_plots(rows, list(report.planned[0].swept))
+        figures = sweep_plots(rows, list(report.planned[0].varied_values))
     for name, figure in figures.items():
-        with whole_file(folder / f"{name}.png") as draft:
+        with replaced_file(folder / f"{name}.png") as draft:
             figure.savefig(draft, dpi=RESOLUTION_DPI)
 
 
@@ -214,7 +217,7 @@ def report_json(report: StudyReport) -> dict[str, Any]:
     elif report.kind == "models":
         content |= {"advice": advice(rows), "laws": law_disagreements(rows)}
     else:
-        content["swept"] = list(first.swept)
+        content["varied_values"] = list(first.varied_values)
     return content
 
 
@@ -230,12 +233,12 @@ def as_csv(rows: Sequence[Row]) -> str:
     return text.getvalue()
 
 
-def report_section(report: StudyReport) -> Section:
+def report_section(report: StudyReport) -> TitledParts:
     """Return tables and failures as a section for a paper's appendix or an issue."""
     failures = (Items(tuple(report.failures)),) if report.failures else ()
-    without = tuple(Section("Runs without a result", (each,)) for each in failures)
+    without = tuple(TitledParts("Runs without a result", (each,)) for each in failures)
     parts = (*report.headline, *report.notes, *report.views, *without)
-    return Section(report.title, parts, level=1)
+    return TitledParts(report.title, parts, level=1)
 
 
 def _in_words(head: str) -> str:
@@ -289,18 +292,18 @@ def _method_sentence(row: Row) -> str:
     """Return how often, how accurately and how fast a method found the solution, in words."""
     low = 100 * row["success_low"]
     high = 100 * row["success_high"]
-    said = f"{row['method']} succeeded in {row['successes']} of {row['runs']} runs"
-    said += f" (95 % interval of the rate: {low:.0f} to {high:.0f} %)"
+    sentence = f"{row['method']} succeeded in {row['successes']} of {row['runs']} runs"
+    sentence += f" (95 % interval of the rate: {low:.0f} to {high:.0f} %)"
     if row["total_s"] is None:
-        return f"{said}, and gave no result."
+        return f"{sentence}, and gave no result."
     misfit = f"with a marker error of {1e3 * row['rms_m']:.2g} mm"
-    return f"{said}, {misfit} and a time of {row['total_s']:.2g} s (medians)."
+    return f"{sentence}, {misfit} and a time of {row['total_s']:.2g} s (medians)."
 
 
 def sweep_sentences(rows: Sequence[Row]) -> list[str]:
     """Return how many runs converged, and how much each estimate varies between them, in words."""
     converged = [row for row in rows if row["converged"]]
-    said = [f"{len(converged)} of {len(rows)} runs converged."]
+    sentences = [f"{len(converged)} of {len(rows)} runs converged."]
     for name in parameters_in(rows):
         values = [row[f"value_{name}"] for row in converged]
         errors = [e for row in converged if (e := row[f"std_error_{name}"]) is not None]
@@ -308,18 +311,18 @@ def sweep_sentences(rows: Sequence[Row]) -> list[str]:
             spread = f"; the largest standard error is {max(errors):.2g}" if errors else ""
             low = f"{min(values):.4g}"
             high = f"{max(values):.4g} {unit_of(name)}".strip()
-            said.append(f"Their {symbol_of(name)} is from {low} to {high}{spread}.")
-    return said
+            sentences.append(f"Their {symbol_of(name)} is from {low} to {high}{spread}.")
+    return sentences
 
 
-def sweep_views(rows: Sequence[Row], swept: Sequence[str]) -> list[Table]:
+def sweep_views(rows: Sequence[Row], varied_keys: Sequence[str]) -> list[Table]:
     """Return tables of estimates and quality by swept values."""
-    places = {short: _swept_cell(key) for key, short in shortened_keys(swept)}
+    places = {short: _varied_cell(key) for key, short in shortened_keys(varied_keys)}
     estimates: dict[str, Cell] = {}
     for name in parameters_in(rows):
         estimates[symbol_with_unit(name)] = _estimate_cell(name)
-    numbers = _number_cells("rms_m", "rollout_rms_m", "iterations", "total_s")
-    quality = {"status": _text_cell("status"), **numbers}
+    number_columns = _number_cells("rms_m", "rollout_rms_m", "iterations", "total_s")
+    quality = {"status": _text_cell("status"), **number_columns}
     return [
         _table_view("Estimates ± standard error", places, estimates, rows),
         _table_view("Quality and cost", places, quality, rows),
@@ -329,7 +332,7 @@ def sweep_views(rows: Sequence[Row], swept: Sequence[str]) -> list[Table]:
 def model_views(rows: Sequence[Row]) -> list[Table]:
     """Return tables of fit, prediction and small-strain moduli of every model."""
     factor, unit = display_unit(rows[0]["unit"])
-    numbers: dict[str, Cell] = {
+    number_columns: dict[str, Cell] = {
         "free": _number_cell("free", 1, "d"),
         f"fit {unit}": _number_cell("rms", factor, ".3g"),
         "ΔAIC": _number_cell("delta_aic", 1, ".1f"),
@@ -342,13 +345,15 @@ def model_views(rows: Sequence[Row]) -> list[Table]:
     for name in names:
         moduli[symbol_with_unit(name)] = _number_cell(name, 1, ".4g", "parameters")
     model = {"": lambda row: "→" if row["chosen"] else "", "model": _text_cell("model")}
-    views = [_table_view("Models", model, numbers, rows)]
-    held = {
+    views = [_table_view("Models", model, number_columns, rows)]
+    test_columns = {
         f"'{n}' {unit}": _number_cell(n, factor, ".3g", "predictions")
         for n in dict.fromkeys(n for r in rows for n in r["predictions"])
     }
-    if len(held) > 1:
-        views.append(_table_view("Recordings held out", {"model": _text_cell("model")}, held, rows))
+    if len(test_columns) > 1:
+        views.append(
+            _table_view("Recordings held out", {"model": _text_cell("model")}, test_columns, rows)
+        )
     return [*views, _transposed_view("Parameters", {"model": _text_cell("model")}, moduli, rows)]
 
 
@@ -371,10 +376,10 @@ def _ratio_text(row: Row) -> str:
 
 
 def _table_view(
-    title: str, names: Mapping[str, Cell], numbers: Mapping[str, Cell], rows: Sequence[Row]
+    title: str, names: Mapping[str, Cell], number_columns: Mapping[str, Cell], rows: Sequence[Row]
 ) -> Table:
     """Return a table of rows, with a column for each cell."""
-    columns = {**names, **numbers}
+    columns = {**names, **number_columns}
     cells = tuple(tuple(cell(row) for cell in columns.values()) for row in rows)
     return Table(title, tuple(columns), cells, len(names))
 
@@ -384,7 +389,7 @@ def _text_cell(name: str) -> Cell:
     return lambda row: str(row[name])
 
 
-def _swept_cell(key: str) -> Cell:
+def _varied_cell(key: str) -> Cell:
     """Return the cell of a swept value, with numbers shortened."""
 
     def cell(row: Row) -> str:

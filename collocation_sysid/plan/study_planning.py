@@ -50,11 +50,11 @@ class PlannedRun:
         Overrides "key=value".
     guess : mapping of str to float or None
         Guesses of the estimated parameters; None where there is none.
-    swept : mapping of str to str
+    varied_values : mapping of str to str
         Values of the swept keys as text; for a comparison of models, "model" and its label.
     allow_code : bool
         Whether to run the Python files that the problem names.
-    held_out : str or None
+    test_name : str or None
         For a comparison of models, the recording that is predicted; "" if all are fitted. None for
         other studies.
     """
@@ -65,19 +65,22 @@ class PlannedRun:
     start: int = 0
     overrides: tuple[str, ...] = ()
     guess: Mapping[str, float | None] = field(default_factory=dict)
-    swept: Mapping[str, str] = field(default_factory=dict)
+    varied_values: Mapping[str, str] = field(default_factory=dict)
     allow_code: bool = False
-    held_out: str | None = None
+    test_name: str | None = None
 
     @property
     def label(self) -> str:
         """Short description of the run for the user."""
-        if self.held_out is not None:
-            what = f" without '{self.held_out}'" if self.held_out else ""
-            return f"{self.swept['model']}{what}"
-        if not self.swept:
+        if self.test_name is not None:
+            what = f" without '{self.test_name}'" if self.test_name else ""
+            return f"{self.varied_values['model']}{what}"
+        if not self.varied_values:
             return f"{self.method}, start {self.start}"
-        return ", ".join(f"{short}={self.swept[key]}" for key, short in shortened_keys(self.swept))
+        return ", ".join(
+            f"{short}={self.varied_values[key]}"
+            for key, short in shortened_keys(self.varied_values)
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return the run as a dictionary for JSON."""
@@ -234,14 +237,14 @@ def plan_sweep(
     read_problem_file(path, overrides)
     planned = []
     for values in itertools.product(*over.values()):
-        swept = dict(zip(over, values, strict=True))
-        run_overrides = [*overrides, *(f"{key}={value}" for key, value in swept.items())]
+        varied_values = dict(zip(over, values, strict=True))
+        run_overrides = [*overrides, *(f"{key}={value}" for key, value in varied_values.items())]
         try:
             file, _ = read_problem_file(path, run_overrides)
         except InputError as error:
             where = "--over" if error.source == "--set" else error.source
             raise InputError(error.message, where, error.where) from error
-        details = {"swept": swept, "allow_code": allow_code}
+        details = {"varied_values": varied_values, "allow_code": allow_code}
         planned.append(_planned_run(path, file, method, run_overrides, **details))
     return planned
 
@@ -281,10 +284,10 @@ def plan_models(
                 "or readings"
             )
     planned = []
-    for held_out in ("", *fitted_recordings(problem)):
+    for test_name in ("", *fitted_recordings(problem)):
         for variant in variants:
             file, _ = read_problem_file(variant.path, variant.overrides)
-            details = {"swept": {"model": variant.label}, "held_out": held_out}
+            details = {"varied_values": {"model": variant.label}, "test_name": test_name}
             details |= {"allow_code": allow_code}
             planned.append(_planned_run(variant.path, file, method, variant.overrides, **details))
     return planned
@@ -326,7 +329,7 @@ def _planned_run(
     solver = content.get("solver", {})
     content["solver"] = {key: solver[key] for key in ("huber", method) if key in solver}
     content["solver"]["method"] = method
-    of_study = start if more.get("held_out") is None else f"without {more['held_out']}"
+    of_study = start if more.get("test_name") is None else f"without {more['test_name']}"
     hashes = _file_hashes(content, path.parent)
     decisive = [content, of_study, hashes, version("collocation-sysid")]
     text = json.dumps(decisive, sort_keys=True)

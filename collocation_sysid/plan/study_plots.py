@@ -58,11 +58,11 @@ def comparison_plots(
 ) -> dict[str, Figure]:
     """Return the figures of a comparison by file name; those without data are left out."""
     figures: dict[str, Figure] = {}
-    answered = [row for row in rows if row["rms_m"] is not None]
-    if answered:
-        figures["convergence"] = convergence_in_time(answered, records)
-        if records[answered[0]["key"]]["tip"] is not None:
-            figures["tip"] = tip_tracks(answered, records)
+    completed = [row for row in rows if row["rms_m"] is not None]
+    if completed:
+        figures["convergence"] = convergence_in_time(completed, records)
+        if records[completed[0]["key"]]["tip"] is not None:
+            figures["tip"] = tip_tracks(completed, records)
     done = [row for row in rows if row["status"] != "missing"]
     centre = reference_parameters(done, yardstick) if done else {}
     # A run without a guess that failed has no place among the starts.
@@ -232,27 +232,29 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
     return figure
 
 
-def sweep_plots(rows: Sequence[Row], swept: Sequence[str]) -> dict[str, Figure]:
+def sweep_plots(rows: Sequence[Row], varied_keys: Sequence[str]) -> dict[str, Figure]:
     """Return the figures of a sweep by file name; empty if no run has a result."""
     if all(row["rms_m"] is None for row in rows):
         return {}
-    return {"sweep": estimates_against(rows, swept)}
+    return {"sweep": estimates_against(rows, varied_keys)}
 
 
-def estimates_against(rows: Sequence[Row], swept: Sequence[str]) -> Figure:
+def estimates_against(rows: Sequence[Row], varied_keys: Sequence[str]) -> Figure:
     """Estimates with their 95 % intervals: a row for each parameter, a column for each key.
 
     Answers that did not converge are crosses. Values of the first other key have colours.
     """
     names = parameters_in(rows)
-    width = max(PAGE_MM / 2, min(PAGE_MM, 80.0 * len(swept)))
+    width = max(PAGE_MM / 2, min(PAGE_MM, 80.0 * len(varied_keys)))
     figure = new_figure(width, 14 + PANEL_MM * len(names))
-    panels = figure.subplots(len(names), len(swept), sharex="col", sharey="row", squeeze=False)
-    shorts = dict(shortened_keys(swept))
-    for column, key in enumerate(swept):
+    panels = figure.subplots(
+        len(names), len(varied_keys), sharex="col", sharey="row", squeeze=False
+    )
+    shorts = dict(shortened_keys(varied_keys))
+    for column, key in enumerate(varied_keys):
         places, texts = _axis_positions([row[key] for row in rows])
         for line, name in zip(panels, names, strict=True):
-            for label, colour, shift, chosen in _groups(rows, swept, key, shorts):
+            for label, colour, shift, chosen in _groups(rows, varied_keys, key, shorts):
                 _draw_estimates(line[column], rows, places + shift, name, chosen, colour, label)
             unit = f" [{unit_of(name)}]" if unit_of(name) else ""
             style_axes(line[column], "", "", "" if column else symbol_as_mathtext(name) + unit)
@@ -260,7 +262,7 @@ def estimates_against(rows: Sequence[Row], swept: Sequence[str]) -> Figure:
         bottom.set_xlabel(shorts[key], fontsize=TEXT_PT)
         shown = list(texts)[:: -(-len(texts) // MOST_TICKS)]
         bottom.set_xticks(shown, [texts[place] for place in shown])
-        if len(swept) > 1:
+        if len(varied_keys) > 1:
             add_legend_above(panels[0, column], 2)
     for line in panels:
         drawn = np.concatenate([c.get_segments() for c in line[0].collections])[..., 1].ravel()
@@ -285,10 +287,10 @@ def _shortened(value: str) -> str:
 
 
 def _groups(
-    rows: Sequence[Row], swept: Sequence[str], key: str, shorts: Mapping[str, str]
+    rows: Sequence[Row], varied_keys: Sequence[str], key: str, shorts: Mapping[str, str]
 ) -> Iterator[tuple[str | None, str, float, Array]]:
     """Return label, colour, offset and mask of the rows that share a value of another key."""
-    other = next((name for name in swept if name != key), None)
+    other = next((name for name in varied_keys if name != key), None)
     if other is None:
         yield None, COLOUR_CYCLE[0], 0.0, np.ones(len(rows), dtype=bool)
         return

@@ -51,14 +51,14 @@ class StudyProgress(Watched):
             self._live.refresh()  # the first run may take less time than a frame
         return self
 
-    def count_run(self, record: Record, slots: int) -> None:
+    def count_run(self, record: Record, worker_count: int) -> None:
         """Count a finished run and update the display.
 
         Parameters
         ----------
         record : Record
             Record of the run.
-        slots : int
+        worker_count : int
             Number of runs that are executed at once.
         """
         run = self._waiting.pop(record["key"])
@@ -67,13 +67,13 @@ class StudyProgress(Watched):
         status = (record.get("result") or record).get("status", record["outcome"])
         count = f"{self.total - len(self._waiting)}/{self.total} runs"
         wall = record.get("wall_s") or 0.0
-        line = f"{count}: {run.label} {status} in {wall:.1f} s{self._remaining_text(slots)}"
+        line = f"{count}: {run.label} {status} in {wall:.1f} s{self._remaining_text(worker_count)}"
         self.update(Text(line, style="dim"), line)
 
-    def _remaining_text(self, slots: int) -> str:
+    def _remaining_text(self, worker_count: int) -> str:
         """Return the estimated remaining time as text; empty if it is unknown."""
         remaining_s = remaining_time_s(
-            [run.method for run in self._waiting.values()], self._walls, slots
+            [run.method for run in self._waiting.values()], self._walls, worker_count
         )
         return "" if remaining_s is None else f"; about {duration(remaining_s)} left"
 
@@ -110,7 +110,7 @@ class DesignProgress(Watched):
 
 
 def remaining_time_s(
-    waiting: Sequence[str], walls: Mapping[str, Sequence[float]], slots: int
+    waiting: Sequence[str], walls: Mapping[str, Sequence[float]], worker_count: int
 ) -> float | None:
     """Return the estimated time for the waiting runs [s]; None if it is unknown.
 
@@ -120,7 +120,7 @@ def remaining_time_s(
         Method of each waiting run.
     walls : mapping of str to sequence of float
         Durations of the finished runs by method [s].
-    slots : int
+    worker_count : int
         Number of runs that are executed at once.
     """
     every = [wall for of_method in walls.values() for wall in of_method]
@@ -129,4 +129,4 @@ def remaining_time_s(
     overall = sum(every) / len(every)
     means = {method: sum(of_method) / len(of_method) for method, of_method in walls.items()}
     expected = [means.get(method, overall) for method in waiting]
-    return max(sum(expected) / slots, max(expected))
+    return max(sum(expected) / worker_count, max(expected))

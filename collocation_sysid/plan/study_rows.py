@@ -156,7 +156,7 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion)
     parameters = _parameter_columns(run, result, yardstick.truth)
     errors = [parameters[f"error_{name}"] for name in run.guess if name in yardstick.truth]
     is_accurate = all(error is not None and error <= yardstick.within for error in errors)
-    numbers = {
+    values = {
         name: None if result is None else column.from_result(result)
         for name, column in COLUMNS.items()
         if column.from_result is not None
@@ -165,12 +165,12 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion)
         "key": run.key,
         "method": run.method,
         "start": run.start,
-        **run.swept,
+        **run.varied_values,
         "status": record["outcome"] if is_timeout or result is None else result.status,
         "converged": converged,
         "success": converged and is_accurate,
         **parameters,
-        **numbers,
+        **values,
         "tip_max_m": (record.get("tip") or {}).get("max_m"),
         "wall_s": record.get("wall_s"),
         "attempts": record.get("attempts"),
@@ -242,14 +242,14 @@ def best_run(rows: Sequence[Row]) -> Row | None:
 
     None if no run has a result.
     """
-    answered = [row for row in rows if row["rms_m"] is not None]
+    completed = [row for row in rows if row["rms_m"] is not None]
 
     def rank(row: Row) -> tuple[bool, bool, float]:
         """Return the sort key of a run."""
         loss = row["loss"] if row["loss"] is not None else inf
         return not row["success"], not row["converged"], loss
 
-    return min(answered, key=rank, default=None)
+    return min(completed, key=rank, default=None)
 
 
 def reference_parameters(rows: Sequence[Row], yardstick: SuccessCriterion) -> dict[str, float]:

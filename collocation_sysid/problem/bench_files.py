@@ -116,11 +116,11 @@ def add_displacement(
     reads them.
     """
     shifts_m = layout.sign * grasp.poses.at(table.t_s)[1]
-    along = shifts_m[:, "xyz".index(layout.axis)]
-    values = {"displacement": along, **dict(zip("xyz", shifts_m.T, strict=True))}
+    displacement_m = shifts_m[:, "xyz".index(layout.axis)]
+    values = {"displacement": displacement_m, **dict(zip("xyz", shifts_m.T, strict=True))}
     usual = ["displacement"] if grasp.zero in ("", layout.axis) else [*grasp.zero]
     if rest_length_m is not None:
-        values["strain"] = along / rest_length_m
+        values["strain"] = displacement_m / rest_length_m
         usual = ["strain"]
     chosen = _named_quantities(layout) or usual
     known = (*DISPLACEMENTS, DISPLACEMENT, STRAIN)
@@ -140,16 +140,16 @@ def add_wrench(table: BenchTable, layout: WrenchSection, at_s: Array, wrench: Ar
         fx, fy, fz [N], tx, ty, tz [N m].
     """
     rows = np.searchsorted((table.t_s[1:] + table.t_s[:-1]) / 2, at_s)
-    whole = np.full((len(table.t_s), 6), np.nan)
-    whole[rows] = layout.sign * layout.symmetry * wrench
+    six_components = np.full((len(table.t_s), 6), np.nan)
+    six_components[rows] = layout.sign * layout.symmetry * wrench
     components = [quantity.key for quantity in (*FORCES, *TORQUES)]
-    values = dict(zip(components, whole.T, strict=True))
-    along = f"f{layout.axis}"
-    values["force"] = values[along]
+    values = dict(zip(components, six_components.T, strict=True))
+    column = f"f{layout.axis}"
+    values["force"] = values[column]
     measured = [key for key in components if np.isfinite(values[key]).any()]
-    usual = ["force"] if measured == [along] else measured
+    usual = ["force"] if measured == [column] else measured
     if layout.area_m2 is not None:
-        values["stress"] = values[along] / layout.area_m2
+        values["stress"] = values[column] / layout.area_m2
         usual = ["stress"]
     chosen = _named_quantities(layout) or usual
     known = (*FORCES, *TORQUES, FORCE, STRESS)
@@ -180,19 +180,19 @@ def bench_tables(
         If two grasps read the same column.
     """
     moved = list(zip(section.moved_sections, experiment.grasps, strict=True))
-    stated_tables = [
+    declared_tables = [
         t for each in section.moved_sections for t in (each.displacement, each.wrench) if t
     ]
-    time = OTHER_TIME if any(table.columns for table in stated_tables) else TIME.column
+    time = OTHER_TIME if any(table.columns for table in declared_tables) else TIME.column
     tables: dict[str, BenchTable] = {}
-    for stated, grasp in moved:
-        if (layout := stated.displacement) is not None:
+    for declared, grasp in moved:
+        if (layout := declared.displacement) is not None:
             name = table_name(section, layout)
             table = tables.setdefault(name, BenchTable(grasp.poses.t_s, time))
             add_displacement(table, layout, grasp, strain_length_m(layout, experiment.body))
     measured = iter(wrenches)
-    for stated, grasp in moved:
-        if (sensed := stated.wrench) is not None and grasp.wrench is not None:
+    for declared, grasp in moved:
+        if (sensed := declared.wrench) is not None and grasp.wrench is not None:
             at_s = grasp.wrench.t_s
             table = tables.setdefault(table_name(section, sensed), BenchTable(at_s, time))
             add_wrench(table, sensed, at_s, next(measured))

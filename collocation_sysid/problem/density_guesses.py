@@ -37,10 +37,12 @@ def with_guessed_densities(section: ObjectSection, parameters: Sections) -> Obje
     return section.model_copy(update=changes)
 
 
-def with_stated_densities(parameters: Sections, body: Body) -> dict[str, ParameterSection | float]:
+def with_declared_densities(
+    parameters: Sections, body: Body
+) -> dict[str, ParameterSection | float]:
     """Return [parameters] with missing guesses of densities taken from the body."""
     return {
-        name: section.model_copy(update={"guess": _stated_density(body, name)})
+        name: section.model_copy(update={"guess": _declared_density(body, name)})
         if isinstance(section, ParameterSection)
         and is_density(name)
         and section.fixed is None
@@ -69,7 +71,7 @@ def _guess(parameters: Sections, name: str) -> float | None:
     return section.fixed if section.guess is None else section.guess
 
 
-def _stated_density(body: Body, name: str) -> float | None:
+def _declared_density(body: Body, name: str) -> float | None:
     """Return the mass [kg] or density [kg/m³] that the body states for a parameter; None if
     it has none.
     """

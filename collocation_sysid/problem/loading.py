@@ -25,10 +25,10 @@ from ..fem.structured import (
 from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Experiment
 from ..recording.node_selection import selection_from_section
-from ..schema_tables import Section, stated_in
+from ..schema_tables import Section, declared_in
 from ..statistics.plausibility import SIZES_M, size_and_density_hypotheses
 from .code_loader import CodeLoader, existing_file
-from .density_guesses import with_guessed_densities, with_stated_densities
+from .density_guesses import with_declared_densities, with_guessed_densities
 from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 from .problem_reading import read_problem_file
 from .problem_size import Say, Size, announce_reading, require_feasible
@@ -83,7 +83,7 @@ def problem_arguments(
         mesh_warnings = [oddity.message for oddity in size_and_density_hypotheses(body)]
     with _locate_in_table(path, "parameters"):
         body_with_friction = body.with_frames(0, frictions=_frictions(file))
-        sections = with_stated_densities(unknowns, body_with_friction)
+        sections = with_declared_densities(unknowns, body_with_friction)
         parameters = Parameters.from_mapping(
             {name: _as_parameter(name, each) for name, each in sections.items()}
         )
@@ -242,7 +242,7 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
         return [branch.name for branch in section.prony if branch.region == region]
 
     def field(section: Section | None, where: str) -> Field | None:
-        return None if section is None else Field(**stated_in(section, Field, where))
+        return None if section is None else Field(**declared_in(section, Field, where))
 
     regions = [
         Region(
@@ -281,8 +281,8 @@ def _rest_shape(section: ObjectSection) -> UnderGravity | Literal["stress_free"]
 
 def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
     """Return the friction parameters that obstacles name, each once."""
-    stated = (each.friction for section in file.experiment for each in section.obstacle)
-    named = (one for one in stated if isinstance(one, str) and one.endswith(FRICTION.name))
+    declared = (each.friction for section in file.experiment for each in section.obstacle)
+    named = (one for one in declared if isinstance(one, str) and one.endswith(FRICTION.name))
     return tuple(dict.fromkeys(map(constant_named, named)))
 
 

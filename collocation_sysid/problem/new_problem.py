@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 from ..errors import InputError
-from ..files import require_possible, whole_file, write_whole
+from ..files import replaced_file, require_possible, write_text_file
 
 # A folder for each kind, see scripts/make_templates.py.
 TEMPLATES = Path(__file__).parent / "templates"
@@ -43,8 +43,8 @@ def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
             raise InputError("it is there already; choose another name", each)
     title = json.dumps(folder.resolve().name, ensure_ascii=False)  # quoted as TOML quotes
     text = (template / file.name).read_text(encoding="utf-8")
-    write_whole(file, text.replace('title = ""', f"title = {title}", 1))
+    write_text_file(file, text.replace('title = ""', f"title = {title}", 1))
     for each in data:
-        with whole_file(folder / each.name) as draft:
+        with replaced_file(folder / each.name) as draft:
             shutil.copyfile(each, draft)
     return [file, *(folder / each.name for each in data)]

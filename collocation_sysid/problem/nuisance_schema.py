@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, create_model, model_validator
 
 from ..recording import Nuisance
 from ..recording.nuisance import KINDS, SCOPE, SCOPE_TEXT, NuisanceRow
-from ..schema_tables import ByForm, Section, given_keys
+from ..schema_tables import ByForm, Section, used_keys
 from ..validated_types import Positive, Text
 
 KEYS = {key: list(rows) for key, rows in groupby(KINDS, key=lambda row: row.key)}
@@ -67,7 +67,7 @@ class NuisancePriorSection(Scoped):
     def _require_one_prior(self) -> NuisancePriorSection:
         """Raise `ValueError` if no prior is given and the scope alone is not sufficient."""
         priors = [key for key in type(self).model_fields if key != "scope"]
-        if not given_keys(self, *priors) and (self.scope == "recording" or not self.usual):
+        if not used_keys(self, *priors) and (self.scope == "recording" or not self.usual):
             expected = "one or both" if len(priors) > 1 else "it"
             raise ValueError(f"found no {' and no '.join(priors)}; expected {expected}")
         return self
@@ -76,15 +76,15 @@ class NuisancePriorSection(Scoped):
 def _prior_section(key: str, rows: list[NuisanceRow]) -> type[Section]:
     """Return the generated table of a key."""
     # What another prior goes with has to be there.
-    needed = any(row.beside is not None for row in rows)
+    needed = any(row.reference is not None for row in rows)
     fields: dict[str, Any] = {}
     for row in rows:
-        known = row.beside or (... if needed else None)
+        known = row.reference or (... if needed else None)
         kind: Any = Positive if needed else Optional[Positive]  # noqa: UP045
         description = f"Standard deviation [{row.unit}]."
         fields[row.prior] = (kind, Field(known, description=description))
     name = "".join(word.title() for word in key.split("_")) + "Prior"
-    description = f"Prior of a nuisance parameter: {rows[0].said}."
+    description = f"Prior of a nuisance parameter: {rows[0].description}."
     section = create_model(name, __base__=NuisancePriorSection, __doc__=description, **fields)
     section.usual = any(row.sigma is not None for row in rows)
     return section
@@ -95,7 +95,8 @@ def _nuisance_section() -> type[Section]:
     fields: dict[str, Any] = {}
     for key, rows in KEYS.items():
         description = " ".join(
-            f"{row.said[0].upper()}{row.said[1:]}: {_described_prior(row)}." for row in rows
+            f"{row.description[0].upper()}{row.description[1:]}: {_described_prior(row)}."
+            for row in rows
         )
         kind: Any = Annotated[Literal["none"] | _prior_section(key, rows), ByForm(str)]
         fields[key] = (kind | None, Field(None, description=description))

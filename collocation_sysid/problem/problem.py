@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from ..array_types import Array
-from ..declarations import key, stated
+from ..declarations import declaration, key
 from ..errors import InputError, located
 from ..fem.body import Body
 from ..fem.spatial_field import FieldModes
@@ -34,7 +34,7 @@ def _as_parameters(parameters: Parameters | Mapping[str, Unknown | Tied | float]
     return parameters if isinstance(parameters, Parameters) else Parameters.from_mapping(parameters)
 
 
-@stated
+@declaration
 class Problem:
     """Experiments that share parameters, and how the parameters are estimated.
 

@@ -179,17 +179,17 @@ def _apply_override(content: dict[str, Any], override: str) -> None:
 
 def _join_dotted_names(content: Any, parts: list[str]) -> list[str]:
     """Return the parts of a key, with names that contain dots joined, such as "core.mu_pa"."""
-    joined = []
+    names = []
     table = content
     while parts:
         count = 1
         if isinstance(table, dict):
             several = range(len(parts), 1, -1)
             count = next((n for n in several if ".".join(parts[:n]) in table), 1)
-        joined.append(".".join(parts[:count]))
+        names.append(".".join(parts[:count]))
         parts = parts[count:]
-        table = table.get(joined[-1]) if isinstance(table, dict) else None
-    return joined
+        table = table.get(names[-1]) if isinstance(table, dict) else None
+    return names
 
 
 def _item_key(place: Any, iterate: str, key: str) -> str | int:

@@ -24,11 +24,13 @@ ANNOUNCED_NODES = 20_000
 NODES = 4953
 STEP_S = 0.57
 STEP_POWER = 1.5
-FACTOR_NUMBERS = 4.8e6
+FACTOR_ENTRIES = 4.8e6
 FACTOR_POWER = 1.4
 # Rows shorter than this take as long: Python calls [s].
 LEAST_STEP_S = 2e-3
 SWEEPS = 10
+# Number of markers of unknown position above which they, not the body, determine the memory.
+MANY_MARKERS = 100
 # Counts beyond this are not told apart.
 MOST_SAMPLES = 10**15
 # Positions that a simulation keeps, and, at each of two points of a search, those and the
@@ -36,6 +38,8 @@ MOST_SAMPLES = 10**15
 SIMULATION_COPIES = 3
 SEARCH_COPIES = 10
 SENSITIVITY_COPIES = 2
+# Copies of the derivatives of the residuals: the array itself and its product with the weights.
+DERIVATIVE_COPIES = 2
 # Memory of the body's arrays and patterns [bytes].
 BYTES_PER_ELEMENT = 8000
 
@@ -52,6 +56,10 @@ class Size:
         Timesteps per sample.
     unknowns : int
         Parameters that are estimated; none for a simulation.
+    markers : int
+        Markers of the recording; zero before it is read.
+    unplaced_markers : int
+        Markers of unknown position on the body; three coordinates of each are estimated.
     """
 
     nodes: int
@@ -59,6 +67,8 @@ class Size:
     samples: int
     substeps: int = 1
     unknowns: int = 0
+    markers: int = 0
+    unplaced_markers: int = 0
 
     @property
     def timesteps(self) -> int:
@@ -70,9 +80,13 @@ class Size:
         copies = SIMULATION_COPIES
         if self.unknowns:
             copies = SEARCH_COPIES + SENSITIVITY_COPIES * self.unknowns
-        numbers = copies * 3 * self.nodes * self.timesteps
-        numbers += FACTOR_NUMBERS * (self.nodes / NODES) ** FACTOR_POWER
-        return (8 * numbers + BYTES_PER_ELEMENT * self.elements) / 1e6
+        values = copies * 3 * self.nodes * self.timesteps
+        if self.unknowns:
+            # Derivatives of all residuals of markers by all parameters are one array.
+            parameters = self.unknowns + 3 * self.unplaced_markers
+            values += DERIVATIVE_COPIES * 3 * self.markers * self.samples * parameters
+        values += FACTOR_ENTRIES * (self.nodes / NODES) ** FACTOR_POWER
+        return (8 * values + BYTES_PER_ELEMENT * self.elements) / 1e6
 
     def time_s(self) -> float:
         """Time of a solve in the reduced space, or of a simulation, on one thread."""
@@ -99,12 +113,18 @@ def require_feasible(size: Size, say: Say | None = None) -> None:
     if size.substeps > 1:
         steps += f" of {size.substeps:,} substeps"
     what = f"{steps} of a body of {size.nodes:,} nodes"
+    remedy = (
+        "a coarser mesh (edge_length_m), a shorter window_s, a lower resample_hz, a larger every, "
+        "or fewer substeps"
+    )
+    if size.unplaced_markers > MANY_MARKERS:
+        what += f" with {size.unplaced_markers:,} markers of unknown position"
+        remedy = f"fewer markers (markers.names), their positions (reference_m), {remedy}"
     there_mb = machine_memory_mb()
     if there_mb is not None and size.memory_mb() > there_mb:
         raise InputError(
             f"{what} take about {size.memory_mb() / 1e3:.3g} GB of memory, and this machine has "
-            f"{there_mb / 1e3:.3g} GB; expected a coarser mesh (edge_length_m), a shorter "
-            "window_s, a lower resample_hz, a larger every, or fewer substeps"
+            f"{there_mb / 1e3:.3g} GB; expected {remedy}"
         )
     is_large = size.samples == 1 and size.nodes > ANNOUNCED_NODES
     if say is not None and (is_large or size.time_s() > ANNOUNCED_SOLVE_S):

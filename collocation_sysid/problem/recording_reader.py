@@ -44,7 +44,7 @@ from ..recording.formats.units import METRES_PER_UNIT
 from ..recording.poses import require_determined_motion
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.time_tables import is_within_experiment, read_custom_sensor
-from ..schema_tables import stated_in
+from ..schema_tables import declared_in
 from ..statistics.modal_misspecifications import find_misspecifications_by_modes
 from .bench_files import strain_length_m
 from .code_loader import CodeLoader, existing_file
@@ -145,7 +145,7 @@ class RecordingReader:
             markers=self._markers(t_s, table),
             nuisance=nuisance_from_section(section.nuisance, self.code.nuisance_row),
             air_density_kg_m3=self.air_density_kg_m3,
-            **stated_in(section, Experiment, ""),
+            **declared_in(section, Experiment, ""),
             **loads,
         )
         if section.has_markers and not self.simulation:
@@ -242,7 +242,7 @@ class RecordingReader:
         kind, word = (Obstacle, "force") if is_obstacle else (Grasp, "wrench")
         number = k + 1 - len(self.section.grasp_list)
         defaults = {"name": f"obstacle {number}"} if is_obstacle else {}
-        arguments: dict[str, Any] = defaults | stated_in(section, kind, self._grasp_key(k))
+        arguments: dict[str, Any] = defaults | declared_in(section, kind, self._grasp_key(k))
         wrench = section.wrench and self._wrench(section.wrench, self._grasp_key(k, word), t_s)
         with located(where=self._grasp_key(k)):
             grasp = kind(**arguments, poses=poses, zero=zero, wrench=wrench)
@@ -264,7 +264,7 @@ class RecordingReader:
         has no file.
         """
         name = self.section.file_of(section)
-        arguments: dict[str, Any] = stated_in(section, Wrench, key)
+        arguments: dict[str, Any] = declared_in(section, Wrench, key)
         for sigma in {"sigma_n", "sigma_nm"} & arguments.keys():
             arguments[sigma] /= section.symmetry
         with located(where=key):
@@ -285,7 +285,7 @@ class RecordingReader:
         Values are None if a simulation has no file.
         """
         key = f"reading.{k}"
-        arguments: dict[str, Any] = {"name": section.name, **stated_in(section, Gauge, key)}
+        arguments: dict[str, Any] = {"name": section.name, **declared_in(section, Gauge, key)}
         _, arguments["expression"] = self.code.function(
             section.code, section.function, f"{key}.code"
         )
@@ -308,8 +308,8 @@ class RecordingReader:
         if not file.is_dir():
             file = existing_file(self.folder, section.file, f"depth.{k}.file")
         unit_m = METRES_PER_UNIT[section.length_unit]
-        stated_keys = section.camera.model_fields_set
-        depth_file = read_depth(file, section.count_m, unit_m, stated_keys)
+        declared_keys = section.camera.model_fields_set
+        depth_file = read_depth(file, section.count_m, unit_m, declared_keys)
         count = len(depth_file.images_m) or len(depth_file.clouds_m)
         t_s = section.t_s if section.t_s is not None else depth_file.t_s
         if t_s is None and count > 1 and not self._is_static:
@@ -332,7 +332,7 @@ class RecordingReader:
         depth_file, at_s = self._depth_images(k)
         names = ("matrix", "pose", "distortion")
         camera_arguments: dict[str, Any] = {name: getattr(depth_file, name) for name in names}
-        camera_arguments |= stated_in(section.camera, DepthCamera, f"{where}.camera")
+        camera_arguments |= declared_in(section.camera, DepthCamera, f"{where}.camera")
         if section.camera.poses is not None:
             file = existing_file(self.folder, section.camera.poses, f"{where}.camera.poses")
             camera_arguments["poses"] = read_poses(file)
@@ -350,7 +350,7 @@ class RecordingReader:
                 image = depth_file.images_m[sample]
                 clouds.append(points_from_image(image, camera))
                 images.append(image if number in outlined else None)
-            arguments = {"name": section.name, **stated_in(section, Depth, where)}
+            arguments = {"name": section.name, **declared_in(section, Depth, where)}
             depth = Depth(
                 t_s=at_s[is_used], clouds=clouds, camera=camera, images_m=images, **arguments
             )
@@ -372,7 +372,7 @@ class RecordingReader:
         table = getattr(self.section, list_key)[k]
         where = f"{list_key}.{k}"
         defaults = {"name": f"{list_key}_{k + 1}"} if "name" in type(table).model_fields else {}
-        arguments = defaults | stated_in(table, kind, where)
+        arguments = defaults | declared_in(table, kind, where)
         for name, key in keys_of(kind):
             if key.constant and key.read and (file_name := getattr(table, key.name)):
                 file = existing_file(self.folder, file_name, f"{where}.{key.name}")
@@ -489,7 +489,7 @@ class RecordingReader:
         intervals = [
             each.model_dump(include={"from_s", "until_s"}) for each in section.moved_sections
         ]
-        held_s = [
+        grasp_intervals_s = [
             (-np.inf if first is None else first, np.inf if last is None else last)
             for first, last in (each.values() for each in intervals)
         ]
@@ -499,9 +499,9 @@ class RecordingReader:
         first_s, last_s = section.window_s or (-np.inf, np.inf)
         t_s = table.t_s[table.t_s >= first_s - TIME_TOLERANCE_S]
         t_s = t_s[t_s <= last_s + TIME_TOLERANCE_S]
-        for name, sequence, held in zip(pose_files, poses, held_s, strict=True):
+        for name, sequence, interval_s in zip(pose_files, poses, grasp_intervals_s, strict=True):
             if name is not None and len(t_s) and not static:
-                require_determined_motion(sequence, t_s, held, self.folder / name)
+                require_determined_motion(sequence, t_s, interval_s, self.folder / name)
         rate_hz = section.resample_hz
         # The files that a simulation writes are thinned when they are read.
         every = 1 if self.simulation else section.every
@@ -509,9 +509,18 @@ class RecordingReader:
             samples = len(t_s) // every
             if rate_hz and not static:
                 samples = int(min((t_s[-1] - t_s[0]) * rate_hz, MOST_SAMPLES)) + 1
-            require_feasible(replace(self.size, samples=samples), self.say)
+            places = section.markers.reference_m
+            size = replace(
+                self.size,
+                samples=samples,
+                markers=len(table.names),
+                unplaced_markers=sum(name not in places for name in table.names),
+            )
+            require_feasible(size, self.say)
         try:
-            aligned = align(poses, table, section.window_s, rate_hz, every, held_s, static)
+            aligned = align(
+                poses, table, section.window_s, rate_hz, every, grasp_intervals_s, static
+            )
         except InputError as error:
             files = dict.fromkeys(name for name in (*pose_files, section.markers.file) if name)
             raise InputError(error.message, where=" and ".join(files)) from error
@@ -535,7 +544,7 @@ class RecordingReader:
             missing_name = names[int(np.isnan(sigma_m).argmax())]
             message = f"no value for {missing_name!r}; expected one for every marker"
             raise InputError(message, where="markers.sigma_m")
-        arguments: dict[str, Any] = stated_in(section, Markers, "markers")
+        arguments: dict[str, Any] = declared_in(section, Markers, "markers")
         return Markers(
             t_s,
             table.positions_m,

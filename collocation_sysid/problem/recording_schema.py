@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from ..recording import Depth, DepthCamera, Experiment, Gauge, Grasp, Markers, Obstacle, Wrench
-from ..schema_tables import ByForm, Section, Unit, Vector, given_keys, section_of
+from ..schema_tables import ByForm, Section, Unit, Vector, section_of, used_keys
 from ..validated_types import AtLeastOne, Boundless, Finite, NotNegative, Positive, Text
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
 
@@ -145,7 +145,7 @@ class MovedSection(Section):
         """Raise `ValueError` for several sources of poses, or keys without the source they
         belong to.
         """
-        sources = given_keys(self, "poses", "displacement", "markers")
+        sources = used_keys(self, "poses", "displacement", "markers")
         if len(sources) > 1:
             raise ValueError(f"found {' and '.join(sources)}; expected one of them")
         if self.gripper_to_body is not None and self.markers is not None:
@@ -153,14 +153,14 @@ class MovedSection(Section):
                 "found gripper_to_body and markers; expected no gripper_to_body, because the "
                 "positions in markers already refer to the undeformed body"
             )
-        for owner, keys in (
+        for section, keys in (
             ("poses", ("quaternion", "length_unit", "gripper_to_body")),
             ("markers", ("max_residual_m", "weights")),
         ):
-            given_names = [key for key in keys if getattr(self, key)]
-            if given_names and getattr(self, owner) is None:
+            present = [key for key in keys if getattr(self, key)]
+            if present and getattr(self, section) is None:
                 raise ValueError(
-                    f"found {given_names[0]} without {owner}; it is only used together with {owner}"
+                    f"found {present[0]} without {section}; it is only used together with {section}"
                 )
         _require_three(self.markers, "markers")
         for name in self.weights:
@@ -256,10 +256,10 @@ class MarkersSection(section_of(Markers, "MarkersSection")):
     @model_validator(mode="after")
     def _require_template(self) -> MarkersSection:
         """Raise `ValueError` for an incomplete template."""
-        given_names = given_keys(self, "template_m", "template_window_s", "max_template_residual_m")
-        if given_names and not {"template_m", "template_window_s"} <= set(given_names):
+        present = used_keys(self, "template_m", "template_window_s", "max_template_residual_m")
+        if present and not {"template_m", "template_window_s"} <= set(present):
             raise ValueError(
-                f"found {', '.join(given_names)}; expected template_m and template_window_s, both "
+                f"found {', '.join(present)}; expected template_m and template_window_s, both "
                 "or neither"
             )
         _require_three(self.template_m, "template_m")

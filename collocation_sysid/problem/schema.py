@@ -19,9 +19,9 @@ from ..schema_tables import (
     Section,
     Unit,
     Vector,
-    given_keys,
     require_one,
     section_of,
+    used_keys,
 )
 from ..validated_types import Count, Finite, Flag, NotNegative, Positive, Text
 from .problem_options import RolloutOptions, UncertaintyOptions
@@ -217,7 +217,7 @@ class ObjectSection(Section):
                 "edge_length_m is used only with surface, cylinder or box_m; expected one of "
                 "these, or no edge_length_m"
             )
-        if len(given_keys(self, "mass_kg", "density_kg_m3")) > 1:
+        if len(used_keys(self, "mass_kg", "density_kg_m3")) > 1:
             require_one(self, "mass_kg", "density_kg_m3")
         if (self.rest_shape == "under_gravity") != (self.scan is not None):
             raise ValueError(
@@ -232,8 +232,8 @@ class ObjectSection(Section):
                     if regions
                     else ("no region, because the object has none")
                 )
-                found = f"prony '{branch.name}' belongs to the region {branch.region!r}"
-                raise ValueError(f"{found}; expected {one}")
+                finding = f"prony '{branch.name}' belongs to the region {branch.region!r}"
+                raise ValueError(f"{finding}; expected {one}")
         return self
 
 
@@ -280,8 +280,8 @@ class ParameterSection(section_of(Unknown, "ParameterSection")):
     @model_validator(mode="after")
     def _require_one_kind(self) -> ParameterSection:
         """Raise `ValueError` for keys that do not belong together."""
-        if len(given_kinds := given_keys(self, "guess", "fixed", "tied_to")) > 1:
-            raise ValueError(f"found {' and '.join(given_kinds)}; expected one of them, or none")
+        if len(used_kinds := used_keys(self, "guess", "fixed", "tied_to")) > 1:
+            raise ValueError(f"found {' and '.join(used_kinds)}; expected one of them, or none")
         of_kind = {
             "guess": ("lower", "upper", "prior", "scale", "typical"),
             "fixed": (),
@@ -289,7 +289,7 @@ class ParameterSection(section_of(Unknown, "ParameterSection")):
         }
         kind = next((key for key in of_kind if getattr(self, key) is not None), "guess")
         others = {key for keys in of_kind.values() for key in keys} - set(of_kind[kind])
-        if useless := given_keys(self, *(n for n in type(self).model_fields if n in others)):
+        if useless := used_keys(self, *(n for n in type(self).model_fields if n in others)):
             alternative = "guess instead, or nothing, to estimate the parameter"
             raise ValueError(
                 f"found {kind} together with {', '.join(useless)}; expected {kind} alone, or "
@@ -304,7 +304,7 @@ def _flatten_parameters(tables: Any, *, prefix: str = "") -> Any:
     """
     if not isinstance(tables, dict):
         return tables
-    flat: dict[str, Any] = {}
+    flattened: dict[str, Any] = {}
     for name, value in tables.items():
         nested = isinstance(value, dict) and not set(value) & set(ParameterSection.model_fields)
         full_name = f"{prefix}{name}"
@@ -313,10 +313,10 @@ def _flatten_parameters(tables: Any, *, prefix: str = "") -> Any:
             if nested and value
             else {full_name: value}
         )
-        if twice := [key for key in inner if key in flat]:
+        if twice := [key for key in inner if key in flattened]:
             raise ValueError(f"{twice[0]!r} is given twice; expected one value")
-        flat.update(inner)
-    return flat
+        flattened.update(inner)
+    return flattened
 
 
 OneParameter = Annotated[ParameterSection | Finite, ByForm((dict, ParameterSection))]

@@ -79,16 +79,16 @@ def _fault_message(fault: Fault, content: dict[str, Any], root: type[BaseModel])
     in_array = key[-1:] != list(fault["loc"][-1:]) and isinstance(fault["loc"][-1], int)
     if kind == "missing" and not in_array:
         return f"missing; expected {expected or ('a value' if model is None else 'a table')}"
-    found = f"found {shortened(_value_at(key, content) if in_array else fault['input'])}"
+    finding = f"found {shortened(_value_at(key, content) if in_array else fault['input'])}"
     if expected and (in_array or kind in ("tuple_type", "list_type", "too_long", "too_short")):
-        return f"{found}; expected {expected}"
+        return f"{finding}; expected {expected}"
     if kind in ("model_type", "model_attributes_type") and model is not None:
-        return f"{found}; expected a table with some of the keys {', '.join(model.model_fields)}"
+        return f"{finding}; expected a table with some of the keys {', '.join(model.model_fields)}"
     if kind == "literal_error":
         choices = fault["ctx"]["expected"]
         hint = hint_at(str(fault["input"]), re.findall("'(.*?)'", choices))
-        return f"{found}; expected {choices}{hint}"
-    return f"{found}; expected {wanted(fault)}"
+        return f"{finding}; expected {choices}{hint}"
+    return f"{finding}; expected {wanted(fault)}"
 
 
 def _fault_location(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> str:

@@ -366,17 +366,17 @@ class Submatrix:
         self, pattern: SymmetricPattern, rows: Index, columns: Index | None = None
     ) -> None:
         # Entries are sorted by column, so that those of the transpose are sorted by row.
-        across, along, source = pattern.full
+        across, row_of_entry, source = pattern.full
         count = pattern.size if columns is None else len(columns)
         place, number = np.full((2, pattern.size), -1)
         place[rows] = np.arange(len(rows))
         number[slice(None) if columns is None else columns] = np.arange(count)
-        is_selected = (place[along] >= 0) & (number[across] >= 0)
+        is_selected = (place[row_of_entry] >= 0) & (number[across] >= 0)
         self._source = source[is_selected]
         self._in_both = source[is_selected] + np.where(
-            (along > across)[is_selected], 0, pattern.entry_count
+            (row_of_entry > across)[is_selected], 0, pattern.entry_count
         )
-        ends = np.cumsum(np.bincount(place[along[is_selected]], minlength=len(rows)))
+        ends = np.cumsum(np.bincount(place[row_of_entry[is_selected]], minlength=len(rows)))
         parts = (
             np.zeros(is_selected.sum()),
             number[across[is_selected]],

@@ -30,7 +30,7 @@ INDEPENDENT = 10000
 # Rotations from which the search starts, about each axis in both directions [rad].
 TURNED = 0.2
 # Starts that are followed to the end.
-KEPT = 2
+LEAST_POINTS_SHARE = 2
 # Points of a cloud that are used; more only cost time.
 ENOUGH = 2000
 
@@ -62,7 +62,7 @@ def align_camera(
         Index of the image.
     """
     rotations, translations = camera.poses
-    corners = ((x - translations[image]) @ rotations[image])[surface.flat_triangles]
+    corners = ((x - translations[image]) @ rotations[image])[surface.plane_triangles]
     sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(sides, axis=1)
     selected_area = area * np.repeat(surface.is_selected, len(area) // len(surface.faces))
@@ -74,10 +74,10 @@ def align_camera(
     tree = KDTree(thinned(camera.depth.points_m[image]))
     gates = np.geomspace(REACH * size_m, camera.depth.gate_m, ITERATIONS)
     rotation_vectors = np.vstack([np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)])
-    near_cloud = np.asarray(tree.data)[KDTree(places).query(tree.data)[0] < gates[0]]
+    cropped_cloud = np.asarray(tree.data)[KDTree(places).query(tree.data)[0] < gates[0]]
     shifts = [
         np.zeros(3),
-        places.mean(axis=0) - near_cloud.mean(axis=0) if len(near_cloud) else np.zeros(3),
+        places.mean(axis=0) - cropped_cloud.mean(axis=0) if len(cropped_cloud) else np.zeros(3),
     ]
     candidates = [
         (1.0, Rotation.from_rotvec(turn), shift) for turn in rotation_vectors for shift in shifts
@@ -87,7 +87,7 @@ def align_camera(
             _iterate_alignment(camera, tree, places, normals, half, *start)
             for _, *start in candidates
         ]
-        candidates = sorted(candidates, key=lambda each: each[0])[:KEPT]
+        candidates = sorted(candidates, key=lambda each: each[0])[:LEAST_POINTS_SHARE]
     _, turn, shift = candidates[0]
     return turn.as_rotvec(), shift
 

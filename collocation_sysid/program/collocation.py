@@ -343,13 +343,13 @@ class Collocation:
         """Name of each entry of p: the parameters' names, then the labels of the nuisance
         parameters.
         """
-        found = [item.name for item in self.parameters.free] + [""] * self.nphi
+        names = [item.name for item in self.parameters.free] + [""] * self.nphi
         for segment in self.transcriptions:
             for place, name in zip(
                 segment.nuisance_indices.indices, segment.nuisance.names, strict=True
             ):
-                found[place] = name
-        return tuple(found)
+                names[place] = name
+        return tuple(names)
 
     def prior_residuals(self, p: Array) -> tuple[Array, Array]:
         """Return residuals (nq + nphi,) of the priors at p and their derivatives, both in standard
@@ -684,8 +684,11 @@ class Collocation:
         out : array, optional
             Overwritten with the result and returned.
         """
-        bent = multipliers is not None
-        parts = [replace(part, has_observation_curvature=bent) for part in self.iterates(z)]
+        uses_observation_curvature = multipliers is not None
+        parts = [
+            replace(part, has_observation_curvature=uses_observation_curvature)
+            for part in self.iterates(z)
+        ]
         multipliers = np.zeros(self.constraint_count) if multipliers is None else multipliers
         used = self.nq * (self.nq + 1) // 2
         count = used + sum(segment.hessian.nnz for segment in self.transcriptions)
@@ -713,7 +716,7 @@ class Collocation:
                 loss_weight=weight,
                 values=here,
                 lifted_histories=lifted_histories,
-                has_observation_curvature=bent,
+                has_observation_curvature=uses_observation_curvature,
             )
             by_q = by_q + by_q_own
             further = further + further_own

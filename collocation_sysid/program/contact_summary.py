@@ -149,19 +149,19 @@ def contact_summaries(experiment: Experiment, x: Array, t_s: Array) -> Iterator[
         law = contact.law_of_contact
         smallest_gap_m = np.inf
         points = []
-        has_touched = np.zeros(contact.points.count, dtype=bool)
+        has_been_in_contact = np.zeros(contact.points.count, dtype=bool)
         for first in range(0, len(x), AT_ONCE):
             gap = law.gaps(contact.points.vectors(x[first : first + AT_ONCE]))
             smallest_gap_m = min(smallest_gap_m, float(gap.min()))
             is_touching = gap < law.widths_m
             points.append(is_touching.sum(axis=1))
-            has_touched |= is_touching.any(axis=0)
+            has_been_in_contact |= is_touching.any(axis=0)
         count = np.concatenate(points)
         ends = np.flatnonzero((count[:-1] > 0) & (count[1:] == 0)) + 1
         face_m2 = (
-            law.surface.area_m2[has_touched].sum()
+            law.surface.area_m2[has_been_in_contact].sum()
             * law.surface.points_per_face
-            / max(1, has_touched.sum())
+            / max(1, has_been_in_contact.sum())
         )
         yield ContactSummary(
             experiment.name,

@@ -172,9 +172,11 @@ class CustomSensorResidual(MeasurementResidual):
         """
         nothing = np.zeros((self.observable.count, self.observable.vector_count, GROUP))
         _, _, by_u = self._evaluate(nothing, np.zeros(self.nuisance.size))
-        by_looked = np.nan_to_num(by_u[..., : by_u.shape[3] - self.own_parameters.shape[1]])
+        by_observables = np.nan_to_num(by_u[..., : by_u.shape[3] - self.own_parameters.shape[1]])
         each = GROUP * self.observable.vector_count
-        squares = np.sum(by_looked.reshape(-1, each) ** 2, axis=0) / max(1, self.is_compared.sum())
+        squares = np.sum(by_observables.reshape(-1, each) ** 2, axis=0) / max(
+            1, self.is_compared.sum()
+        )
         with np.errstate(divide="ignore"):
             return 1 / np.sqrt(squares)
 

@@ -32,7 +32,7 @@ class DepthError:
     ----------
     points : int
         Number of points that are compared.
-    seen : int
+    compared_points : int
         Number of points in the images, including those of other things.
     rms_m : float or None
         Root mean square distance of the compared points; None without any.
@@ -52,7 +52,7 @@ class DepthError:
     """
 
     points: int
-    seen: int
+    compared_points: int
     rms_m: float | None
     reach_m: float
     gate_m: float
@@ -151,7 +151,7 @@ class SurfaceComparison:
         shortened = np.where(sigmas > HUBER, HUBER * sigmas, sigmas**2)
         return DepthError(
             points=len(distances_m),
-            seen=sum(map(len, depth.clouds)),
+            compared_points=sum(map(len, depth.clouds)),
             rms_m=root_mean(distances_m**2) if len(distances_m) else None,
             reach_m=max(self.correspondences.gate_m, depth.gate_m),
             gate_m=depth.gate_m,
@@ -166,8 +166,8 @@ def _positions_at_observable(residual: DepthResidual, t_s: Array, positions_m: A
     """Return positions (N, 3n) of a motion at the times of a measurement's observable,
     interpolated.
     """
-    flat = positions_m.reshape(len(t_s), -1)
+    position_rows = positions_m.reshape(len(t_s), -1)
     at_s = np.clip(residual.observable_s, t_s[0], t_s[-1])
     if len(t_s) >= FEWEST_FOR_SPLINE:
-        return np.asarray(CubicSpline(t_s, flat)(at_s))
-    return np.array([np.interp(at_s, t_s, each) for each in flat.T]).T
+        return np.asarray(CubicSpline(t_s, position_rows)(at_s))
+    return np.array([np.interp(at_s, t_s, each) for each in position_rows.T]).T

@@ -39,7 +39,7 @@ STEP_PX = 0.25
 OUTSIDE_PX = 1.5
 # If at least this many pixels show background per pixel without depth, the sensor measures its
 # background, and missing depths are failures.
-SEEN_BACKGROUND = 0.1
+LEAST_BACKGROUND_SHARE = 0.1
 # What pixels show, compared with a point of the outline.
 BODY = 0
 UNKNOWN = 1
@@ -181,7 +181,7 @@ def no_depth_is_empty(
     # The middle of the body as stated, which may move with the camera: a coarse measure suffices.
     middle_m = float(camera.body_middle_m(sample)[2])
     background = np.count_nonzero(image_m > middle_m + size_m)
-    return bool(background < SEEN_BACKGROUND * np.count_nonzero(np.isnan(image_m)))
+    return bool(background < LEAST_BACKGROUND_SHARE * np.count_nonzero(np.isnan(image_m)))
 
 
 def _outline_points(
@@ -198,11 +198,11 @@ def _outline_points(
     if eye_m is None or (own_m[:, 2] <= 0).any():
         return None
     facing = surface.is_facing(shape_m, eye_m)
-    ends, beside = surface.edges
-    is_front = facing[beside]
-    first, second = beside.T
+    ends, faces_of_edges = surface.edges
+    is_front = facing[faces_of_edges]
+    first, second = faces_of_edges.T
     front_triangle = np.where(is_front[:, 0], first, second)
-    parts = len(surface.flat_triangles) // len(surface.faces)
+    parts = len(surface.plane_triangles) // len(surface.faces)
     outline_edges = np.flatnonzero(
         (is_front[:, 0] != is_front[:, 1]) & surface.is_selected[front_triangle // parts]
     )
@@ -210,7 +210,7 @@ def _outline_points(
         return None
     ends = ends[outline_edges]
     front_triangle = front_triangle[outline_edges]
-    corners = surface.flat_triangles[front_triangle]
+    corners = surface.plane_triangles[front_triangle]
     lengths_m = np.linalg.norm(np.diff(shape_m[ends], axis=1)[:, 0], axis=1)
     counts = np.maximum(1, np.ceil(lengths_m / camera_in.depth.spacing_m).astype(int))
     edge = np.repeat(np.arange(len(outline_edges)), counts)
@@ -235,7 +235,7 @@ def _outline_points(
     inwards = np.sum(normals * (places_px - centres), axis=1) < 0
     outwards = np.where(inwards[:, None], -normals, normals)
     separate = _first_of_each_cube(points_m, camera_in.depth.spacing_m)
-    alone = ~_covered(places_px + OUTSIDE_PX * outwards, pixels[surface.flat_triangles[facing]])
+    alone = ~_covered(places_px + OUTSIDE_PX * outwards, pixels[surface.plane_triangles[facing]])
     selected = separate[(alone & (length_px > 1e-6))[separate]]
     if not len(selected):
         return None

@@ -153,7 +153,7 @@ class DepthResidual(MeasurementResidual):
         samples, points = pairs.is_compared.shape
         rotations, translations = self.correspondences.camera.poses
         in_camera = np.einsum("sji,sej->sei", rotations, pairs.normals)
-        along_normal = np.einsum("sei,si->se", pairs.normals, translations)[..., None]
+        normal_motion = np.einsum("sei,si->se", pairs.normals, translations)[..., None]
         offsets_s = np.broadcast_to(
             (self.observable_s[times] - self.t_s[:, None])[:, None],
             (samples, points, times.shape[1]),
@@ -163,7 +163,7 @@ class DepthResidual(MeasurementResidual):
             pairs.weights,
             pairs.normals,
             in_camera,
-            along_normal,
+            normal_motion,
             pairs.points,
             pairs.rays,
         ]
@@ -212,14 +212,14 @@ class DepthResidual(MeasurementResidual):
         view = self.correspondences.camera
         nodes = self.correspondences_in_use.nodes.shape[2]
         sizes = np.cumsum([0, self._neighbour_times.shape[1], nodes, 3, 3, 1, 3, 3]).tolist()
-        offsets, weights, normal, in_camera, along_normal, point, ray = ca.vertsplit(data, sizes)
+        offsets, weights, normal, in_camera, normal_motion, point, ray = ca.vertsplit(data, sizes)
         values = self.nuisance.values_by_row(phi, self.own_parameters[0])
         clock_shift = values.get(DEPTH_TIME, ca.SX(0))
         times = ca.vertsplit(offsets)
         in_time = ca.vertcat(*lagrange_weights(clock_shift, times))
         surface = values_in @ ca.kron(in_time, weights)
         corrected = view.corrected_expression(point, ray, values)
-        return ca.dot(normal, surface) - ca.dot(in_camera, corrected) - along_normal
+        return ca.dot(normal, surface) - ca.dot(in_camera, corrected) - normal_motion
 
     def rough_residuals(self, x: Array, phi: Array) -> Array:
         """Return the distances from visible parts of the surface to the points of the first
@@ -232,7 +232,7 @@ class DepthResidual(MeasurementResidual):
         )
 
     @property
-    def loss_of_far_points(self) -> float:
+    def loss_of_distant_points(self) -> float:
         """Loss of the points beyond the gate, each counted as if its distance were the
         stated gate.
         """
@@ -302,8 +302,10 @@ class DepthResidual(MeasurementResidual):
         """
         means, counts = self._pooling
         columns = int(np.prod(values.shape[3:]))  # zero where nothing is estimated
-        flat = means @ values.reshape(values.shape[0] * values.shape[1] * values.shape[2], columns)
-        return flat.reshape(len(counts), counts.shape[1] // GROUP, GROUP, *values.shape[3:])
+        value_rows = means @ values.reshape(
+            values.shape[0] * values.shape[1] * values.shape[2], columns
+        )
+        return value_rows.reshape(len(counts), counts.shape[1] // GROUP, GROUP, *values.shape[3:])
 
     # In pictures ------------------------------------------------------------------------------
 

@@ -72,7 +72,7 @@ class ExperimentIterate:
         lifted contact pressures.
         """
         dynamics = self.equations.dynamics
-        pressed = dynamics.contact_with_given_pressures(self.x, self.lifted_pressures)
+        pressed = dynamics.contact_with_pressures(self.x, self.lifted_pressures)
         return (*dynamics.histories(self.x, self.lifted_histories), *pressed)
 
     @cached_property
@@ -116,9 +116,9 @@ class ExperimentIterate:
         points from their edges [pixels].
         """
         distances = []
-        for reading, looked in self.surface_residuals[len(self.segment.depths) :]:
+        for reading, observation in self.surface_residuals[len(self.segment.depths) :]:
             assert isinstance(reading, OutlineResidual)
-            distances_px = reading.signed_distances_px(looked, self.phi)
+            distances_px = reading.signed_distances_px(observation, self.phi)
             distances.append((reading, distances_px[np.isfinite(distances_px)]))
         return distances
 
@@ -126,13 +126,13 @@ class ExperimentIterate:
     def loss(self) -> float:
         """Loss of all measurements, without priors."""
         pairs = zip(self.segment.residuals, self.observables, strict=True)
-        return sum(reading.loss(looked, self.phi) for reading, looked in pairs)
+        return sum(reading.loss(observation, self.phi) for reading, observation in pairs)
 
     @cached_property
     def loss_gradients(self) -> list[tuple[Array, Array]]:
         """Gradient of the loss of each measurement by its observables (n, e, 3) and by φ (k,)."""
         pairs = zip(self.segment.residuals, self.observables, strict=True)
-        return [reading.loss_gradient(looked, self.phi) for reading, looked in pairs]
+        return [reading.loss_gradient(observation, self.phi) for reading, observation in pairs]
 
     def gradient(self) -> tuple[Array, Array]:
         """Return the gradient of the loss by x (N, 3n) [1/m] and by (q, φ) (nq + k,).
@@ -146,10 +146,10 @@ class ExperimentIterate:
         by_p = np.zeros(nq + len(phi))
         by_reaction = None
         pairs = zip(self.segment.residuals, self.loss_gradients, strict=True)
-        for k, (reading, (by_looked, by_phi)) in enumerate(pairs):
+        for k, (reading, (by_observables, by_phi)) in enumerate(pairs):
             by_p[nq:] += by_phi
             if k not in self.lifted_observables:
-                products = reading.observable.vjp(self.motion, phi, by_looked)
+                products = reading.observable.vjp(self.motion, phi, by_observables)
                 by_x = by_x + products.by_x
                 by_p[nq:] = by_p[nq:] + products.by_phi
                 if products.by_reaction is not None:

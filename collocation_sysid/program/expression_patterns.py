@@ -84,16 +84,18 @@ class ExpressionPattern:
         shapes = (data.shape, rows.indices.shape, *(each.indices.shape for each in inputs))
         shape = np.broadcast_shapes(*(shape[1:] for shape in shapes))
 
-        def flat(values: NDArray[T], length: int) -> NDArray[T]:
+        def one_dimensional(values: NDArray[T], length: int) -> NDArray[T]:
             broadcast = np.broadcast_to(values, (length, *shape))
             return broadcast.reshape(length, int(np.prod(shape)))
 
-        def joined(parts: Sequence[PatternIndices]) -> PatternIndices:
-            places = [flat(part.indices, len(part.indices)) for part in parts]
-            units = [flat(np.asarray(part.unit), len(part.indices)) for part in parts]
+        def concatenated(parts: Sequence[PatternIndices]) -> PatternIndices:
+            places = [one_dimensional(part.indices, len(part.indices)) for part in parts]
+            units = [one_dimensional(np.asarray(part.unit), len(part.indices)) for part in parts]
             return PatternIndices(np.concatenate(places), np.concatenate(units))
 
-        return cls(expression, flat(data, len(data)), joined(inputs), joined([rows]))
+        return cls(
+            expression, one_dimensional(data, len(data)), concatenated(inputs), concatenated([rows])
+        )
 
     @classmethod
     def from_recursion(

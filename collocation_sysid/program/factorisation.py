@@ -147,7 +147,7 @@ class _RefinedFactor:
         Factor of S.
     skew : sparse array
         K.
-    factorise_whole : callable
+    factorise_complete : callable
         Returns the factor of S + K, which is used if the series does not converge.
     positive_definite : bool
         Always true.
@@ -157,14 +157,14 @@ class _RefinedFactor:
 
     symmetric: Factor
     skew: sp.csc_array
-    factorise_whole: Callable[[], Factor]
+    factorise_complete: Callable[[], Factor]
     positive_definite: bool = True
     divergence_flags: list[bool] = field(default_factory=list)
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
         """Solve for right-hand sides (k,) or (k, m)."""
         if self.divergence_flags:
-            return self.factorise_whole().solve(right, transposed)
+            return self.factorise_complete().solve(right, transposed)
         solution = correction = self.symmetric.solve(right)
         size = last = np.abs(solution).max(axis=0, initial=TINY)
         shrinks = 1.0
@@ -176,7 +176,7 @@ class _RefinedFactor:
             shrinks = float((length / last).max(initial=0.0))
             if not shrinks <= CONTRACTION:
                 self.divergence_flags.append(True)
-                return self.factorise_whole().solve(right, transposed)
+                return self.factorise_complete().solve(right, transposed)
             solution = solution + correction
             last = length
         return solution
@@ -224,9 +224,9 @@ class Factoriser:
         position[free] = np.arange(len(free))
         rows = position[pattern.rows]
         columns = position[pattern.columns]
-        self._kept = np.flatnonzero((rows >= 0) & (columns >= 0))
-        rows = rows[self._kept]
-        columns = columns[self._kept]
+        self._free_entries = np.flatnonzero((rows >= 0) & (columns >= 0))
+        rows = rows[self._free_entries]
+        columns = columns[self._free_entries]
         self._size = len(free)
         ones = np.ones(len(rows))
         graph = sp.csr_array((ones, (rows, columns)), shape=(self._size, self._size))
@@ -241,7 +241,7 @@ class Factoriser:
         strict = rows != columns
         self._full_rows = np.concatenate([rows, columns[strict]])
         self._full_columns = np.concatenate([columns, rows[strict]])
-        self._full_source = np.concatenate([self._kept, self._kept[strict]])
+        self._full_source = np.concatenate([self._free_entries, self._free_entries[strict]])
         # Whether an entry has the skew part's own sign; none on the diagonal.
         self._signs = np.concatenate([strict.astype(float), -np.ones(strict.sum())])
         self._entries = pattern.entry_count
@@ -296,7 +296,7 @@ class Factoriser:
         """Skyline factorisation for narrow bands; None for others."""
         if not self.is_banded or self.half_bandwidth > NARROW:
             return None
-        return make_skyline(self._size, *self._ranks, self._kept)
+        return make_skyline(self._size, *self._ranks, self._free_entries)
 
     @property
     def _sparse_work(self) -> float:
@@ -348,11 +348,11 @@ class Factoriser:
             return _SparseFactor(lu, _has_positive_pivots(lu))
 
         @cache
-        def whole() -> Factor:
+        def complete_factor() -> Factor:
             return _SparseFactor(self._superlu(values, pivot_below=1.0, skew=skew), True)
 
         entries = self._signs * skew[self._full_source]
-        return _RefinedFactor(definite, self._sparse_matrix(entries), whole)
+        return _RefinedFactor(definite, self._sparse_matrix(entries), complete_factor)
 
     def _factorise_definite(self, values: Array) -> Factor | None:
         """Return the factor of a symmetric matrix, or None if it is not positive definite."""
@@ -369,7 +369,7 @@ class Factoriser:
         if self.skyline:
             return None
         band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
-        band.T.reshape(-1)[self._band_places] = values[self._kept]
+        band.T.reshape(-1)[self._band_places] = values[self._free_entries]
         return _BandFactor(band, self._order) if cholesky_in_place(band) else None
 
     def _pardiso(self) -> Pardiso:

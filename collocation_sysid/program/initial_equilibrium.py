@@ -120,7 +120,7 @@ def _without_contact(forces: Forces, shape: Array) -> Array:
 
 
 def _partial_displacement(
-    experiment: Experiment, carried_m: Array, time_s: float, share: float
+    experiment: Experiment, displaced_m: Array, time_s: float, share: float
 ) -> Array:
     """Return positions (n, 3) with the grasps moved by a share of their displacement from the
     carried body [m].
@@ -129,11 +129,11 @@ def _partial_displacement(
     squeezed or sheared at large rotations. Obstacles have their final rotation already. Other nodes
     keep their positions.
     """
-    positions = carried_m.copy()
+    positions = displaced_m.copy()
     for grasp in experiment.grasps:
         if not grasp.is_active(time_s):
             continue
-        start = carried_m[grasp.nodes]
+        start = displaced_m[grasp.nodes]
         nodes = grasp.nodes
         place = np.ix_(nodes, grasp.axis_indices)
         goal = grasp.positions_at(experiment.body.nodes_m, [time_s])[0]

@@ -21,7 +21,7 @@ from ..model.contact import Contact
 from .experiment_iterate import ExperimentIterate
 from .lifted_force_histories import LiftedForceHistory
 from .sparse_assembly import EntryBlock
-from .transcription import Weighed
+from .transcription import WeightedHistory
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class LiftedContactPressure(LiftedForceHistory):
             / self.unit_m
         )
 
-    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> Weighed:
+    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
         """Return the history, and μ (1, N, I) such that multipliers · equations = Σ μ_k
         (unscaled equations of k).
         """

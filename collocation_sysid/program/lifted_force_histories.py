@@ -26,7 +26,7 @@ from .experiment_iterate import ExperimentIterate
 from .lifted_reactions import LiftedReactions, motion_equations
 from .lifted_variables import LiftedVariables, concatenated_entries
 from .sparse_assembly import EntryBlock
-from .transcription import RowWeights, Weighed
+from .transcription import RowWeights, WeightedHistory
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class LiftedForceHistory(LiftedVariables):
     Attributes
     ----------
     motion_history : int
-        Index of the history among those of the motion, `ExperimentIterate.histories_along`.
+        Index of the history among those of the motion, `ExperimentIterate.histories_of_trajectory`.
     force_index : int
         Index of the force, see `ForceHistory`.
     reactions : LiftedReactions or None
@@ -98,7 +98,7 @@ class LiftedForceHistory(LiftedVariables):
         predicted = self._history_of(iterate).internal_variables(slice(self.shape[1])).ravel()
         return z[self.columns] - predicted / self.segment.length_m
 
-    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> Weighed:
+    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
         """Return the history and its weights in the Lagrangian.
 
         Returns
@@ -188,8 +188,8 @@ class LiftedForceHistory(LiftedVariables):
                 weight = weights[k + lag] * shares[pairs]
                 if rows.omits_prescribed:
                     weight[
-                        dynamics.is_temporarily_held[k, dofs]
-                        | dynamics.is_temporarily_held[k + lag, dofs]
+                        dynamics.is_temporarily_prescribed[k, dofs]
+                        | dynamics.is_temporarily_prescribed[k + lag, dofs]
                     ] = 0.0
                 yield pairs, k[:, 0], row, weight / self.segment.force_n
 

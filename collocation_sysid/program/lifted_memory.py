@@ -25,7 +25,7 @@ from .experiment_iterate import ExperimentIterate
 from .lifted_reactions import LiftedReactions, MotionEquations, motion_equations
 from .lifted_variables import LiftedVariables, concatenated_entries
 from .sparse_assembly import EntryBlock
-from .transcription import RowWeights, Weighed
+from .transcription import RowWeights, WeightedHistory
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +133,7 @@ class LiftedMemory(LiftedVariables):
         """Index of the history: that of the body is the first."""
         return 0
 
-    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> Weighed:
+    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
         """Return the history and its weights in the Lagrangian.
 
         Returns
@@ -329,17 +329,19 @@ class LiftedMemory(LiftedVariables):
         """Return the derivatives of equations of motion by m, one array for each lag."""
         place, own, dofs, _ = (each[changes.derivative_indices] for each in self._stress_entries)
         scale = self.unit_pa[own] / self.segment.force_n
-        taken = self.segment.dynamics.is_temporarily_held
+        is_prescribed = self.segment.dynamics.is_temporarily_prescribed
 
         def slopes(times: slice) -> Array:
             scaled = history.body.stresses.memory_force_jacobian(history.xi[times], history.theta)
             return np.where(
-                changes.rows.omits_prescribed & taken[times, dofs], 0.0, scaled[:, place] * scale
+                changes.rows.omits_prescribed & is_prescribed[times, dofs],
+                0.0,
+                scaled[:, place] * scale,
             )
 
         scaled = self._scaled_by_lag(self._force_lags, slopes)
         for each, values in zip(self._force_lags, scaled, strict=True):
-            is_prescribed_later = taken[each.start + each.lag : each.stop + each.lag, dofs]
+            is_prescribed_later = is_prescribed[each.start + each.lag : each.stop + each.lag, dofs]
             values[changes.rows.omits_prescribed & is_prescribed_later] = 0.0
         return scaled
 
@@ -366,13 +368,13 @@ class LiftedMemory(LiftedVariables):
         # f_H is linear in x and in H, so that its slope by both is that by H at the weights.
 
         def slopes(times: slice) -> Array:
-            found = segment.body.stresses.memory_force_jacobian(
+            derivatives = segment.body.stresses.memory_force_jacobian(
                 weights.forces[times], history.theta
             )
-            return found[:, place] * scale
+            return derivatives[:, place] * scale
 
-        found = [by_q, *self._scaled_by_lag(self._state_lags, slopes)]
-        return np.concatenate([each.ravel() for each in found])
+        values = [by_q, *self._scaled_by_lag(self._state_lags, slopes)]
+        return np.concatenate([each.ravel() for each in values])
 
     @staticmethod
     def _scaled_by_lag(lags: list[_Lag], derivatives: Callable[[slice], Array]) -> list[Array]:

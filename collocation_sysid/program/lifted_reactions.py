@@ -72,7 +72,9 @@ class LiftedReactions(LiftedVariables):
         """Structure of ∂c/∂x, including forces on dofs while a grasp prescribes them."""
         segment = self.segment
         dynamics = self.segment.dynamics
-        untaken = replace(dynamics, is_temporarily_held=np.zeros_like(dynamics.is_temporarily_held))
+        untaken = replace(
+            dynamics, is_temporarily_prescribed=np.zeros_like(dynamics.is_temporarily_prescribed)
+        )
         return MotionJacobian(
             untaken, self.sensed_dofs, self.sensed_dofs, segment.length_m, segment.force_n
         )
@@ -163,8 +165,8 @@ def motion_equations(
     if reactions is not None:
         kinds.append((reactions.sensed_dofs, reactions.sensed_dofs, reactions.offsets.row, False))
     equations = []
-    for moving, dofs, first, taken in kinds:
+    for moving, dofs, first, is_prescribed in kinds:
         number = np.full(transcription.dof_count, -1)
         number[moving] = np.searchsorted(dofs, moving)
-        equations.append(MotionEquations(number, first, len(dofs), taken))
+        equations.append(MotionEquations(number, first, len(dofs), is_prescribed))
     return equations

@@ -21,7 +21,7 @@ import numpy as np
 from ..array_types import Array, Index
 from .experiment_iterate import ExperimentIterate
 from .expression_patterns import ExpressionPattern
-from .transcription import RowWeights, Transcription, Weighed
+from .transcription import RowWeights, Transcription, WeightedHistory
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ class LiftedVariables(ABC):
         """Index of the history among those of the motion, or None if the group is no history."""
         return None
 
-    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> Weighed:
+    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
         """Return the history, and the weights of each h_k in multipliers · equations.
 
         Raises

@@ -113,9 +113,9 @@ class LiftedWrench(LiftedVariables):
     def patterns(self) -> tuple[ExpressionPattern, ...]:
         """Expressions of the equations: W itself, moments of the nodes, tool, and low-pass."""
         channel = self.observable
-        numbers = np.arange(self.count).reshape(self.shape)
-        wrench = self.offsets.variable + numbers[0].T
-        of_wrench = numbers[0].T
+        indices = np.arange(self.count).reshape(self.shape)
+        wrench = self.offsets.variable + indices[0].T
+        of_wrench = indices[0].T
         unit = self._unit[:, None]
         minus = -self._row_unit[:, None]
         own = PatternIndices(of_wrench, -minus)
@@ -128,12 +128,14 @@ class LiftedWrench(LiftedVariables):
             channel.known_rows + channel.reaction_grid.delay_steps, channel.node_dofs
         )
         units = np.array([[self.segment.length_m], [self.segment.force_n]])
-        looked = [
+        observed = [
             PatternIndices(np.moveaxis(each.reshape(channel.count, -1, 3), 2, 0), unit)
             for each, unit in zip((self._position_columns, reaction_columns), units, strict=True)
         ]
-        taken = PatternIndices(of_wrench[..., None], minus[..., None])
-        terms.append(ExpressionPattern.from_arrays(MOMENT, channel.moment_data, looked, taken))
+        reaction_indices = PatternIndices(of_wrench[..., None], minus[..., None])
+        terms.append(
+            ExpressionPattern.from_arrays(MOMENT, channel.moment_data, observed, reaction_indices)
+        )
         if len(tool := channel.tool_parameters):
             data = channel.tool_inputs(np.zeros(len(self.phi_columns)), channel.count)[1]
             by_phi = PatternIndices(self.phi_columns[tool][:, None])
@@ -143,7 +145,7 @@ class LiftedWrench(LiftedVariables):
                 )
             )
         if len(lag := channel.low_pass_parameters):
-            places = self.offsets.variable + numbers
+            places = self.offsets.variable + indices
             by_phi = self.phi_columns[lag][:, None, None]
             unfiltered, filtered = (PatternIndices(places[k : k + 1], self._unit) for k in (0, 1))
             terms.append(
@@ -153,7 +155,7 @@ class LiftedWrench(LiftedVariables):
                     states=filtered,
                     input_indices=unfiltered,
                     constants=PatternIndices(by_phi),
-                    rows=PatternIndices(numbers[1:], self._row_unit),
+                    rows=PatternIndices(indices[1:], self._row_unit),
                 )
             )
         return tuple(terms)
@@ -173,8 +175,8 @@ class LiftedWrench(LiftedVariables):
     def loss_gradient(self, iterate: ExperimentIterate) -> Array:
         """Return the gradient of the loss by the scaled variables (count,)."""
         own = np.zeros(self.count)
-        by_looked, _ = iterate.loss_gradients[self.residual_index]
-        own[self.count - self._wrench_size :] = (by_looked.reshape(-1, 6) * self._unit).ravel()
+        by_observables, _ = iterate.loss_gradients[self.residual_index]
+        own[self.count - self._wrench_size :] = (by_observables.reshape(-1, 6) * self._unit).ravel()
         return own
 
     @cached_property

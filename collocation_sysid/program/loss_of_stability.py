@@ -30,9 +30,9 @@ from ..recording.experiment import Experiment
 BIOT_RATIO = 0.29559774
 # Stretch over the critical one below which a surface instability is reported: a mesh is stiffer or
 # softer than a half-space by this factor.
-NEAR = 1.15
+NEAREST_FACTOR = 1.15
 # Lowest eigenvalue over that of the undeformed body below which a failure is a loss of stability.
-LOST = 0.5
+LEAST_REDUCTION = 0.5
 # Displacement over the largest one from which on a face belongs to the mode.
 MOVING = 0.5
 # Shift of the eigenvalues away from zero, over the lowest of the undeformed body.
@@ -40,7 +40,7 @@ SHIFT = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class LostStability:
+class StabilityLoss:
     """Mode in which a body loses its stability, and the stretches where the mode is largest.
 
     Attributes
@@ -74,7 +74,10 @@ class LostStability:
     @property
     def is_surface_instability(self) -> bool:
         """Whether the stretch is near the one at which surfaces wrinkle."""
-        return self.smaller_stretch < 1 and self.smaller_stretch <= NEAR * self.critical_stretch
+        return (
+            self.smaller_stretch < 1
+            and self.smaller_stretch <= NEAREST_FACTOR * self.critical_stretch
+        )
 
     @property
     def message(self) -> str:
@@ -108,19 +111,19 @@ def explain_failure(
     if error.state_m is None:
         return error
     try:
-        instability = find_lost_stability(experiment, theta, error.state_m, error.time_s)
+        instability = find_stability_loss(experiment, theta, error.state_m, error.time_s)
     except (ArpackError, RuntimeError, np.linalg.LinAlgError):
         return error
     if instability is None:
         return error
     explained_error = SimulationError(instability.message, error.time_s, error.element)
-    explained_error.lost_stability = instability
+    explained_error.stability_loss = instability
     return explained_error
 
 
-def find_lost_stability(
+def find_stability_loss(
     experiment: Experiment, theta: Array, x: Array, time_s: float
-) -> LostStability | None:
+) -> StabilityLoss | None:
     """Return the mode in which a body is about to lose its stability, or None.
 
     None where the lowest eigenvalue is not small compared with that of the undeformed body, and
@@ -144,7 +147,7 @@ def find_lost_stability(
     if not reference > 0:
         return None
     value, shape = _lowest(forces, x, free, SHIFT * reference)
-    if not value < LOST * reference:
+    if not value < LEAST_REDUCTION * reference:
         return None
     nodes = experiment.body.nodes
     own = len(nodes.points_m)
@@ -167,7 +170,7 @@ def _lowest(forces: Forces, x: Array, free: Index, translation_m: float) -> tupl
     return float(values[0]), np.asarray(root @ vectors[:, 0])
 
 
-def _on_surface(points_m: Array, positions_m: Array, mode: Array, surface: Index) -> LostStability:
+def _on_surface(points_m: Array, positions_m: Array, mode: Array, surface: Index) -> StabilityLoss:
     """Return the mode with stretches and wavelength on the surface's triangles (F, 3)."""
     edges_m, moved_m, differences = (
         np.stack([each[surface[:, k]] - each[surface[:, 0]] for k in (1, 2)], axis=1)
@@ -190,7 +193,7 @@ def _on_surface(points_m: Array, positions_m: Array, mode: Array, surface: Index
     critical = float(BIOT_RATIO ** (1 / power)) if 0 < power < np.inf else 0.0
     slopes2 = np.einsum("fij,fik,fjk->f", inverse, differences, differences)
     share = (areas_m2 * amplitude2).sum() / max((areas_m2 * slopes2).sum(), np.finfo(float).tiny)
-    return LostStability(
+    return StabilityLoss(
         positions_m=positions_m,
         mode=mode,
         faces=surface,

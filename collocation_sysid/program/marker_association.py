@@ -245,13 +245,13 @@ class MarkerAssociation:
             The new chart, which is self if nothing has left it, and φ in it.
         """
         points = self.places_m(phi)
-        has_left = False
+        changed_cell = False
         for m in self.estimated:
-            has_left = has_left or self._has_left(points[m], int(self.cells[m]))
+            changed_cell = changed_cell or self._is_outside(points[m], int(self.cells[m]))
         samples = self.clock_samples
         if abs(shift_samples - samples) > SAMPLES_OFF:
             samples = round(shift_samples)
-        if not has_left:
+        if not changed_cell:
             return (
                 self if samples == self.clock_samples else replace(self, clock_samples=samples)
             ), phi
@@ -294,7 +294,7 @@ class MarkerAssociation:
             crossing_counts=again,
         )
 
-    def _has_left(self, point: Array, cell: int) -> bool:
+    def _is_outside(self, point: Array, cell: int) -> bool:
         """Whether another element contains a place better than element `cell`, by more than
         `BETTER`; false for NaN.
         """

@@ -42,14 +42,14 @@ class MarkerResidual(MeasurementResidual):
     is_initially_at_rest : bool
         Whether the body rests in its first state before the first time; then a shifted marker is
         predicted there, otherwise such samples are not compared.
-    earlier_times : int
+    preceding_times : int
         Number of the channel's times before the first sample.
     """
 
     observable: PointPositions
     markers: Markers
     is_initially_at_rest: bool
-    earlier_times: int
+    preceding_times: int
 
     @classmethod
     def from_markers(
@@ -60,7 +60,7 @@ class MarkerResidual(MeasurementResidual):
         association: MarkerAssociation,
         huber: float | None = None,
         is_initially_at_rest: bool = True,
-        earlier_times: int = 0,
+        preceding_times: int = 0,
     ) -> MarkerResidual:
         """Build the measurement model of the markers of an experiment.
 
@@ -69,7 +69,7 @@ class MarkerResidual(MeasurementResidual):
         markers : Markers
             Measured tracks.
         rows : (T,) array
-            Grid times of the observable, one for each sample and `earlier_times` ones before.
+            Grid times of the observable, one for each sample and `preceding_times` ones before.
         nuisance : NuisanceMap
             Nuisance parameters of the experiment.
         association : MarkerAssociation
@@ -78,12 +78,12 @@ class MarkerResidual(MeasurementResidual):
             Threshold of Huber's loss in standard deviations; None means a quadratic loss.
         is_initially_at_rest : bool
             Whether the body is at rest before the first time.
-        earlier_times : int
+        preceding_times : int
             Number of `rows` before the first sample.
         """
         places = np.full((len(markers.names), association.axes.shape[2]), -1)
         places[association.estimated] = nuisance.indices_of_rows(PLACE).reshape(-1, places.shape[1])
-        shifted = earlier_times + np.arange(len(markers.t_s)) + association.clock_samples
+        shifted = preceding_times + np.arange(len(markers.t_s)) + association.clock_samples
         covered = (shifted < len(rows)) & ((shifted >= 0) | is_initially_at_rest)
         is_compared = markers.is_present & covered[:, None]
         return cls(
@@ -98,7 +98,7 @@ class MarkerResidual(MeasurementResidual):
             own_parameters=nuisance.marker_indices(len(markers.names)),
             markers=markers,
             is_initially_at_rest=is_initially_at_rest,
-            earlier_times=earlier_times,
+            preceding_times=preceding_times,
         )
 
     @property
@@ -121,7 +121,7 @@ class MarkerResidual(MeasurementResidual):
     @property
     def _sample_indices(self) -> Index:
         """Index (T,) of each sample among the channel's times."""
-        return self.earlier_times + np.arange(len(self.t_s))
+        return self.preceding_times + np.arange(len(self.t_s))
 
     @cached_property
     def _neighbour_count(self) -> int:

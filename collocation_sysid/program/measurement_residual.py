@@ -413,14 +413,16 @@ class MeasurementResidual(ABC):
         """
         window = self.stencil(phi, len(values))
         samples, each, vectors = window.indices.shape
-        around = values.reshape(-1, GROUP)[window.indices].reshape(samples, each, GROUP * vectors)
+        neighbouring = values.reshape(-1, GROUP)[window.indices].reshape(
+            samples, each, GROUP * vectors
+        )
         own = np.broadcast_to(
             phi[self.own_parameters.T][:, None], (self.own_parameters.shape[1], samples, each)
         )
         measured, weight = (part[:, :samples] for part in self._data_and_weights)
         is_covered = self.is_covered(len(values))[:samples, None]
         data = np.concatenate([window.data, measured, weight * is_covered])
-        u = np.concatenate([around.transpose(2, 0, 1), own])
+        u = np.concatenate([neighbouring.transpose(2, 0, 1), own])
         return self.expression_for(vectors, len(window.data)), window, u, data
 
     def _grouped(self, values: Array) -> Array:
@@ -474,11 +476,11 @@ class MeasurementResidual(ABC):
             return none, np.zeros((*none.shape, size))
         window, residual, by_u = self._evaluate(values, phi)
         samples, each, vectors = window.indices.shape
-        by_looked = by_u[..., : GROUP * vectors]
+        by_observables = by_u[..., : GROUP * vectors]
         by_own = by_u[..., GROUP * vectors :]
         derivatives = np.zeros((*by_u.shape[:3], size))
         first = size - len(phi)
-        derivatives[..., observable_derivatives.columns] = by_looked @ _gather(
+        derivatives[..., observable_derivatives.columns] = by_observables @ _gather(
             observable_derivatives.by_common, window.indices
         )
         if len(observable_derivatives.entities):
@@ -486,12 +488,12 @@ class MeasurementResidual(ABC):
             times = window.indices[:, entities] // values.shape[1]
             number = np.arange(len(entities))[:, None]
             shape = samples, len(entities), GROUP * vectors, observable_derivatives.by_own.shape[3]
-            around = observable_derivatives.by_own[times, number].reshape(shape)
+            neighbouring = observable_derivatives.by_own[times, number].reshape(shape)
             _add_columns(
                 derivatives,
                 entities,
                 first + observable_derivatives.own_parameters,
-                by_looked[:, entities] @ around,
+                by_observables[:, entities] @ neighbouring,
             )
         if self.own_parameters.size:
             _add_columns(derivatives, np.arange(each), first + self.own_parameters, by_own)
@@ -508,11 +510,13 @@ class MeasurementResidual(ABC):
             return window, residual.transpose(1, 2, 0), by_u.transpose(2, 3, 0, 1)
         window, at_zero, by_u = self._linear_part
         samples, each, vectors = window.indices.shape
-        around = values.reshape(-1, GROUP)[window.indices].reshape(samples, each, GROUP * vectors)
+        neighbouring = values.reshape(-1, GROUP)[window.indices].reshape(
+            samples, each, GROUP * vectors
+        )
         if self.own_parameters.size:
             own = np.broadcast_to(phi[self.own_parameters], (samples, *self.own_parameters.shape))
-            around = np.concatenate([around, own], axis=2)
-        return window, at_zero + (by_u @ around[..., None])[..., 0], by_u
+            neighbouring = np.concatenate([neighbouring, own], axis=2)
+        return window, at_zero + (by_u @ neighbouring[..., None])[..., 0], by_u
 
     @cached_property
     def _linear_part(self) -> tuple[RowStencil, Array, Array] | None:
@@ -551,13 +555,13 @@ class MeasurementResidual(ABC):
         instrument, window, u, data = self._inputs_at(values, phi)
         by_u = instrument.loss.evaluate_with_jacobian(u, data)[1][0]
         places = window.indices
-        by_looked, by_own = np.split(by_u, [GROUP * places.shape[2]])
-        by_looked = by_looked.reshape(places.shape[2], GROUP, *places.shape[:2])
+        by_observables, by_own = np.split(by_u, [GROUP * places.shape[2]])
+        by_observables = by_observables.reshape(places.shape[2], GROUP, *places.shape[:2])
         where = np.moveaxis(places, 2, 0).ravel()
         count = values.size // GROUP
         for axis in range(GROUP):
             by_values[..., axis] = np.bincount(
-                where, by_looked[:, axis].ravel(), minlength=count
+                where, by_observables[:, axis].ravel(), minlength=count
             ).reshape(values.shape[:2])
         np.add.at(by_phi, self.own_parameters, by_own.sum(axis=1).T)
         return by_values, by_phi
@@ -567,10 +571,12 @@ class MeasurementResidual(ABC):
     def _gather_matrix(self, places: Index) -> sp.csr_array:
         """Return ∂u/∂(c, φ) of samples with stencils (s, E, v); rows by sample, then by input."""
         samples, each, vectors = places.shape
-        of_looked = GROUP * places[..., None] + np.arange(GROUP)
+        observable_columns = GROUP * places[..., None] + np.arange(GROUP)
         first = GROUP * self.observable.count * self.observable.vector_count
         own = np.broadcast_to(first + self.own_parameters, (samples, *self.own_parameters.shape))
-        columns = np.concatenate([of_looked.reshape(samples, each, GROUP * vectors), own], axis=2)
+        columns = np.concatenate(
+            [observable_columns.reshape(samples, each, GROUP * vectors), own], axis=2
+        )
         rows = np.arange(columns.size + 1)
         shape = columns.size, first + self.nuisance.size
         return sp.csr_array((np.ones(columns.size), columns.ravel(), rows), shape=shape)
@@ -641,8 +647,8 @@ def _gather(by: Array, places: Index) -> Array:
     the observable.
     """
     times, each, _, count = by.shape
-    flat = by.reshape(times * each, GROUP, count)[places]
-    return flat.reshape(*places.shape[:2], GROUP * places.shape[2], count)
+    rows = by.reshape(times * each, GROUP, count)[places]
+    return rows.reshape(*places.shape[:2], GROUP * places.shape[2], count)
 
 
 def _add_columns(slope: Array, entities: Index, columns: Index, values: Array) -> None:
@@ -675,8 +681,8 @@ def neighbouring_times(known_s: Array, at_s: Array, count: int) -> Index:
     count : int
         Number of neighbours, at most n.
     """
-    beside = np.searchsorted(known_s, at_s, side="right") - 1
-    first = np.clip(beside - (count - 1) // 2, 0, len(known_s) - count)
+    index_before = np.searchsorted(known_s, at_s, side="right") - 1
+    first = np.clip(index_before - (count - 1) // 2, 0, len(known_s) - count)
     return first[:, None] + np.arange(count)
 
 

@@ -36,7 +36,7 @@ MOST_SAMPLES = 300
 
 
 @dataclass(frozen=True, eq=False)
-class StatedMotion:
+class DeclaredMotion:
     """Statements of an experiment about poses, markers, mesh size and gravity, each of which may be
     wrong.
 
@@ -70,7 +70,7 @@ class StatedMotion:
     name: str = ""
 
     @classmethod
-    def from_experiment(cls, experiment: Experiment) -> StatedMotion | None:
+    def from_experiment(cls, experiment: Experiment) -> DeclaredMotion | None:
         """Return the statements of an experiment for its first samples.
 
         None if the experiment is static, or no single rigid motion carries the body at all times.
@@ -94,7 +94,7 @@ class StatedMotion:
         """Return points (T, M, 3) of the world in the grasp's frame [m]."""
         return np.einsum("tji,tmj->tmi", self.rotations, points_m - self.translations_m[:, None])
 
-    def with_prior_motion(self, rotation: Array, translation_m: Array) -> StatedMotion:
+    def with_prior_motion(self, rotation: Array, translation_m: Array) -> DeclaredMotion:
         """Return the statements with another rigid motion C before the poses U: x → U(Cx)."""
         shifted = self.translations_m + self.rotations @ translation_m
         return replace(self, rotations=self.rotations @ rotation, translations_m=shifted)
@@ -174,13 +174,13 @@ class ModalResponse:
             experiment.start == "equilibrium",
         )
 
-    def predict(self, stated: StatedMotion) -> Array:
+    def predict(self, declared: DeclaredMotion) -> Array:
         """Return predictions (S, T, M, 3) of the markers for S combinations of stiffness
         and damping, the last for a rigid body [m].
         """
-        scale = stated.mesh_scale
-        loads = self._modal_loads(stated)
-        step_s = float(stated.t_s[1] - stated.t_s[0])
+        scale = declared.mesh_scale
+        loads = self._modal_loads(declared)
+        step_s = float(declared.t_s[1] - declared.t_s[0])
         omega = self._frequencies(scale)
         states = [
             _oscillator_responses(omega, ratio, loads, step_s, self.is_initially_at_rest)
@@ -191,11 +191,13 @@ class ModalResponse:
         limit = scale * self.size_m
         # Small strains are assumed: what sways farther than the body is long, stays there.
         relative_size = np.linalg.norm(swayed, axis=3, keepdims=True) / limit
-        predictions = stated.to_world(
+        predictions = declared.to_world(
             scale * self.places_m + swayed / np.maximum(relative_size, 1.0)
         )
         return (
-            delayed_tracks(predictions, stated.t_s, stated.lag_s) if stated.lag_s else predictions
+            delayed_tracks(predictions, declared.t_s, declared.lag_s)
+            if declared.lag_s
+            else predictions
         )
 
     def _frequencies(self, scale: float) -> Array:
@@ -206,19 +208,13 @@ class ModalResponse:
         stiffnesses = softest * np.geomspace(1.0, STIFFEST, STIFFNESSES)
         return np.asarray(np.outer(stiffnesses, self.relative_frequencies), dtype=np.float64)
 
-    def _modal_loads(self, stated_motion: StatedMotion) -> Array:
+    def _modal_loads(self, declared: DeclaredMotion) -> Array:
         """Return the modal loads (T, K) of gravity and the grasp's acceleration."""
-        inverse = stated_motion.rotations.transpose(0, 2, 1)
-        step_s = float(stated_motion.t_s[1] - stated_motion.t_s[0])
-        lift = stated_motion.gravity_m_s2 - _second_differences(
-            stated_motion.translations_m, step_s
-        )
+        inverse = declared.rotations.transpose(0, 2, 1)
+        step_s = float(declared.t_s[1] - declared.t_s[0])
+        lift = declared.gravity_m_s2 - _second_differences(declared.translations_m, step_s)
         pushed = np.einsum("tij,tj->ti", inverse, lift)
-        rotated = (
-            inverse
-            @ _second_differences(stated_motion.rotations, step_s)
-            * stated_motion.mesh_scale
-        )
+        rotated = inverse @ _second_differences(declared.rotations, step_s) * declared.mesh_scale
         return pushed @ self.translation_loads.T - np.einsum(
             "tij,kij->tk", rotated, self.rotation_loads
         )

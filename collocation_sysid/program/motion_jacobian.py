@@ -1,13 +1,10 @@
 """Equations of motion of selected dofs as rows of a sparse Jacobian, in scaled quantities.
 
 Rows are c / `force_n`, differentiated by x / `strain_length_m`; a prescribed dof has the row (x − u
-x̄) /
-`strain_length_m` instead. A dof that is prescribed for a part of the time has a grasp row at those
-times
-instead of an equation of motion, and the force on it at those times counts in no later row (see
-`Dynamics.is_temporarily_held`): where a grasp begins or ends, entries differ from those of the
-scheme, and
-`ReleasedGrasps` corrects them.
+x̄) / `strain_length_m` instead. A dof that is prescribed for a part of the time has a grasp row at
+those times instead of an equation of motion, and the force on it at those times counts in no later
+row (see `Dynamics.is_temporarily_prescribed`): where a grasp begins or ends, entries differ from
+those of the scheme, and `ReleasedGrasps` corrects them.
 """
 
 from __future__ import annotations
@@ -62,9 +59,9 @@ class MotionJacobian:
     @cached_property
     def _skew(self) -> BlockBand:
         """Structure of `structure` for adding the skew parts of ∂F/∂x and ∂F/∂v."""
-        spins = self.dynamics.forces.has_skew_damping
+        has_skew_damping = self.dynamics.forces.has_skew_damping
         return skew_block_band(
-            self.pattern.size, self._row_starts, self._blocks(), by_velocity=spins
+            self.pattern.size, self._row_starts, self._blocks(), by_velocity=has_skew_damping
         )
 
     @property
@@ -213,7 +210,7 @@ class _DroppedForce:
         Index of the evaluation.
     source : (e,) array
         Entries in lower triangles.
-    whole : (e,) array
+    complete : (e,) array
         Entries in both triangles, in the order of `full_skew_values`.
     a, b : float
         Coefficients of G = ∂F/∂ξ and C = ∂F/∂ν.
@@ -222,7 +219,7 @@ class _DroppedForce:
     positions: Index
     evaluation: int
     source: Index
-    whole: Index  # the same in both triangles, as `skew_values` has them
+    complete: Index  # the same in both triangles, as `skew_values` has them
     a: float
     b: float
 
@@ -272,7 +269,7 @@ class ReleasedGrasps:
         scale : float
             Factor of the rows, `strain_length_m` / `force_n`.
         """
-        is_prescribed = dynamics.is_temporarily_held
+        is_prescribed = dynamics.is_temporarily_prescribed
         nothing = np.zeros(0, dtype=np.int64)
         place = np.full(pattern.size, -1)
         place[row_dofs] = np.arange(len(row_dofs))
@@ -307,9 +304,9 @@ class ReleasedGrasps:
             force = entry.a * by_position[entry.evaluation, entry.source]
             values[entry.positions] -= force + entry.b * by_velocity[entry.evaluation, entry.source]
             if skew.size:
-                values[entry.positions] -= entry.a * skew[entry.evaluation, entry.whole]
+                values[entry.positions] -= entry.a * skew[entry.evaluation, entry.complete]
             if rate_skew.size:
-                values[entry.positions] -= entry.b * rate_skew[entry.evaluation, entry.whole]
+                values[entry.positions] -= entry.b * rate_skew[entry.evaluation, entry.complete]
         values[self.zeros] = 0.0
         values[self.ones] = 1.0
 
@@ -327,7 +324,9 @@ def _dropped_forces(
     for k in range(dynamics.first_row, dynamics.row_count):
         for j in range(1, min(dynamics.largest_lag, dynamics.row_count - 1 - k) + 1):
             weight = scale * tables.w[k + j, j]
-            released = dynamics.is_temporarily_held[k] & ~dynamics.is_temporarily_held[k + j]
+            released = (
+                dynamics.is_temporarily_prescribed[k] & ~dynamics.is_temporarily_prescribed[k + j]
+            )
             if weight == 0 or not released.any():
                 continue
             entries = np.flatnonzero(released[rows])
@@ -343,7 +342,7 @@ def _dropped_forces(
                             positions.ravel(),
                             evaluation=k - dynamics.first_row,
                             source=source[entries],
-                            whole=entries,
+                            complete=entries,
                             a=a,
                             b=b,
                         )

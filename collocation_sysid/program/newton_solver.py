@@ -29,7 +29,7 @@ FAST = 0.1
 # Largest number of chord steps with one factor.
 OFTEN = 8
 # Chord steps end when the expected remaining error is this share of the tolerance.
-LEFT = 1e-5
+LEAST_RESIDUAL_SHARE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class NewtonSolver:
         self.pattern = experiment.sparsity
         self.factoriser = Factoriser.cached(self.pattern, self.free)
         self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
-        self._kept: Factor | None = None
+        self._last_factor: Factor | None = None
 
     def solve(
         self,
@@ -162,15 +162,15 @@ class NewtonSolver:
         self._require_upright(x)
         if not keep_definite:
             # What these lead to without end may be far off: the search then begins where they did.
-            nearer, done = self._simplified_newton(x, residual, linearise)
+            improved, done = self._simplified_newton(x, residual, linearise)
             if done:
-                return nearer
+                return improved
         value, *matrix = self._timed(linearise, x)
         factor = self._factorise(matrix, x, keep_definite)
         step = self._step(factor, value)
         for _ in range(self.options.max_iterations):
             if self._is_last(step):
-                self._kept = factor
+                self._last_factor = factor
                 x[self.free] += step
                 return x
             x, factor, step = self._backtrack(x, step, factor, residual, linearise, keep_definite)
@@ -190,16 +190,16 @@ class NewtonSolver:
         """
         is_own = False
         for _ in range(self.options.max_iterations):
-            if self._kept is not None:
-                nearer, done = self._chord_steps(x, residual, self._kept)
+            if self._last_factor is not None:
+                improved, done = self._chord_steps(x, residual, self._last_factor)
                 if done:
-                    return nearer, True
-                if nearer is x and is_own:
+                    return improved, True
+                if improved is x and is_own:
                     break
-                x = nearer
+                x = improved
             _, *matrix = self._timed(linearise, x)
             try:
-                self._kept = self._factorise(matrix, x, False)
+                self._last_factor = self._factorise(matrix, x, False)
                 is_own = True
             except NewtonFailure:
                 break
@@ -214,21 +214,21 @@ class NewtonSolver:
             Last state, which is x itself if steps grow or invert an element; and whether it is the
             solution.
         """
-        nearer = x.copy()
+        improved = x.copy()
         before = None
         done = False
         for _ in range(OFTEN):
-            step = self._step(factor, self._timed(residual, nearer))
+            step = self._step(factor, self._timed(residual, improved))
             length = float(np.linalg.norm(step))
             rate = length / before if before else 1.0
             if not rate <= 1.0:
                 return x, False
-            nearer[self.free] += step
-            done = self._is_last(rate * step, LEFT)
+            improved[self.free] += step
+            done = self._is_last(rate * step, LEAST_RESIDUAL_SHARE)
             if done or (before and rate > FAST):
                 break
             before = length
-        return (nearer, done) if self.has_no_inverted_element(nearer) else (x, False)
+        return (improved, done) if self.has_no_inverted_element(improved) else (x, False)
 
     def _with_prescribed(self, x: Array, goal: Array, linearise: Linearise) -> Array:
         """Return the state with the prescribed dofs at `goal`, and free dofs in equilibrium
@@ -434,7 +434,7 @@ def simulation_error(
         Description of the step, as the subject of a sentence.
     static : bool
         If true, the error contains the state where the path of equilibria ended, see
-        `lost_stability.explain_failure`.
+        `stability_loss.explain_failure`.
     """
     element = solver.worst_element(failure.x)
     ratio = float(solver.body.volume_ratios(failure.x)[0, element].min())

@@ -270,8 +270,8 @@ class PointPositions:
         by_x = np.zeros_like(motion.x)
         by_phi = np.zeros(len(phi))
         here = self.association.estimated
-        flat = by_values.reshape(len(by_values), -1)
-        by_x[self.rows] = (self.operator(phi).T @ flat.T).T
+        rows = by_values.reshape(len(by_values), -1)
+        by_x[self.rows] = (self.operator(phi).T @ rows.T).T
         if len(here):
             own = np.einsum(
                 "tmi,tmik->mk",

@@ -208,14 +208,14 @@ class Observation:
         """
         segment = self.segment
         size = self.segment.nq + len(self.phi)
-        found = []
+        linearisations = []
         motions = self.linearised_motions(x, response, step)
         for reading, motion in zip(segment.residuals, motions, strict=True):
             values_and_slopes = reading.observable.linearise(
                 motion, self.phi, segment.dynamic_parameters, size
             )
-            found.append(reading.linearise(*values_and_slopes, self.phi, size))
-        return found
+            linearisations.append(reading.linearise(*values_and_slopes, self.phi, size))
+        return linearisations
 
     def linearise_fixed_motion(self, x: Array) -> list[tuple[Array, Array]]:
         """Linearise the residuals of all measurements by φ, at a motion that does not change.

@@ -74,7 +74,7 @@ def continue_simulation(
     options: NewtonOptions | None = None,
     progress: Progress | None = None,
     stopwatch: Stopwatch | None = None,
-    near_solution: Array | None = None,
+    approximate_solution: Array | None = None,
 ) -> tuple[Array, SimulationError | None]:
     """Continue a trajectory until its end or until a step fails.
 
@@ -92,7 +92,7 @@ def continue_simulation(
         Called with the share of the rows done.
     stopwatch : Stopwatch, optional
         Accumulates the time spent.
-    near_solution : (N, 3n) array, optional
+    approximate_solution : (N, 3n) array, optional
         Trajectory at other parameters, as the first guess of equilibria.
 
     Returns
@@ -115,7 +115,7 @@ def continue_simulation(
     if known is None:
         try:
             at_start = dynamics.forces.at_times(slice(1))
-            start_guess = None if near_solution is None else near_solution[0]
+            start_guess = None if approximate_solution is None else approximate_solution[0]
             solver = solvers.for_prescribed(is_prescribed[0])
             goals_m = dynamics.prescribed_m[0]
             x[0], v0 = initial_state(experiment, at_start, solver, start_guess, goals_m)
@@ -135,7 +135,7 @@ def continue_simulation(
         forces[known_rows] = dynamics.forces_with_histories(histories, known_rows).total(
             xi[:known_evaluations], nu[:known_evaluations]
         )
-    dynamics.zero_held_forces(forces)
+    dynamics.zero_prescribed_forces(forces)
     previous_histories = tuple(history.final_state for history in histories)
     for t in range(done, dynamics.row_count):
         row = RowEquations(dynamics, x, forces, t, previous_histories)
@@ -143,10 +143,10 @@ def continue_simulation(
         goal = dynamics.prescribed_m[t, solver.is_prescribed]
         if not dynamics.is_static:
             guess = extrapolate(x[:t], dynamics.step_s * v0)
-        elif near_solution is None:
+        elif approximate_solution is None:
             guess = _extrapolate_static(x[:t], solver.is_prescribed, goal)
         else:
-            guess = near_solution[t]
+            guess = approximate_solution[t]
         try:
             x[t] = solve_row(solver, row, guess, x[t - 1], goal)
         except NewtonFailure as failure:
@@ -156,7 +156,7 @@ def continue_simulation(
                 solver, failure, time_s, f"the step at row {t}", static=static
             )
         forces[t] = row.force(x[t])
-        forces[t, dynamics.is_temporarily_held[t]] = 0
+        forces[t, dynamics.is_temporarily_prescribed[t]] = 0
         if previous_histories:
             (xi_t,), (nu_t,) = row.states(x[t])
             previous_histories = advance_states(

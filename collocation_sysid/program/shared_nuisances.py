@@ -93,10 +93,10 @@ def _require_same_objects(leader: Experiment, experiment: Experiment, row: Nuisa
     """Raise InputError if a nuisance parameter is shared by experiments whose objects differ."""
     theirs = row.same(leader)
     ours = row.same(experiment)
-    for thing in ours:
-        if theirs[thing] != ours[thing]:
+    for entry in ours:
+        if theirs[entry] != ours[entry]:
             raise _sharing_error(
-                experiment, row, f"'{leader.name}', which has another {thing}", f"the same {thing}"
+                experiment, row, f"'{leader.name}', which has another {entry}", f"the same {entry}"
             )
 
 
@@ -114,15 +114,15 @@ def _require_same_prior(
             experiment, row, difference, f"the same prior as here, {second.sigma:g}"
         )
     if row == PLACE:
-        given = [_stated_place(*one), _stated_place(*other)]
-        if not np.allclose(*given, rtol=0, atol=1e-9, equal_nan=True):
+        places = [_declared_place(*one), _declared_place(*other)]
+        if not np.allclose(*places, rtol=0, atol=1e-9, equal_nan=True):
             difference = f"'{leader.name}', which states another {label.partition(',')[0]}"
             raise _sharing_error(
                 experiment, row, difference, "the same position in both, or in neither"
             )
 
 
-def _stated_place(experiment: Experiment, entry: NuisanceEntry) -> Array:
+def _declared_place(experiment: Experiment, entry: NuisanceEntry) -> Array:
     """Return the stated place (3,) of a marker, NaN if there is none."""
     markers = experiment.markers
     at = markers.predict_positions(experiment.body.nodes_m)[entry.number]

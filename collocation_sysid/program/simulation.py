@@ -140,7 +140,7 @@ def simulate(
         density that leaves a node without mass.
     SimulationError
         When a step fails even after halvings; names time and element, and where an equilibrium
-        ceased to be stable the mode, see `program.find_lost_stability`.
+        ceased to be stable the mode, see `program.find_stability_loss`.
     """
     theta = resolve_theta(experiment.body, parameters)
     try:

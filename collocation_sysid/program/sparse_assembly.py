@@ -96,13 +96,13 @@ class SparseAssembly:
         all_indices[added] = codes[absent] - columns * height
         counts = np.bincount(columns, minlength=width)
         counts[: len(indptr) - 1] += np.diff(indptr)
-        numbers = [np.searchsorted(codes, each) for each in group_codes]
+        group_indices = [np.searchsorted(codes, each) for each in group_codes]
         return cls(
             np.concatenate([[0], np.cumsum(counts)]),
             all_indices,
             None if is_initial[: len(indices)].all() else np.flatnonzero(is_initial),
-            tuple(own[each] for each in numbers),
-            tuple(bool(np.bincount(each, minlength=1).max() > 1) for each in numbers),
+            tuple(own[each] for each in group_indices),
+            tuple(bool(np.bincount(each, minlength=1).max() > 1) for each in group_indices),
         )
 
     @property

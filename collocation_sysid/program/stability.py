@@ -140,7 +140,7 @@ def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
     in_basis = [basis.T @ (each @ basis) for each in (stiffness, damping)]
     exponents = _exponents(*in_basis)
     guess = exponents[np.argmax(exponents.real)]
-    return max(_growth_near(stiffness, damping, float(abs(guess))), 0.0)
+    return max(_growth_about(stiffness, damping, float(abs(guess))), 0.0)
 
 
 def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
@@ -186,7 +186,7 @@ class _CayleyTransform(LinearOperator):
         return np.concatenate([first + 2 * self.sigma * y, second + 2 * self.sigma * w])
 
 
-def _growth_near(stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> float:
+def _growth_about(stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> float:
     """Return the largest Re(s) of s² + D s + K for sparse matrices, with |s| of about σ; at
     least 0.
     """

@@ -140,7 +140,7 @@ class StepContact:
         self._theta = theta
         self._pattern = pattern
         self._from = np.full((2, 1), np.nan)
-        self._near = list[tuple[Contact, ContactCandidates]]()
+        self._candidates_of_contacts = list[tuple[Contact, ContactCandidates]]()
         edges_m = [each.law_of_contact.surface.edge_m for each in contacts]
         self.acts = bool(contacts)
         self._margin_m = MARGIN * min(edges_m, default=0.0)
@@ -150,8 +150,10 @@ class StepContact:
     def force(self, xi: Array, nu: Array) -> Array:
         """Return the contact forces (3n,) [N] at ξ and ν, each (1, 3n)."""
         force = np.zeros(xi.size)
-        for near, u, data in self._candidates(xi[0], nu[0]):
-            force += near.assemble(near.law.point_force_function.evaluate(u, data), xi.size)
+        for candidates, u, data in self._candidates(xi[0], nu[0]):
+            force += candidates.assemble(
+                candidates.law.point_force_function.evaluate(u, data), xi.size
+            )
         return force
 
     def linearise(
@@ -176,22 +178,22 @@ class StepContact:
             Lower triangle of its skew part; empty without friction or other velocity dependence.
         """
         force = np.zeros(xi.size)
-        rubs = any(each.law_of_contact.depends_on_velocity for each in self._contacts)
+        has_friction = any(each.law_of_contact.depends_on_velocity for each in self._contacts)
         symmetric = np.zeros(self._pattern.entry_count)
-        skew = np.zeros(self._pattern.entry_count * rubs)
-        for near, u, data in self._candidates(xi[0], nu[0]):
-            push, slopes = near.law.point_force_function.evaluate_with_jacobian(u, data)
-            force += near.assemble(push, xi.size)
+        skew = np.zeros(self._pattern.entry_count * has_friction)
+        for candidates, u, data in self._candidates(xi[0], nu[0]):
+            push, slopes = candidates.law.point_force_function.evaluate_with_jacobian(u, data)
+            force += candidates.assemble(push, xi.size)
             (touch,) = np.nonzero(push.any(axis=0))
             by_way = rates[0] * slopes[:, :3, touch]
-            if near.law.depends_on_velocity:
+            if candidates.law.depends_on_velocity:
                 by_way += rates[1] * slopes[:, 3:, touch]
-            weights = near.weights[touch]
-            here = near.entries[touch].ravel()
+            weights = candidates.weights[touch]
+            here = candidates.entries[touch].ravel()
             blocks = np.einsum("pa,ijp,pb->paibj", weights, by_way, weights)
-            blocks = blocks.reshape(near.entries[touch].shape)
-            counted = (near.symmetric_factors, near.skew_factors)[
-                : 1 + near.law.depends_on_velocity
+            blocks = blocks.reshape(candidates.entries[touch].shape)
+            counted = (candidates.symmetric_factors, candidates.skew_factors)[
+                : 1 + candidates.law.depends_on_velocity
             ]
             for part, counts in zip((symmetric, skew), counted, strict=False):
                 part += np.bincount(
@@ -206,14 +208,14 @@ class StepContact:
         ends = np.array([xi - self._half_s * nu, xi + self._half_s * nu])
         if not np.abs(ends - self._from).max() <= CHANGE * self._margin_m:
             self._from = ends
-            self._near = []
+            self._candidates_of_contacts = []
             for each in self._contacts:
                 gaps = each.law_of_contact.gaps(each.points.vectors(ends)).min(axis=0)
                 (chosen,) = np.nonzero(gaps < each.law_of_contact.widths_m + self._margin_m)
                 if len(chosen):
-                    near = ContactCandidates.from_indices(
+                    candidates = ContactCandidates.from_indices(
                         each.law_of_contact, self._pattern, chosen.tobytes()
                     )
-                    self._near.append((each, near))
-        for contact, near in self._near:
-            yield near, *near.inputs(contact, xi, nu, self._theta)
+                    self._candidates_of_contacts.append((each, candidates))
+        for contact, candidates in self._candidates_of_contacts:
+            yield candidates, *candidates.inputs(contact, xi, nu, self._theta)

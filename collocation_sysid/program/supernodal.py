@@ -124,8 +124,8 @@ class Pardiso:
             For any other error except a pivot that is not positive.
         """
         count = 1 if right is None else right.size // self.size
-        numbers = (1, 1, POSITIVE_DEFINITE, phase, self.size)
-        one, which, kind, stage, size = (ctypes.byref(ctypes.c_int(k)) for k in numbers)
+        settings = (1, 1, POSITIVE_DEFINITE, phase, self.size)
+        one, which, kind, stage, size = (ctypes.byref(ctypes.c_int(k)) for k in settings)
         error = ctypes.c_int(0)
         silent = ctypes.byref(ctypes.c_int(0))
         columns = ctypes.byref(ctypes.c_int(count))

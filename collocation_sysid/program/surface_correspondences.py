@@ -27,7 +27,7 @@ from .depth_outline import Outline
 from .visible_surface import GRAZING, VisibleSurface
 
 # Share of the distance perpendicular to the normal beyond which a point lies beyond an edge.
-BESIDE = 0.5
+LARGEST_OFFSET_EDGES = 0.5
 # Gate before anything is fitted, relative to the diagonal of the body.
 WIDE = 0.25
 # Later gate, relative to the median distance of the points.
@@ -39,7 +39,7 @@ SAME = 0.2
 # Largest alignment in standard deviations of its prior; more belongs to something else.
 FARTHEST = 4.0
 # Reasons for leaving points out, in the order in which they are tested.
-LEFT_OUT = ("far", "grazing", "turned away", "not chosen", "hidden")
+EXCLUSION_REASONS = ("far", "grazing", "turned away", "not chosen", "hidden")
 # Share of the spacing of points by which a part must be in front to hide another; shapes that
 # change by less have converged.
 FRONT = 0.5
@@ -151,7 +151,7 @@ class SurfaceCorrespondences:
             if name != "reasons"
         }
         total = np.sum([each["reasons"] for each in images], axis=0).tolist()
-        own: dict[str, Any] = {"excluded_counts": dict(zip(LEFT_OUT, total, strict=True))}
+        own: dict[str, Any] = {"excluded_counts": dict(zip(EXCLUSION_REASONS, total, strict=True))}
         own |= {
             "start_values": camera.parameter_values(phi),
             "gate_m": gate_m,
@@ -236,7 +236,7 @@ class SurfaceCorrespondences:
         """
         view = self.camera
         is_facing = self.surface.is_facing(x, self.camera.eye_m(phi, 0), GRAZING)
-        middles = x[self.surface.flat_triangles[is_facing]].mean(axis=1)
+        middles = x[self.surface.plane_triangles[is_facing]].mean(axis=1)
         distances_m, _ = KDTree(view.world_points(phi, 0)).query(middles)
         return np.minimum(distances_m, initial_gate_m(self.body.nodes_m))
 
@@ -286,7 +286,7 @@ def _match_image(
     dict of arrays
         Arrays of the points within the gate, by attribute name of `SurfaceCorrespondences`; and
         "reasons", the
-        numbers of points left out in the order of `LEFT_OUT`.
+        numbers of points left out in the order of `EXCLUSION_REASONS`.
     """
     depth = camera.depth
     cloud = camera.depth.clouds[sample]
@@ -300,7 +300,7 @@ def _match_image(
     distance = np.linalg.norm(offsets, axis=1)
     lateral = np.linalg.norm(offsets - np.sum(offsets * normals, axis=1)[:, None] * normals, axis=1)
     # A point beyond an edge of what the camera sees pulls that along the way to it.
-    is_beyond_edge = lateral > BESIDE * distance + depth.sigma_m
+    is_beyond_edge = lateral > LARGEST_OFFSET_EDGES * distance + depth.sigma_m
     normals[is_beyond_edge] = offsets[is_beyond_edge] / distance[is_beyond_edge, None]
     has_similar_normal = is_visible = is_any = np.ones(len(indices), dtype=bool)
     if cloud.shape[1] == 6:
@@ -356,11 +356,11 @@ def _nearest_facing(
     """
     low = x.min(axis=0) - gate_m
     high = x.max(axis=0) + gate_m
-    near = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
+    in_box = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
     facing = np.flatnonzero(surface.is_facing(x, eye_m))
-    if not len(facing) or not len(near):
-        return near[:0], near[:0], np.zeros((0, 3))
-    return near, *surface.nearest_points(x, world[near], facing)
+    if not len(facing) or not len(in_box):
+        return in_box[:0], in_box[:0], np.zeros((0, 3))
+    return in_box, *surface.nearest_points(x, world[in_box], facing)
 
 
 def initial_correspondences(experiment: Experiment) -> tuple[SurfaceCorrespondences, ...]:

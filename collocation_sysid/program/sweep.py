@@ -175,7 +175,9 @@ class PrescribedColumns:
     def from_columns(cls, sweep: Sweep, dofs: Index, columns: Array) -> PrescribedColumns:
         """Build the prescribed rows of dofs (g,) that change by `columns` (N, g, c) [m]."""
         return cls(
-            dofs, columns, sweep.dynamics.is_temporarily_held[:, dofs] | ~np.isin(dofs, sweep.free)
+            dofs,
+            columns,
+            sweep.dynamics.is_temporarily_prescribed[:, dofs] | ~np.isin(dofs, sweep.free),
         )
 
     @property
@@ -201,7 +203,7 @@ class PrescribedColumns:
         q = step.row.q[0]
         force = np.zeros((len(sweep.free), self.column_count))
         skew = step.row.skew(0, step.skew, step.rate_skew)
-        matrix = sweep.beside.extract(p * step.by_position + q * step.by_velocity, skew)
+        matrix = sweep.prescribed_block.extract(p * step.by_position + q * step.by_velocity, skew)
         force[:, changed] = matrix @ now[:, changed]
         return force
 
@@ -344,9 +346,11 @@ class Sweep:
         self.sensed = transcription.sensed_dofs
         self.factoriser = Factoriser.cached(self.pattern, self.free, factorisation)
         self.matrix = Submatrix(self.pattern, self.free)
-        self.beside = Submatrix(self.pattern, self.free, transcription.prescribed_motion.dofs)
+        self.prescribed_block = Submatrix(
+            self.pattern, self.free, transcription.prescribed_motion.dofs
+        )
         self.of_sensed = Submatrix(self.pattern, self.sensed)
-        self._takes = bool(self.dynamics.is_temporarily_held.any())
+        self._takes = bool(self.dynamics.is_temporarily_prescribed.any())
 
     def __reduce__(self) -> tuple[type[Sweep], tuple[Transcription, int, None, Choice]]:
         return Sweep, (self.segment, self.dynamics.row_count, None, self.factorisation)
@@ -461,7 +465,7 @@ class Sweep:
                 known = np.zeros(x.shape[1])
                 for j, other in enumerate(later, 1):
                     known += other.w[j] * y[t + j]
-                known[self.dynamics.is_temporarily_held[t]] = 0
+                known[self.dynamics.is_temporarily_prescribed[t]] = 0
                 remaining[t] -= p[0] * by_state + q[0] * by_rate
                 if known.any():
                     by_position = self.matrix.extract(step.by_position, -step.skew) @ known
@@ -490,7 +494,7 @@ class Sweep:
         the time prescribes the dof, in place.
         """
         if self._takes:
-            rows[self.dynamics.is_temporarily_held[t, self.free]] = 0
+            rows[self.dynamics.is_temporarily_prescribed[t, self.free]] = 0
         return rows
 
     @property
@@ -510,8 +514,8 @@ class Sweep:
     def _step_bytes(self) -> int:
         """Memory of one time step: element results and one factor [bytes]."""
         solver = self.factoriser
-        numbers = solver.unsymmetric_factor_size if self.body.is_unsymmetric else solver.factor_size
-        return 8 * (self.body.linearisation_width + numbers)
+        values = solver.unsymmetric_factor_size if self.body.is_unsymmetric else solver.factor_size
+        return 8 * (self.body.linearisation_width + values)
 
     def dynamics_at(self, equations: EquationsAtParameters) -> Dynamics:
         """Return the equations of motion of the first rows with the inputs of a setting."""
@@ -586,7 +590,7 @@ class Sweep:
         time get a diagonal entry alone.
         """
         pattern = self.pattern
-        is_prescribed = dynamics.is_temporarily_held[grid_times]
+        is_prescribed = dynamics.is_temporarily_prescribed[grid_times]
 
         def matrix(k: int) -> tuple[Array, Array]:
             values = rows[k].block(
@@ -647,7 +651,7 @@ class ForwardSubstitution:
     ) -> None:
         self.solver = solver
         self.columns = columns
-        self.held = grasp_forces if len(solver.sensed) else None
+        self.grasp_forces = grasp_forces if len(solver.sensed) else None
         self.violation_n = 0.0
         self.indefinite = 0
         size = solver.pattern.size
@@ -662,7 +666,7 @@ class ForwardSubstitution:
         self.past_forces = deque(last.forces, maxlen=reach)
         # Also where these rows do not: they may be continued.
         self.weighs_past = bool(solver.segment.dynamics.tables.w[:, 1:].any())
-        self.carried: list[MemoryForwardColumns | ForceForwardColumns] = []
+        self.internal_states: list[MemoryForwardColumns | ForceForwardColumns] = []
         self._known = last.history_columns
 
     @property
@@ -672,7 +676,7 @@ class ForwardSubstitution:
             solutions=tuple(self.past),
             increments=tuple(self.past_increments),
             forces=tuple(self.past_forces),
-            history_columns=tuple(each.columns for each in self.carried),
+            history_columns=tuple(each.columns for each in self.internal_states),
         )
 
     def iterate_rows(self, x: Array, done: int = 0, out: Array | None = None) -> Iterator[Array]:
@@ -696,11 +700,11 @@ class ForwardSubstitution:
         acceleration = dynamics.acceleration(x)
         known = self._known or [None] * len(histories)
         pairs = zip(histories, known, strict=True)
-        self.carried = [
+        self.internal_states = [
             each.forward_columns(columns.input_derivatives, done, own) for each, own in pairs
         ]
         for t in range(done, first):  # the start is given
-            for each in self.carried:
+            for each in self.internal_states:
                 each.advance(partial(np.zeros, self.shape), partial(np.zeros, self.shape))
             start = np.zeros(self.shape)
             if columns.prescribed is not None:
@@ -764,7 +768,7 @@ class ForwardSubstitution:
         if self.weighs_past:
             right += weighted_sum_of_past(w, self.past_increments, self._of_free)
         right -= mass * weighted_sum_of_past(s, self.past, self.shape).take(free, axis=0)
-        for each in self.carried:
+        for each in self.internal_states:
             force = force + each.force_columns()
         forced = force.take(free, axis=0)
         forced += self._past_force(step, row)
@@ -778,12 +782,12 @@ class ForwardSubstitution:
         out[free] = solution
         if prescribed is not None:
             prescribed.write_into(t, out)
-        for each in self.carried:
+        for each in self.internal_states:
             each.advance(
                 partial(self._stencil_sum, row.p, out), partial(self._stencil_sum, row.q, out)
             )
-        if self.held is not None:
-            self._store_grasp_forces(self.held, step, force, out)
+        if self.grasp_forces is not None:
+            self._store_grasp_forces(self.grasp_forces, step, force, out)
         self.past.appendleft(out)
 
     def _store_grasp_forces(

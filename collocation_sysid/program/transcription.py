@@ -53,7 +53,7 @@ from .wrench_residual import WrenchResidual, wrench_residuals
 T = TypeVar("T", bound=np.generic)
 # Of what two stencils (p, q) of an evaluation make of its two matrices.
 Factors = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
-Weighed = tuple[AnyHistory, Array]
+WeightedHistory = tuple[AnyHistory, Array]
 
 CHARTED = ("markers", "depths", "outlines", "residuals", "local_loss", "_loss_scale")
 
@@ -217,9 +217,9 @@ class Transcription:
     @cached_property
     def camera_models(self) -> tuple[DepthCameraModel, ...]:
         """Camera models of the depth cameras, in their order."""
-        numbers = range(len(self.experiment.depths))
+        cameras = range(len(self.experiment.depths))
         return tuple(
-            DepthCameraModel.from_experiment(self.experiment, k, self.nuisance) for k in numbers
+            DepthCameraModel.from_experiment(self.experiment, k, self.nuisance) for k in cameras
         )
 
     @cached_property
@@ -548,10 +548,10 @@ class Transcription:
         p = np.concatenate([q, phi[self.nuisance.motion_indices]])
         u, by_p = self.inputs.evaluate_at(p)
         dynamics = self.dynamics.with_inputs(u)
-        held = self.prescribed_motion.evaluate_at(phi)
-        if held.depends_on_phi:
-            dynamics = replace(dynamics, prescribed_m=self._prescribed_positions(held))
-        return EquationsAtParameters(self.inputs, p, self.nq, by_p, dynamics, held)
+        prescribed = self.prescribed_motion.evaluate_at(phi)
+        if prescribed.depends_on_phi:
+            dynamics = replace(dynamics, prescribed_m=self._prescribed_positions(prescribed))
+        return EquationsAtParameters(self.inputs, p, self.nq, by_p, dynamics, prescribed)
 
     @cached_property
     def inputs(self) -> Inputs:
@@ -630,7 +630,7 @@ class Transcription:
     @cached_property
     def is_grasp_constraint(self) -> NDArray[np.bool_]:
         """Mask (constraints,) of the constraints that prescribe a displacement."""
-        grasped = self.dynamics.is_temporarily_held.copy()
+        grasped = self.dynamics.is_temporarily_prescribed.copy()
         grasped[:, self.prescribed_dofs] = True
         return self.select_rows(grasped)
 
@@ -641,7 +641,7 @@ class Transcription:
         in `constraint_values`.
         """
         residual = equations.dynamics.residual(x, histories)
-        return self.dynamics.zero_held_forces(residual)[:, self.free_dofs]
+        return self.dynamics.zero_prescribed_forces(residual)[:, self.free_dofs]
 
     @cached_property
     def motion_rows(self) -> MotionJacobian:
@@ -682,12 +682,12 @@ class Transcription:
         by_p = np.zeros((self.grid_times, self.dof_count, len(self.dynamic_parameters)))
         rows = slice(dynamics.first_row, None)
         by_p[rows] = equations.force_derivatives(rows, forces.by_theta)
-        by_p = dynamics.combine(dynamics.tables.w, dynamics.zero_held_forces(by_p))
+        by_p = dynamics.combine(dynamics.tables.w, dynamics.zero_prescribed_forces(by_p))
         if equations.mass_depends_on_parameters:
-            whole = slice(None)
-            by_p -= equations.inertia_derivatives(whole, dynamics.acceleration(x), whole)
+            all_rows = slice(None)
+            by_p -= equations.inertia_derivatives(all_rows, dynamics.acceleration(x), all_rows)
         by_p /= self.force_n
-        dynamics.zero_held_forces(by_p)
+        dynamics.zero_prescribed_forces(by_p)
         by_p[:, self.prescribed_dofs] = 0
         if equations.prescribed.depends_on_phi:
             by_p[:, equations.prescribed.dofs, self.nq :] -= (
@@ -716,8 +716,8 @@ class Transcription:
         by_time = multipliers.reshape(self.constraint_times, self.constraints_per_time)
         rows[dynamics.first_row :, self.constrained_dofs] = by_time / self.force_n
         rows[:, self.prescribed_dofs] = 0
-        rows = dynamics.zero_held_forces(rows)
-        forces = dynamics.zero_held_forces(dynamics.combine_transposed(t.w, rows))
+        rows = dynamics.zero_prescribed_forces(rows)
+        forces = dynamics.zero_prescribed_forces(dynamics.combine_transposed(t.w, rows))
         if isinstance(reaction_weights, np.ndarray):
             rows = rows + reaction_weights
             forces = forces + dynamics.combine_transposed(t.w, reaction_weights)
@@ -839,7 +839,7 @@ class Transcription:
         weights: RowWeights,
         loss_weight: float,
         values: Array,
-        lifted_histories: Sequence[Weighed] = (),
+        lifted_histories: Sequence[WeightedHistory] = (),
         has_observation_curvature: bool = True,
     ) -> tuple[Array, list[Array]]:
         """Second derivatives of loss_weight · loss + multipliers · c of this segment.
@@ -910,7 +910,7 @@ class Transcription:
         x: Array,
         equations: EquationsAtParameters,
         weights: Array,
-        lifted_histories: Sequence[Weighed],
+        lifted_histories: Sequence[WeightedHistory],
     ) -> SecondDerivatives:
         """Return the weighted second derivatives of the forces at all N evaluations,
         including a stated initial state.

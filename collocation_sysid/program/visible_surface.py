@@ -28,7 +28,10 @@ GRAZING = 0.3
 
 # Flat triangles that stand for a face of three nodes, or of six with those on ab, bc, ca.
 CORNERS = np.vstack([np.eye(3), [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]]])
-FLAT = {3: np.array([[0, 1, 2]]), 6: np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])}
+TRIANGLES_OF_FACE = {
+    3: np.array([[0, 1, 2]]),
+    6: np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,23 +74,23 @@ class VisibleSurface:
         ]
 
     @property
-    def flat_triangles(self) -> Index:
+    def plane_triangles(self) -> Index:
         """Flat triangles (F·k, 3) as indices into `nodes`; those of a face are consecutive."""
-        return self.faces[:, FLAT[self.faces.shape[1]]].reshape(-1, 3)
+        return self.faces[:, TRIANGLES_OF_FACE[self.faces.shape[1]]].reshape(-1, 3)
 
     @cached_property
     def edges(self) -> tuple[Index, Index]:
         """Edges (K, 2) between two flat triangles, as indices into `nodes`, and these
         triangles (K, 2).
         """
-        flat = self.flat_triangles
-        ends = np.sort(flat[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        triangles = self.plane_triangles
+        ends = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         unique, number, counts = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
         order = np.argsort(number.ravel(), kind="stable")
         first = np.cumsum(counts) - counts
         paired = counts == 2
-        beside = np.stack([order[first[paired]], order[first[paired] + 1]], axis=1) // 3
-        return unique[paired], beside
+        faces_of_edges = np.stack([order[first[paired]], order[first[paired] + 1]], axis=1) // 3
+        return unique[paired], faces_of_edges
 
     def to_faces(self, triangles: Index, barycentric: Array) -> tuple[Index, Array]:
         """Return faces (P,), and barycentric coordinates (P, 3) on them, of points on flat
@@ -100,7 +103,7 @@ class VisibleSurface:
         barycentric : (P, 3) array
             Barycentric coordinates in the triangles.
         """
-        parts = FLAT[self.faces.shape[1]]
+        parts = TRIANGLES_OF_FACE[self.faces.shape[1]]
         corners = CORNERS[parts[triangles % len(parts)]]
         return triangles // len(parts), np.einsum("pc,pci->pi", barycentric, corners)
 
@@ -167,8 +170,8 @@ class VisibleSurface:
             Smallest cosine between the normal and the direction to the camera.
         """
         if eye_m is None:
-            return np.ones(len(self.flat_triangles), dtype=bool)
-        a, b, c = x[self.flat_triangles].transpose(1, 0, 2)
+            return np.ones(len(self.plane_triangles), dtype=bool)
+        a, b, c = x[self.plane_triangles].transpose(1, 0, 2)
         normal = np.cross(b - a, c - a)
         way = eye_m - (a + b + c) / 3
         sizes = np.linalg.norm(normal, axis=1) * np.linalg.norm(way, axis=1)
@@ -198,7 +201,7 @@ class VisibleSurface:
         optical_axis *= np.sign(optical_axis @ (x.mean(axis=0) - eye_m))
         depths = (x - eye_m) @ optical_axis
         away = (points_m - eye_m) @ optical_axis
-        corners = self.flat_triangles[self.is_facing(x, eye_m, 0.0)]
+        corners = self.plane_triangles[self.is_facing(x, eye_m, 0.0)]
         corners = corners[(depths[corners] > 0).all(axis=1)]
         places = ((x - eye_m) @ np.transpose(across) / depths[:, None])[corners]
         projected = (points_m - eye_m) @ np.transpose(across) / away[:, None]
@@ -238,7 +241,7 @@ class VisibleSurface:
         ((P,) array, (P, 3) array)
             Faces, and barycentric coordinates on them.
         """
-        corners = x[self.flat_triangles[candidates]]
+        corners = x[self.plane_triangles[candidates]]
         middles = corners.mean(axis=1)
         sizes = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
         neighbours = KDTree(middles).query(points, min(NEARBY, len(corners)))
@@ -251,10 +254,10 @@ class VisibleSurface:
             here = np.flatnonzero(away[:, rank] - sizes[own] < least)
             on = nearest_points_of_triangles(points[here], corners[own[here]])
             distances = np.linalg.norm(on - points[here], axis=1)
-            is_nearer = distances < least[here]
-            here = here[is_nearer]
-            on = on[is_nearer]
-            distances = distances[is_nearer]
+            is_closer = distances < least[here]
+            here = here[is_closer]
+            on = on[is_closer]
+            distances = distances[is_closer]
             triangles[here] = own[here]
             feet[here] = on
             least[here] = distances

@@ -239,9 +239,9 @@ class GraspWrench:
     @cached_property
     def frames(self) -> tuple[Array, Array]:
         """Axes Q (n, 3, 3) and origins o (n, 3) [m] of the sensor."""
-        turns, shifts = self.poses_at(self.known_rows)
+        rotations, shifts = self.poses_at(self.known_rows)
         if self.frame == "grasp":
-            return turns, shifts + turns @ self.point_m
+            return rotations, shifts + rotations @ self.point_m
         axes = np.tile(np.eye(3), (self.count, 1, 1))
         return axes, np.tile(self.point_m, (self.count, 1))
 
@@ -318,9 +318,9 @@ class GraspWrench:
         from o, and the second derivative of the translation.
         """
         axes, points = (each[:count] for each in self.frames)
-        turns, shifts = self.poses_at(self.known_rows[:count])
+        rotations, shifts = self.poses_at(self.known_rows[:count])
         turn_rates, shift_rates = self.pose_accelerations(count)
-        parts = (axes, turns, turn_rates, shifts - points, shift_rates)
+        parts = (axes, rotations, turn_rates, shifts - points, shift_rates)
         data = np.concatenate([each.reshape(count, -1) for each in parts], axis=1)
         return phi[self.tool_parameters], data.T
 
@@ -465,7 +465,7 @@ class GraspWrench:
         value = self.evaluate_without_tool(motion.reactions)
         axes = self.frames[0][: len(value)]
         data = [axes.reshape(-1, 9), value, np.tile(self.point_m, (len(value), 1))]
-        slopes = SEEN_FROM.evaluate_with_jacobian(
+        slopes = IN_MOVED_FRAME.evaluate_with_jacobian(
             np.zeros((6, len(value))), np.concatenate(data, axis=1).T
         )[1]
         k = self.known_rows[: len(value)]
@@ -487,9 +487,9 @@ def sensed_dofs(experiment: Experiment) -> Index:
 def _moment(u: ca.SX, data: ca.SX) -> ca.SX:
     """Expression of force and torque (6,) of one node."""
     place, reaction = ca.vertsplit(u, 3)
-    axes, point, held = ca.vertsplit(data, [0, 9, 12, 15])
+    axes, point, reaction_force = ca.vertsplit(data, [0, 9, 12, 15])
     axes = ca.reshape(axes, 3, 3)
-    force = held * reaction
+    force = reaction_force * reaction
     return ca.vertcat(axes @ force, axes @ ca.cross(place - point, force))
 
 
@@ -523,7 +523,7 @@ def _low_pass_step(before: ca.SX, now: ca.SX, last: ca.SX, lag: ca.SX, data: ca.
 # Force and torque (6,) of one node, by x_g and R_g; data are Q, o and what is held.
 MOMENT = GeneratedFunction(_moment, 6, 15)
 # W (6,) by a turn and a shift of the frame; data are Q, W and the point in the frame.
-SEEN_FROM = GeneratedFunction(_in_moved_frame, 6, 18)
+IN_MOVED_FRAME = GeneratedFunction(_in_moved_frame, 6, 18)
 # Of T by the φ of `low_pass_parameters`; data are whether it is the start, and T / Δt of a φ of
 # one.
 LOW_PASS = Recursion(_low_pass_step, 1, 1, 1, 2)

@@ -36,7 +36,7 @@ class Actuator(ABC, Generic[S]):
         For messages and reports.
     t_s : (m,) or None
         Times of the stated tension or pressure; None if it is constant.
-    stated_values : TimeSeries
+    declared_values : TimeSeries
         The tension or pressure as stated.
     factor : float
         Factor on the stated tension or pressure.
@@ -48,7 +48,7 @@ class Actuator(ABC, Generic[S]):
     t_s: Array | None
     factor: float
     body_measure: BodyMeasure[S] | None
-    stated_values: TimeSeries
+    declared_values: TimeSeries
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     unit: ClassVar[str]  # of the tension or pressure
@@ -87,11 +87,11 @@ class Actuator(ABC, Generic[S]):
         return replace(self, factor=factor, **{self.offset_field: offset})
 
     @abstractmethod
-    def energy_amplitude(self, stated_value: Any, factor: Any, offset: Any) -> Any:
+    def energy_amplitude(self, declared_value: Any, factor: Any, offset: Any) -> Any:
         """Return the amplitude c for a stated tension or pressure: numbers, arrays or CasADi
         expressions.
         """
 
     def energy_amplitude_at(self, t_s: Array) -> Array:
         """Return the amplitude c at the times `t_s` (T,), as (T,)."""
-        return self.energy_amplitude(self.stated_values.values_at(t_s), *self.factor_and_offset)
+        return self.energy_amplitude(self.declared_values.values_at(t_s), *self.factor_and_offset)

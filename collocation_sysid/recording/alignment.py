@@ -55,7 +55,7 @@ def align(
     window_s: tuple[float, float] | None = None,
     resample_hz: float | None = None,
     every: int = 1,
-    hold_s: Sequence[tuple[float, float]] | None = None,
+    grasp_intervals_s: Sequence[tuple[float, float]] | None = None,
     static: bool = False,
 ) -> AlignedRecording:
     """Put poses and markers on one evenly spaced time grid over the time that they share.
@@ -78,7 +78,7 @@ def align(
         Rate of the new grid, which starts at the first sample that is kept.
     every : int
         Use every n-th sample of the markers.
-    hold_s : sequence of (float, float), optional
+    grasp_intervals_s : sequence of (float, float), optional
         First and last time at which each grasp holds; its poses need not cover other times. The
         whole recording by default.
     static : bool
@@ -91,8 +91,8 @@ def align(
         three samples.
     """
     table = table if window_s is None else _cut_to_window(table, window_s)
-    hold_s = hold_s or [(-np.inf, np.inf)] * len(poses)
-    table, notes = _cut_to_poses(table, poses, hold_s, 1 if static else _FEWEST_SAMPLES)
+    grasp_intervals_s = grasp_intervals_s or [(-np.inf, np.inf)] * len(poses)
+    table, notes = _cut_to_poses(table, poses, grasp_intervals_s, 1 if static else _FEWEST_SAMPLES)
     if every > 1:
         table = MarkerTable(table.t_s[::every], table.names, table.positions_m[::every])
     if static:
@@ -120,7 +120,7 @@ def align(
 def _cut_to_poses(
     table: MarkerTable,
     poses: Sequence[PoseSequence],
-    hold_s: Sequence[tuple[float, float]],
+    grasp_intervals_s: Sequence[tuple[float, float]],
     fewest: int,
 ) -> tuple[MarkerTable, list[str]]:
     """Return the markers at times for which every grasp that holds has a pose, and notes on the
@@ -132,26 +132,30 @@ def _cut_to_poses(
         If fewer than `fewest` samples remain.
     """
     t_s = table.t_s
-    is_kept = np.ones(len(t_s), dtype=bool)
-    moving = [(p, window_s) for p, window_s in zip(poses, hold_s, strict=True) if len(p.t_s) > 1]
+    is_inside = np.ones(len(t_s), dtype=bool)
+    moving = [
+        (p, window_s)
+        for p, window_s in zip(poses, grasp_intervals_s, strict=True)
+        if len(p.t_s) > 1
+    ]
     for sequence, (from_s, until_s) in moving:
         slack_s = _tolerance_s(sequence, t_s)
         # Beyond its first or last pose a grasp must not be asked for one.
         if from_s < sequence.t_s[0] - slack_s:
-            is_kept &= t_s >= sequence.t_s[0] - slack_s
+            is_inside &= t_s >= sequence.t_s[0] - slack_s
         if until_s > sequence.t_s[-1] + slack_s:
-            is_kept &= t_s <= sequence.t_s[-1] + slack_s
-    if is_kept.all():
+            is_inside &= t_s <= sequence.t_s[-1] + slack_s
+    if is_inside.all():
         return table, []
     spans = " and ".join(_span_text(sequence.t_s) for sequence, _ in moving)
-    if is_kept.sum() < fewest:
+    if is_inside.sum() < fewest:
         raise InputError(
-            f"poses run {spans}, markers {_span_text(t_s)}: they share {is_kept.sum()} marker "
+            f"poses run {spans}, markers {_span_text(t_s)}: they share {is_inside.sum()} marker "
             "samples; "
             f"expected at least {fewest}: check that both are of one recording and one "
             "clock, and window_s"
         )
-    cut = t_s[is_kept]
+    cut = t_s[is_inside]
     ends = [
         f"{length_s:.6g} s at the {end}"
         for length_s, end in ((cut[0] - t_s[0], "start"), (t_s[-1] - cut[-1], "end"))
@@ -159,12 +163,12 @@ def _cut_to_poses(
     ]
     note = (
         f"the markers were cut to the time of the poses by {' and '.join(ends)}, "
-        f"{(~is_kept).sum()} of {len(t_s)} samples: poses run {spans}, markers ran "
+        f"{(~is_inside).sum()} of {len(t_s)} samples: poses run {spans}, markers ran "
         f"{_span_text(t_s)}"
     )
     if cut[0] > t_s[0]:
         note += f"; start now refers to the state at {cut[0]:.9g} s now"
-    return MarkerTable(cut, table.names, table.positions_m[is_kept]), [note]
+    return MarkerTable(cut, table.names, table.positions_m[is_inside]), [note]
 
 
 def _cut_to_window(table: MarkerTable, window_s: tuple[float, float]) -> MarkerTable:
@@ -172,13 +176,13 @@ def _cut_to_window(table: MarkerTable, window_s: tuple[float, float]) -> MarkerT
     first_s, last_s = window_s
     steps = np.diff(table.t_s)
     slack_s = STEP_TOLERANCE * float(np.median(steps)) if steps.size else 0.0
-    is_kept = (table.t_s >= first_s - slack_s) & (table.t_s <= last_s + slack_s)
-    if not is_kept.any():
+    is_inside = (table.t_s >= first_s - slack_s) & (table.t_s <= last_s + slack_s)
+    if not is_inside.any():
         raise InputError(
             f"window_s = [{first_s:g}, {last_s:g}] holds no marker sample; "
             f"the markers run from {table.t_s[0]:.9g} s to {table.t_s[-1]:.9g} s"
         )
-    return MarkerTable(table.t_s[is_kept], table.names, table.positions_m[is_kept])
+    return MarkerTable(table.t_s[is_inside], table.names, table.positions_m[is_inside])
 
 
 def _even_grid(t_s: Array, rate_hz: float) -> Array:
@@ -206,9 +210,9 @@ def _interpolate_markers(table: MarkerTable, grid: Array) -> Array:
     between = (1.0 - fraction) * x[k] + fraction * x[k + 1]
     between[step_s > _GAP_STEPS * np.median(np.diff(t_s))] = np.nan
     # On a sample its neighbour does not matter, even if that one is missing.
-    on_earlier = fraction <= _SAME_TIME_STEPS
+    on_previous_sample = fraction <= _SAME_TIME_STEPS
     on_later = fraction >= 1.0 - _SAME_TIME_STEPS
-    return np.where(on_earlier, x[k], np.where(on_later, x[k + 1], between))
+    return np.where(on_previous_sample, x[k], np.where(on_later, x[k + 1], between))
 
 
 def _poses_on_grid(poses: PoseSequence, t_s: Array, grid: Array) -> PoseSequence | None:
@@ -237,12 +241,12 @@ def _poses_on_grid(poses: PoseSequence, t_s: Array, grid: Array) -> PoseSequence
         return None
     moved = poses.t_s + np.interp(poses.t_s, times, grid[within] - poses.t_s[nearest])
     moved[nearest] = grid[within]
-    kept_samples = slice(nearest[0] if within[0] else 0, nearest[-1] + 1 if within[-1] else None)
+    samples = slice(nearest[0] if within[0] else 0, nearest[-1] + 1 if within[-1] else None)
     return replace(
         poses,
-        t_s=moved[kept_samples],
-        positions_m=poses.positions_m[kept_samples],
-        quaternions_xyzw=poses.quaternions_xyzw[kept_samples],
+        t_s=moved[samples],
+        positions_m=poses.positions_m[samples],
+        quaternions_xyzw=poses.quaternions_xyzw[samples],
     )
 
 

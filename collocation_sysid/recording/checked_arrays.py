@@ -72,11 +72,11 @@ def read_only_nodes(values: ArrayLike, shape: tuple[int | None, ...], name: str)
     InputError
         If the values are not whole numbers from 0 upwards, or the shape differs.
     """
-    numbers = np.asarray(values)
-    if numbers.size and not np.issubdtype(numbers.dtype, np.integer):
-        raise InputError(f"{name} must hold node numbers (integers), not {numbers.dtype}")
-    _require_shape(numbers.shape, shape, name)
-    nodes = numbers.astype(np.int64)
+    indices = np.asarray(values)
+    if indices.size and not np.issubdtype(indices.dtype, np.integer):
+        raise InputError(f"{name} must hold node numbers (integers), not {indices.dtype}")
+    _require_shape(indices.shape, shape, name)
+    nodes = indices.astype(np.int64)
     if nodes.size and nodes.min() < 0:
         raise InputError(f"{name} must hold node numbers from 0 upwards, not {nodes.min()}")
     nodes.setflags(write=False)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import Array
-from ..declarations import Key, as_given, key, stated
+from ..declarations import Key, declaration, identity, key
 from ..errors import InputError
 from ..files import reason
 from ..schema_tables import Vector
@@ -55,12 +55,12 @@ _COLUMNS = Key("columns", list[Text], default=[])
 _GRASP = Key(
     "grasp",
     AtLeastOne | None,
-    said="Instead of points: the number of the grasp, from 1, whose force and torque the sensor "
-    "measures.",
+    description="Instead of points: the number of the grasp, from 1, whose force and torque the "
+    "sensor measures.",
 )
 
 
-@stated
+@declaration
 class Gauge:
     """A custom sensor: its reading is an expression of a few points of the body, or of a grasp.
 
@@ -105,11 +105,11 @@ class Gauge:
     t_s: ArrayLike
     values: ArrayLike | None
     sigma: float = key(Positive)
-    points_m: ArrayLike = key(_POINTS, converter=as_given, default=())
+    points_m: ArrayLike = key(_POINTS, converter=identity, default=())
     unknowns: Mapping[str, float] = key(dict[str, Positive], default_factory=dict)
-    grasp: int | None = key(_GRASP, converter=as_given, default=None)
+    grasp: int | None = key(_GRASP, converter=identity, default=None)
     frame: Frame = key(Frame, default="grasp")
-    columns: Sequence[str] = key(_COLUMNS, converter=as_given, default=())
+    columns: Sequence[str] = key(_COLUMNS, converter=identity, default=())
     unit: str = key(str, default="")
 
     def __post_init__(self) -> None:
@@ -209,19 +209,19 @@ class Gauge:
         zero_rates = np.zeros_like(points)
         of_points = [points, zero_rates, zero_rates]
         rest = of_points if self.grasp is None else [np.ones(3), np.ones(3)]
-        looked = [ca.SX.sym("c", *np.atleast_2d(np.transpose(each)).T.shape) for each in rest]
+        observables = [ca.SX.sym("c", *np.atleast_2d(np.transpose(each)).T.shape) for each in rest]
         t_s = ca.SX.sym("t_s")
         own = ca.SX.sym("own", len(self.unknowns))
         names = POINT_INPUTS if self.grasp is None else GRASP_INPUTS
         try:
-            read = self.read(t_s, looked, ca.vertsplit(own) if self.unknowns else [])
+            read = self.read(t_s, observables, ca.vertsplit(own) if self.unknowns else [])
         except (Exception, SystemExit) as error:
             raise InputError(
                 f"the reading '{self.name}' cannot be evaluated ({reason(error)}); expected a "
                 f"function of an argument `at` with the attributes t_s, {', '.join(names)}, and "
                 f"of its unknowns {', '.join(self.unknowns) or '(none)'}, in CasADi operations"
             ) from error
-        u = ca.veccat(*looked, own)
+        u = ca.veccat(*observables, own)
         slopes = ca.Function("slopes", [t_s, u], [read, ca.jacobian(read, u)])
         at_rest = np.concatenate([*(each.ravel("F") for each in rest), np.zeros(own.numel())])
         if not all(np.isfinite(e.full()).all() for e in slopes(self.sample_times_s[0], at_rest)):

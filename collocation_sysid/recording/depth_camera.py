@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..array_types import Array
-from ..declarations import as_given, key, stated
+from ..declarations import declaration, identity, key
 from ..errors import InputError
 from ..fem.selection import Selection
 from ..schema_tables import Vector
@@ -44,7 +44,7 @@ def _require_poses(poses: Any) -> PoseSequence:
     return poses
 
 
-@stated
+@declaration
 class DepthCamera:
     """A depth camera, or the frame of a scanner.
 
@@ -67,9 +67,9 @@ class DepthCamera:
         If the matrix is not that of a pinhole camera, or the pose is no rigid motion.
     """
 
-    matrix: Any = key(tuple[Vector, Vector, Vector] | None, converter=as_given, default=None)
-    distortion: Any = key(list[Finite], converter=as_given, default=())
-    pose: Any = key(PoseMatrix | None, converter=as_given, default=None)
+    matrix: Any = key(tuple[Vector, Vector, Vector] | None, converter=identity, default=None)
+    distortion: Any = key(list[Finite], converter=identity, default=())
+    pose: Any = key(PoseMatrix | None, converter=identity, default=None)
     poses: PoseSequence | None = key(converter=_require_poses, default=None)
 
     def __post_init__(self) -> None:
@@ -162,7 +162,7 @@ def _require_selection(faces: Any) -> Selection:
     return faces
 
 
-@stated
+@declaration
 class Depth:
     """Depth images, or clouds of points of a body, of one camera, one for each sample time.
 
@@ -212,7 +212,7 @@ class Depth:
     t_s: Any
     clouds: Sequence[Any]
     sigma_m: float = key(Positive)
-    camera: DepthCamera = key(converter=as_given, default=DepthCamera())
+    camera: DepthCamera = key(converter=identity, default=DepthCamera())
     spacing_m: float = key(Positive, default=0.004)
     gate_m: float = key(Positive, default=0.01)
     faces: Selection | None = key(

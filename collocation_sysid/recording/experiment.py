@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import Array, Index
-from ..declarations import as_given, key, stated
+from ..declarations import declaration, identity, key
 from ..errors import InputError
 from ..schema_tables import Vector, tables
 from ..validated_types import Flag, NotNegative
@@ -48,7 +48,7 @@ def _state(name: str) -> Callable[[ArrayLike], Array]:
     return float_converter((None, 3), f"start_{name}")
 
 
-@stated
+@declaration
 class Experiment:
     """One recording of a body: a motion or a series of equilibria, with loads and measurements.
 
@@ -111,7 +111,7 @@ class Experiment:
     body: Body
     t_s: Array = key(converter=float_converter((None,), "t_s"))
     grasps: tuple[Grasp, ...] = key(converter=tuple[Grasp, ...])
-    markers: Markers = key(converter=as_given, default=None)
+    markers: Markers = key(converter=identity, default=None)
     gravity_m_s2: Array = key(
         Vector, converter=float_converter((3,), "gravity_m_s2"), default=EARTH_M_S2
     )
@@ -219,8 +219,8 @@ class Experiment:
     @cached_property
     def prescribed_dofs(self) -> Index:
         """Sorted dofs (3 · node + axis) with prescribed displacements at every sample time."""
-        is_held = self.is_prescribed(self.t_s)
-        return np.flatnonzero(is_held.all(axis=0))
+        is_prescribed = self.is_prescribed(self.t_s)
+        return np.flatnonzero(is_prescribed.all(axis=0))
 
     @cached_property
     def free_dofs(self) -> Index:
@@ -241,26 +241,26 @@ class Experiment:
             Prescribed coordinates [m]; NaN where a coordinate is free.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        is_held = self.is_prescribed(times)
-        positions = np.full(is_held.shape, np.nan)
+        is_prescribed = self.is_prescribed(times)
+        positions = np.full(is_prescribed.shape, np.nan)
         for grasp in self.grasps:
             holding = np.flatnonzero(grasp.is_active(times))
-            carried_m = grasp.positions_at(self.body.nodes_m, times[holding])
-            positions[np.ix_(holding, grasp.nodes, grasp.axis_indices)] = carried_m[
+            moved_m = grasp.positions_at(self.body.nodes_m, times[holding])
+            positions[np.ix_(holding, grasp.nodes, grasp.axis_indices)] = moved_m[
                 ..., grasp.axis_indices
             ]
-        return is_held, positions
+        return is_prescribed, positions
 
     def is_prescribed(self, t_s: ArrayLike) -> NDArray[np.bool_]:
         """Return whether each nodal coordinate is prescribed at the times `t_s` (T,), as (T, n, 3)
         bool.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        is_held = np.zeros((len(times), *self.body.nodes_m.shape), dtype=bool)
+        is_prescribed = np.zeros((len(times), *self.body.nodes_m.shape), dtype=bool)
         for grasp in self.grasps:
             holding = np.flatnonzero(grasp.is_active(times))
-            is_held[np.ix_(holding, grasp.nodes, grasp.axis_indices)] = True
-        return is_held
+            is_prescribed[np.ix_(holding, grasp.nodes, grasp.axis_indices)] = True
+        return is_prescribed
 
     def prescribed_positions(self, t_s: ArrayLike) -> Array:
         """Return the prescribed coordinates of `prescribed_dofs` at the times `t_s` (T,), as (T,
@@ -295,10 +295,10 @@ class Experiment:
         from the start. In a static experiment the share jumps at these times.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        share_joined, share_left = (
+        first_share, last_share = (
             self._share_since(load, change, times) for change in get_args(LoadTime)
         )
-        return share_joined - share_left
+        return first_share - last_share
 
     def _share_since(self, load: PointMass | Force, change: LoadTime, times: Array) -> Array:
         """Return the share (T,) of a load that has joined (or left, by `change`) at the given
@@ -316,7 +316,7 @@ class Experiment:
         within = self.t_s[0] < getattr(load, change) < self.t_s[-1]
         return bool(within) and not self.is_static
 
-    def stated_node_forces_n(self, t_s: ArrayLike) -> Array:
+    def declared_node_forces_n(self, t_s: ArrayLike) -> Array:
         """Return the forces besides gravity on each node at times `t_s` (T,), as (T, n, 3) [N]."""
         n = len(self.body.nodes_m)
         times = np.atleast_1d(t_s)
@@ -344,7 +344,7 @@ class Experiment:
         if any(actuator.energy_amplitude_at(self.t_s).any() for actuator in self.actuators):
             return True
         tied = np.repeat(self.point_mass_at_nodes_kg(self.t_s), 3, axis=1)
-        forces = self.stated_node_forces_n(self.t_s).reshape(tied.shape)
+        forces = self.declared_node_forces_n(self.t_s).reshape(tied.shape)
         return bool((tied != 0)[:, self.free_dofs].any() or forces[:, self.free_dofs].any())
 
     @property
@@ -538,12 +538,14 @@ class Experiment:
                 f"two tendons or pressures are called {twice[0]!r}; expected different names"
             )
         for actuator in self.actuators:
-            actuator.stated_values.require_covered(self.t_s, actuator.name)
+            actuator.declared_values.require_covered(self.t_s, actuator.name)
         if not self.pressures:
             return
-        is_held, places_m = self.prescribed_displacements(self.t_s)
-        throughout = np.asarray(is_held.all(axis=0))
-        bounded = tuple(pressure.with_held_rim(throughout, places_m) for pressure in self.pressures)
+        is_prescribed, places_m = self.prescribed_displacements(self.t_s)
+        throughout = np.asarray(is_prescribed.all(axis=0))
+        bounded = tuple(
+            pressure.with_fixed_rim(throughout, places_m) for pressure in self.pressures
+        )
         vars(self)["pressures"] = bounded
 
     def _check_start(self) -> None:
@@ -552,7 +554,9 @@ class Experiment:
                 f"loaded_since_s is given, but start is '{self.start}'; loaded_since_s is the "
                 "time for which a body that starts in equilibrium has been loaded"
             )
-        is_state_given = self.start_positions_m is not None or self.start_velocities_m_s is not None
+        has_initial_state = (
+            self.start_positions_m is not None or self.start_velocities_m_s is not None
+        )
         if self.start == "given":
             if self.start_positions_m is None:
                 raise InputError("start = 'given' needs start_positions_m")
@@ -561,22 +565,22 @@ class Experiment:
             self._append_obstacle_frames(len(self.start_positions_m))
             for name in ("start_positions_m", "start_velocities_m_s"):
                 read_only_floats(getattr(self, name), self.body.nodes_m.shape, name)
-        elif is_state_given:
+        elif has_initial_state:
             raise InputError(f"a starting state is given, but start is '{self.start}'")
         if self.start == "equilibrium":
             self._require_unique_equilibrium()
 
-    def _append_obstacle_frames(self, given_count: int) -> None:
+    def _append_obstacle_frames(self, node_count: int) -> None:
         """Append positions and velocities of the obstacles' frames to a given start state without
         them.
 
         Parameters
         ----------
-        given_count : int
+        node_count : int
             Number of nodes of the given state.
         """
         frames = self.body.frames.ravel()
-        if given_count == len(self.body.nodes_m):
+        if node_count == len(self.body.nodes_m):
             return
         at_s = self.t_s[0] + np.array([0.0, 1e-3 * self.timestep_s])
         places = self.rigid_positions(at_s)[:, frames]
@@ -587,12 +591,13 @@ class Experiment:
     def _require_unique_equilibrium(self) -> None:
         if self.obstacles:
             return  # these may carry it: the rest state is looked for
-        is_held = self.is_prescribed(self.t_s[:1])[0]
-        motions = free_rigid_motions(self.body.nodes_m, is_held)
+        is_prescribed = self.is_prescribed(self.t_s[:1])[0]
+        motions = free_rigid_motions(self.body.nodes_m, is_prescribed)
         if motions:
             raise InputError(
                 "start = 'equilibrium' needs grasps that leave the body no rigid motion, but it "
                 f"can {' and '.join(motions)}, so that its rest state is not unique; "
-                f"{int(is_held.any(axis=1).sum())} nodes are held at the start. Grasp at least 3 "
-                "nodes that are not on one line, hold more axes, or use start = 'undeformed'"
+                f"{int(is_prescribed.any(axis=1).sum())} nodes are held at the start. Grasp at "
+                "least 3 nodes that are not on one line, hold more axes, or use start = "
+                "'undeformed'"
             )

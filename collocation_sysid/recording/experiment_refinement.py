@@ -23,7 +23,7 @@ def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
     body = experiment.body
     markers = experiment.markers
 
-    def anew(load):
+    def refined_load(load):
         return replace(load, nodes=refine_nodes(load.nodes, load.selection, body, finer))
 
     placement = place_markers(
@@ -36,9 +36,9 @@ def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
     return replace(
         experiment,
         body=finer,
-        grasps=(*map(anew, experiment.body_grasps), *experiment.obstacles),
-        masses=tuple(map(anew, experiment.masses)),
-        forces=tuple(map(anew, experiment.forces)),
+        grasps=(*map(refined_load, experiment.body_grasps), *experiment.obstacles),
+        masses=tuple(map(refined_load, experiment.masses)),
+        forces=tuple(map(refined_load, experiment.forces)),
         pressures=tuple(pressure.on_refined_body(body, finer) for pressure in experiment.pressures),
         markers=replace(markers, placement=placement, places_m=None),
         start_positions_m=_interpolated(experiment.start_positions_m, body, finer),

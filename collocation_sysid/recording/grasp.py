@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import Array, Index
-from ..declarations import as_given, key, stated
+from ..declarations import declaration, identity, key
 from ..errors import InputError
 from ..fem.selection import Selection
 from ..validated_types import Finite, NotNegative
@@ -30,7 +30,7 @@ SMALLEST_SINGULAR_VALUE = 1e-6
 Axes = Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]
 
 
-@stated
+@declaration
 class Grasp:
     """Nodes held by the robot, and the rigid motion that carries them.
 
@@ -67,7 +67,7 @@ class Grasp:
     """
 
     nodes: Index = key(Nodes, converter=node_converter("the grasp"), read=selection_from_section)
-    poses: PoseSequence = key(converter=as_given)  # matrices stay until there are times
+    poses: PoseSequence = key(converter=identity)  # matrices stay until there are times
     from_s: float = key(Finite | None, default=-np.inf)
     until_s: float = key(Finite | None, default=np.inf)
     sigma_m: float | None = key(NotNegative | None, default=None)
@@ -138,7 +138,7 @@ class Grasp:
             All nodes of the undeformed body.
         t_s : (T,) array
         """
-        return self.poses.carried_positions(nodes_m[self.nodes], t_s)
+        return self.poses.moved_positions(nodes_m[self.nodes], t_s)
 
 
 def prescribed_nodes(grasps: Sequence[Grasp]) -> Index:

@@ -66,7 +66,7 @@ def fastest_rotation(experiment: Experiment, substeps: int) -> GraspRotation:
     t_s = experiment.t_s[0] + step_s * np.arange(steps + 1)
     largest = 0.0
     time_s = float(t_s[0])
-    is_hold = False
+    is_rigid_grasp = False
     for grasp in () if experiment.is_static else experiment.grasps:
         times_s = t_s[grasp.is_active(t_s)]
         if len(times_s) < 2:
@@ -79,8 +79,10 @@ def fastest_rotation(experiment: Experiment, substeps: int) -> GraspRotation:
         if angle > largest:
             largest = angle
             time_s = float(times_s[k])
-            is_hold = grasp.poses.interpolation == "hold"
+            is_rigid_grasp = grasp.poses.interpolation == "hold"
     needed = max(1, ceil(substeps * largest / TARGET_ANGLE_RAD))
     # A pose that is held turns by as much at a sample, however many steps there are between.
-    remedy = 'set interpolation = "smooth" in the grasp' if is_hold else f"set {_KEY} = {needed}"
+    remedy = (
+        'set interpolation = "smooth" in the grasp' if is_rigid_grasp else f"set {_KEY} = {needed}"
+    )
     return GraspRotation(experiment.name, largest, time_s, step_s, remedy)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..array_types import Array, Index
-from ..declarations import Key, key, stated
+from ..declarations import Key, declaration, key
 from ..errors import InputError
 from ..fem.selection import Selection
 from ..schema_tables import Vector
@@ -128,7 +128,7 @@ class Load:
         return self if nodes is self.nodes else replace(self, nodes=nodes)
 
 
-@stated
+@declaration
 class PointMass(Load):
     """A rigid point mass tied to nodes: inertia and weight.
 
@@ -170,7 +170,7 @@ _TABLE = Key(
 )
 
 
-@stated
+@declaration
 class Force(Load):
     """A force on nodes besides gravity.
 

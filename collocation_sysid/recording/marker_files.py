@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..array_types import Array
-from ..declarations import key, stated
+from ..declarations import declaration, key
 from ..errors import InputError, hint_at, listed
 from .checked_arrays import float_converter, read_only_tracks
 from .formats import c3d, motive, plain_csv, qualisys, trc
@@ -29,7 +29,7 @@ _TEXT_FORMATS = {
 }
 
 
-@stated
+@declaration
 class MarkerTable:
     """Marker tracks as measured, before they are tied to a body.
 
@@ -101,9 +101,9 @@ def read_markers(
     raw = _read_tracks(path, _label_chooser(names, labels))
     metres = METRES_PER_UNIT[_length_unit(raw, length_unit)]
     t_s = _times_s(raw, rate_hz)
-    names_taken = [labels.get(label, label) for label in raw.labels]
-    coordinates, notes = _mark_missing(raw, names_taken)
-    return MarkerTable(t_s, tuple(names_taken), coordinates * metres, (*raw.notes, *notes))
+    used_names = [labels.get(label, label) for label in raw.labels]
+    coordinates, notes = _mark_missing(raw, used_names)
+    return MarkerTable(t_s, tuple(used_names), coordinates * metres, (*raw.notes, *notes))
 
 
 def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
@@ -135,15 +135,15 @@ def _label_chooser(names: Sequence[str] | None, renamed: Mapping[str, str]) -> L
         known = [renamed.get(label, label) for label in labels]
         _require_distinct(known, "after renaming two markers are named")
         if names is None:
-            wanted = [
+            chosen = [
                 k for k, label in enumerate(labels) if label not in excluded or label in renamed
             ]
             if not labels:
                 raise InputError("holds no markers")
-            if not wanted:
+            if not chosen:
                 remedy = f"label them, or rename with labels: {', '.join(labels)}"
                 raise InputError(f"holds unlabelled markers only; {remedy}")
-            return wanted
+            return chosen
         if not names:
             raise InputError("no markers are requested; omit the names to use all markers")
         for name in names:
@@ -191,17 +191,17 @@ def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
     """Return the times (T,) of the frames [s]: as in the file, else from the frame rate."""
     t_s = raw.t_s
     rates = {raw.rate_key: raw.rate_hz, "rate_hz": rate_hz}
-    stated_rates = {key: rate for key, rate in rates.items() if rate}
+    declared_rates = {key: rate for key, rate in rates.items() if rate}
     if t_s is not None:
-        for key, rate in stated_rates.items():
+        for key, rate in declared_rates.items():
             _require_rate(t_s, key, rate)
         return t_s
-    if not stated_rates:
+    if not declared_rates:
         raise InputError(
             f"neither {raw.rate_key} nor a column of times states when the frames were taken; "
             "expected rate_hz"
         )
-    first, *others = stated_rates.values()
+    first, *others = declared_rates.values()
     if not all(math.isclose(first, other, rel_tol=1e-6) for other in others):
         raise InputError(
             f"rate_hz is {rate_hz:g}, but {raw.rate_key} says {first:g}; expected the same, or no "

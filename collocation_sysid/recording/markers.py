@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import Array, Index
-from ..declarations import Key, as_given, key, stated
+from ..declarations import Key, declaration, identity, key
 from ..errors import InputError
 from ..validated_types import Positive
 from .checked_arrays import float_converter, read_only_floats, read_only_tracks
@@ -33,12 +33,12 @@ _PLACES = Key(
     "places",
     Literal["free", "surface"],
     lambda word: word == "surface",
-    said="Whether estimated positions may be anywhere, or stay on the surface.",
+    description="Whether estimated positions may be anywhere, or stay on the surface.",
     default="free",
 )
 
 
-@stated
+@declaration
 class Markers:
     """Marker tracks and the markers' places on the body.
 
@@ -82,12 +82,12 @@ class Markers:
     sigma_m: Array = key(converter=np.asarray)
     names: tuple[str, ...] = key(converter=tuple[str, ...], default=None)
     places_m: Array | None = key(converter=np.asarray, default=None)
-    placement: Placement = key(converter=as_given, default=None)
+    placement: Placement = key(converter=identity, default=None)
     places_sigma_m: Array | None = key(converter=np.asarray, default=None)
     on_surface: bool = key(_PLACES, converter=bool, default=False)
     located: NDArray[np.bool_] = key(converter=np.asarray, default=None)
     attach: AttachmentRule = key(AttachmentRule, default="auto")
-    max_distance_m: float | None = key(_FARTHEST, converter=as_given, default=None)
+    max_distance_m: float | None = key(_FARTHEST, converter=identity, default=None)
 
     def __post_init__(self) -> None:
         shape = len(self.t_s), None, 3
@@ -189,7 +189,7 @@ class Markers:
         return cls(t_s, np.zeros((len(np.atleast_1d(t_s)), 0, 3)), 1.0)
 
     @property
-    def first_seen_sample(self) -> int:
+    def first_visible_sample(self) -> int:
         """Index of the first sample in which a marker is seen; 0 if none is."""
         return int(self.is_present.any(axis=1).argmax())
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import Array
-from ..declarations import key, stated
+from ..declarations import declaration, key
 from ..errors import InputError
 from ..schema_tables import Vector
 from ..validated_types import AtLeastOne, Positive
@@ -30,7 +30,7 @@ def _with_torques(values: ArrayLike) -> Array:
     return np.hstack([rows, np.full_like(rows, np.nan)]) if forces_alone else rows
 
 
-@stated
+@declaration
 class Wrench:
     """Force and torque that a grasp exerts on the body, as measured by a sensor.
 

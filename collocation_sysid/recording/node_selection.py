@@ -13,7 +13,7 @@ from ..array_types import Index
 from ..errors import InputError
 from ..fem.selection import Ball, Box, Face, FaceName, Indices, Named, Selection
 from ..schema_tables import ByForm, Corner, Section, Vector, require_one
-from ..validated_types import Positive, Text, Whole
+from ..validated_types import Positive, StrictInteger, Text
 from .checked_arrays import read_only_nodes
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class NodesSection(Section):
     box_m: tuple[Corner, Corner] | None = None
     ball_m: tuple[Vector, Positive] | None = None
     face: FaceName | None = None
-    indices: list[Whole] | None = None
+    indices: list[StrictInteger] | None = None
     name: Text | None = None
 
     @model_validator(mode="after")
@@ -85,10 +85,10 @@ def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:
         By the converter: if there are no nodes, or as `read_only_nodes` does.
     """
 
-    def chosen(wanted: Any) -> Any:
-        if isinstance(wanted, Selection):
-            return wanted
-        nodes = np.unique(read_only_nodes(wanted, (None,), f"nodes of {what}"))
+    def chosen(selection: Any) -> Any:
+        if isinstance(selection, Selection):
+            return selection
+        nodes = np.unique(read_only_nodes(selection, (None,), f"nodes of {what}"))
         if nodes.size == 0:
             raise InputError(f"{what} needs at least one node; its selection found none")
         nodes.setflags(write=False)

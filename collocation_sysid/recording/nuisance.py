@@ -70,13 +70,13 @@ class NuisanceRow:
         Unit of the values: "m", "s", "rad", …
     sigma : float or None
         Standard deviation of the prior; None where it is not estimated by default.
-    said : str
+    description : str
         Description, for documentation.
     label : str
         Name in tables of results, with {which} for the component and {axis}; the name by default.
     key : str
         Key of [experiment.nuisance] in the problem file.
-    beside : float or None
+    reference : float or None
         Standard deviation if the key's table states other priors only.
     of : str
         Component that has values of its own: the recording, or each marker, grasp, …; "recording"
@@ -93,7 +93,7 @@ class NuisanceRow:
         Largest change in a step of the solver, in prior standard deviations.
     step : callable, optional
         ``step(experiment)``, largest change in a step of the solver, in `unit`.
-    told : str
+    sentence : str
         Sentence in the terminal, with {size}, {way} and {which}.
     by : {"length", "worst", "each"}
         Values that the terminal shows: the longest vector, the value farthest from its prior, or
@@ -115,11 +115,11 @@ class NuisanceRow:
     name: str
     unit: str
     sigma: float | None
-    said: str = ""
+    description: str = ""
     label: str = ""
     _: KW_ONLY
     key: str = ""
-    beside: float | None = None
+    reference: float | None = None
     of: Component = "recording"
     axes: str = ""
     changes: tuple[ModelPart, ...] = ("reading",)
@@ -128,7 +128,7 @@ class NuisanceRow:
     high: float = np.inf
     reach: float = 1.0
     step: Callable[[Any], float] | None = None
-    told: str = ""
+    sentence: str = ""
     by: Literal["length", "worst", "each"] = "each"
     same: Callable[[Any], dict[str, Any]] = lambda experiment: {}
     reading: Callable[[Any, Any, Any, Any], Any] | None = None
@@ -253,8 +253,8 @@ PLACE = NuisanceRow(
     reach=UNLIMITED_REACH,
     step=_largest_place_step_m,
     label="place of {which}, {axis}",
-    said="errors of the positions in reference_m without a reference_sigma_m; they rotate with "
-    "the body",
+    description="errors of the positions in reference_m without a reference_sigma_m; they rotate "
+    "with the body",
     same=lambda e: {"body": id(e.body), "kind of places": e.markers.on_surface},
 )
 OFFSET = NuisanceRow(
@@ -267,8 +267,8 @@ OFFSET = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="length",
     label="camera offset of {which}, {axis}",
-    told="camera offset of markers: up to {size}",
-    said="a constant offset of each marker in the cameras' frame",
+    sentence="camera offset of markers: up to {size}",
+    description="a constant offset of each marker in the cameras' frame",
     reading=_shift_position,
 )
 CALIBRATION_SCALE = NuisanceRow(
@@ -278,8 +278,8 @@ CALIBRATION_SCALE = NuisanceRow(
     key="calibration_scale",
     considered=2e-3,
     label="scale of the cameras",
-    told="scale error of the cameras: {signed}",
-    said="scale error of all lengths that the cameras measure: the factor minus one",
+    sentence="scale error of the cameras: {signed}",
+    description="scale error of all lengths that the cameras measure: the factor minus one",
     applies=_has_markers,
     reading=lambda y, values, t_s, data: y + values * (y - ca.DM(data.pivot_m)),
 )
@@ -291,8 +291,8 @@ CALIBRATION_DISTORTION = NuisanceRow(
     considered=0.02,
     applies=_has_markers,
     label="distortion of the cameras",
-    told="distortion of the cameras: {signed}",
-    said="radial distortion of first order about the body's middle: a factor 1 + k r²",
+    sentence="distortion of the cameras: {signed}",
+    description="radial distortion of first order about the body's middle: a factor 1 + k r²",
     reading=_distort_position,
 )
 TIME = NuisanceRow(
@@ -303,8 +303,8 @@ TIME = NuisanceRow(
     changes=("clock",),
     applies=_is_motion,
     label="time shift",
-    told="markers measured {size} {way} than stated{limit}",
-    said="how much later than stated the markers were measured, on the grasps' clock",
+    sentence="markers measured {size} {way} than stated{limit}",
+    description="how much later than stated the markers were measured, on the grasps' clock",
     same=lambda e: {"time between samples": round(e.timestep_s, 12)},
     clock=lambda values, t_s, data: values,
 )
@@ -317,8 +317,8 @@ CLOCK_RATE = NuisanceRow(
     changes=("clock",),
     applies=lambda experiment: _is_motion(experiment) and _has_markers(experiment),
     label="rate of the markers' clock",
-    told="the markers' clock is slow by {signed}",
-    said="how much slower than the grasps' clock that of the markers runs",
+    sentence="the markers' clock is slow by {signed}",
+    description="how much slower than the grasps' clock that of the markers runs",
     clock=lambda values, t_s, data: values * (t_s - data.recorded_s[0]),
 )
 POSE_TURN = NuisanceRow(
@@ -330,9 +330,9 @@ POSE_TURN = NuisanceRow(
     changes=("reading", "gravity"),
     by="length",
     label="turn of the pose, {axis}",
-    told="rotation of the poses: {size}",
-    said="a constant rotation of grasps and body in the cameras' frame, which rotates gravity in "
-    "the body's frame",
+    sentence="rotation of the poses: {size}",
+    description="a constant rotation of grasps and body in the cameras' frame, which rotates "
+    "gravity in the body's frame",
     reading=_rotate_position,
 )
 POSE_SHIFT = NuisanceRow(
@@ -344,8 +344,8 @@ POSE_SHIFT = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="length",
     label="shift of the pose, {axis}",
-    told="translation of the poses: {size}",
-    said="a constant translation of grasps and body in the cameras' frame",
+    sentence="translation of the poses: {size}",
+    description="a constant translation of grasps and body in the cameras' frame",
     reading=_shift_position,
 )
 TILT = NuisanceRow(
@@ -358,8 +358,8 @@ TILT = NuisanceRow(
     applies=lambda experiment: bool(np.any(experiment.gravity_m_s2)),
     by="length",
     label="tilt of gravity, {axis}",
-    told="tilt of gravity: {size}",
-    said="a tilt of the direction of gravity",
+    sentence="tilt of gravity: {size}",
+    description="a tilt of the direction of gravity",
     same=lambda e: {"gravity": tuple(e.gravity_m_s2)},
 )
 GRASP_TURN = NuisanceRow(
@@ -372,8 +372,8 @@ GRASP_TURN = NuisanceRow(
     applies=_has_observable_hand_eye,
     by="length",
     label="turn in the grasp, {axis}",
-    told="rotation of the body in the gripper: {size}",
-    said="a constant rotation of the body in its grasps",
+    sentence="rotation of the body in the gripper: {size}",
+    description="a constant rotation of the body in its grasps",
     same=_hand_eye_sharing_key,
 )
 GRASP_SHIFT = NuisanceRow(
@@ -386,9 +386,9 @@ GRASP_SHIFT = NuisanceRow(
     applies=_has_observable_hand_eye,
     by="length",
     label="shift in the grasp, {axis}",
-    told="translation of the body in the gripper: {size}",
-    said="a constant translation of the body in its grasps; both if the start is an equilibrium "
-    "and markers measure it",
+    sentence="translation of the body in the gripper: {size}",
+    description="a constant translation of the body in its grasps; both if the start is an "
+    "equilibrium and markers measure it",
     same=_hand_eye_sharing_key,
 )
 ZERO = NuisanceRow(
@@ -401,8 +401,8 @@ ZERO = NuisanceRow(
     changes=("grasps",),
     by="worst",
     label="zero of grasp {which}, {axis}",
-    told="zero error of a displacement: up to {size}",
-    said="a constant offset of each displacement along each of its axes",
+    sentence="zero error of a displacement: up to {size}",
+    description="a constant offset of each displacement along each of its axes",
 )
 OBSTACLE_OFFSET = NuisanceRow(
     "obstacle_offset_m",
@@ -414,8 +414,8 @@ OBSTACLE_OFFSET = NuisanceRow(
     by="worst",
     applies=lambda experiment: bool(experiment.obstacles),
     label="place of {which}",
-    told="position error of an obstacle: up to {size}",
-    said="a constant offset of each obstacle along its normal, or along the axis of its "
+    sentence="position error of an obstacle: up to {size}",
+    description="a constant offset of each obstacle along its normal, or along the axis of its "
     "displacement, which changes the beginning of the contact",
 )
 OBSTACLE_TILT = NuisanceRow(
@@ -430,8 +430,9 @@ OBSTACLE_TILT = NuisanceRow(
     considered=0.2 * DEGREE,
     applies=lambda experiment: any(each.shape.has_tilt for each in experiment.obstacles),
     label="tilt of {which}, {axis}",
-    told="tilt of an obstacle: {size}",
-    said="a constant tilt of each obstacle that is a plane or a box, about its point or middle",
+    sentence="tilt of an obstacle: {size}",
+    description="a constant tilt of each obstacle that is a plane or a box, about its point or "
+    "middle",
 )
 OBSTACLE_TIME = NuisanceRow(
     "obstacle_time_s",
@@ -444,8 +445,8 @@ OBSTACLE_TIME = NuisanceRow(
     considered=1e-3,
     applies=lambda experiment: any(len(each.poses.t_s) > 1 for each in experiment.obstacles),
     label="delay of {which}",
-    told="delay of an obstacle: up to {size}",
-    said="delay of each obstacle's motion, to first order",
+    sentence="delay of an obstacle: up to {size}",
+    description="delay of each obstacle's motion, to first order",
 )
 TENSION_FACTOR = NuisanceRow(
     "tension_factor",
@@ -455,8 +456,8 @@ TENSION_FACTOR = NuisanceRow(
     of="tendon",
     changes=("drives",),
     label="{which}, more than stated",
-    told="{which} by {signed}",
-    said="scale error of the tension of each tendon: the factor minus one",
+    sentence="{which} by {signed}",
+    description="scale error of the tension of each tendon: the factor minus one",
 )
 TENSION_OFFSET = NuisanceRow(
     "tension_lost_n",
@@ -466,8 +467,8 @@ TENSION_OFFSET = NuisanceRow(
     of="tendon",
     changes=("drives",),
     label="{which}, lost",
-    told="{which} {signed}",
-    said="tension of each tendon that is lost by friction",
+    sentence="{which} {signed}",
+    description="tension of each tendon that is lost by friction",
 )
 PRESSURE_FACTOR = NuisanceRow(
     "pressure_factor",
@@ -477,8 +478,8 @@ PRESSURE_FACTOR = NuisanceRow(
     of="pressure",
     changes=("drives",),
     label="{which}, more than stated",
-    told="{which} by {signed}",
-    said="scale error of each pressure: the factor minus one",
+    sentence="{which} by {signed}",
+    description="scale error of each pressure: the factor minus one",
 )
 PRESSURE_OFFSET = NuisanceRow(
     "pressure_lost_pa",
@@ -488,8 +489,8 @@ PRESSURE_OFFSET = NuisanceRow(
     of="pressure",
     changes=("drives",),
     label="{which}, lost",
-    told="{which} {signed}",
-    said="offset by which each pressure is lower than stated",
+    sentence="{which} {signed}",
+    description="offset by which each pressure is lower than stated",
 )
 JOINING = NuisanceRow(
     "joining_s",
@@ -500,9 +501,9 @@ JOINING = NuisanceRow(
     changes=("loads",),
     step=lambda experiment: SAMPLES_A_STEP * experiment.timestep_s,
     label="{which}",
-    told="{which} {number}{error}{unit} {way} than {stated}",
-    said="delay with which each point mass or force begins or ends, if it does so within the "
-    "recording",
+    sentence="{which} {number}{error}{unit} {way} than {stated}",
+    description="delay with which each point mass or force begins or ends, if it does so within "
+    "the recording",
 )
 TARE = NuisanceRow(
     "tare",
@@ -514,8 +515,8 @@ TARE = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="worst",
     label="tare{which} of {axis}",
-    told="tare: up to {size}",
-    said="a constant offset of each component of a wrench, in multiples of its sigma",
+    sentence="tare: up to {size}",
+    description="a constant offset of each component of a wrench, in multiples of its sigma",
 )
 SENSOR_TIME = NuisanceRow(
     "sensor_time_s",
@@ -529,8 +530,8 @@ SENSOR_TIME = NuisanceRow(
     high=3.0,
     by="worst",
     label="time shift of the sensor{which}",
-    told="delay of the sensor: {size}",
-    said="delay of the measured wrenches; at most three standard deviations",
+    sentence="delay of the sensor: {size}",
+    description="delay of the measured wrenches; at most three standard deviations",
 )
 SENSOR_LAG = NuisanceRow(
     "sensor_lag_s",
@@ -544,9 +545,9 @@ SENSOR_LAG = NuisanceRow(
     high=3.0,
     by="worst",
     label="lag of the sensor{which}",
-    told="time constant of the sensor: {size}",
-    said="time constant of a first-order low-pass in the sensor; from zero to three standard "
-    "deviations",
+    sentence="time constant of the sensor: {size}",
+    description="time constant of a first-order low-pass in the sensor; from zero to three "
+    "standard deviations",
 )
 TOOL_MASS = NuisanceRow(
     "tool_kg",
@@ -558,8 +559,8 @@ TOOL_MASS = NuisanceRow(
     low=0.0,
     by="worst",
     label="mass of the tool{which}",
-    told="mass of the tool: {size}",
-    said="mass of the tool between a sensor and the body",
+    sentence="mass of the tool: {size}",
+    description="mass of the tool between a sensor and the body",
 )
 TOOL_CENTRE = NuisanceRow(
     "tool_m",
@@ -571,11 +572,11 @@ TOOL_CENTRE = NuisanceRow(
     changes=("sensor",),
     applies=lambda experiment: bool(experiment.nuisance.tool_kg),
     by="worst",
-    beside=0.05,
+    reference=0.05,
     label="centre of the tool{which}, {axis}",
-    told="offset of the tool's centre: up to {size}",
-    said="centre of the tool relative to the sensor's point; in the world's frame, relative to "
-    "that of the grasped nodes",
+    sentence="offset of the tool's centre: up to {size}",
+    description="centre of the tool relative to the sensor's point; in the world's frame, "
+    "relative to that of the grasped nodes",
 )
 DEPTH_TURN = NuisanceRow(
     "depth_turn_rad",
@@ -590,8 +591,9 @@ DEPTH_TURN = NuisanceRow(
     high=4.0,
     by="length",
     label="turn of {which}, {axis}",
-    told="rotation of a depth camera: {size}",
-    said="rotation of each depth camera about the middle of the body, along the camera's axes",
+    sentence="rotation of a depth camera: {size}",
+    description="rotation of each depth camera about the middle of the body, along the camera's "
+    "axes",
     same=_camera_sharing_key,
 )
 DEPTH_SHIFT = NuisanceRow(
@@ -609,8 +611,8 @@ DEPTH_SHIFT = NuisanceRow(
     step=lambda experiment: CAMERA_SHIFT_A_STEP_M,
     by="length",
     label="shift of {which}, {axis}",
-    told="translation of a depth camera: {size}",
-    said="translation of each depth camera; if neither is given, the first image is first "
+    sentence="translation of a depth camera: {size}",
+    description="translation of each depth camera; if neither is given, the first image is first "
     "aligned with the body",
     same=_camera_sharing_key,
 )
@@ -628,8 +630,8 @@ DEPTH_BIAS = NuisanceRow(
     step=lambda experiment: CAMERA_SHIFT_A_STEP_M,
     by="worst",
     label="bias of {which}",
-    told="offset of the depth: {size}",
-    said="offset that is added to each depth of an image",
+    sentence="offset of the depth: {size}",
+    description="offset that is added to each depth of an image",
 )
 DEPTH_SCALE = NuisanceRow(
     "depth_scale",
@@ -644,8 +646,8 @@ DEPTH_SCALE = NuisanceRow(
     reach=4.0,
     by="worst",
     label="scale of {which}",
-    told="scale error of the depth: {size}",
-    said="scale error of each depth of an image: the factor minus one",
+    sentence="scale error of the depth: {size}",
+    description="scale error of each depth of an image: the factor minus one",
 )
 DEPTH_TIME = NuisanceRow(
     "depth_time_s",
@@ -659,8 +661,8 @@ DEPTH_TIME = NuisanceRow(
     high=3.0,
     by="worst",
     label="time shift of {which}",
-    told="delay of a depth camera: {size}",
-    said="delay of a depth camera; at most three standard deviations",
+    sentence="delay of a depth camera: {size}",
+    description="delay of a depth camera; at most three standard deviations",
 )
 DEPTH_EDGE = NuisanceRow(
     "depth_edge_px",
@@ -675,8 +677,8 @@ DEPTH_EDGE = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="worst",
     label="edge of {which}",
-    told="silhouettes end {size} inside the body's outline",
-    said="distance by which silhouettes in the images of each depth camera end inside the "
+    sentence="silhouettes end {size} inside the body's outline",
+    description="distance by which silhouettes in the images of each depth camera end inside the "
     "outline of the body, in pixels",
 )
 
@@ -775,7 +777,7 @@ else:
         namespace={
             "__module__": __name__,
             "__doc__": _DOCSTRING
-            + "\n".join(f"{row.name} : float or None\n    {row.said}." for row in KINDS)
+            + "\n".join(f"{row.name} : float or None\n    {row.description}." for row in KINDS)
             + _SCOPE_DOCSTRING,
         },
     )

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..array_types import Array, Index
-from ..declarations import key, stated
+from ..declarations import declaration, key
 from ..errors import InputError
 from ..fem.constants import FRICTION, Constant, constant_named
 from ..fem.contact_surface import ContactSurface
@@ -43,7 +43,7 @@ def _require_selection(faces: Any) -> Selection:
     return faces
 
 
-@stated
+@declaration
 class Obstacle(Grasp):
     """A rigid solid that pushes against the surface of a body, with or without friction.
 

@@ -11,9 +11,9 @@ import numpy as np
 from pydantic import model_validator
 
 from ..array_types import Array
-from ..declarations import key, stated
+from ..declarations import declaration, key
 from ..errors import InputError
-from ..schema_tables import Section, Vector, require_one, section_of, stated_in
+from ..schema_tables import Section, Vector, declared_in, require_one, section_of
 from ..validated_types import NotNegative, Positive
 from .checked_arrays import float_converter
 
@@ -71,7 +71,7 @@ def _unit_vector_converter(name: str) -> Any:
     return made
 
 
-@stated
+@declaration
 class Plane(Solid):
     """The half-space behind a plane.
 
@@ -122,7 +122,7 @@ class Plane(Solid):
         return ca.dot(ca.DM(self.normal), point - ca.DM(self.point_m))
 
 
-@stated
+@declaration
 class Sphere(Solid):
     """A ball, such as the tip of a probe.
 
@@ -152,7 +152,7 @@ def _checked_ends(value: Any) -> Array:
     return ends
 
 
-@stated
+@declaration
 class _AxialSolid(Solid):
     """A solid of revolution about an axis between two ends."""
 
@@ -181,7 +181,7 @@ class _AxialSolid(Solid):
         return axial, _length(offset - axial * axis), half
 
 
-@stated
+@declaration
 class Cylinder(_AxialSolid):
     """A cylinder with flat ends, whose edges may be rounded.
 
@@ -203,7 +203,7 @@ class Cylinder(_AxialSolid):
         return _corner_distance(beyond + self.rounding_m) - self.rounding_m
 
 
-@stated
+@declaration
 class Capsule(_AxialSolid):
     """A cylinder with a half-ball at each end, such as a finger.
 
@@ -221,7 +221,7 @@ class Capsule(_AxialSolid):
         return _length(ca.vertcat(beyond, radial)) - self.radius_m
 
 
-@stated
+@declaration
 class Cuboid(Solid):
     """A box along the axes of its frame, whose edges may be rounded.
 
@@ -341,4 +341,4 @@ def solid_key(solid: Solid) -> str:
 def solid_from_section(section: SolidSection) -> Solid:
     """Return the solid that a `SolidSection` states."""
     ((name, own),) = ((name, own) for name, own in section if own is not None)
-    return KINDS[name](**stated_in(own, KINDS[name], name))
+    return KINDS[name](**declared_in(own, KINDS[name], name))

@@ -79,14 +79,12 @@ def read_poses(
     t_s = times_in_column(grid, *time)
     others = [k for k in range(len(grid.columns)) if k != time[0]]
     if sorted(grid.columns[k] for k in others) == sorted(_MATRIX_COLUMNS):
-        matrices = _numbers_in_columns(grid, map(grid.columns.index, _MATRIX_COLUMNS)).reshape(
-            -1, 4, 4
-        )
+        matrices = _read_columns(grid, map(grid.columns.index, _MATRIX_COLUMNS)).reshape(-1, 4, 4)
         return _from_matrices(t_s, matrices, length_unit, lines)
     axes, metres = _position_columns(grid, length_unit)
     components = _quaternion_columns(grid, quaternion, [k for k in others if k not in axes])
-    positions_m = _numbers_in_columns(grid, axes) * metres
-    return _checked_sequence(t_s, positions_m, _numbers_in_columns(grid, components), lines)
+    positions_m = _read_columns(grid, axes) * metres
+    return _checked_sequence(t_s, positions_m, _read_columns(grid, components), lines)
 
 
 def _checked_sequence(
@@ -103,7 +101,7 @@ def _checked_sequence(
 # Columns ------------------------------------------------------------------------------------------
 
 
-def _numbers_in_columns(grid: TextTable, places: Iterable[int]) -> Array:
+def _read_columns(grid: TextTable, places: Iterable[int]) -> Array:
     """Return the cells of these columns as numbers (rows, columns); blank cells raise an
     `InputError`.
     """

@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline, PPoly
 from scipy.spatial.transform import Rotation
 
 from ..array_types import Array, Index
-from ..declarations import key, stated
+from ..declarations import declaration, key
 from ..errors import InputError
 from .checked_arrays import float_converter, read_only_floats
 from .sample_times import TIME_TOLERANCE_S, first_unordered_time
@@ -27,7 +27,7 @@ Interpolation = Literal["smooth", "linear", "hold"]
 
 QUATERNION_NORM_TOLERANCE = 1e-3
 # A held pose starts at its sample, also where the time asked for is rounded to just before it.
-_HOLD_SNAP_STEPS = 1e-6
+_INTERVAL_SNAP_STEPS = 1e-6
 # Largest entry of RᵀR − I of a rotation: files print few digits, and mistakes are far larger.
 _ORTHONORMALITY_TOLERANCE = 1e-3
 # Largest deviation of a matrix's last row from 0, 0, 0, 1, which files print exactly.
@@ -42,7 +42,7 @@ LONGEST_STEP_S = 1.0
 LARGEST_REST_DIFFERENCE = 1e-6
 
 
-@stated
+@declaration
 class PoseSequence:
     """Rigid motion x(t) = R(t) X + p(t) from undeformed to current positions.
 
@@ -161,7 +161,7 @@ class PoseSequence:
             return self._rotations.as_matrix()[first], self.positions_m[first]
         self._require_times_covered(times)
         if self.interpolation == "hold":
-            snap_s = _HOLD_SNAP_STEPS * np.diff(self.t_s).min() + TIME_TOLERANCE_S
+            snap_s = _INTERVAL_SNAP_STEPS * np.diff(self.t_s).min() + TIME_TOLERANCE_S
             k = np.maximum(np.searchsorted(self.t_s, times + snap_s, side="right") - 1, 0)
             return self._rotations.as_matrix()[k], self.positions_m[k]
         if self.interpolation == "smooth" and len(self.t_s) > 2:
@@ -180,7 +180,7 @@ class PoseSequence:
         rotations = (Rotation.from_quat(self.quaternions_xyzw[k]) * turn).as_matrix()
         return rotations, self.positions_m[k] + fraction * step_m
 
-    def carried_positions(self, points_m: ArrayLike, t_s: ArrayLike) -> Array:
+    def moved_positions(self, points_m: ArrayLike, t_s: ArrayLike) -> Array:
         """Return positions (T, k, 3) [m] of undeformed points (k, 3) at the times `t_s` (T,)."""
         rotations, translations = self.at(t_s)
         points = np.asarray(points_m, dtype=np.float64)
@@ -336,7 +336,7 @@ def smooth_spline(t_s: Array, values: Array) -> PPoly:
 
 
 def require_determined_motion(
-    poses: PoseSequence, t_s: Array, hold_s: tuple[float, float], file: str | Path
+    poses: PoseSequence, t_s: Array, interval_s: tuple[float, float], file: str | Path
 ) -> None:
     """Raise an `InputError` if poses do not determine the motion of a grasp while it holds.
 
@@ -345,7 +345,7 @@ def require_determined_motion(
     poses : PoseSequence
     t_s : (T,) array
         Times of the recording's samples.
-    hold_s : (float, float)
+    interval_s : (float, float)
         First and last time at which the grasp holds.
     file : str or Path
         File of the poses, for messages.
@@ -356,8 +356,8 @@ def require_determined_motion(
         For a single pose, for poses that are missing for more than a sample at either end, and for
         a smooth motion that is sampled below 1 Hz.
     """
-    first_s = max(t_s[0], hold_s[0])
-    last_s = min(t_s[-1], hold_s[1])
+    first_s = max(t_s[0], interval_s[0])
+    last_s = min(t_s[-1], interval_s[1])
     lasts = f"the recording lasts from {first_s:.6g} s to {last_s:.6g} s"
     if len(poses.t_s) == 1:
         raise InputError(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import Array, Index
-from ..declarations import Key, key, stated
+from ..declarations import Key, declaration, key
 from ..errors import InputError
 from ..fem.refinement import split_faces_in_four
 from ..fem.selection import Indices, Selection, rows_of_faces
@@ -51,7 +51,7 @@ _TABLE = Key(
 )
 
 
-@stated
+@declaration
 class Pressure(Actuator[EnclosedVolume]):
     """A pressure above the surroundings' on faces of the boundary, such as a cavity's wall.
 
@@ -70,8 +70,8 @@ class Pressure(Actuator[EnclosedVolume]):
         recording.
     name : str
         Name; pressure_1, pressure_2 and so on by default.
-    factor, lost_pa : float
-        Pressure in the body: factor · stated pressure − lost_pa.
+    factor, loss_pa : float
+        Pressure in the body: factor · stated pressure − loss_pa.
     """
 
     faces: Selection | Index = key(Nodes, converter=_checked_faces, read=selection_from_section)
@@ -80,15 +80,15 @@ class Pressure(Actuator[EnclosedVolume]):
     name: str = key(Text | None, default="pressure")
     _: KW_ONLY
     factor: float = 1.0
-    lost_pa: float = 0.0
+    loss_pa: float = 0.0
     body_measure: BodyMeasure[EnclosedVolume] | None = None
 
     unit: ClassVar[str] = "Pa"
-    offset_field: ClassVar[str] = "lost_pa"
+    offset_field: ClassVar[str] = "loss_pa"
 
     def __post_init__(self) -> None:
         pressure = TimeSeries(self.pressure_pa, self.t_s, f"pressure_pa of {self.name}")
-        vars(self).update(pressure_pa=pressure.values, t_s=pressure.t_s, stated_values=pressure)
+        vars(self).update(pressure_pa=pressure.values, t_s=pressure.t_s, declared_values=pressure)
 
     def _measure_on(self, body: Body) -> EnclosedVolume:
         """Return the volume behind the faces of a body.
@@ -124,11 +124,11 @@ class Pressure(Actuator[EnclosedVolume]):
         corners = self.on_body(body).measure.faces[:, :3]
         return replace(self, faces=split_faces_in_four(corners, body.mesh), body_measure=None)
 
-    def energy_amplitude(self, stated_value: Any, factor: Any, offset: Any) -> Any:
+    def energy_amplitude(self, declared_value: Any, factor: Any, offset: Any) -> Any:
         """Return the amplitude of the energy: minus the pressure in the body."""
-        return offset - factor * stated_value
+        return offset - factor * declared_value
 
-    def with_held_rim(self, is_prescribed: NDArray[np.bool_], prescribed_m: Array) -> Pressure:
+    def with_fixed_rim(self, is_prescribed: NDArray[np.bool_], prescribed_m: Array) -> Pressure:
         """Return the pressure with a volume that does not depend on the motion of a held rim.
 
         The volume of an open patch is that of the cones over its faces from an apex. The pressure

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..array_types import Array
-from ..files import whole_file
+from ..files import replaced_file
 from .marker_files import MarkerTable
 from .pose_files import POSE_COLUMNS
 from .poses import PoseSequence
@@ -69,7 +69,7 @@ def _write_csv(path: str | Path, header: Sequence[str], values: Array) -> None:
     """Write a header and rows of numbers; NaN becomes a blank cell. The file is replaced when
     complete.
     """
-    with whole_file(path) as draft, open(draft, "w", newline="", encoding="utf-8") as file:
+    with replaced_file(path) as draft, open(draft, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)
         for row in values + 0.0:  # without the sign of a zero

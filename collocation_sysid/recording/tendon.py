@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from ..array_types import Array
-from ..declarations import Key, key, stated
+from ..declarations import Key, declaration, key
 from ..errors import InputError
 from ..fem.shape import PolylineLength
 from ..schema_tables import Vector
@@ -36,7 +36,7 @@ _TABLE = Key(
 )
 
 
-@stated
+@declaration
 class Tendon(Actuator[PolylineLength]):
     """A thread through points of the body, straight between them, that pulls itself shorter.
 
@@ -54,8 +54,8 @@ class Tendon(Actuator[PolylineLength]):
         recording.
     name : str
         Name; tendon_1, tendon_2 and so on by default.
-    factor, lost_n : float
-        Tension at the body: max(0, factor · stated tension − lost_n).
+    factor, loss_n : float
+        Tension at the body: max(0, factor · stated tension − loss_n).
     """
 
     points_m: Array = key(
@@ -67,11 +67,11 @@ class Tendon(Actuator[PolylineLength]):
     name: str = key(Text | None, default="tendon")
     _: KW_ONLY
     factor: float = 1.0
-    lost_n: float = 0.0
+    loss_n: float = 0.0
     body_measure: BodyMeasure[PolylineLength] | None = None
 
     unit: ClassVar[str] = "N"
-    offset_field: ClassVar[str] = "lost_n"
+    offset_field: ClassVar[str] = "loss_n"
 
     def __post_init__(self) -> None:
         points = self.points_m
@@ -93,7 +93,7 @@ class Tendon(Actuator[PolylineLength]):
                 f"{name}: tension_n is {tension.values[row]:g} N in row {row + 1}; expected 0 or "
                 "more: a tendon only pulls"
             )
-        vars(self).update(tension_n=tension.values, t_s=tension.t_s, stated_values=tension)
+        vars(self).update(tension_n=tension.values, t_s=tension.t_s, declared_values=tension)
 
     def _measure_on(self, body: Body) -> PolylineLength:
         """Return the length of the polyline in a body; an `InputError` if a point is too far
@@ -111,9 +111,9 @@ class Tendon(Actuator[PolylineLength]):
             )
         return PolylineLength(nodes, weights, len(body.nodes_m))
 
-    def energy_amplitude(self, stated_value: Any, factor: Any, offset: Any) -> Any:
+    def energy_amplitude(self, declared_value: Any, factor: Any, offset: Any) -> Any:
         """Return the tension at the body, max(0, factor · stated − lost); 0 if the stated tension
         is 0.
         """
-        pull = factor * stated_value - offset
-        return (stated_value > 0) * (pull > 0) * pull
+        pull = factor * declared_value - offset
+        return (declared_value > 0) * (pull > 0) * pull

@@ -229,13 +229,13 @@ def _read_displacements(
     return read_columns(path, quantities, columns, requires_times=timed)
 
 
-def _axis_components(table: QuantityTable, wanted: Sequence[Quantity], axis: str) -> Array:
-    """Return the (T, n) values of the `wanted` quantities; NaN where missing.
+def _axis_components(table: QuantityTable, quantities: Sequence[Quantity], axis: str) -> Array:
+    """Return the (T, n) values of the `quantities` quantities; NaN where missing.
 
     A machine's quantity, whose name contains no axis, becomes the component along `axis`.
     """
-    places = {quantity.key: k for k, quantity in enumerate(wanted)}
-    values = np.full((len(table.t_s), len(wanted)), np.nan)
+    places = {quantity.key: k for k, quantity in enumerate(quantities)}
+    values = np.full((len(table.t_s), len(quantities)), np.nan)
     for key, column in table.values.items():
         values[:, places.get(key, "xyz".index(axis))] = column
     return values
@@ -276,16 +276,16 @@ def read_custom_sensor(
         line is named.
     """
     grid = read_table(decode(read_bytes(path)))
-    wanted = list(columns) or [name for name in grid.columns if name != "t_s"]
-    for name in ("t_s", *wanted):
+    names = list(columns) or [name for name in grid.columns if name != "t_s"]
+    for name in ("t_s", *names):
         if (count := grid.columns.count(name)) != 1:
             there = f"{count} columns are called" if count else "there is no column"
             hint = "" if count else hint_at(name, grid.columns)
             among = ", ".join(grid.columns)
             raise grid.error_at(f"{there} {name!r}; expected one among {among}{hint}")
     t_s = times_in_column(grid, grid.columns.index("t_s"))
-    values = numeric_cells(grid, [grid.columns.index(name) for name in wanted], True)
-    return _without_rounding(t_s), np.asarray(values), wanted
+    values = numeric_cells(grid, [grid.columns.index(name) for name in names], True)
+    return _without_rounding(t_s), np.asarray(values), names
 
 
 def is_within_experiment(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..array_types import Array
 from ..errors import InputError, require_among
-from ..files import safe_name, whole_file
+from ..files import replaced_file, safe_name
 from .figure_style import BLACK, BLUE, GREEN, LINE_PT, TEXT_PT, add_legend_above, style_axes
 from .pictures.over_time import rms_over_markers
 from .pictures.projection import ParallelCamera
@@ -35,7 +35,7 @@ from .pictures.scene import (
     draw_scale,
     legend_handles,
     sheet,
-    with_near_outlines,
+    with_nearby_outlines,
 )
 from .replay import MotionRecord, damaged_run_refused, read_run, run_headline
 
@@ -142,7 +142,7 @@ def film(
     dpi = PIXELS_WIDE[file.suffix.lower()] / (FILM_WIDTH_MM / 25.4)
     with rc_context({"animation.ffmpeg_path": ffmpeg} if ffmpeg else {}):
         writer = _frame_writer(fps, ffmpeg)
-        with whole_file(file) as draft, writer.saving(picture.figure, str(draft), dpi):
+        with replaced_file(file) as draft, writer.saving(picture.figure, str(draft), dpi):
             for number, t in enumerate(shown):
                 picture.show_sample(int(t))
                 writer.grab_frame()
@@ -226,10 +226,12 @@ class FilmFigure:
         surface_m = surface_m[is_finite]
         outlines_m = replay.obstacles_m
         camera = ParallelCamera.facing_motion(surface_m, replay.up)
-        surroundings_m = with_near_outlines(
+        surroundings_m = with_nearby_outlines(
             surface_m, None if outlines_m is None else outlines_m[is_finite]
         )
-        depth_points_m = [rows[np.isfinite(rows[:, 4]), 5:] for rows in replay.seen.values()]
+        depth_points_m = [
+            rows[np.isfinite(rows[:, 4]), 5:] for rows in replay.visible_points.values()
+        ]
         everything = np.vstack(
             [surroundings_m.reshape(-1, 3), replay.measured_m.reshape(-1, 3), *depth_points_m]
         )
@@ -318,7 +320,7 @@ class FilmFigure:
         draw_directions(axes, camera, (7.0, 4.0))
         draw_scale(axes, mm_per_m, (FILM_WIDTH_MM * 0.17, 4.0))
         named = ["grasped", "measured", "behind the body"]
-        if self.replay.seen:
+        if self.replay.visible_points:
             markers = named[1:] if len(self.replay.marker_names) else []
             named = ["grasped", *markers, "depth image"]
         draw_legend(
@@ -333,7 +335,7 @@ class FilmFigure:
             outlines_m = None if replay.obstacles_m is None else replay.obstacles_m[sample]
             drawn.update(
                 positions[sample],
-                replay.held[sample],
+                replay.is_prescribed[sample],
                 measured,
                 None,
                 outlines_m,

@@ -151,7 +151,7 @@ def _measurements_section(findings: QuickCheck) -> Table:
 
 def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
     """Return a sentence on each grasp of an experiment; several grasps are numbered from 1."""
-    own = [grasp_sentence(hold) for hold in holds if hold.experiment == experiment]
+    own = [grasp_sentence(grasp) for grasp in holds if grasp.experiment == experiment]
     if len(own) == 1:
         return {f"grasp of '{experiment}'": own[0]}
     return {f"grasp {k} of '{experiment}'": sentence for k, sentence in enumerate(own, start=1)}

@@ -103,7 +103,7 @@ class DepthProjection:
             eye_m = (
                 shape_m.mean(axis=0) + VIEWER_DISTANCE_RATIO * size_m * self.parallel_camera.axes[2]
             )
-        corners = shape_m[self.skin.flat_triangles[self.skin.is_facing(shape_m, eye_m)]]
+        corners = shape_m[self.skin.plane_triangles[self.skin.is_facing(shape_m, eye_m)]]
         closed = corners[:, [0, 1, 2, 0]].reshape(-1, 3)
         own_m = self.view.to_camera_m(self.phi, closed, sample)
         if self.view.depth.camera.matrix is not None:

@@ -262,7 +262,7 @@ class _FrameWindow:
                 self.pv.PolyData(measured), color=VERMILION, name="measured", **balls
             )
         shapes = self.replay.shapes_m
-        grasped = np.flatnonzero(self.replay.held[sample])
+        grasped = np.flatnonzero(self.replay.is_prescribed[sample])
         if shapes is not None and len(grasped):
             nodes = self.pv.PolyData(np.asarray(shapes[sample][grasped], dtype=float))
             self.plotter.add_mesh(nodes, color=BLACK, name="grasped", **{**balls, "point_size": 8})

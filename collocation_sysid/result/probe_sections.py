@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from ..display import Section, Table, short
+from ..display import Table, TitledParts, short
 from ..errors import listed
 from ..fem.constants import symbol_of
 from ..runs.result_content import Result
@@ -33,12 +33,12 @@ DEEPER_CHECK_ADVICE = (
 )
 
 
-def probe_section(result: Result) -> Section:
+def probe_section(result: Result) -> TitledParts:
     """Return the table of all probes with its conclusions; a section without parts if there are no
     probes.
     """
     if not result.probes:
-        return Section("Probes", ())
+        return TitledParts("Probes", ())
     names = _shown_estimates(result)
     heads = ("refit", "−Δχ²", "size", *map(symbol_of, names))
     rows = [
@@ -55,7 +55,9 @@ def probe_section(result: Result) -> Section:
         "and of the combined interval. They are first-order estimates, except those of "
         "significant assumptions."
     )
-    return Section("Probes", (Table("", heads, tuple(rows), texts=1), read, *_conclusions(result)))
+    return TitledParts(
+        "Probes", (Table("", heads, tuple(rows), texts=1), read, *_conclusions(result))
+    )
 
 
 def probe_lines(result: Result) -> list[str | Table]:
@@ -63,7 +65,7 @@ def probe_lines(result: Result) -> list[str | Table]:
 
     After routine probes without a significant result the table is left out; empty without probes.
     """
-    if is_routine(result) and not any(probe.told for probe in result.probes):
+    if is_routine(result) and not any(probe.sentences for probe in result.probes):
         return [*_conclusions(result)] if result.probes else []
     return [each for each in probe_section(result).parts if isinstance(each, (str, Table))]
 
@@ -137,7 +139,7 @@ def _conclusions(result: Result) -> Iterator[str]:
     the most
     important assumption that the data do not determine.
     """
-    significant = [probe for probe in result.probes if probe.told]
+    significant = [probe for probe in result.probes if probe.sentences]
     relaxed = sorted(
         (p for p in significant if p.kind == "assumption"), key=lambda p: -p.chi_squared
     )
@@ -145,7 +147,7 @@ def _conclusions(result: Result) -> Iterator[str]:
         disagreeing = [p for p in significant if p.kind == kind]
         if disagreeing:
             changes = (
-                f"{p.name}: {listed(_named_change(p, result, n) for n in p.told)}"
+                f"{p.name}: {listed(_named_change(p, result, n) for n in p.sentences)}"
                 for p in disagreeing
             )
             yield f"{kind}s disagree significantly ({'; '.join(changes)})"
@@ -182,7 +184,7 @@ def _most_important_assumption(result: Result) -> Iterator[str]:
     The most important assumption contributes most to the variance of the first stiffness that has a
     budget.
     """
-    significant = {name.partition(" ")[0] for p in result.probes for name in p.told}
+    significant = {name.partition(" ")[0] for p in result.probes for name in p.sentences}
     undetermined = {
         p.name.partition(" ")[0] for p in result.probes if p.kind == "assumption"
     } - significant

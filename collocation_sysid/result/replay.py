@@ -29,7 +29,7 @@ ARRAYS_FILE = "trajectory.npz"
 # Prefix of a wrench array, before its number from 1.
 WRENCH_PREFIX = "wrench_"
 # Prefixes of arrays of the attributes that are mappings, before the name.
-GROUP_PREFIXES = {"readings": "reading_", "fields": "field_", "seen": "seen_"}
+GROUP_PREFIXES = {"readings": "reading_", "fields": "field_", "visible_points": "visible_"}
 # Prefix of the unit of a custom sensor, before its name.
 UNIT_PREFIX = "unit_"
 # Arrays of the body, the same for all experiments of a run.
@@ -50,10 +50,10 @@ ARRAY_LAYOUT = {
     "surface_parts": ("iu", "F"),
     "surface_nodes": ("iu", "Fs"),
     "t_s": ("f", "T"),
-    "held": ("b", "Tn"),
+    "is_prescribed": ("b", "Tn"),
     "up": ("f", "3"),
     "marker_places_m": ("f", "M3"),
-    "given_places_m": ("f", "M3"),
+    "declared_places_m": ("f", "M3"),
     "measured_m": ("f", "TM3"),
     "positions_m": ("f", "Tn3"),
     "markers_m": ("f", "TM3"),
@@ -95,14 +95,14 @@ class MotionRecord:
         Nodes of each boundary triangle; of quadratic elements also those on its sides.
     part_names : (P,) str
         Names of the parts; "" for elements outside all regions.
-    held : (T, n) bool
+    is_prescribed : (T, n) bool
         Whether a node has a prescribed displacement along some axis.
     up : (3,)
         Unit vector against gravity; z where there is no gravity.
     marker_names : (M,) str
     marker_places_m : (M, 3)
         Estimated places of the markers on the undeformed body.
-    given_places_m : (M, 3)
+    declared_places_m : (M, 3)
         Stated places of the markers, NaN where none was stated.
     measured_m : (T, M, 3)
         Measured markers, NaN where missing.
@@ -129,7 +129,7 @@ class MotionRecord:
     fields : mapping of name to (E, 4)
         For each spatially varying constant: the estimate, the ends of its 95 % interval, and its
         posterior over its prior standard deviation; NaN in elements of other regions.
-    seen : mapping of name to (k, 8)
+    visible_points : mapping of name to (k, 8)
         For each depth camera, rows of points: time [s], image coordinates u and v, depth [m],
         distance
         behind the surface [m] (NaN for points that do not count), and position in the world [m].
@@ -149,11 +149,11 @@ class MotionRecord:
     surface_parts: NDArray[np.integer]
     surface_nodes: NDArray[np.integer]
     part_names: Sequence[str]
-    held: NDArray[np.bool_]
+    is_prescribed: NDArray[np.bool_]
     up: Array
     marker_names: Sequence[str]
     marker_places_m: Array
-    given_places_m: Array
+    declared_places_m: Array
     measured_m: Array
     positions_m: Array | None = None
     markers_m: Array | None = None
@@ -168,7 +168,7 @@ class MotionRecord:
     gaps_m: Array | None = None
     pressures_pa: Array | None = None
     fields: Mapping[str, Array] = field(default_factory=dict)
-    seen: Mapping[str, Array] = field(default_factory=dict)
+    visible_points: Mapping[str, Array] = field(default_factory=dict)
     reading_units: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
@@ -200,7 +200,7 @@ class MotionRecord:
         """
         body = experiment.body
         markers = experiment.markers
-        stated_m = markers.predict_positions(body.nodes_m)
+        declared_m = markers.predict_positions(body.nodes_m)
         nodes_m = body.nodes.points_m
         # Frames of obstacles are left out: experiments of a run have one body, but not as many.
         fitted, simulated = (
@@ -218,8 +218,8 @@ class MotionRecord:
             np.asarray(experiment.is_prescribed(experiment.t_s).any(axis=2))[:, : len(nodes_m)],
             experiment.upward_direction,
             markers.names,
-            stated_m if places_m is None else places_m,
-            np.where(markers.located[:, None], stated_m, np.nan),
+            declared_m if places_m is None else places_m,
+            np.where(markers.located[:, None], declared_m, np.nan),
             markers.positions_m,
             *(fitted or (None, None)),
             *(simulated or (None, None)),
@@ -248,7 +248,7 @@ class MotionRecord:
         """
         tolerance_s = float(np.diff(self.t_s).max(initial=0.0)) / 2 + TIME_TOLERANCE_S
         nearest = [np.zeros((0, 3))]
-        for rows in self.seen.values():
+        for rows in self.visible_points.values():
             points = rows[np.isfinite(rows[:, 4])]
             times = np.unique(points[:, 0])
             differences_s = np.abs(times - self.t_s[sample])
@@ -399,12 +399,14 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
     fits = {
         "readings": lambda shape: len(shape) == 2 and shape[0] and shape[1] % 3 == 1 < shape[1],
         "fields": lambda shape: shape == (elements, 4),
-        "seen": lambda shape: shape[1:] == (8,),
+        "visible_points": lambda shape: shape[1:] == (8,),
     }
     for group, front in GROUP_PREFIXES.items():
-        for name, said in arrays[group].items():
-            if said.dtype.kind != "f" or not fits[group](said.shape):
-                raise ValueError(f"{front}{name} is {said.dtype} of shape {said.shape}")
+        for name, expected_shape in arrays[group].items():
+            if expected_shape.dtype.kind != "f" or not fits[group](expected_shape.shape):
+                raise ValueError(
+                    f"{front}{name} is {expected_shape.dtype} of shape {expected_shape.shape}"
+                )
     for key in ("tetrahedra", "surface", "surface_nodes"):
         if arrays[key].min() < 0 or arrays[key].max() >= sizes["n"]:
             raise ValueError(f"{key} contains nodes that do not exist")

@@ -1,6 +1,6 @@
 """Reports as self-contained HTML pages or Markdown, and the report of a folder of compare or sweep.
 
-The content of a report is a `Section`: `comparison_report` makes one from a study's folder,
+The content of a report is a `TitledParts`: `comparison_report` makes one from a study's folder,
 `run_sections.run_report` one from a run folder.
 """
 
@@ -16,8 +16,8 @@ from ..display import (
     Items,
     Line,
     Picture,
-    Section,
     Table,
+    TitledParts,
     as_html,
     as_markdown,
     escape,
@@ -67,7 +67,7 @@ class StudySummary:
     failures: tuple[str, ...]
 
 
-def comparison_report(folder: str | Path) -> Section:
+def comparison_report(folder: str | Path) -> TitledParts:
     """Return the report of a folder that compare or sweep wrote.
 
     Raises
@@ -82,25 +82,25 @@ def comparison_report(folder: str | Path) -> Section:
         pictures = [Picture(f, CAPTIONS.get(f.stem, f.stem)) for f in own_pictures(folder)]
         ended = {"Runs without a result": [Items(study.failures)] if study.failures else []}
         titled = {**ended, "Pictures": pictures}
-        return Section(
+        return TitledParts(
             study.title,
             (
                 Line(f"{len(study.runs)} runs of {study.problem}", "quiet"),
-                Section("", study.headline, style="verdict good"),
+                TitledParts("", study.headline, style="verdict good"),
                 *(Line(note, "quiet") for note in study.notes),
                 *study.tables,
-                *(Section(title, tuple(each)) for title, each in titled.items() if each),
+                *(TitledParts(title, tuple(each)) for title, each in titled.items() if each),
             ),
             level=1,
         )
 
 
-def report_text(report: Section, file: Path) -> str:
+def report_text(report: TitledParts, file: Path) -> str:
     """Return the text of a report for a file: Markdown if its name ends in ``.md``, else HTML."""
     return as_markdown([report]) if file.suffix == ".md" else report_html(report)
 
 
-def report_html(report: Section) -> str:
+def report_html(report: TitledParts) -> str:
     """Return a report as the HTML text of one page that contains its pictures."""
     page = files("collocation_sysid.result").joinpath("report.html").read_text("utf-8")
     # A text cannot hold these places, since "<" is escaped.

@@ -17,7 +17,7 @@ import numpy as np
 from ..array_types import Array
 from ..errors import InputError
 from ..fem.body import Body
-from ..files import RESULT_FILE, write_whole
+from ..files import RESULT_FILE, write_text_file
 from ..program.contact_summary import surface_gaps_and_pressures
 from ..program.depth_comparison import SurfaceComparison
 from ..recording.experiment import Experiment
@@ -114,7 +114,7 @@ def draw_run(
         )
     pictures_s = time.perf_counter() - began_s
     result = replace(result, elapsed_s=replace(result.elapsed_s, pictures=pictures_s))
-    write_whole(file, _result_text(result))
+    write_text_file(file, _result_text(result))
     return result
 
 
@@ -218,7 +218,7 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
             )
             of_cells = _field_estimates(finished, experiment.body)
             of_cameras = _depth_rows(finished, experiment)
-            collected.append(replace(replay, fields=of_cells, seen=of_cameras))
+            collected.append(replace(replay, fields=of_cells, visible_points=of_cameras))
     return collected
 
 

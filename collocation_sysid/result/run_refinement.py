@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import InputError
-from ..files import RESULT_FILE, require_own, whole_file
+from ..files import RESULT_FILE, replaced_file, require_own
 from ..model.parameters import Parameters
 from ..problem import Problem
 from ..runs.numerical_error import solve_refined
@@ -85,7 +85,7 @@ def refine_run(
     def keep(refinement: Refinement) -> Result:
         """Write a refinement and the updated result into the folder, and return the latter."""
         after = with_refinement(before, refinement, problem.parameters)
-        with whole_file(levels_file) as levels, whole_file(file) as draft:
+        with replaced_file(levels_file) as levels, replaced_file(file) as draft:
             levels.write_text(as_json(refinement) + "\n", encoding="utf-8")
             draft.write_text(as_json(after) + "\n", encoding="utf-8")
         return after

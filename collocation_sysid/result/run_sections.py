@@ -17,11 +17,11 @@ from ..display import (
     Line,
     Listing,
     Picture,
-    Section,
     Shown,
     Span,
     Table,
-    flat,
+    TitledParts,
+    flattened_parts,
     millimetres,
     number,
     own_pictures,
@@ -119,7 +119,7 @@ def run_summary(result: Result, folder: Path | None = None, budget: bool = False
     )
     tables = [budget_table(result)] if budget and result.budget else []
     written = [] if folder is None else [f"written to {folder}"]
-    return [*flat(sections), *tables, *probe_lines(result), *ended, *written]
+    return [*flattened_parts(sections), *tables, *probe_lines(result), *ended, *written]
 
 
 def estimate_sections(result: Result) -> list[Shown]:
@@ -128,10 +128,10 @@ def estimate_sections(result: Result) -> list[Shown]:
     """
     sections = [verdict_section(result.trust), *remedy_command(result.trust.concerns)]
     sections += [*_deeper_check_advice(result), _parameter_section(result)]
-    return [*flat(sections)]
+    return [*flattened_parts(sections)]
 
 
-def run_report(run: str | Path) -> Section:
+def run_report(run: str | Path) -> TitledParts:
     """Return the complete report of a run folder, with its pictures.
 
     Raises
@@ -153,30 +153,30 @@ def run_report(run: str | Path) -> Section:
             Line((badge, Span(took)), "quiet"),
             replace(verdict, parts=(verdict.parts[0], meaning, *verdict.parts[1:])),
             _cards(result),
-            *flat([_outcome_section(result)]),
+            *flattened_parts([_outcome_section(result)]),
             *pictures[:1],
-            Section(
+            TitledParts(
                 "What to do", (*_remedy_lines(result.trust.concerns), *_deeper_check_advice(result))
             ),
             _parameter_section(result),
-            Section("Error bars", tuple(_error_bars(result))),
+            TitledParts("Error bars", tuple(_error_bars(result))),
             probe_section(result),
             _fit_section(result),
             _notes_section(result),
             *_marker_place_sections(result),
             *_nuisance_sections(result),
-            Section("Residuals", tuple(_residual_tables(result, run))),
-            Section("Pictures", tuple(pictures[1:])),
-            Section("Problem and provenance", tuple(_provenance_parts(result, run))),
+            TitledParts("Residuals", tuple(_residual_tables(result, run))),
+            TitledParts("Pictures", tuple(pictures[1:])),
+            TitledParts("Problem and provenance", tuple(_provenance_parts(result, run))),
         ]
-        shown = (each for each in parts if not isinstance(each, Section) or each.parts)
-        return Section(result.title or "Run", tuple(shown), level=1)
+        shown = (each for each in parts if not isinstance(each, TitledParts) or each.parts)
+        return TitledParts(result.title or "Run", tuple(shown), level=1)
 
 
 # What terminal and page show ----------------------------------------------------------------------
 
 
-def _outcome_section(result: Result) -> Section:
+def _outcome_section(result: Result) -> TitledParts:
     """Return how the solve ended, with the largest violations of the equations of motion if it
     failed.
     """
@@ -184,12 +184,12 @@ def _outcome_section(result: Result) -> Section:
     if not result.converged:
         parts.append("Largest violations of the equations of motion:")
         parts += [f"  {violation}" for violation in result.dynamics.largest]
-    return Section("", tuple(parts))
+    return TitledParts("", tuple(parts))
 
 
 def verdict_section(
     trust: Assessment, linked: bool = False, max_reasons: int | None = None
-) -> Section:
+) -> TitledParts:
     """Return the verdict in one word, with its reasons.
 
     Parameters
@@ -206,7 +206,7 @@ def verdict_section(
         cure = Span(" (what to do)", to=f"#cure-{concern.topic}")
         spans = (Span(f"  {concern.message}"), *[cure] * linked)
         lines.append(Line(spans, verdict))
-    return Section("", tuple(lines), style=f"verdict {verdict}")
+    return TitledParts("", tuple(lines), style=f"verdict {verdict}")
 
 
 def _deeper_check_advice(result: Result) -> list[Line]:
@@ -220,7 +220,7 @@ def remedy_command(concerns: Iterable[Concern]) -> list[Line]:
     return [Line(f"what to do: {explain_command(*pages)}", "quiet")] if pages else []
 
 
-def _parameter_section(result: Result) -> Section:
+def _parameter_section(result: Result) -> TitledParts:
     """Return the table of corrected values with combined and statistical uncertainties, and remarks
     on it.
     """
@@ -228,7 +228,7 @@ def _parameter_section(result: Result) -> Section:
     rows = tuple((symbol_with_unit(name), *_estimate_row(result, name)) for name in values)
     heads = ("", "value", "±", "95 % interval", "± stat", "± syst", "guess", "")
     faint = tuple(range(len(result.parameters), len(values)))
-    parts: list[Shown] = [Table("", heads, rows, texts=1, faint=faint, aside=1)]
+    parts: list[Shown] = [Table("", heads, rows, texts=1, faint=faint, note_column=1)]
     parts += [field.sentence(name) for name, field in result.fields.items()]
     if any(each.combined95 for each in values.values()):
         parts.append(_coverage_sentence(result))
@@ -253,7 +253,7 @@ def _parameter_section(result: Result) -> Section:
             f"corrected for the stated grip layer and machine compliance: {', '.join(known)}"
         )
     parts += _undetermined_sentence(result)
-    return Section("Parameters", (*parts, *_largest_contributions(result), *result.basis))
+    return TitledParts("Parameters", (*parts, *_largest_contributions(result), *result.basis))
 
 
 def _undetermined_sentence(result: Result) -> list[str]:
@@ -382,7 +382,7 @@ def _interval_text(ends: tuple[float, float] | None) -> str:
     return "" if ends is None else "{:.5g} … {:.5g}".format(*ends)
 
 
-def _fit_section(result: Result) -> Section:
+def _fit_section(result: Result) -> TitledParts:
     """Return the misfit of measurements and equations, the predictions, the time taken, and side
     results.
     """
@@ -423,9 +423,9 @@ def _fit_section(result: Result) -> Section:
         )
     lines += [f"time: {_elapsed_text(result.elapsed_s)}", _iterations_text(result)]
     for name, each in experiments.items():
-        if each.beside:
-            lines.append(f"nuisance parameters of '{name}': {'; '.join(each.beside)}")
-    return Section("Fit", tuple(lines))
+        if each.notes:
+            lines.append(f"nuisance parameters of '{name}': {'; '.join(each.notes)}")
+    return TitledParts("Fit", tuple(lines))
 
 
 def _elapsed_text(elapsed: Elapsed) -> str:
@@ -540,9 +540,9 @@ def _forces_text(*sizes: float | None) -> str:
     return ", ".join(f"{short(size)} {unit}" for size, unit in pairs if size)
 
 
-def _notes_section(result: Result) -> Section:
+def _notes_section(result: Result) -> TitledParts:
     """Return the notes of a run as a section."""
-    return Section("Notes", tuple(f"note: {note}" for note in result.notes))
+    return TitledParts("Notes", tuple(f"note: {note}" for note in result.notes))
 
 
 # What the page alone has --------------------------------------------------------------------------
@@ -592,7 +592,7 @@ def _error_bars(result: Result) -> Iterator[Shown]:
         yield budget_table(result)
 
 
-def _marker_place_sections(result: Result) -> Iterator[Section]:
+def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
     """Yield for each experiment a table of the estimated places of its markers [mm]."""
     explanation = (
         "Positions on the undeformed body in millimetres, each with its standard error. "
@@ -606,15 +606,15 @@ def _marker_place_sections(result: Result) -> Iterator[Section]:
             for x, error in zip(place.position_m, errors_m, strict=True):
                 cells += [f"{1e3 * x:.2f}", "–" if error is None else number(1e3 * error, 2)]
             prior = "exact" if place.prior_m == 0 else _size_text(place.prior_m, "m")
-            rows.append((marker, *cells, prior, "" if place.given else "not given"))
+            rows.append((marker, *cells, prior, "" if place.is_declared else "not given"))
         heads = ("", "x", "±", "y", "±", "z", "±", "prior ±", "")
         if rows:
             table = Table("", heads, tuple(rows), texts=1)
             title = f"Positions of the markers of '{experiment}'"
-            yield Section(title, (Line(explanation, "quiet"), table))
+            yield TitledParts(title, (Line(explanation, "quiet"), table))
 
 
-def _nuisance_sections(result: Result) -> Iterator[Section]:
+def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
     """Yield for each experiment a table of its other nuisance parameters, in mm, ms or degrees."""
     explanation = (
         "Estimated for this recording alone, together with the parameters; the prior has a mean "
@@ -630,7 +630,7 @@ def _nuisance_sections(result: Result) -> Iterator[Section]:
         title = f"Nuisance parameters of '{experiment}'"
         is_part = experiment in (result.fit.symmetry or {})
         loads = " Forces are those of the modelled part." if is_part else ""
-        yield Section(title, (Line(explanation + loads, "quiet"), table))
+        yield TitledParts(title, (Line(explanation + loads, "quiet"), table))
 
 
 def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
@@ -655,7 +655,7 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
     """Return the largest marker residuals of a run folder as (error [m], time [s], marker), largest
     first.
 
-    Of each marker, two listed errors are more than `APART` samples apart.
+    Of each marker, two listed errors are more than `LEAST_DISAGREEMENT_RATIO` samples apart.
 
     Raises
     ------

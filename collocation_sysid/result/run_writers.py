@@ -237,8 +237,8 @@ def replaced_folder(
     require_replaceable(target, overwrite, marker_file, content_word)
     target.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(target)
-    owner = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"
-    temporary = target.with_name(f".{target.name}.{owner}.partial")
+    process_name = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"
+    temporary = target.with_name(f".{target.name}.{process_name}.partial")
     temporary.mkdir()
     try:
         with naming(target, temporary):
@@ -249,11 +249,11 @@ def replaced_folder(
         raise
     try:
         require_replaceable(target, overwrite, marker_file, content_word)
-        _replace_folder(temporary, target, target.with_name(f".{target.name}.{owner}.old"))
+        _replace_folder(temporary, target, target.with_name(f".{target.name}.{process_name}.old"))
     except (InputError, OSError) as error:
-        kept = target.with_name(f"{target.name}-{owner}")
+        backup = target.with_name(f"{target.name}-{process_name}")
         with suppress(OSError):
-            temporary = temporary.rename(kept)
+            temporary = temporary.rename(backup)
         raise InputError(
             f"the finished run cannot be moved to this folder ({error}); it is kept in {temporary}",
             target,

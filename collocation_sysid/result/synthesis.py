@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError, require_among
-from ..files import whole_file
+from ..files import replaced_file
 from ..model.schemes import SCHEMES
 from ..problem import Problem
 from ..problem.bench_files import (
@@ -167,7 +167,7 @@ def write_data(
         ):
             section = sections.get(experiment.name)
             files = [place / n for n in named.values()]
-            drafts = [stack.enter_context(whole_file(file)) for file in files]
+            drafts = [stack.enter_context(replaced_file(file)) for file in files]
             drafts_of |= dict(zip(files, drafts, strict=True))
             by_key = dict(zip(named, drafts, strict=True))
             _write_tables(experiment, section, trajectory, by_key, rng, recipe)
@@ -188,7 +188,7 @@ def write_data(
                 )
                 written.append(folder / FRAMES_FILE)
         by_name = {file.name: draft for file, draft in drafts_of.items()}
-        listing = stack.enter_context(whole_file(place / LIST_FILE))
+        listing = stack.enter_context(replaced_file(place / LIST_FILE))
         hashes = listed_hashes(place) | hashes_of(by_name)
         listing.write_text(list_as_text(hashes), encoding="utf-8")
     return written

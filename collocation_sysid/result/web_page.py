@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..array_types import Array
 from ..display import escape
-from ..files import write_whole
+from ..files import write_text_file
 from .pictures.projection import ParallelCamera
 from .replay import MotionRecord
 
@@ -112,7 +112,7 @@ def write_page(
     }
     # In one pass, so that a name which looks like a place is not filled in.
     page = re.sub("@(TITLE|HEADLINE|DATA)@", lambda place: texts[place[1]], template)
-    write_whole(file, page)
+    write_text_file(file, page)
     return Path(file)
 
 
@@ -152,7 +152,7 @@ def _page_data(replay: MotionRecord, colouring: Colouring) -> dict[str, Any]:
         "shares": {name: _base64(np.rint(255 * x), "u1") for name, x in shares.items()},
         "opening": int(np.nansum(np.abs(next(iter(shares.values()))), axis=1).argmax()),
         "colours": [[round(255 * c) for c in colormaps["cividis"](k / 8)[:3]] for k in range(9)],
-        "held": _base64(replay.held[samples][:, surface_nodes], "u1"),
+        "held": _base64(replay.is_prescribed[samples][:, surface_nodes], "u1"),
         "outlines": ""
         if replay.obstacles_m is None
         else _base64(replay.obstacles_m[samples], "<f4"),

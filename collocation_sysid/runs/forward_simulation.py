@@ -25,7 +25,7 @@ from ..program.wrench_observable import ReactionGrid
 from ..recording import Experiment
 from ..statistics.discretisation_error import (
     Refinement,
-    change_towards_observations,
+    change_in_observations,
     discretisation_errors,
 )
 from ..statistics.estimates import Estimate
@@ -298,7 +298,7 @@ def step_error(
             differences.append(way.reshape(-1, 2, 3))
         differences += _sensor_differences(part, rollout.trajectory, share)
         differences += _depth_differences(part, rollout.trajectory, share)
-    change = change_towards_observations(fit, differences)[: collocation.nq]
+    change = change_in_observations(fit, differences)[: collocation.nq]
     q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
     linear = problem.parameters.linear_names
     order = as_scheme(problem.scheme).order
@@ -347,9 +347,9 @@ def _depth_differences(
     displacements_m = way_rows_m.T.reshape(len(rows_s), -1, 3, 1)
     return [
         reading.residual_changes(
-            looked, displacements_m[:, reading.correspondences.surface.nodes], part.phi
+            observation, displacements_m[:, reading.correspondences.surface.nodes], part.phi
         )[..., 0]
-        for reading, looked in sights
+        for reading, observation in sights
     ]
 
 

@@ -155,11 +155,11 @@ def instrument_misfits(
     return results
 
 
-def _misfit(what: str, stated: str, ratio: Array, size: str = "") -> InstrumentMisfit:
+def _misfit(what: str, declared_size: str, ratio: Array, size: str = "") -> InstrumentMisfit:
     """Return the misfit of differences over σ, `ratio`, in which NaN is left out."""
     known = ratio[np.isfinite(ratio)]
     sigmas = root_mean(known**2)
-    return InstrumentMisfit(what, stated, sigmas, sigmas, known.size, size)
+    return InstrumentMisfit(what, declared_size, sigmas, sigmas, known.size, size)
 
 
 # Blind predictions --------------------------------------------------------------------------------

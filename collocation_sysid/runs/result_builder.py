@@ -22,7 +22,7 @@ from ..program.contact_summary import friction_summaries
 from ..program.depth_comparison import DepthError
 from ..recording.experiment import Experiment
 from ..recording.nuisance import GAUGE, JOINING, PLACE, TARE, in_readable_unit
-from ..serialisation import alike
+from ..serialisation import copy_fields
 from ..statistics.field_estimates import FieldEstimate
 from ..statistics.identifiability import identifiability_sentences
 from ..statistics.scale_identifiability import relative_scale_note
@@ -73,7 +73,7 @@ def build_result(answer: SolvedProblem) -> Result:
         nuisance=_nuisance(answer),
         fields={name: _field_result(field) for name, field in answer.fields.items()},
         uncertainty=_uncertainty_result(answer),
-        scan=None if solution.scan is None else alike(ScanResult, solution.scan),
+        scan=None if solution.scan is None else copy_fields(ScanResult, solution.scan),
         fit=_fit_result(answer),
         residuals=answer.diagnoses,
         dynamics=DynamicsResult(
@@ -141,7 +141,7 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
     if known is None:
         return None
     reported = [k for k, name in enumerate(known.names) if not is_field_coefficient(name)]
-    return alike(
+    return copy_fields(
         UncertaintyResult,
         known,
         names=tuple(known.names[k] for k in reported),
@@ -153,7 +153,7 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
         verdicts=tuple(identifiability_sentences(known)),
         recordings=_recordings_agreement(answer),
         profiles={
-            profile.parameter: alike(
+            profile.parameter: copy_fields(
                 ProfileResult,
                 profile,
                 rises=profile.losses - profile.losses.min(),
@@ -273,7 +273,7 @@ def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedE
     if not isinstance(simulated, ForwardSimulation):
         return SimulatedExperiment(fitted, failed=simulated)
     force, torque = simulated.wrench_rms
-    return alike(
+    return copy_fields(
         SimulatedExperiment,
         simulated,
         fitted=fitted,
@@ -311,7 +311,7 @@ def _place_sentences(places: Mapping[str, MarkerPlace]) -> Iterator[str]:
     moved = {
         n: place.displacement_m or 0.0
         for n, place in places.items()
-        if place.prior_m and place.given
+        if place.prior_m and place.is_declared
     }
     if moved:
         worst = max(moved, key=moved.__getitem__)
@@ -320,7 +320,7 @@ def _place_sentences(places: Mapping[str, MarkerPlace]) -> Iterator[str]:
             f"{short(1e3 * moved[worst])} mm ({worst}; prior "
             f"±{short(1e3 * places[worst].prior_m)} mm)"
         )
-    if unknown := [place for place in places.values() if not place.given]:
+    if unknown := [place for place in places.values() if not place.is_declared]:
         count = f"{len(unknown)} marker" + ("s" if len(unknown) > 1 else "")
         errors = [float(p.std_error_m.max()) for p in unknown if p.std_error_m is not None]
         known = (
@@ -341,9 +341,9 @@ def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Itera
             continue
         groups = [[k] for k in here]
         if row.by == "length":
-            numbers = dict.fromkeys(nuisance.entries[k].number for k in here)
+            entry_numbers = dict.fromkeys(nuisance.entries[k].number for k in here)
             vectors = [
-                nuisance.indices_of_rows(row, component=number).tolist() for number in numbers
+                nuisance.indices_of_rows(row, component=number).tolist() for number in entry_numbers
             ]
             # Several markers have one each: the longest counts.
             groups = [max(vectors, key=lambda own: float(np.linalg.norm(values[own])))]
@@ -380,7 +380,7 @@ def _nuisance_sentence(
     size = float(np.linalg.norm(values))
     error = entry.sigma * known.get(name, np.nan)
     allowed = low + 1e-3 < part.phi[k] < high - 1e-3
-    sentence = (entry.row.told or "{which} {signed}").format(
+    sentence = (entry.row.sentence or "{which} {signed}").format(
         size=f"{short(factor * size)}{unit}",
         signed=f"{short(factor * float(values[0]))}{unit}",
         number=short(factor * size),
@@ -389,6 +389,8 @@ def _nuisance_sentence(
         way="later" if values[0] > 0 else "earlier",
         which=entry.label.rpartition(" [")[0],
         limit="" if allowed else ", the largest value allowed",
-        stated=f"{nuisance.timed_loads[entry.number].stated_s:g} s" if entry.row == JOINING else "",
+        stated=f"{nuisance.timed_loads[entry.number].declared_s:g} s"
+        if entry.row == JOINING
+        else "",
     )
     return f"{sentence} (prior ±{short(factor * entry.sigma)}{unit})"

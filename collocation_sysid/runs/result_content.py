@@ -146,7 +146,7 @@ class FieldResult:
     shapes : FieldResolution
     range : (least, most)
         Range of its values in the elements.
-    share_told : float or None
+    determined_share : float or None
         Share of the volume where the interval is less than half as wide as the prior's; None
         without intervals.
     identified : int or None
@@ -159,7 +159,7 @@ class FieldResult:
 
     shapes: FieldResolution
     range: tuple[float, float]
-    share_told: float | None
+    determined_share: float | None
     identified: int | None
     likelier: Mapping[str, float]
     phases: PhaseSummary | None = None
@@ -168,7 +168,7 @@ class FieldResult:
         """Return a one-line summary of the field; `name` is the name of its constant."""
         least, most = self.range
         sentence = f"{symbol_of(name)} from {least:.3g} to {most:.3g} {unit_of(name)}".strip()
-        if self.identified is None or self.share_told is None:
+        if self.identified is None or self.determined_share is None:
             return sentence
         if self.phases is not None:
             lower, contrast, upper = self.phases.contrast
@@ -176,11 +176,11 @@ class FieldResult:
             return (
                 f"{sentence}: two phases, contrast {contrast:.3g} ({lower:.3g} to {upper:.3g}), "
                 f"inclusion {1e6 * volume_m3:.3g} cm³ ({1e6 * least_m3:.3g} to "
-                f"{1e6 * most_m3:.3g}); the phase is determined in {self.share_told:.0%} of the "
-                "volume"
+                f"{1e6 * most_m3:.3g}); the phase is determined in {self.determined_share:.0%} of "
+                "the volume"
             )
         shapes = f"{self.identified} of the {self.shapes.modes} shapes of its field"
-        share = f"halve the prior uncertainty in {self.share_told:.0%} of the volume"
+        share = f"halve the prior uncertainty in {self.determined_share:.0%} of the volume"
         details = [f"resolved details: above {short(1e3 * self.shapes.detail_m)} mm"]
         if len(self.likelier) > 1:
             each = ", ".join(f"{length} m {gain:+.1f}" for length, gain in self.likelier.items())
@@ -298,7 +298,7 @@ class FittedExperiment:
     samples, missing : int
         Numbers of marker samples that are present, and that are missing.
     static : bool
-    beside : tuple of str
+    notes : tuple of str
         Sentences on the nuisance parameters of this recording.
     wrench_rms_n, wrench_rms_nm, reading_rms
         RMS differences of forces, torques and custom sensors; None if not measured.
@@ -318,7 +318,7 @@ class FittedExperiment:
     samples: int
     missing: int
     static: bool
-    beside: tuple[str, ...]
+    notes: tuple[str, ...]
     wrench_rms_n: float | None = optional()
     wrench_rms_nm: float | None = optional()
     reading_rms: Mapping[str, float] | None = optional()

@@ -24,7 +24,7 @@ Solve = Callable[[Method, Collocation], Solution]
 
 
 @dataclass(frozen=True, eq=False)
-class FollowedStart:
+class CompletedStart:
     """Start of a search after several starts of a scan were followed to convergence.
 
     Attributes
@@ -59,15 +59,17 @@ def robust_loss(solution: Solution) -> float:
     collocation = solution.collocation
     p, _ = collocation.unpack(solution.z)
     prior, _ = collocation.prior_residuals(p)
-    far_loss = sum(
-        reading.loss_of_far_points for part in solution.parts for reading, _ in part.depth_residuals
+    loss_of_distant_points = sum(
+        reading.loss_of_distant_points
+        for part in solution.parts
+        for reading, _ in part.depth_residuals
     )
-    return sum(part.loss for part in solution.parts) + float(prior @ prior) + far_loss
+    return sum(part.loss for part in solution.parts) + float(prior @ prior) + loss_of_distant_points
 
 
 def follow_starts(
     solver: Method, collocation: Collocation, scan: Scan, watch: Watch | None, solve: Solve
-) -> FollowedStart:
+) -> CompletedStart:
     """Follow the starts of a scan to convergence and return the one with the lowest loss.
 
     Parameters
@@ -83,7 +85,7 @@ def follow_starts(
     solve : callable
         ``solve(method, collocation)``, with renewed correspondences.
     """
-    first = FollowedStart(collocation, scan, None, "")
+    first = CompletedStart(collocation, scan, None, "")
     if not scan.others or not has_local_minima(collocation):
         return first
     own = getattr(solver, "name", getattr(getattr(solver, "func", None), "name", ""))
@@ -111,4 +113,4 @@ def follow_starts(
         note += ": there are local minima; the lowest one is reported"
     chosen = replace(scan, best=best, parameters=scan.starts[best])
     started = replace(collocation, parameters=scan.starts[best])
-    return FollowedStart(started, chosen, solution if is_own else None, note)
+    return CompletedStart(started, chosen, solution if is_own else None, note)

@@ -133,27 +133,27 @@ def _solve_once(
     """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier
     solution.
     """
-    earlier = WarmStart.read(start) if isinstance(start, (str, Path)) else start
-    problem = problem if earlier is None else earlier.apply_to_problem(problem)
+    warm_start = WarmStart.read(start) if isinstance(start, (str, Path)) else start
+    problem = problem if warm_start is None else warm_start.apply_to_problem(problem)
     try:
-        needs_whole_start = getattr(solver, "needs_whole_start", False)
+        needs_complete_start = getattr(solver, "needs_complete_start", False)
         collocation = problem.collocation()
         started_from: list[str] = []
         for experiment in collocation.experiments:
             require_depth_units(experiment)
-        if earlier is not None and problem.substeps == "auto":
-            collocation = replace(collocation, substeps=earlier.substeps)
+        if warm_start is not None and problem.substeps == "auto":
+            collocation = replace(collocation, substeps=warm_start.substeps)
         has_guesses = not collocation.parameters.names_without_guess
         if has_guesses:
             require_memory(problem, collocation, solver)
-        collocation, scan = start_problem(collocation, needs_whole_start)
+        collocation, scan = start_problem(collocation, needs_complete_start)
         if not has_guesses:  # the estimate evaluates the program at a guess
             require_memory(problem, collocation, solver)
         collocation = associated_at_guess(collocation)
         variables = None
-        if earlier is not None and not scan:
-            collocation = earlier.apply_to_places(collocation)
-            variables = earlier.simulated_variables(collocation)
+        if warm_start is not None and not scan:
+            collocation = warm_start.apply_to_places(collocation)
+            variables = warm_start.simulated_variables(collocation)
         solver = with_workers(solver, workers)
         solution = None
         if scan is not None:
@@ -172,7 +172,11 @@ def _solve_once(
             solution = solve_with_renewed_correspondences(solver, collocation, watch, variables)
         if scan is None and solution.status in FAILED_STATUSES:
             scan, solution = _solve_from_scan(solver, solution, watch)
-        if solution.status.converged and earlier is None and solution.method == ReducedSpace.name:
+        if (
+            solution.status.converged
+            and warm_start is None
+            and solution.method == ReducedSpace.name
+        ):
             solution = _best_of_second_start(solver, solution, watch)
     except InputError as error:
         raise error.located(problem.path) from error
@@ -189,10 +193,10 @@ def _depth_notes(solution: Solution) -> Iterator[str]:
     camera.
     """
     for part in solution.parts:
-        for reading, looked in part.depth_residuals:
-            distance_m = reading.signed_distances_m(looked, part.phi)
+        for reading, observation in part.depth_residuals:
+            distance_m = reading.signed_distances_m(observation, part.phi)
             sighting = reading.correspondences
-            left_out = ", ".join(
+            excluded = ", ".join(
                 f"{count} {why}" for why, count in sighting.excluded_counts.items() if count
             )
             distances = "are compared, because none is near enough to the body"
@@ -204,15 +208,15 @@ def _depth_notes(solution: Solution) -> Iterator[str]:
             yield (
                 f"experiment '{part.segment.experiment.name}': {sighting.is_compared.sum()} "
                 f"points of '{sighting.camera.depth.name}' {distances}; excluded: "
-                f"{left_out or 'none'}"
+                f"{excluded or 'none'}"
             )
-        for outline, apart_px in part.outline_distances_px:
-            if len(apart_px):
+        for outline, distance_px in part.outline_distances_px:
+            if len(distance_px):
                 yield (
-                    f"experiment '{part.segment.experiment.name}': {len(apart_px)} points of the "
-                    "model's outline deviate from the edges in "
+                    f"experiment '{part.segment.experiment.name}': {len(distance_px)} points of "
+                    "the model's outline deviate from the edges in "
                     f"'{outline.correspondences.camera.depth.name}' by "
-                    f"{np.sqrt(np.mean(apart_px**2)):.2g} pixels (RMS)"
+                    f"{np.sqrt(np.mean(distance_px**2)):.2g} pixels (RMS)"
                 )
 
 
@@ -238,8 +242,8 @@ def _solve_from_scan(
         The new solution, or the failed one.
     """
     reason = f"the search from the guess failed ({failed.status.value})"
-    needs_whole_start = getattr(solver, "needs_whole_start", False)
-    scan = rescue(failed.collocation, reason, needs_whole_start)
+    needs_complete_start = getattr(solver, "needs_complete_start", False)
+    scan = rescue(failed.collocation, reason, needs_complete_start)
     if scan is None:
         return None, failed
     again = associated_at_guess(replace(failed.collocation, parameters=scan.parameters))

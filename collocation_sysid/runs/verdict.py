@@ -196,7 +196,7 @@ def _unseen_depth_concerns(name: str, rollout: ForwardSimulation | str) -> Itera
     """Yield a concern for each depth camera without a point near the simulated surface."""
     for camera, error in rollout.depth.items() if isinstance(rollout, ForwardSimulation) else ():
         if not error.points:
-            data = {"experiment": name, "camera": camera, "seen": error.seen}
+            data = {"experiment": name, "camera": camera, "seen": error.compared_points}
             yield Concern("prediction/unseen", "doubtful", data)
 
 
@@ -245,10 +245,10 @@ def depth_errors(solution: Solution) -> dict[tuple[str, str], DepthError]:
     """Distances of depth cameras' points from the fitted surface, by (experiment, camera)."""
     return {
         (part.segment.experiment.name, reading.correspondences.camera.depth.name): (
-            SurfaceComparison.from_fit(reading, part.x, looked, part.phi).error
+            SurfaceComparison.from_fit(reading, part.x, observation, part.phi).error
         )
         for part in solution.parts
-        for reading, looked in part.depth_residuals
+        for reading, observation in part.depth_residuals
     }
 
 

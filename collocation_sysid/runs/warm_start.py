@@ -81,8 +81,10 @@ class WarmStart:
         }
         points = np.array([place for named in places_m.values() for place in named.values()])
         with damage_refused(folder, RESULT_FILE, "solve that problem again"):
-            numbers = np.array([*values.values(), *nuisance.values(), *points.reshape(-1, 3).flat])
-            if not np.isfinite(numbers).all():
+            all_values = np.array(
+                [*values.values(), *nuisance.values(), *points.reshape(-1, 3).flat]
+            )
+            if not np.isfinite(all_values).all():
                 raise ValueError("a value that is not finite")
         return cls(folder, values, nuisance, places_m, result.problem.substeps)
 

@@ -59,15 +59,15 @@ PREDICTION = 3.0
 # The same for "doubtful".
 GROSS_PREDICTION = 10.0
 # Nuisance parameters in standard deviations of their priors: "check".
-FAR = 3.0
+LARGEST_OFFSET = 3.0
 # The same for "doubtful".
 ABSURD = 6.0
 # Pose of a depth camera in standard deviations of its prior: "check", because it compensates wrong
 # shapes.
-CAMERA_FAR = 2.0
+LARGEST_CAMERA_OFFSET = 2.0
 # Distance of outline points from the edge [pixels] that needs an explanation: edges of pixels
 # scatter by 0.3, lenses and wrong depths at edges by one.
-OUTLINE_FAR_PX = 3.0
+LARGEST_OUTLINE_DISTANCE_PX = 3.0
 # Share of outline points that may be farther.
 OUTLINE_SHARE = 0.1
 # Time shift in standard deviations of its prior: "check".
@@ -167,7 +167,7 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     no_noise = persistent or shared or not np.isfinite(dependence.lag1_deviation)
     # Residuals of exactly zero are those of no measurement at all.
     smaller = not larger and 0 < factor < 1 / MISFIT and level.smaller_p < RARE and not is_used
-    stated = level.sigma_key
+    sigma_key = level.sigma_key
     return [
         *(outlier.concern for outlier in uncertainty.outliers),
         *concern_if(
@@ -178,9 +178,13 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
         ),
         *concern_if(is_used and not persistent, False, "residuals/shared"),
         *concern_if(
-            larger, factor > GROSS_MISFIT and no_noise, "noise/larger", factor=factor, stated=stated
+            larger,
+            factor > GROSS_MISFIT and no_noise,
+            "noise/larger",
+            factor=factor,
+            stated=sigma_key,
         ),
-        *concern_if(smaller, False, "noise/smaller", factor=1 / (factor or 1.0), stated=stated),
+        *concern_if(smaller, False, "noise/smaller", factor=1 / (factor or 1.0), stated=sigma_key),
         *_noisy_marker_concerns(level),
         *_disagreement_concerns(uncertainty),
     ]
@@ -331,7 +335,11 @@ def nuisance_concerns(
         Limits of the estimates, likewise.
     """
     items = [*zip(names, deviations, low, high, strict=True)]
-    limit = max(FAR, float(normal_isf(RARE / 2 / max(1, len(items))))) if items else FAR
+    limit = (
+        max(LARGEST_OFFSET, float(normal_isf(RARE / 2 / max(1, len(items)))))
+        if items
+        else LARGEST_OFFSET
+    )
     concerns: list[Concern] = []
     for name, phi, lowest, highest in items:
         deviation = abs(float(phi))
@@ -364,7 +372,11 @@ def camera_pose_concerns(names: Sequence[str], deviations: Sequence[float]) -> l
     worst = int(np.argmax(np.abs(deviations)))
     deviation = abs(float(deviations[worst]))
     return concern_if(
-        deviation > CAMERA_FAR, False, "nuisance/camera", name=names[worst], deviations=deviation
+        deviation > LARGEST_CAMERA_OFFSET,
+        False,
+        "nuisance/camera",
+        name=names[worst],
+        deviations=deviation,
     )
 
 
@@ -378,13 +390,17 @@ def outline_concerns(camera: str, distances_px: Array) -> list[Concern]:
     distances_px : (n,) array
         Distances of outline points from the edges in the images [pixels].
     """
-    share = float(np.mean(np.abs(distances_px) > OUTLINE_FAR_PX)) if len(distances_px) else 0.0
+    share = (
+        float(np.mean(np.abs(distances_px) > LARGEST_OUTLINE_DISTANCE_PX))
+        if len(distances_px)
+        else 0.0
+    )
     return concern_if(
         share > OUTLINE_SHARE,
         False,
         "residuals/outline",
         camera=camera,
-        pixels=OUTLINE_FAR_PX,
+        pixels=LARGEST_OUTLINE_DISTANCE_PX,
         percent=100 * share,
     )
 
@@ -519,12 +535,12 @@ def contact_concerns(summaries: Iterable[ContactSummary], guess: str = "") -> li
     for each in sorted(summaries, key=lambda touch: touch.face_count):
         data = {"experiment": each.experiment, "obstacle": each.obstacle, "guess": guess}
         coarse = 0 < each.face_count < FEWEST_FACES
-        numbers = {"faces": each.face_count, "face_mm": each.face_mm}
+        sizes = {"faces": each.face_count, "face_mm": each.face_mm}
         for one in (
             *concern_if(
                 not each.face_count, not guess, "contact/never", mm=1e3 * each.gap_m, **data
             ),
-            *concern_if(coarse, False, "contact/coarse", **numbers, **data),
+            *concern_if(coarse, False, "contact/coarse", **sizes, **data),
             *concern_if(
                 bool(guess) and each.is_initially_in_contact, False, "contact/pressed", **data
             ),
@@ -553,8 +569,8 @@ def rotation_step_concerns(
     grid.
     """
     turn = fastest_rotation(experiment, substeps)
-    numbers = {"step_ms": 1e3 * turn.step_s, "rate_rad_s": turn.rate_rad_s}
-    return concern_if(turn.angle_rad > limit_rad, False, code, **vars(turn), **numbers)
+    sizes = {"step_ms": 1e3 * turn.step_s, "rate_rad_s": turn.rate_rad_s}
+    return concern_if(turn.angle_rad > limit_rad, False, code, **vars(turn), **sizes)
 
 
 def scheme_concerns(

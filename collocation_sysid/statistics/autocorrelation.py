@@ -148,10 +148,10 @@ def lagged_products(
                 within[k] += slope[:, channel].T @ each
         for k in range(last + 1):
             twice = 1 if k == 0 else 2
-            ahead = slice(k, None)
+            lagged_rows = slice(k, None)
             behind = slice(None, len(residual) - k)
-            products.append(twice * np.sum(residual[ahead] * residual[behind]))
-            diagonal_counts.append(twice * np.sum(present[ahead] & present[behind]))
+            products.append(twice * np.sum(residual[lagged_rows] * residual[behind]))
+            diagonal_counts.append(twice * np.sum(present[lagged_rows] & present[behind]))
         shifted.append(within)
         overlaps.append(overlap)
     shifted = np.concatenate(shifted)
@@ -417,7 +417,7 @@ def _error_process(block: ResidualBlock, slope: Array, autocovariance: Array) ->
     if not autocovariance[0] > 0:  # the fit leaves too little to be corrected
         autocovariance = np.array([raw_variance])
     coefficients = _autoregression_of(block, autocovariance)
-    along = process_autocorrelation(coefficients, len(residual))
+    correlation = process_autocorrelation(coefficients, len(residual))
     innovation, known = _innovations(residual, present, coefficients)
     channels = _channel_covariance(innovation, known)
     weight = present.sum(axis=0)
@@ -434,17 +434,17 @@ def _error_process(block: ResidualBlock, slope: Array, autocovariance: Array) ->
             covariance = np.eye(len(covariance))
             freedom = np.inf
         return ErrorProcess(
-            autocorrelation=along,
+            autocorrelation=correlation,
             channel_covariance=covariance,
             order=len(coefficients),
             samples=np.inf,
             degrees_of_freedom=freedom,
         )
     fitted = float(np.sum(slope**2))
-    memory = 1 + 2 * float(np.sum(along[1:] ** 2))
+    memory = 1 + 2 * float(np.sum(correlation[1:] ** 2))
     independent = _mean_sample_count(present) * _effective_channels(channels)
     return ErrorProcess(
-        autocorrelation=along,
+        autocorrelation=correlation,
         channel_covariance=channels,
         order=len(coefficients),
         samples=max(1.0, (known.sum() - fitted) / max(1, measured.sum())),

@@ -29,7 +29,7 @@ HARDLY = 0.1
 # Share from which on it is well visible.
 WELL = 0.5
 # Descriptions whose share is smaller than the best by less than this are not distinguishable.
-ALIKE = 0.1
+EQUIVALENT_MISFIT = 0.1
 # The axes of a camera in frames of other conventions: right, down and ahead in columns.
 FRAMES = {
     "x to the right, y up, z backwards": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
@@ -130,11 +130,11 @@ def require_depth_units(experiment: Experiment) -> None:
     """
     for depth in experiment.depths:
         view = _CameraTrial(experiment, depth)
-        if view.visible_share(view.stated) >= HARDLY:
+        if view.visible_share(view.declared) >= HARDLY:
             continue
         factors = [10.0**k for k in range(-LARGEST_POWER, LARGEST_POWER + 1) if k]
         shares = {
-            factor: view.visible_share(_with_factor(view.stated, factor)) for factor in factors
+            factor: view.visible_share(_with_factor(view.declared, factor)) for factor in factors
         }
         factor = max(factors, key=lambda each: shares[each])
         if shares[factor] < (HARDLY if view.collapsed else WELL):
@@ -154,7 +154,7 @@ def camera_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     """Yield hypotheses for depth cameras that see hardly anything of the body."""
     for depth in experiment.depths:
         view = _CameraTrial(experiment, depth)
-        here = view.visible_share(view.stated)
+        here = view.visible_share(view.declared)
         if here >= HARDLY:
             continue
         data = {"percent": 100 * here, "within_mm": 1e3 * view.within_m}
@@ -173,7 +173,7 @@ class _CameraTrial:
 
     Attributes
     ----------
-    stated : CameraDescription
+    declared : CameraDescription
         Description as stated.
     within_m : float
         Points within this distance of the undeformed body may belong to it [m].
@@ -183,7 +183,7 @@ class _CameraTrial:
         Whether too few points are left to be near much of the body.
     """
 
-    stated: CameraDescription
+    declared: CameraDescription
     within_m: float
     points_m: float
     body_m: float
@@ -207,7 +207,7 @@ class _CameraTrial:
             )
             carrier[:3, :3] = rotations[0]
             carrier[:3, 3] = translations[0]
-        self.stated = CameraDescription(carrier, camera.pose)
+        self.declared = CameraDescription(carrier, camera.pose)
         self.within_m = initial_gate_m(self.shape_m)
         eye_m = (carrier @ camera.pose)[:3, 3]
         self.points_m = float(np.median(np.linalg.norm(points_m, axis=1)))
@@ -223,7 +223,7 @@ class _CameraTrial:
         is_facing = self.skin.is_facing(self.shape_m, eye_m if self.pinhole else None)
         if not is_facing.any():
             return 0.0
-        middles_m = self.shape_m[self.skin.flat_triangles[is_facing]].mean(axis=1)
+        middles_m = self.shape_m[self.skin.plane_triangles[is_facing]].mean(axis=1)
         in_camera = (middles_m - eye_m) @ turn / seeing.factor
         nearest, _ = self.tree.query(in_camera, distance_upper_bound=self.within_m / seeing.factor)
         return float(np.isfinite(nearest).mean())
@@ -242,7 +242,7 @@ class _CameraTrial:
                 for kinds in combinations((*MISTAKES, *alone), count)
                 for names in product(*kinds)
             }
-            least = max(WELL, max(shares.values()) - ALIKE)
+            least = max(WELL, max(shares.values()) - EQUIVALENT_MISFIT)
             if well := [names for names in shares if shares[names] >= least]:
                 return sorted(well, key=lambda names: -shares[names])
         return []
@@ -250,4 +250,4 @@ class _CameraTrial:
     def _corrected(self, mistakes: tuple[str, ...]) -> CameraDescription:
         """Return the stated description with some mistakes corrected."""
         undo = dict(chain.from_iterable(kind.items() for kind in (*MISTAKES, POWERS)))
-        return reduce(lambda seeing, name: undo[name](seeing), mistakes, self.stated)
+        return reduce(lambda seeing, name: undo[name](seeing), mistakes, self.declared)

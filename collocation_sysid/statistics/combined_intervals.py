@@ -113,13 +113,13 @@ def combine(
         low, high = map(at.from_value, error.interval95)
         low = low + known_effect
         high = high + known_effect
-    low, high = widened((low, high), centre, systematic)
+    low, high = widened_interval((low, high), centre, systematic)
     combined95 = _interval(at, low, high, bounds)
     deviation = (high - low) / 2 / NORMAL_95 / at.derivative(at.to_value(centre))
     return CombinedEstimate(value, spread, statistical95, deviation, combined95, correction)
 
 
-def widened(ends: Interval, centre: float, deviation: float) -> Interval:
+def widened_interval(ends: Interval, centre: float, deviation: float) -> Interval:
     """Return a 95 % interval with one more independent contribution, added in quadrature.
 
     Parameters

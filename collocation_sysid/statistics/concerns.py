@@ -93,7 +93,7 @@ TOPICS: Mapping[str, Topic] = {
             "grasp-layer": "the fit is better if the grasp holds one layer of nodes {deep}: "
             "compare the box of grasp.nodes with the ends of the fingers",
             "grasp": "the box of the grasp of '{experiment}' selects {nodes} nodes, but "
-            "{nearly_held} more if it is enlarged by a tenth of an element's edge, or "
+            "{nearly_grasped} more if it is enlarged by a tenth of an element's edge, or "
             "{nearly_free} fewer if it is reduced by as much, and the estimated stiffness "
             "depends on them; move the faces of the box grasp.nodes midway between layers of "
             "nodes, or mesh the body with a layer of nodes where the fingers end",
@@ -430,9 +430,11 @@ def message_of(code: str, data: Mapping[str, Any]) -> str:
     """
     topic, _, rest = code.partition("/")
     shown = {k: listed(v) if isinstance(v, (list, tuple)) else v for k, v in data.items()}
-    said = TOPICS[topic].messages[rest].format(**shown)
-    nearer = f" (the misfit becomes {data['nearer']:.2g} times smaller)" if "nearer" in data else ""
-    return f"{data['of']}: {said}{nearer}" if data.get("of") else said
+    message = TOPICS[topic].messages[rest].format(**shown)
+    distance_text = (
+        f" (the misfit becomes {data['nearer']:.2g} times smaller)" if "nearer" in data else ""
+    )
+    return f"{data['of']}: {message}{distance_text}" if data.get("of") else message
 
 
 @dataclass(frozen=True)

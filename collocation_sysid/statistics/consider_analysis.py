@@ -99,9 +99,9 @@ def changes_of_assumptions(
         tables; None for what is exact.
     """
     rows = [(row, deviations.get(row.name, row.sigma)) for row in ASSUMPTIONS]
-    stated = [(row, s) for row, s in rows if s is not None]
+    assumptions = [(row, s) for row, s in rows if s is not None]
     correlation = deviations.get(CORRELATION_KEY) or CORRELATION
-    of_bodies = changed_residuals(collocation, z, stated, surface_correlation=correlation)
+    of_bodies = changed_residuals(collocation, z, assumptions, surface_correlation=correlation)
     of_nuisances = changes_of_nuisances(collocation, z, deviations)
     both = zip(of_bodies.blocks, of_nuisances.blocks, strict=True)
     blocks = [np.concatenate(each, axis=3) for each in both]
@@ -115,13 +115,13 @@ def changes_of_nuisances(
     arguments as in `changes_of_assumptions`.
     """
 
-    def widened(experiment: Experiment) -> Experiment:
+    def with_added_nuisances(experiment: Experiment) -> Experiment:
         nuisance = experiment.nuisance
         sigmas = {row: deviations.get(row.name, row.considered) for row in KINDS}
         more = {r.name: s for r, s in sigmas.items() if s and nuisance.sigma(r) is None}
         return replace(experiment, nuisance=replace(nuisance, **more))
 
-    wider = [widened(experiment) for experiment in collocation.experiments]
+    wider = [with_added_nuisances(experiment) for experiment in collocation.experiments]
     wide = replace(collocation, experiments=wider, huber=UNWEIGHTED)  # whatever their weights
     p, positions = collocation.unpack(z)
     values = dict(zip(collocation.parameter_names, p.tolist(), strict=True))
@@ -209,10 +209,10 @@ def _changes_by_effects(
         forces_n=forces,
         rows_n=rows,
     )
-    for reading, _, looked, by in propagate_columns(
+    for reading, _, observation, by in propagate_columns(
         part, solver, columns, rows[:, segment.sensed_dofs]
     ):
-        yield reading.residual_changes(looked, by, part.phi)
+        yield reading.residual_changes(observation, by, part.phi)
 
 
 def propagate_columns(
@@ -242,12 +242,12 @@ def propagate_columns(
     response = iterate.observation.response_of_rows(
         ForwardSubstitution(solver, columns, grasp_forces=sensed).iterate_rows(x), sensed
     )
-    numbers = np.arange(columns.count)
+    columns_numbered = np.arange(columns.count)
     size = columns.count + len(phi)
     motions = iterate.observation.linearised_motions(x, response, is_by_parameters=False)
     for reading, motion in zip(segment.residuals, motions, strict=True):
         motion = _without_row_changes(motion, inertia_n)
-        values, slopes = reading.observable.linearise(motion, phi, numbers, size)
+        values, slopes = reading.observable.linearise(motion, phi, columns_numbered, size)
         yield reading, motion, values, slopes.by_common[..., : columns.count]
 
 

@@ -49,37 +49,35 @@ STEPS = 4
 SETTLED = 0.02
 
 
-def routine_probes_with_steps(answered: SolvedFit) -> tuple[Probe, ...]:
+def routine_probes_with_steps(fit: SolvedFit) -> tuple[Probe, ...]:
     """Relax the routine assumptions by one linear step, and iterate the one that gives concern.
 
     A linear step suffices to find that an assumption is wrong, but not for estimates that change by
     much of their value. The most significant assumption that gives concern therefore takes a few
     further steps, each with a simulation.
     """
-    probes_found = routine_probes(answered)
-    alarming = [probe for probe in probes_found if is_alarming(probe)]
+    probes = routine_probes(fit)
+    alarming = [probe for probe in probes if is_alarming(probe)]
     if not alarming:
-        return probes_found
+        return probes
     worst = max(alarming, key=lambda probe: probe.chi_squared)
-    followed = replace(
-        _iterate_probe(answered, worst, significance_limit(answered.changes)), routine=True
-    )
-    return tuple(followed if probe is worst else probe for probe in probes_found)
+    with_steps = replace(_iterate_probe(fit, worst, significance_limit(fit.changes)), routine=True)
+    return tuple(with_steps if probe is worst else probe for probe in probes)
 
 
-def deep_probes(answered: SolvedFit) -> tuple[Probe, ...]:
+def deep_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
     """Refit windows of time, recordings where there are several, and with assumptions relaxed.
 
     Routine assumptions have the same prior and level of significance as in `routine_probes`.
     """
-    parts = [*_window_probes(answered), *_recording_probes(answered)]
-    relaxed = [*_relaxed_probes(answered)]
+    parts = [*_window_probes(solved_fit), *_recording_probes(solved_fit)]
+    relaxed = [*_relaxed_probes(solved_fit)]
     tests = sum(len(probe.moves) for probe in parts) + len(relaxed)
     limit = float(normal_isf(CHANCE / 2 / max(1, tests)))
-    limits = dict.fromkeys(ROUTINE, significance_limit(answered.changes))
+    limits = dict.fromkeys(ROUTINE, significance_limit(solved_fit.changes))
     return (
         *(_with_significant_moves(each, limit) for each in parts),
-        *(_iterate_probe(answered, probe, limits.get(probe.name, limit)) for probe in relaxed),
+        *(_iterate_probe(solved_fit, probe, limits.get(probe.name, limit)) for probe in relaxed),
     )
 
 
@@ -136,7 +134,7 @@ def _with_significant_moves(probe: Probe, limit: float) -> Probe:
     significant = (
         n for n, move in probe.moves.items() if abs(move.change) > limit * move.std_error
     )
-    return replace(probe, told=tuple(significant))
+    return replace(probe, sentences=tuple(significant))
 
 
 # Freed assumptions --------------------------------------------------------------------------------
@@ -167,8 +165,8 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
         return probe
     first = len(at.fit.names)
     collocation = at.collocation
-    kept_names = assumption_name(probe.name), CORRELATION_KEY
-    alone = {name: size if name in kept_names else None for name, size in at.deviations.items()}
+    accepted_names = assumption_name(probe.name), CORRELATION_KEY
+    alone = {name: size if name in accepted_names else None for name, size in at.deviations.items()}
     wide = with_relaxed_assumption(at.fit, at.changes, probe.name, _widening(probe.name))
     p = at.parameters
     _, positions = collocation.unpack(at.z)
@@ -187,7 +185,7 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
         probe = relaxed_probe(at, probe.name, wide, p)
         if np.abs(step[: wide.shared_count]).max(initial=0.0) < SETTLED:
             break
-    return replace(probe, told=(probe.name,) if probe.is_beyond(limit) else ())
+    return replace(probe, sentences=(probe.name,) if probe.is_beyond(limit) else ())
 
 
 def _widening(name: str) -> float:

@@ -305,7 +305,7 @@ def discretisation_errors(
     return errors
 
 
-def change_towards_observations(fit: LinearisedFit, residual_changes: Sequence[Array]) -> Array:
+def change_in_observations(fit: LinearisedFit, residual_changes: Sequence[Array]) -> Array:
     """Return the change (p,) of the parameters if the predictions change by given residuals.
 
     Parameters

@@ -277,11 +277,11 @@ def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -
         name = item.name
         estimate = estimates[item.name]
         if estimate.at_bound:
-            nearer = min(
+            nearest = min(
                 ("lower", "upper"), key=lambda side: abs(getattr(item, side) - estimate.value)
             )
             notes.append(
-                f"{name} ended at its {nearer} bound {getattr(item, nearer):g}: it has no "
+                f"{name} ended at its {nearest} bound {getattr(item, nearest):g}: it has no "
                 "error bar, and the error bars of the others include its uncertainty; widen "
                 "the bound, or fix it if it is known"
             )
@@ -368,31 +368,31 @@ def noise_notes(requested: str, kind: Noise, level: NoiseLevel, errors: str) -> 
     if requested == "estimated" or level.suggested_noise == "given":
         return []
     factor = float(np.sqrt(level.pooled))
-    stated = level.sigma_key
+    sigma_key = level.sigma_key
     low, high = (pick(level.factors, key=level.factors.__getitem__) for pick in (min, max))
     if level.is_unequal and level.factors[high] > NOTEWORTHY**2 * level.factors[low]:
         least = f"{level.factors[low]:.2g} ({low})"
         most = f"{level.factors[high]:.2g} ({high})"
-        size = f"between {least} and {most} times as large as expected from {stated}"
+        size = f"between {least} and {most} times as large as expected from {sigma_key}"
     elif factor > NOTEWORTHY:
-        size = f"{factor:.2g} times as large as expected from {stated}"
+        size = f"{factor:.2g} times as large as expected from {sigma_key}"
     elif factor < 1 / NOTEWORTHY:
         size = (
-            f"only {factor:.2g} times as large as expected from {stated}, which seems "
+            f"only {factor:.2g} times as large as expected from {sigma_key}, which seems "
             f"{1 / factor:.2g} "
         )
         size += "times too large"
     else:
         return []
     if kind != "given" or (factor > 1 and errors == "autocorrelated"):
-        so = f"the error bars are computed from the residuals. Check {stated} and the model"
+        so = f"the error bars are computed from the residuals. Check {sigma_key} and the model"
     elif factor > 1:
         so = "the error bars are too small by about that much; check "
-        so += f"{stated} and the model, or use noise = 'auto'"
+        so += f"{sigma_key} and the model, or use noise = 'auto'"
     elif requested == "given":
-        so = f"the error bars are computed from {stated}, as requested"
+        so = f"the error bars are computed from {sigma_key}, as requested"
     else:
-        so = f"the residuals are not independent, so the error bars are computed from {stated}"
+        so = f"the residuals are not independent, so the error bars are computed from {sigma_key}"
     return [f"the residuals are {size}; {so}"]
 
 

@@ -37,7 +37,7 @@ from .linearised import factorise_information, linearise_fit
 from .uncertainty import Uncertainty
 
 # The data determine an element if its interval is less than this share of the prior's.
-TOLD = 0.5
+LEAST_DETERMINED_SHARE = 0.5
 # Log-evidence from which on another amplitude or length is reported.
 LIKELIER = 3.0
 # Variance over that of the prior above which error bars contain model error, and no evidence is
@@ -102,7 +102,7 @@ class FieldEstimate:
         Mode coefficients a.
     covariance : (m, m) array
         Their covariance.
-    stated_density_kg_m3 : float or None
+    declared_density_kg_m3 : float or None
         Stated density that the deviation refers to [kg/m³]; None for other constants.
     sampled_intervals : (lower, upper) or None
         Ends (k,) of the 95 % intervals from samples; None if they follow from the deviation.
@@ -118,7 +118,7 @@ class FieldEstimate:
     quantile: float
     coefficients: Array
     covariance: Array
-    stated_density_kg_m3: float | None = None
+    declared_density_kg_m3: float | None = None
     sampled_intervals: tuple[Array, Array] | None = None
     phases: PhaseSummary | None = None
 
@@ -127,8 +127,8 @@ class FieldEstimate:
         """Lower and upper ends (k,) of the 95 % intervals."""
         if self.sampled_intervals is not None:
             return self.sampled_intervals
-        if self.stated_density_kg_m3 is not None:
-            half_width = self.quantile * self.deviation * self.stated_density_kg_m3
+        if self.declared_density_kg_m3 is not None:
+            half_width = self.quantile * self.deviation * self.declared_density_kg_m3
             return self.value - half_width, self.value + half_width
         factor = np.exp(self.quantile * self.deviation)
         return self.value / factor, self.value * factor
@@ -142,7 +142,7 @@ class FieldEstimate:
     @property
     def is_informed(self) -> NDArray[np.bool_]:
         """Mask (k,) of the elements that the data determine better than the prior."""
-        return self.deviation_over_prior < TOLD
+        return self.deviation_over_prior < LEAST_DETERMINED_SHARE
 
     @property
     def identified_modes(self) -> int:
@@ -150,7 +150,7 @@ class FieldEstimate:
         the prior.
         """
         known = np.linalg.eigvalsh(np.nan_to_num(self.covariance, nan=1.0))
-        return int((known < TOLD).sum())
+        return int((known < LEAST_DETERMINED_SHARE).sum())
 
     @property
     def by_element(self) -> Array:
@@ -221,15 +221,15 @@ class FieldEstimate:
                 "stated": self.modes.length_m,
                 "likely": self.modes.length_m / 2,
             }
-        told = [
+        determined = [
             Concern(f"field/{what}", data={"name": self.name, **v})
             for what, v in contradicted.items()
         ]
         if below := int((self.value <= 0).sum()):
             counts = {"name": self.name, "below": below, "elements": len(self.value)}
             least = {"least": float(self.value.min()), "stated": amplitude}
-            told.insert(0, Concern("field/negative", "doubtful", counts | least))
-        return told
+            determined.insert(0, Concern("field/negative", "doubtful", counts | least))
+        return determined
 
 
 def field_estimates(
@@ -269,9 +269,9 @@ def field_estimates(
         coefficients = body.field_slices[number]
         mean, slopes = _mean_logarithm(constants, number, modes).evaluate_with_jacobian(q, NOTHING)
         local = mean[0] + modes.logarithms(theta[coefficients])
-        stated = None
+        declared = None
         if part.stress_field is None:
-            stated = part.density_kg_m3
+            declared = part.density_kg_m3
         gradient = slopes + modes.jacobian(theta[coefficients]) @ by_q[coefficients]
         # What is at a bound has no variance: it is taken for known.
         used = np.flatnonzero(gradient.any(axis=0) & ~np.isnan(np.diag(covariance)))
@@ -279,7 +279,7 @@ def field_estimates(
         variance = np.einsum("ei,ij,ej->e", own, covariance[np.ix_(used, used)], own)
         deviation = np.sqrt(variance + modes.omitted_deviation**2)
         free = [names.index(name) for name in [*body.constants][coefficients] if name in names]
-        values = np.exp(local) if stated is None else stated * local
+        values = np.exp(local) if declared is None else declared * local
         estimate = FieldEstimate(
             name=part.field_name,
             modes=modes,
@@ -289,7 +289,7 @@ def field_estimates(
             quantile=quantile,
             coefficients=theta[coefficients],
             covariance=covariance[np.ix_(free, free)],
-            stated_density_kg_m3=stated,
+            declared_density_kg_m3=declared,
         )
         if isinstance(modes, TwoPhaseModes):
             contrast = theta[coefficients.stop - 1]

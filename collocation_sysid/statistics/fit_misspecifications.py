@@ -20,7 +20,7 @@ from ..errors import InputError, SimulationError
 from ..methods.continuation import first_samples
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status
-from ..program.modal_prediction import StatedMotion
+from ..program.modal_prediction import DeclaredMotion
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp
 from ..recording.poses import PoseSequence
@@ -98,66 +98,66 @@ def _refit_hypotheses(
     solution: Solution, experiment: Experiment, budget: int | None
 ) -> list[Hypothesis]:
     """Return the hypotheses without which the experiment fits far better."""
-    given = first_samples(experiment, MOST_SAMPLES)
-    alone = _Refitter(solution, given, budget)
-    fitted_m = alone.fit(given)
+    first = first_samples(experiment, MOST_SAMPLES)
+    alone = _Refitter(solution, first, budget)
+    fitted_m = alone.fit(first)
     if fitted_m is None:
         return []
     trial = HypothesisTest(
-        _misfit(given, fitted_m),
+        _misfit(first, fitted_m),
         alone.misfit_after_refit,
         BETTER,
         smallest_misfit=1.0,
         noise_level=NOISE,
     )
     of = f"'{experiment.name}'"
-    lags = [] if given.is_static else _clock_hypotheses(alone, given, fitted_m, of)
-    comparison = ModalComparison.from_experiment(given, solution.parameters)
-    turned = [] if comparison is None else _gravity_hypotheses(given, comparison)
+    lags = [] if first.is_static else _clock_hypotheses(alone, first, fitted_m, of)
+    comparison = ModalComparison.from_experiment(first, solution.parameters)
+    turned = [] if comparison is None else _gravity_hypotheses(first, comparison)
     return [
         *trial.accepted(
             [
                 *lags,
-                *_slip_hypotheses(given, fitted_m, of),
+                *_slip_hypotheses(first, fitted_m, of),
                 *turned,
-                *_grasp_layer_hypotheses(given, of),
+                *_grasp_layer_hypotheses(first, of),
             ]
         )
     ]
 
 
-def _gravity_hypotheses(stated: Experiment, comparison: ModalComparison) -> Iterator[Hypothesis]:
+def _gravity_hypotheses(declared: Experiment, comparison: ModalComparison) -> Iterator[Hypothesis]:
     """Yield the direction of gravity that suits the natural modes best, as a hypothesis."""
-    others = gravity_hypotheses(comparison.stated)
+    others = gravity_hypotheses(comparison.declared)
     nearest = min(others, key=lambda each: comparison.misfit_m(each.corrected), default=None)
     if nearest is not None:
         gravity_m_s2 = nearest.corrected.gravity_m_s2
-        yield replace(nearest, corrected=replace(stated, gravity_m_s2=gravity_m_s2))
+        yield replace(nearest, corrected=replace(declared, gravity_m_s2=gravity_m_s2))
 
 
-def _grasp_layer_hypotheses(stated: Experiment, of: str) -> Iterator[Hypothesis]:
+def _grasp_layer_hypotheses(declared: Experiment, of: str) -> Iterator[Hypothesis]:
     """Yield hypotheses of grasps one layer of elements deeper or less deep."""
     for deeper, deep in ((True, "deeper"), (False, "less deep")):
-        if (layered := _with_shifted_grasps(stated, deeper)) is not None:
+        if (layered := _with_shifted_grasps(declared, deeper)) is not None:
             yield Hypothesis("grasp-layer", of, {"deep": deep}, layered)
 
 
-def _slip_hypotheses(stated: Experiment, fitted_m: Array, of: str) -> Iterator[Hypothesis]:
+def _slip_hypotheses(declared: Experiment, fitted_m: Array, of: str) -> Iterator[Hypothesis]:
     """Yield the hypothesis that one marker slipped, if its residuals change abruptly; the
     experiment is then refitted without it.
     """
-    residual = _residual(stated, fitted_m)
-    described = StatedMotion.from_experiment(stated)
+    residual = _residual(declared, fitted_m)
+    described = DeclaredMotion.from_experiment(declared)
     if described is not None:
         residual = np.einsum("tji,tmj->tmi", described.rotations, residual[: len(described.t_s)])
     clearest = [_largest_step(residual[:, m]) for m in range(residual.shape[1])]
     m = int(np.argmax([ratio for ratio, _ in clearest]))
     if clearest[m][0] < SLIP or residual.shape[1] < 2:
         return
-    tracks = np.array(stated.markers.positions_m)
+    tracks = np.array(declared.markers.positions_m)
     tracks[:, m] = np.nan
-    data = {"marker": stated.markers.names[m], "t_s": stated.t_s[clearest[m][1]]}
-    without = replace(stated, markers=replace(stated.markers, positions_m=tracks))
+    data = {"marker": declared.markers.names[m], "t_s": declared.t_s[clearest[m][1]]}
+    without = replace(declared, markers=replace(declared.markers, positions_m=tracks))
     yield Hypothesis("marker-slip", of, data, without)
 
 
@@ -185,16 +185,16 @@ class _Refitter:
     sweeps.
     """
 
-    def __init__(self, solution: Solution, stated: Experiment, sweeps: int | None) -> None:
+    def __init__(self, solution: Solution, declared: Experiment, sweeps: int | None) -> None:
         self.collocation = solution.collocation
         fitted = [segment.experiment for segment in self.collocation.transcriptions]
         rows = sum(len(experiment.t_s) for experiment in fitted)
         self.each = min(MOST_SWEEPS, max(FEWEST_SWEEPS, solution.iterations))
-        work = EFFORT * self.each * rows // len(stated.t_s)
+        work = EFFORT * self.each * rows // len(declared.t_s)
         self.sweeps = min(BUDGET, work) if sweeps is None else sweeps
         self.known: dict[Experiment, Array | None] = {}
-        if len(fitted) == 1 and len(stated.t_s) == rows:
-            self.known[stated] = solution.readings_m[0]
+        if len(fitted) == 1 and len(declared.t_s) == rows:
+            self.known[declared] = solution.readings_m[0]
 
     def fit(self, experiment: Experiment) -> Array | None:
         """Return the fitted markers (T, M, 3) [m]; None if there is no fit. Results are cached."""
@@ -223,19 +223,19 @@ class _Refitter:
 
 
 def _clock_hypotheses(
-    alone: _Refitter, stated: Experiment, fitted_m: Array, of: str
+    alone: _Refitter, declared: Experiment, fitted_m: Array, of: str
 ) -> Iterator[Hypothesis]:
     """Yield the clock lag for which residuals and velocities agree best, after a few refits."""
-    least = _misfit(stated, fitted_m)
+    least = _misfit(declared, fitted_m)
     lag_s = 0.0
-    shifted = stated
+    shifted = declared
     best = None
     for _ in range(CLOCK_REFITS):
         more_s = _marker_lag_s(shifted, fitted_m)
         lag_s += more_s
         if abs(more_s) < SAME_LAG_S:
             break
-        later = with_pose_lag(stated, lag_s)
+        later = with_pose_lag(declared, lag_s)
         fitted = None if later is None else alone.fit(later)
         if later is None or fitted is None:
             break
@@ -308,9 +308,9 @@ def _with_shifted_grasps(experiment: Experiment, deeper: bool) -> Experiment | N
     for grasp in experiment.grasps:
         is_grasped = np.isin(np.arange(n), grasp.nodes)
         # The layer that touches what is held, or of what is held that which touches the rest.
-        touched = is_grasped if deeper else ~is_grasped
+        is_shifted = is_grasped if deeper else ~is_grasped
         grown = np.zeros(n, dtype=bool)
-        grown[cells[touched[cells].any(axis=1)]] = True
+        grown[cells[is_shifted[cells].any(axis=1)]] = True
         nodes = np.flatnonzero(grown if deeper else is_grasped & ~grown)
         if len(nodes) < 3 or len(nodes) > n - 1:
             return None

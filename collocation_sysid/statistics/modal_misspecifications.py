@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ..array_types import Array, Index
 from ..errors import SimulationError
-from ..program.modal_prediction import ModalResponse, StatedMotion, delayed_tracks
+from ..program.modal_prediction import DeclaredMotion, ModalResponse, delayed_tracks
 from ..recording.experiment import Experiment
 from .axes import OTHER_AXES
 from .misspecification_hypothesis import Hypothesis, HypothesisTest, clock_hypothesis, rank
@@ -29,7 +29,7 @@ from .plausibility import (
 )
 
 # Factor by which the misfit must decrease.
-FAR_BETTER = 2.0
+LEAST_IMPROVEMENT = 2.0
 # Additional factor for hypotheses with fitted numbers.
 FITTED = 1.5
 # Accuracy of small strains and a few modes, over the size of the body.
@@ -47,7 +47,7 @@ ONE_OF_MANY = 1.05
 # Deformation of an equilibrium over the body's diagonal that needs no explanation.
 DEFORMED = 0.1
 # Distance of the tracks over the body's diagonal from which on no stiffness explains them.
-FAR_OFF = 0.3
+LARGEST_MISFIT = 0.3
 
 
 def find_misspecifications_by_modes(
@@ -70,11 +70,15 @@ def find_misspecifications_by_modes(
         return rank([*load_sign_hypotheses(experiment), *_rigid_axes(experiment)])
     comparison = ModalComparison.from_experiment(experiment, constants)
     tried = _rigid_axes(experiment) if comparison is None else comparison.hypotheses()
-    found = [*tried, *name_exchange_hypotheses(experiment, huber), *step_hypotheses(experiment)]
-    found += undriven_motion(experiment)
-    if comparison is not None and not found and not experiment.obstacles:
-        found += comparison.unlike()
-    return rank(found)
+    hypotheses = [
+        *tried,
+        *name_exchange_hypotheses(experiment, huber),
+        *step_hypotheses(experiment),
+    ]
+    hypotheses += undriven_motion(experiment)
+    if comparison is not None and not hypotheses and not experiment.obstacles:
+        hypotheses += comparison.unlike()
+    return rank(hypotheses)
 
 
 def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
@@ -86,12 +90,14 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
     places_m = markers.predict_positions(experiment.rigid_positions(experiment.t_s))
     size_m = float(np.linalg.norm(np.ptp(body.mesh.bounds_m, axis=0)))
 
-    def left(tracks_m: Array) -> float:
-        apart_m = np.linalg.norm(tracks_m - places_m, axis=2)
-        return float(np.hypot(np.nanmedian(apart_m), DEFORMED * size_m))
+    def remaining_misfit(tracks_m: Array) -> float:
+        distances_m = np.linalg.norm(tracks_m - places_m, axis=2)
+        return float(np.hypot(np.nanmedian(distances_m), DEFORMED * size_m))
 
     if markers.sample_count:
-        trial = HypothesisTest(left(markers.positions_m), left, FAR_BETTER)
+        trial = HypothesisTest(
+            remaining_misfit(markers.positions_m), remaining_misfit, LEAST_IMPROVEMENT
+        )
         yield from trial.accepted(_axes(f"'{experiment.name}'", markers.positions_m))
 
 
@@ -110,7 +116,7 @@ class ModalComparison:
 
     Attributes
     ----------
-    stated : StatedMotion
+    declared : DeclaredMotion
         Description as stated.
     names : (M,) tuple of str
         Names of the markers.
@@ -120,7 +126,7 @@ class ModalComparison:
         Smallest misfit that can be expected [m].
     """
 
-    stated: StatedMotion
+    declared: DeclaredMotion
     names: tuple[str, ...]
     response: ModalResponse
     floor_m: float
@@ -134,31 +140,37 @@ class ModalComparison:
         None if the body has no modes, no single grasp carries it, there are too few tracks, or
         tendons or pressures drive it.
         """
-        given = None if experiment.actuators else StatedMotion.from_experiment(experiment)
-        if given is None or np.isfinite(given.tracks_m[..., 0]).sum() < 3:
+        declared = None if experiment.actuators else DeclaredMotion.from_experiment(experiment)
+        if declared is None or np.isfinite(declared.tracks_m[..., 0]).sum() < 3:
             return None
         try:
-            sway = ModalResponse.from_experiment(experiment, constants)
+            response = ModalResponse.from_experiment(experiment, constants)
         except (SimulationError, np.linalg.LinAlgError, ArpackError):
             return None
         markers = experiment.markers
         noise_m = np.sqrt(3) * np.median(markers.sigma_m)
-        return cls(given, markers.names, sway, float(np.hypot(noise_m, ROUGHLY * sway.size_m)))
+        return cls(
+            declared, markers.names, response, float(np.hypot(noise_m, ROUGHLY * response.size_m))
+        )
 
-    def misfit_m(self, stated: StatedMotion) -> float:
+    def misfit_m(self, declared: DeclaredMotion) -> float:
         """Return the misfit of the best stiffness [m]."""
-        return float(self._misfits_m(stated, self.response.predict(stated)).min())
+        return float(self._misfits_m(declared, self.response.predict(declared)).min())
 
-    def best_prediction(self, stated: StatedMotion) -> Array:
+    def best_prediction(self, declared: DeclaredMotion) -> Array:
         """Return the markers (T, M, 3) of the best stiffness [m]."""
-        predicted = self.response.predict(stated)
-        return predicted[int(self._misfits_m(stated, predicted).argmin())]
+        predicted = self.response.predict(declared)
+        return predicted[int(self._misfits_m(declared, predicted).argmin())]
 
     def hypotheses(self) -> Iterator[Hypothesis]:
         """Iterate over the hypotheses that fit far better than the description as stated."""
-        trial = HypothesisTest(self.misfit_m(self.stated), self.misfit_m, FAR_BETTER)
+        trial = HypothesisTest(self.misfit_m(self.declared), self.misfit_m, LEAST_IMPROVEMENT)
         yield from trial.accepted(
-            [*simple_hypotheses(self.stated), *self._frame_hypotheses(), *self._clock_hypotheses()]
+            [
+                *simple_hypotheses(self.declared),
+                *self._frame_hypotheses(),
+                *self._clock_hypotheses(),
+            ]
         )
         yield from self._name_hypotheses()
         yield from self._other_axes()
@@ -167,32 +179,32 @@ class ModalComparison:
         """Yield the hypothesis that no stiffness explains the tracks, if they are far from
         all predictions.
         """
-        misfit_m = self.misfit_m(self.stated)
+        misfit_m = self.misfit_m(self.declared)
         size_m = self.response.size_m
-        strength = misfit_m / (FAR_OFF * size_m)
+        strength = misfit_m / (LARGEST_MISFIT * size_m)
         if strength > 1:
             data = {"by_mm": 1e3 * misfit_m, "size_mm": 1e3 * size_m}
-            yield Hypothesis("unlike", self.stated.name, data, strength=strength)
+            yield Hypothesis("unlike", self.declared.name, data, strength=strength)
 
     def _other_axes(self) -> Iterator[Hypothesis]:
         """Yield hypotheses of other axes of the tracks, tested by the modes."""
-        predicted = self.response.predict(self.stated)
+        predicted = self.response.predict(self.declared)
 
-        def left(tracks_m: Array) -> float:
-            turned = replace(self.stated, tracks_m=tracks_m)
+        def remaining_misfit(tracks_m: Array) -> float:
+            turned = replace(self.declared, tracks_m=tracks_m)
             return float(self._misfits_m(turned, predicted).min())
 
-        given_m = self.stated.tracks_m
-        yield from HypothesisTest(left(given_m), left, FAR_BETTER).accepted(
-            _axes(self.stated.name, given_m)
-        )
+        declared_m = self.declared.tracks_m
+        yield from HypothesisTest(
+            remaining_misfit(declared_m), remaining_misfit, LEAST_IMPROVEMENT
+        ).accepted(_axes(self.declared.name, declared_m))
 
-    def _misfits_m(self, stated: StatedMotion, predicted: Array) -> Array:
+    def _misfits_m(self, declared: DeclaredMotion, predicted: Array) -> Array:
         """Return the misfit (S,) of each prediction: root mean square distance of the best
         90 % of the samples, and the floor [m].
         """
-        present = np.isfinite(stated.tracks_m[..., 0]) & np.isfinite(predicted[0, ..., 0])
-        distance = np.linalg.norm(predicted - stated.tracks_m, axis=3)[:, present]
+        present = np.isfinite(declared.tracks_m[..., 0]) & np.isfinite(predicted[0, ..., 0])
+        distance = np.linalg.norm(predicted - declared.tracks_m, axis=3)[:, present]
         squares = np.sort(distance**2, axis=1)
         used = max(1, int(np.ceil(USED * squares.shape[1])))
         return np.sqrt(squares[:, :used].mean(axis=1) + self.floor_m**2)
@@ -201,16 +213,16 @@ class ModalComparison:
         """Yield hypotheses of a rigid motion before the poses, and of a rigid motion of the
         tracks.
         """
-        given = self.stated
+        declared = self.declared
         places_m = self.response.places_m
         if not _determines_rotation(places_m):
             return
-        moved_poses = moved_tracks = given
+        moved_poses = moved_tracks = declared
         for k in range(REFITS):
             best = (
                 moved_poses.to_grasp_frame(self.best_prediction(moved_poses))
                 if k
-                else np.broadcast_to(places_m, given.tracks_m.shape)
+                else np.broadcast_to(places_m, declared.tracks_m.shape)
             )
             moved_poses = moved_poses.with_prior_motion(
                 *_fit_rigid_motion(best, moved_poses.to_grasp_frame(moved_poses.tracks_m))
@@ -219,25 +231,25 @@ class ModalComparison:
                 moved_tracks.tracks_m, self.best_prediction(moved_tracks)
             )
             moved_tracks = replace(moved_tracks, tracks_m=moved_tracks.tracks_m @ turn.T + shift_m)
-        yield Hypothesis("gripper-frame", given.name, corrected=moved_poses, handicap=FITTED)
-        yield Hypothesis("camera-frame", given.name, corrected=moved_tracks, handicap=FITTED)
+        yield Hypothesis("gripper-frame", declared.name, corrected=moved_poses, handicap=FITTED)
+        yield Hypothesis("camera-frame", declared.name, corrected=moved_tracks, handicap=FITTED)
 
     def _clock_hypotheses(self) -> Iterator[Hypothesis]:
         """Yield the hypothesis of the clock lag that fits best."""
-        given = self.stated
-        predicted = self.response.predict(given)
-        allowed = LAGS_S[np.abs(LAGS_S) < LONGEST_LAG * np.ptp(given.t_s)].tolist()
-        delayed = (delayed_tracks(predicted, given.t_s, lag_s) for lag_s in allowed)
-        misfits = [self._misfits_m(given, each).min() for each in delayed]
+        declared = self.declared
+        predicted = self.response.predict(declared)
+        allowed = LAGS_S[np.abs(LAGS_S) < LONGEST_LAG * np.ptp(declared.t_s)].tolist()
+        delayed = (delayed_tracks(predicted, declared.t_s, lag_s) for lag_s in allowed)
+        misfits = [self._misfits_m(declared, each).min() for each in delayed]
         if misfits:
             lag_s = allowed[int(np.argmin(misfits))]
-            yield clock_hypothesis(given.name, lag_s, replace(given, lag_s=lag_s), FITTED)
+            yield clock_hypothesis(declared.name, lag_s, replace(declared, lag_s=lag_s), FITTED)
 
     def _name_hypotheses(self) -> Iterator[Hypothesis]:
         """Yield the hypothesis that markers have each other's names, tested on these markers."""
-        given = self.stated
+        declared = self.declared
         squares = np.sum(
-            (given.tracks_m[:, :, None] - self.best_prediction(given)[:, None]) ** 2, axis=3
+            (declared.tracks_m[:, :, None] - self.best_prediction(declared)[:, None]) ** 2, axis=3
         )
         is_complete = np.isfinite(squares).any(axis=0).all()
         if not is_complete or len(self.names) < 2:
@@ -247,21 +259,21 @@ class ModalComparison:
         if not len(exchanged):
             return
         few, renamed = (
-            _with_markers(given, given.tracks_m[:, order], exchanged)
+            _with_markers(declared, declared.tracks_m[:, order], exchanged)
             for order in (np.arange(len(chosen)), np.argsort(chosen))
         )
         listed = ", ".join(f"{self.names[k]} is {self.names[chosen[k]]}" for k in exchanged)
-        hypothesis = Hypothesis("markers-exchanged", given.name, {"names": listed}, renamed)
-        yield from HypothesisTest(self.misfit_m(few), self.misfit_m, FAR_BETTER).accepted(
+        hypothesis = Hypothesis("markers-exchanged", declared.name, {"names": listed}, renamed)
+        yield from HypothesisTest(self.misfit_m(few), self.misfit_m, LEAST_IMPROVEMENT).accepted(
             [hypothesis]
         )
 
 
-def _with_markers(stated: StatedMotion, tracks_m: Array, markers: Index) -> StatedMotion:
+def _with_markers(declared: DeclaredMotion, tracks_m: Array, markers: Index) -> DeclaredMotion:
     """Return the description with the tracks of some markers only."""
     few_m = np.full_like(tracks_m, np.nan)
     few_m[:, markers] = tracks_m[:, markers]
-    return replace(stated, tracks_m=few_m)
+    return replace(declared, tracks_m=few_m)
 
 
 def _fit_rigid_motion(from_m: Array, to_m: Array) -> tuple[Array, Array]:
@@ -289,44 +301,48 @@ UNITS = {1e-3: "mm", 1e-2: "cm", 0.0254: "in", 1e3: "", 1e2: ""}
 SAME_DIRECTION = 0.94
 
 
-def simple_hypotheses(stated: StatedMotion) -> Iterator[Hypothesis]:
+def simple_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
     """Iterate over the hypotheses without fitted numbers, each with the mistake corrected."""
-    moving = np.ptp(stated.rotations, axis=0).any() or np.ptp(stated.translations_m, axis=0).any()
-    if moving or np.abs(stated.translations_m).any():
-        yield from _pose_hypotheses(stated)
+    moving = (
+        np.ptp(declared.rotations, axis=0).any() or np.ptp(declared.translations_m, axis=0).any()
+    )
+    if moving or np.abs(declared.translations_m).any():
+        yield from _pose_hypotheses(declared)
         yield from _unit_hypotheses(
-            stated, "translations_m", "the poses would fit if they", "grasp"
+            declared, "translations_m", "the poses would fit if they", "grasp"
         )
-    yield from _unit_hypotheses(stated, "tracks_m", "the markers would fit if they", "markers")
-    yield from _unit_hypotheses(stated, "mesh_scale", "the mesh would fit if it", "object")
-    yield from gravity_hypotheses(stated)
+    yield from _unit_hypotheses(declared, "tracks_m", "the markers would fit if they", "markers")
+    yield from _unit_hypotheses(declared, "mesh_scale", "the mesh would fit if it", "object")
+    yield from gravity_hypotheses(declared)
 
 
-def _pose_hypotheses(stated: StatedMotion) -> Iterator[Hypothesis]:
+def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
     """Yield hypotheses of inverted poses, inverted rotations and other quaternion orders."""
-    inverse = stated.rotations.transpose(0, 2, 1)
-    shift = -np.einsum("tij,tj->ti", inverse, stated.translations_m)
-    inverted = replace(stated, rotations=inverse, translations_m=shift)
-    yield Hypothesis("poses-inverted", stated.name, corrected=inverted)
-    yield Hypothesis("rotation-inverted", stated.name, corrected=replace(stated, rotations=inverse))
-    quaternions = Rotation.from_matrix(stated.rotations).as_quat()
+    inverse = declared.rotations.transpose(0, 2, 1)
+    shift = -np.einsum("tij,tj->ti", inverse, declared.translations_m)
+    inverted = replace(declared, rotations=inverse, translations_m=shift)
+    yield Hypothesis("poses-inverted", declared.name, corrected=inverted)
+    yield Hypothesis(
+        "rotation-inverted", declared.name, corrected=replace(declared, rotations=inverse)
+    )
+    quaternions = Rotation.from_matrix(declared.rotations).as_quat()
     # Signs are free; neighbours of one sign keep the reordered ones continuous.
     flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
     quaternions *= np.cumprod(np.r_[1.0, np.where(flips, -1.0, 1.0)])[:, None]
     for order, turn in (("wxyz", -1), ("xyzw", 1)):
         reordered = Rotation.from_quat(np.roll(quaternions, turn, axis=1)).as_matrix()
-        without = replace(stated, rotations=reordered)
-        yield Hypothesis("quaternion-order", stated.name, {"order": order}, without)
+        without = replace(declared, rotations=reordered)
+        yield Hypothesis("quaternion-order", declared.name, {"order": order}, without)
 
 
 def _unit_hypotheses(
-    stated: StatedMotion, what: str, who: str, section: str
+    declared: DeclaredMotion, what: str, who: str, section: str
 ) -> Iterator[Hypothesis]:
     """Yield hypotheses that an attribute of the description is in another unit of length.
 
     Parameters
     ----------
-    stated : StatedMotion
+    declared : DeclaredMotion
         Description as stated.
     what : str
         Attribute of the description.
@@ -339,17 +355,17 @@ def _unit_hypotheses(
     for factor, unit in UNITS.items():
         remedy = f'set {key} = "{unit}"' if unit else f"check {key}"
         data = {"who": who, "factor": factor, "remedy": remedy}
-        without = replace(stated, **{what: factor * getattr(stated, what)})
-        yield Hypothesis("length-unit", stated.name, data, without)
+        without = replace(declared, **{what: factor * getattr(declared, what)})
+        yield Hypothesis("length-unit", declared.name, data, without)
 
 
-def gravity_hypotheses(stated: StatedMotion) -> Iterator[Hypothesis]:
+def gravity_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
     """Iterate over the hypotheses of gravity along the other axes, and with the other sign."""
-    size = float(np.linalg.norm(stated.gravity_m_s2))
+    size = float(np.linalg.norm(declared.gravity_m_s2))
     for axis, name in enumerate("xyz"):
         for sign, plus in ((1.0, "+"), (-1.0, "−")):
             other: Array = np.where(np.arange(3) == axis, sign * size, 0.0)
-            if size and other @ stated.gravity_m_s2 <= SAME_DIRECTION * size**2:
+            if size and other @ declared.gravity_m_s2 <= SAME_DIRECTION * size**2:
                 data = {"axis": plus + name, "vector": ", ".join(f"{x:g}" for x in other)}
-                without = replace(stated, gravity_m_s2=other)
-                yield Hypothesis("gravity", stated.name, data, without)
+                without = replace(declared, gravity_m_s2=other)
+                yield Hypothesis("gravity", declared.name, data, without)

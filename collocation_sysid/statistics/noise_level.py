@@ -163,10 +163,10 @@ def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseL
     squares = []
     counts = []
     shares = []
-    stated = np.zeros_like(information.prior)
+    prior_score = np.zeros_like(information.prior)
     for block, slope in zip(fit.blocks, information.scaled_jacobians, strict=True):
         if block.has_noise_floor:
-            stated += _stated_score_covariance(block, slope)
+            prior_score += _prior_score_covariance(block, slope)
             continue
         by_marker = slope.reshape(*block.is_present.shape, 3, slope.shape[2])
         for m in np.flatnonzero(block.is_present.any(axis=0)).tolist():
@@ -182,15 +182,15 @@ def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseL
         np.array(counts, dtype=float),
         besides,
         np.array(shares).reshape(len(names), *information.prior.shape),
-        information.prior + stated,
-        of_score + stated,
+        information.prior + prior_score,
+        of_score + prior_score,
     )
     sigma_keys = [b.sigma_key for b in fit.blocks if b.is_present.any() and not b.has_noise_floor]
     # That of places stands for all.
     return replace(level, sigma_key=min(sigma_keys, key="sigma_m".__ne__, default="sigma_m"))
 
 
-def _stated_score_covariance(block: ResidualBlock, slope: Array) -> Array:
+def _prior_score_covariance(block: ResidualBlock, slope: Array) -> Array:
     """Return the covariance (r, r) of the score due to a block whose noise is at least as stated.
 
     Residuals larger than stated increase it.
@@ -204,8 +204,10 @@ def _stated_score_covariance(block: ResidualBlock, slope: Array) -> Array:
     """
     rows = slope.reshape(slope.shape[0] * slope.shape[1], slope.shape[2])
     share = rows.T @ rows
-    left = max(1.0, block.measurement_count - float(np.trace(share)))
-    factor = max(1.0, float(np.sum(block.residual**2)) / shortened_power(block) / left)
+    degrees_of_freedom = max(1.0, block.measurement_count - float(np.trace(share)))
+    factor = max(
+        1.0, float(np.sum(block.residual**2)) / shortened_power(block) / degrees_of_freedom
+    )
     return factor * share
 
 
@@ -237,12 +239,13 @@ def project_errors(information: Information, errors: Sequence[Array]) -> tuple[A
     ((K, r) array, list of (K, T, M, 3) arrays)
         Scores, and the residuals that remain after the fit.
     """
-    flat = [each.reshape(len(each), each.shape[1], -1) for each in errors]
-    pairs = [*zip(flat, information.scaled_jacobians, strict=True)]
+    error_rows = [each.reshape(len(each), each.shape[1], -1) for each in errors]
+    pairs = [*zip(error_rows, information.scaled_jacobians, strict=True)]
     scores = np.sum([np.einsum("ktc,tcr->kr", e, slope) for e, slope in pairs], axis=0)
     remaining = [e - np.einsum("tcr,kr->ktc", slope, scores) for e, slope in pairs]
     return scores, [
-        each.reshape(given.shape) for each, given in zip(remaining, errors, strict=True)
+        each.reshape(errors_of_block.shape)
+        for each, errors_of_block in zip(remaining, errors, strict=True)
     ]
 
 

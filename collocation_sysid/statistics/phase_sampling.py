@@ -98,15 +98,19 @@ class InternalFaces:
         """Find the faces between some elements of a mesh, numbered in the order of `cells`."""
         corners = mesh.tetrahedra[cells]
         triples = np.sort(corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]], axis=2)
-        owner = np.repeat(np.arange(len(cells)), 4)
-        flat = triples.reshape(-1, 3)
-        order = np.lexsort(flat.T)
-        same = (flat[order[1:]] == flat[order[:-1]]).all(axis=1)
+        cell_of_face = np.repeat(np.arange(len(cells)), 4)
+        all_triples = triples.reshape(-1, 3)
+        order = np.lexsort(all_triples.T)
+        same = (all_triples[order[1:]] == all_triples[order[:-1]]).all(axis=1)
         first = order[:-1][same]
         second = order[1:][same]
-        a, b, c = mesh.points_m[flat[first]].swapaxes(0, 1)
+        a, b, c = mesh.points_m[all_triples[first]].swapaxes(0, 1)
         areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-        return cls(np.column_stack([owner[first], owner[second]]), areas / areas.mean(), len(cells))
+        return cls(
+            np.column_stack([cell_of_face[first], cell_of_face[second]]),
+            areas / areas.mean(),
+            len(cells),
+        )
 
     @property
     def adjacency(self) -> sp.csr_array:

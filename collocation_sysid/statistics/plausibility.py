@@ -127,9 +127,9 @@ def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
             continue
         shifts_m = grasp.poses.at(grasp.wrench.t_s)[1]
         for axis in grasp.zero or _pushing_axis(grasp, shifts_m):
-            along = "xyz".index(axis)
-            displacement_m = shifts_m[:, along]
-            load_n = grasp.wrench.values[:, along]
+            axis_index = "xyz".index(axis)
+            displacement_m = shifts_m[:, axis_index]
+            load_n = grasp.wrench.values[:, axis_index]
             is_measured = np.isfinite(load_n)
             if isinstance(grasp, Obstacle):
                 # Before contact the load is noise.
@@ -170,13 +170,13 @@ def step_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     if len(experiment.markers.positions_m) < FEWEST:
         return
     if (grasp := carrying_grasp(experiment)) is not None:
-        carried_m = grasp.poses.carried_positions(_marker_box_m(experiment), experiment.t_s)
-        yield from _pose_jump_hypotheses(experiment, carried_m)
-        yield from _common_jump(experiment, carried_m)
+        moved_m = grasp.poses.moved_positions(_marker_box_m(experiment), experiment.t_s)
+        yield from _pose_jump_hypotheses(experiment, moved_m)
+        yield from _common_jump(experiment, moved_m)
     yield from _slip_hypotheses(experiment)
 
 
-def _common_jump(experiment: Experiment, carried_m: Array) -> Iterator[Hypothesis]:
+def _common_jump(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]:
     """Yield the hypothesis of a step of all markers together that the poses do not have."""
     tracks_m = experiment.markers.positions_m
     sigma_m = experiment.markers.sigma_m
@@ -187,8 +187,8 @@ def _common_jump(experiment: Experiment, carried_m: Array) -> Iterator[Hypothesi
         return
     sizes = step_sizes(tracks_m[rows]).min(axis=1)
     k = int(sizes.argmax())
-    carried = step_sizes(carried_m[rows]).max(axis=1)[k]
-    usual_m = max(_usual_change(sizes), float(carried), 2 * float(np.median(sigma_m)))
+    grasp_step_m = step_sizes(moved_m[rows]).max(axis=1)[k]
+    usual_m = max(_usual_change(sizes), float(grasp_step_m), 2 * float(np.median(sigma_m)))
     yield from _step_hypothesis("markers-jump", experiment, int(rows[k]), float(sizes[k]), usual_m)
 
 
@@ -206,12 +206,14 @@ def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
     grasps = experiment.grasps
     if experiment.start != "equilibrium" or experiment.actuators or experiment.obstacles:
         return
-    is_held_throughout = (grasp.from_s <= t_s[0] and grasp.until_s >= t_s[-1] for grasp in grasps)
+    is_grasped_throughout = (
+        grasp.from_s <= t_s[0] and grasp.until_s >= t_s[-1] for grasp in grasps
+    )
     motions = [part for grasp in grasps for part in grasp.poses.at(t_s)]
-    loads = [experiment.stated_node_forces_n(t_s), experiment.point_mass_at_nodes_kg(t_s)]
+    loads = [experiment.declared_node_forces_n(t_s), experiment.point_mass_at_nodes_kg(t_s)]
     if (
         not grasps
-        or not all(is_held_throughout)
+        or not all(is_grasped_throughout)
         or any(_changes(each) for each in (*motions, *loads))
     ):
         return
@@ -251,14 +253,14 @@ def step_sizes(x: Array) -> Array:
     return np.sqrt(np.maximum(opposite, 0.0))
 
 
-def _pose_jump_hypotheses(experiment: Experiment, carried_m: Array) -> Iterator[Hypothesis]:
+def _pose_jump_hypotheses(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]:
     """Yield the hypothesis of the largest jump of points (T, m, 3) carried by the poses, if
     the markers do not follow it.
     """
-    sizes = step_sizes(carried_m).max(axis=1)
+    sizes = step_sizes(moved_m).max(axis=1)
     k = int(sizes.argmax())
     markers = step_sizes(experiment.markers.positions_m)[k]
-    moved = np.linalg.norm(np.diff(carried_m, 2, axis=0), axis=2).max(axis=1)
+    moved = np.linalg.norm(np.diff(moved_m, 2, axis=0), axis=2).max(axis=1)
     sigma_m = float(np.median(experiment.markers.sigma_m))
     if np.isfinite(markers).any():
         usual_m = max(_usual_change(moved), float(np.nanmedian(markers)), 2 * sigma_m)

@@ -80,8 +80,8 @@ def estimate_pose_noise(poses: PoseSequence) -> tuple[float, float]:
     """
     if len(poses.t_s) < 4 * ORDER:
         return 0.0, 0.0
-    turns = poses.rotation_steps
-    sizes = [np.diff(poses.positions_m, ORDER, axis=0), np.diff(turns, ORDER - 1, axis=0)]
+    rotations = poses.rotation_steps
+    sizes = [np.diff(poses.positions_m, ORDER, axis=0), np.diff(rotations, ORDER - 1, axis=0)]
     scale = np.sqrt(binom(2 * ORDER, ORDER))
     # The median of squares, so that a jump or a stroke does not count as noise.
     sigmas = [float(np.median(np.abs(size)) / 0.6745 / scale) for size in sizes]
@@ -144,20 +144,22 @@ def _residual_samples(
     """Return samples (K, T, M, 3) of the changes of each measurement's residuals."""
     segment = iterate.segment
     prescribed = iterate.equations.prescribed
-    numbers = prescribed.positions_m.size * 8
-    count = int(np.clip(BYTES / numbers, FEWEST_DRAWS, DRAWS))
+    value_count = prescribed.positions_m.size * 8
+    count = int(np.clip(BYTES / value_count, FEWEST_DRAWS, DRAWS))
     displacements_m = np.zeros((*prescribed.positions_m.shape, count))
     pose_errors = []
     for grasp, noise in zip(segment.experiment.grasps, noises, strict=True):
-        shifts, turns = _pose_samples(iterate, grasp, noise, rng, count)
-        _add_displacements(displacements_m, iterate, grasp, shifts, turns)
-        pose_errors.append((grasp, shifts, turns))
+        shifts, rotations = _pose_samples(iterate, grasp, noise, rng, count)
+        _add_displacements(displacements_m, iterate, grasp, shifts, rotations)
+        pose_errors.append((grasp, shifts, rotations))
     solver = Sweep(segment)
     changes = []
     columns = SweepColumns.from_prescribed(solver, iterate.equations, displacements_m)
     for reading, motion, values, by in propagate_columns(iterate, solver, columns):
-        for grasp, shifts, turns in pose_errors:
-            by = by + reading.observable.frame_changes(grasp, motion, iterate.phi, shifts, turns)
+        for grasp, shifts, rotations in pose_errors:
+            by = by + reading.observable.frame_changes(
+                grasp, motion, iterate.phi, shifts, rotations
+            )
         changes.append(np.moveaxis(reading.residual_changes(values, by, iterate.phi), 3, 0))
     return changes
 

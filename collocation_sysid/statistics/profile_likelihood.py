@@ -140,11 +140,11 @@ def compute_profile(
 def _find_end(rise: Callable[[float], float], step: float, bound: float) -> float | None:
     """Return where the loss has risen enough, on one side; None if it has not at the bound."""
     inside = 0.0
-    nearer = min if step > 0 else max
+    closest = min if step > 0 else max
     for _ in range(MOST_DOUBLINGS):
         if inside == bound:
             return None
-        outside = nearer(inside + step, bound)
+        outside = closest(inside + step, bound)
         if rise(outside) >= 0:
             within = PRECISION * abs(outside)
             return root_scalar(rise, bracket=(inside, outside), xtol=within).root
@@ -237,6 +237,6 @@ def _loss_with_fixed(solution: Solution, item: Parameter, value: float) -> float
 def _noise_scale(solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, k: int) -> float:
     """Return the variance of the estimate over that for the stated σ; 1 if it is not finite."""
     size = relative_derivatives(solution.collocation.parameters, solution.q)[k]
-    stated_error = size * least_squares_of_fit(fit).standard_errors[k]
-    scale = float(uncertainty.covariance[k, k] / stated_error**2)
+    standard_error = size * least_squares_of_fit(fit).standard_errors[k]
+    scale = float(uncertainty.covariance[k, k] / standard_error**2)
     return scale if np.isfinite(scale) else 1.0

@@ -115,13 +115,13 @@ def single_fits(fit: LinearisedFit) -> Iterator[tuple[LinearisedFit, Array]]:
     """Iterate over the fits to each recording alone, each with its parameters less the
     joint ones.
     """
-    for name, numbers in blocks_by_recording(fit).items():
+    for name, block_numbers in blocks_by_recording(fit).items():
         # What recordings share they have to find alone, too.
         mine = [
             other.startswith((f"{name}: ", "shared")) for other in fit.names[fit.shared_count :]
         ]
         columns = np.r_[np.arange(fit.shared_count), fit.shared_count + np.flatnonzero(mine)]
-        yield fit_part(fit, [fit.blocks[k] for k in numbers], columns)
+        yield fit_part(fit, [fit.blocks[k] for k in block_numbers], columns)
 
 
 def fit_part(

@@ -75,7 +75,7 @@ class Probe:
     size, size_error : float or None
         Estimated error of a relaxed assumption in its unit, and its standard error; None for parts
         of the data.
-    told : tuple of str
+    sentences : tuple of str
         What is significant: for a part of the data the estimates that differ, for an assumption its
         name.
     routine : bool
@@ -91,7 +91,7 @@ class Probe:
     moves: Mapping[str, EstimateChange]
     size: float | None = None
     size_error: float | None = None
-    told: tuple[str, ...] = ()
+    sentences: tuple[str, ...] = ()
     routine: bool = False
     relevance: float | None = None
 
@@ -261,12 +261,12 @@ def with_relaxed_assumption(
     )
 
 
-def relaxed_probe(answered: SolvedFit, name: str, wide: LinearisedFit, p: Array) -> Probe:
+def relaxed_probe(fit: SolvedFit, name: str, wide: LinearisedFit, p: Array) -> Probe:
     """Return the optimum of a fit with one assumption relaxed, by one linear step.
 
     Parameters
     ----------
-    answered : SolvedFit
+    fit : SolvedFit
         The fit.
     name : str
         The assumption with its component.
@@ -280,23 +280,23 @@ def relaxed_probe(answered: SolvedFit, name: str, wide: LinearisedFit, p: Array)
     Probe
         Its size is that of the most significant amplitude, if there are several. `report` is empty.
     """
-    first = len(answered.fit.names)
+    first = len(fit.fit.names)
     step = gauss_newton_step(wide)
     after = wide.after_step(step)
     own = step[first:]
-    uncertainty = answered.uncertainty_of_refit(after, p + step[:first])
-    before = least_squares_of_fit(answered.fit)
+    uncertainty = fit.uncertainty_of_refit(after, p + step[:first])
+    before = least_squares_of_fit(fit.fit)
     remaining = least_squares_of_fit(after)
     decrease = before.loss(np.zeros(first)) - remaining.loss(np.zeros(len(step)))
-    unit = answered.deviations[assumption_name(name)] or 1.0
+    unit = fit.deviations[assumption_name(name)] or 1.0
     errors = np.array([*uncertainty.nuisance.values()][first - wide.shared_count :])
     worst = int(np.argmax(np.nan_to_num(np.abs(own) / errors)))
-    probe = Probe("assumption", name, decrease, answered.changes_of_estimates(uncertainty))
+    probe = Probe("assumption", name, decrease, fit.changes_of_estimates(uncertainty))
     probe = replace(probe, size=float(unit * own[worst]), size_error=float(unit * errors[worst]))
-    return replace(probe, relevance=relevance(answered, probe))
+    return replace(probe, relevance=relevance(fit, probe))
 
 
-def relevance(answered: SolvedFit, probe: Probe) -> float:
+def relevance(fit: SolvedFit, probe: Probe) -> float:
     """Return the largest change of an estimate by a probe, in half widths of its statistical
     interval.
 
@@ -308,7 +308,7 @@ def relevance(answered: SolvedFit, probe: Probe) -> float:
         if move.of_statistical95 is None or is_field_coefficient(name):
             continue
         shares.append(abs(move.of_statistical95))
-        interval = answered.statistical[name].statistical95
+        interval = fit.statistical[name].statistical95
         if probe.name == DRIFT and is_modulus(name) and interval is not None:
             half_width = max((interval[1] - interval[0]) / 2, 1e-300)
             shares.append(abs(0.5 * (probe.size or 0.0) * move.value) / half_width)

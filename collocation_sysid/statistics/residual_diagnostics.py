@@ -41,7 +41,7 @@ ROUNDING_M = 1e-9
 # Share of the samples beyond Huber's threshold that noise alone may explain.
 MOST_WILD = 0.05
 # Factor within which uncorrelated residuals agree with σ.
-AS_STATED = 1.25
+LARGEST_AGREEING_RATIO = 1.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,9 +262,9 @@ def _white_noise_message(diagnosis: MarkerDiagnosis) -> str:
     """
     factor = diagnosis.noise_factor
     chance = normal_isf(SIGNIFICANCE / 2) / np.sqrt(6 * diagnosis.samples)
-    if factor > max(AS_STATED, 1 + chance):
+    if factor > max(LARGEST_AGREEING_RATIO, 1 + chance):
         return f"uncorrelated, but {factor:.2g} times as large as expected from sigma_m"
-    if factor < min(1 / AS_STATED, 1 - chance):
+    if factor < min(1 / LARGEST_AGREEING_RATIO, 1 - chance):
         return f"uncorrelated, and only {factor:.2g} times as large as expected from sigma_m"
     return "uncorrelated, consistent with noise"
 
@@ -373,12 +373,12 @@ def _find_outlier(block: ResidualBlock, marker: int, significance: float) -> Out
 
 def _without_sample(block: ResidualBlock, marker: int, sample: int) -> ResidualBlock:
     """Return the block without one sample of a marker."""
-    is_kept: Mask = np.ones(block.is_present.shape, dtype=bool)
-    is_kept[sample, marker] = False
-    each = is_kept[..., None]
+    is_included: Mask = np.ones(block.is_present.shape, dtype=bool)
+    is_included[sample, marker] = False
+    each = is_included[..., None]
     return replace(
         block,
-        is_present=block.is_present & is_kept,
+        is_present=block.is_present & is_included,
         residual=block.residual * each,
         jacobian=block.jacobian * each[..., None],
         misfit=None if block.misfit is None else block.misfit * each,

@@ -55,12 +55,12 @@ def probed_deviations(deviations: Mapping[str, float | None]) -> dict[str, float
     return {**deviations, **{name: usual[name] for name in exact}}
 
 
-def routine_probes(answered: SolvedFit) -> tuple[Probe, ...]:
+def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
     """Relax each routine assumption by one linear step from the answer.
 
     Parameters
     ----------
-    answered : SolvedFit
+    solved_fit : SolvedFit
         The fit. An assumption that has no column in its `changes`, because it is estimated or has
         no effect, is not probed.
 
@@ -69,14 +69,14 @@ def routine_probes(answered: SolvedFit) -> tuple[Probe, ...]:
     tuple of Probe
         Probes with `routine` set; `report` is empty where the amplitude is not significant.
     """
-    limit = significance_limit(answered.changes)
+    limit = significance_limit(solved_fit.changes)
     probes = []
     for name in ROUTINE:
-        wide = with_relaxed_assumption(answered.fit, answered.changes, name, WIDENING)
-        if any(block.jacobian[..., len(answered.fit.names) :].any() for block in wide.blocks):
-            probe = relaxed_probe(answered, name, wide, answered.parameters)
+        wide = with_relaxed_assumption(solved_fit.fit, solved_fit.changes, name, WIDENING)
+        if any(block.jacobian[..., len(solved_fit.fit.names) :].any() for block in wide.blocks):
+            probe = relaxed_probe(solved_fit, name, wide, solved_fit.parameters)
             significant = (name,) if probe.is_beyond(limit) else ()
-            probes.append(replace(probe, routine=True, told=significant))
+            probes.append(replace(probe, routine=True, sentences=significant))
     return tuple(probes)
 
 
@@ -93,4 +93,8 @@ def is_alarming(probe: Probe) -> bool:
     """Whether a relaxed assumption is significant, and relevant to the estimates that are
     reported.
     """
-    return bool(probe.told) and probe.kind == "assumption" and (probe.relevance or 0.0) >= RELEVANT
+    return (
+        bool(probe.sentences)
+        and probe.kind == "assumption"
+        and (probe.relevance or 0.0) >= RELEVANT
+    )

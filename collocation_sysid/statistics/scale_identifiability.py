@@ -22,7 +22,7 @@ from .concerns import Concern, Grade
 from .distributions import chi2_isf
 
 # Relative error up to which parameters can multiply all constants by a common factor.
-LEFT = 1e-8
+LEAST_REMAINDER = 1e-8
 
 
 def parameters_of_open_scale(
@@ -33,12 +33,12 @@ def parameters_of_open_scale(
     """
     if not any(is_density(item.name) for item in parameters.free):
         return ()
-    return _scaled_parameters(experiments, parameters, includes_stated=False)
+    return _scaled_parameters(experiments, parameters, includes_declared=False)
 
 
 def relative_moduli(experiments: Iterable[Experiment], parameters: Parameters) -> tuple[str, ...]:
     """Return the parameters that are determined relative to the stated densities only."""
-    return _scaled_parameters(experiments, parameters, includes_stated=True)
+    return _scaled_parameters(experiments, parameters, includes_declared=True)
 
 
 def scale_concerns(
@@ -65,7 +65,7 @@ def relative_scale_note(experiments: Iterable[Experiment], parameters: Parameter
 
 
 def _scaled_parameters(
-    experiments: Iterable[Experiment], parameters: Parameters, includes_stated: bool
+    experiments: Iterable[Experiment], parameters: Parameters, includes_declared: bool
 ) -> tuple[str, ...]:
     """Return the free parameters that multiply all moduli and densities by a common factor; empty
     if data or priors determine the factor.
@@ -76,7 +76,7 @@ def _scaled_parameters(
         Experiments; those for validation are ignored.
     parameters : Parameters
         Shared parameters.
-    includes_stated : bool
+    includes_declared : bool
         Whether densities that are not estimated count as multiplied too.
     """
     fitted = [experiment for experiment in experiments if not experiment.validation]
@@ -91,7 +91,7 @@ def _scaled_parameters(
         constants = ThetaMap(usual, body)
         theta = constants.theta(usual.guess_q)
         slope = constants.jacobian(usual.guess_q)
-        change = _common_scaling(body, theta, slope, includes_stated)
+        change = _common_scaling(body, theta, slope, includes_declared)
         if key in with_known_force or change is None:
             change = np.zeros(len(slope))
         size = np.where(theta == 0, 1.0, np.abs(theta))
@@ -102,22 +102,27 @@ def _scaled_parameters(
     if not scaling.any():
         return ()
     solution = np.linalg.lstsq(matrix, scaling, rcond=None)[0]
-    moves = np.abs(solution) > LEFT * np.abs(solution).max(initial=0.0)
+    moves = np.abs(solution) > LEAST_REMAINDER * np.abs(solution).max(initial=0.0)
     priors = np.array([item.prior is not None for item in usual.free], dtype=bool)
-    if np.abs(matrix @ solution - scaling).max() > LEFT or (moves & priors).any():
+    if np.abs(matrix @ solution - scaling).max() > LEAST_REMAINDER or (moves & priors).any():
         return ()
     return tuple(item.name for item, is_moved in zip(usual.free, moves, strict=True) if is_moved)
 
 
-def _common_scaling(body: Body, theta: Array, slope: Array, is_stated: bool) -> Array | None:
+def _common_scaling(
+    body: Body, theta: Array, slope: Array, includes_declared: bool
+) -> Array | None:
     """Return the change of θ (k,) if all moduli and densities change by a common factor;
     None if a density cannot.
     """
-    if not is_stated and not all(part.has_free_density for part in body.parts):
+    if not includes_declared and not all(part.has_free_density for part in body.parts):
         return None
     scaled = [
         is_modulus(name)
-        or (without_region(name) == DENSITY.name and not (is_stated and not slope[place].any()))
+        or (
+            without_region(name) == DENSITY.name
+            and not (includes_declared and not slope[place].any())
+        )
         for place, name in enumerate(body.constants)
     ]
     return np.where(scaled, theta, 0.0)
@@ -126,7 +131,7 @@ def _common_scaling(body: Body, theta: Array, slope: Array, is_stated: bool) -> 
 # Probability that noise of a motionless marker is taken for motion.
 RARE = 1e-3
 # Displacement of grasped nodes up to which they count as motionless, over sigma_m.
-HELD = 2.0
+LEAST_RESTRAINT = 2.0
 
 
 def is_motionless(experiment: Experiment) -> bool:
@@ -139,11 +144,11 @@ def is_motionless(experiment: Experiment) -> bool:
     if (is_prescribed.any(axis=0) != lasting).any():
         return False
     displacement_m = np.ptp(positions_m[:, lasting], axis=0)
-    if displacement_m.size and displacement_m.max() > HELD * sigma_m:
+    if displacement_m.size and displacement_m.max() > LEAST_RESTRAINT * sigma_m:
         return False
     if np.ptp(experiment.point_mass_at_nodes_kg(t_s), axis=0).any():
         return False
-    if np.ptp(experiment.stated_node_forces_n(t_s), axis=0).any():
+    if np.ptp(experiment.declared_node_forces_n(t_s), axis=0).any():
         return False
     present = markers.is_present[..., None]
     counts = np.maximum(present.sum(axis=0), 1)

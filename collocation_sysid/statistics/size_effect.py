@@ -101,5 +101,5 @@ def obstacle_shifts_m(iterate: ExperimentIterate) -> Iterator[tuple[Obstacle, Ar
         pivot_m = turn @ iterate.segment.nuisance.grasp_pivot_m + shift
         pivot_m = np.where(free, first_contacts[support[-1]].place_m, pivot_m)
         way_m = each.normal * (each.normal @ (each.place_m - pivot_m))
-        turns, _ = obstacle.poses.at(t_s)
-        yield obstacle, turns @ (turns[each.row].T @ way_m)
+        rotations, _ = obstacle.poses.at(t_s)
+        yield obstacle, rotations @ (rotations[each.row].T @ way_m)

@@ -27,7 +27,7 @@ LENGTHS = 10
 # Longest correlation length over the extent of the body.
 LONGEST = 0.5
 # Directions in which the data determine more than this share of a parameter are left out.
-TAKEN = 0.1
+LEAST_CORRELATION = 0.1
 # Largest number of images that are used.
 MOST_SAMPLES = 20
 
@@ -83,7 +83,7 @@ def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialC
             np.concatenate(
                 [singular_values, np.zeros(len(present_channels) - len(singular_values))]
             )
-            < TAKEN,
+            < LEAST_CORRELATION,
         ]
         if free.shape[1] > 2:
             contrasts.append(

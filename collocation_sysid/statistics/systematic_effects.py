@@ -234,8 +234,8 @@ class ExperimentAtAnswer:
         segment = self.iterate.segment
         gaps_m = surface_gaps_and_pressures(segment.experiment, self.theta, self.iterate.x)[0]
         nearest = np.fmin.reduce(gaps_m, axis=0)
-        is_touched = np.nan_to_num(nearest, nan=np.inf) < segment.length_m
-        known = np.unique(self.body.mesh.surface[is_touched])
+        is_in_contact = np.nan_to_num(nearest, nan=np.inf) < segment.length_m
+        known = np.unique(self.body.mesh.surface[is_in_contact])
         modes = surface_modes(self.body, known, self.surface_correlation)
         return thickness_m(self.body) * modes
 
@@ -382,18 +382,18 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
     force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(smaller)
     force = force / (2 * SMALL)
     # Of a body made under gravity the deflection over the size grows with the weight over s².
-    heavier = at.force_change_by_scan_weight() * (-2.0 if at.body.has_stated_mass else 1.0)
-    mass = (0.0 if at.body.has_stated_mass else 3.0) * at.own_mass_kg
+    heavier = at.force_change_by_scan_weight() * (-2.0 if at.body.has_declared_mass else 1.0)
+    mass = (0.0 if at.body.has_declared_mass else 3.0) * at.own_mass_kg
     for number, contact in at.contacts.items():
-        stated = contact.law_of_contact.obstacle.stiffness_pa_m is not None
-        force += (2.0 if stated else 1.0) * at.contact_n(number)
+        has_stiffness = contact.law_of_contact.obstacle.stiffness_pa_m is not None
+        force += (2.0 if has_stiffness else 1.0) * at.contact_n(number)
     segment = at.iterate.segment
-    turns: Array = np.nan_to_num(segment.prescribed_motion.pose_rows[0])
+    rotations: Array = np.nan_to_num(segment.prescribed_motion.pose_rows[0])
     arms_m = (
         segment.prescribed_motion.displaced_nodes(at.iterate.phi)[0]
         - segment.nuisance.grasp_pivot_m
     )
-    displacement_m = np.einsum("tgj,gj->tg", turns, arms_m)
+    displacement_m = np.einsum("tgj,gj->tg", rotations, arms_m)
     for obstacle, shift_m in obstacle_shifts_m(at.iterate):
         obstacle_dofs = np.searchsorted(segment.prescribed_motion.dofs, obstacle.prescribed_dofs)
         displacement_m[:, obstacle_dofs] = np.tile(shift_m, len(obstacle.nodes))
@@ -473,18 +473,20 @@ def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
 def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Effect of a larger Poisson's ratio where it is stated; None where it is estimated."""
     items = {item.name: item for item in at.parameters.items}
-    stated = {
+    constants = {
         name
         for name, item in items.items()
         if without_region(name) == "poisson"
         and (items[item.tied.to] if item.tied else item).is_fixed
     }
-    if not stated:
+    if not constants:
         return None
     values = at.parameters.values(at.iterate.q)
     larger, smaller = (
         at.internal_n(
-            theta=at.body.theta_from_values({n: v + way * (n in stated) for n, v in values.items()})
+            theta=at.body.theta_from_values(
+                {n: v + way * (n in constants) for n, v in values.items()}
+            )
         )
         for way in (SMALL, -SMALL)
     )
@@ -647,14 +649,14 @@ def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
 def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
     """Effect of an error of the surface along its normal, by one mode of a smooth random field."""
     moved_m = at.surface_modes_m[mode]
-    grasping = at.iterate.segment.prescribed_motion
-    turns: Array = np.nan_to_num(grasping.pose_rows[0])
+    prescribed_motion = at.iterate.segment.prescribed_motion
+    rotations: Array = np.nan_to_num(prescribed_motion.pose_rows[0])
     offsets_m = moved_m.ravel()[
         3 * (at.iterate.equations.prescribed.dofs // 3)[:, None] + np.arange(3)
     ]
     return Effect(
         at.force_change_by_reference(moved_m),
-        displacement_m=np.einsum("tgj,gj->tg", turns, offsets_m),
+        displacement_m=np.einsum("tgj,gj->tg", rotations, offsets_m),
     )
 
 
@@ -723,7 +725,7 @@ Deviation = Annotated[Literal["none"] | Positive, ByForm(str)]
 KnownDeviation = Annotated[KnownEffect | Deviation, ByForm((dict, KnownEffect))]
 # Rows that are never negative, of which a mean may be stated: what gives way does not push.
 OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n")
-_SAID = """Standard deviations of assumptions that are not estimated; "none" for an exact one.
+_DOCUMENTATION = """Standard deviations of systematic effects; "none" for what is exact.
 
 An effect that is known to exist, such as the compliance of a machine, has a table of mean and
 deviation. Nuisance parameters of recordings, by their names, count if they are not estimated.
@@ -732,7 +734,7 @@ Attributes
 ----------
 """
 _FIELDS = [(row.name, row.sigma, f"{row.description} [{row.unit or 1}]") for row in ASSUMPTIONS]
-_FIELDS += [(row.name, row.considered, f"{row.said} [{row.unit}]") for row in KINDS]
+_FIELDS += [(row.name, row.considered, f"{row.description} [{row.unit}]") for row in KINDS]
 
 
 class _AssumptionsBase(Options):
@@ -748,8 +750,8 @@ class _AssumptionsBase(Options):
     def deviations(self) -> dict[str, float | None]:
         """Standard deviations by name; None for what is exact."""
         by_name: dict[str, float | None] = {}
-        for name, stated in vars(self).items():
-            known = stated.deviation if isinstance(stated, KnownEffect) else stated
+        for name, deviation in vars(self).items():
+            known = deviation.deviation if isinstance(deviation, KnownEffect) else deviation
             by_name[name] = None if known == "none" else known
         return by_name
 
@@ -757,9 +759,9 @@ class _AssumptionsBase(Options):
     def means(self) -> dict[str, float]:
         """Known effects by name, each over its standard deviation."""
         return {
-            name: stated.mean / stated.deviation
-            for name, stated in vars(self).items()
-            if isinstance(stated, KnownEffect)
+            name: deviation.mean / deviation.deviation
+            for name, deviation in vars(self).items()
+            if isinstance(deviation, KnownEffect)
         }
 
 
@@ -791,6 +793,7 @@ else:
         kw_only=True,
         namespace={
             "__module__": __name__,
-            "__doc__": _SAID + "\n".join(f"{name}\n    {said}." for name, _, said in _FIELDS),
+            "__doc__": _DOCUMENTATION
+            + "\n".join(f"{name}\n    {said}." for name, _, said in _FIELDS),
         },
     )

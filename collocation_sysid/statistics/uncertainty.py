@@ -285,7 +285,7 @@ def _error_bars(
     """
     level = estimate_noise_level(fit, factored)
     without_outliers, outliers = remove_outliers(fit)
-    dependence_found, dependent = _dependence(without_outliers)
+    dependence, dependent = _dependence(without_outliers)
     correlated = requested.errors == "autocorrelated" or (requested.errors == "auto" and dependent)
     kind: Noise = level.suggested_noise if requested.noise == "auto" else requested.noise
     if requested.noise == "auto" and correlated and level.pooled < 1:
@@ -308,7 +308,7 @@ def _error_bars(
     return (
         covariance,
         student_ppf(0.975, freedom),
-        ErrorBasis(kind, used, level, dependence_found, outliers),
+        ErrorBasis(kind, used, level, dependence, outliers),
     )
 
 
@@ -460,26 +460,26 @@ class MarkerPlace:
         Standard error of each coordinate [m], zero for an exact place; None without error bars.
     prior_m : float
         Prior standard deviation of each coordinate [m], zero for an exact place.
-    given_m : (3,) array or None
+    declared_m : (3,) array or None
         Stated place [m]; None if there is none.
     """
 
     position_m: Array
     std_error_m: Array | None
     prior_m: float
-    given_m: Array | None
-    SERIALISED_PROPERTIES: ClassVar = ("given",)
+    declared_m: Array | None
+    SERIALISED_PROPERTIES: ClassVar = ("is_declared",)
 
     @property
-    def given(self) -> bool:
+    def is_declared(self) -> bool:
         """Whether a place was stated."""
-        return self.given_m is not None
+        return self.declared_m is not None
 
     @property
     def displacement_m(self) -> float | None:
         """Distance of the estimate from the stated place [m]; None if there is none."""
-        given = self.given_m
-        return None if given is None else float(np.linalg.norm(self.position_m - given))
+        declared_m = self.declared_m
+        return None if declared_m is None else float(np.linalg.norm(self.position_m - declared_m))
 
 
 def marker_places(

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..array_types import Array
 from ..model.parameters import Parameters
-from .combined_intervals import NORMAL_95, Interval, combine, widened
+from .combined_intervals import NORMAL_95, Interval, combine, widened_interval
 from .consider_analysis import ResidualChanges
 from .discretisation_error import DiscretisationError, estimate_changes
 from .distributions import student_ppf
@@ -79,7 +79,7 @@ class BudgetLine:
         total = known_variance + deviation**2
         shares = {name: share * known_variance / total for name, share in self.shares.items()}
         shares[source] = deviation**2 / total
-        least, most = widened((low, high), coordinate.from_value(self.value), deviation)
+        least, most = widened_interval((low, high), coordinate.from_value(self.value), deviation)
         return BudgetLine(
             self.value,
             _ranked(shares),
@@ -186,18 +186,18 @@ class VarianceSources:
             Share that would remain with known nuisance parameters; and share that would remain if
             recordings agreed.
         """
-        widened = self.widening * by_q
-        known, all_free, all_widened = (
+        scaled_by_noise = self.widening * by_q
+        known, all_free, all_scaled_by_noise = (
             float(g @ of_q @ g)
             for g, of_q in (
                 (by_q, self.covariance_known),
                 (by_q, self.covariance_free),
-                (widened, self.covariance_free),
+                (scaled_by_noise, self.covariance_free),
             )
         )
         if not all_free > 0:
             return 1.0, 1.0
-        agreed = 1.0 if (self.widening == 1).all() else all_free / all_widened
+        agreed = 1.0 if (self.widening == 1).all() else all_free / all_scaled_by_noise
         return float(np.clip(known / all_free, 0.0, 1.0)), agreed
 
     def variance_between_recordings(self, by_q: Array, others: float, counted: float) -> float:

@@ -66,7 +66,7 @@ UNITS = (
     ("torques", {"newton millimetres": 1e-3, "kilogram-force metres": 9.80665}, TORQUES),
 )
 # Offset over the standard deviation of the tare's prior from which on the sensor was not zeroed.
-FAR_TARE = 3.0
+LARGEST_TARE = 3.0
 # Error of a calibration that gives no concern.
 SAME_GAIN = 0.05
 # Error of the reference point that gives no concern [m].
@@ -128,9 +128,9 @@ def _misses(part: ExperimentIterate) -> bool:
     # They are behind the markers.
     pairs = zip(part.segment.sensors, part.observables[1:], strict=False)
     return any(
-        float(np.sum(sensor.residuals(looked, part.phi) ** 2))
+        float(np.sum(sensor.residuals(observation, part.phi) ** 2))
         > MISFIT**2 * sensor.is_compared_by_component.sum()
-        for sensor, looked in pairs
+        for sensor, observation in pairs
     )
 
 
@@ -143,21 +143,21 @@ def _markers_misfit(part: ExperimentIterate) -> float:
 
 
 def _from_markers(
-    collocation: Collocation, seen: Sequence[Transcription], method: ReducedSpace
+    collocation: Collocation, transcriptions: Sequence[Transcription], method: ReducedSpace
 ) -> list[ExperimentIterate]:
     """Return experiments fitted to their markers alone, with the nuisance parameters of the
     wrenches at zero; empty if the fit fails.
     """
-    if not seen:
+    if not transcriptions:
         return []
-    without_wrenches = [without_grasp_sensors(segment.experiment) for segment in seen]
+    without_wrenches = [without_grasp_sensors(segment.experiment) for segment in transcriptions]
     try:
         solution = method(replace(collocation, experiments=without_wrenches))
     except (InputError, SimulationError):
         return []
     solution.unless_interrupted()
     parts = []
-    for segment, part in zip(seen, solution.parts, strict=True):
+    for segment, part in zip(transcriptions, solution.parts, strict=True):
         values = dict(zip(part.segment.nuisance.names, part.phi, strict=True))
         phi = np.array([values.get(name, 0.0) for name in segment.nuisance.names])
         parts.append(ExperimentIterate(segment, part.q, phi, part.x))
@@ -204,12 +204,12 @@ class _OneSensor:
         blind = without_grasp_sensors(segment.experiment)
         self.scale_known = not segment.body.mass_derivatives or blind.has_known_force
         self._known: dict[tuple[bytes, Frame, bytes], Array] = {}
-        self.given = DescribedWrench(sensor.wrench, segment.experiment.nuisance.tare or 0.0)
+        self.declared = DescribedWrench(sensor.wrench, segment.experiment.nuisance.tare or 0.0)
 
     def causes(self) -> Iterator[Hypothesis]:
         """Yield the hypotheses that improve the fit; if there is none, that of a large tare."""
         accepted: list[Hypothesis] = []
-        misfit = self.misfit(self.given)
+        misfit = self.misfit(self.declared)
         if misfit > MISFIT:
             test = HypothesisTest(misfit, self.misfit, BETTER, smallest_misfit=1.0)
             accepted = list(test.accepted(self._mistakes()))
@@ -217,10 +217,10 @@ class _OneSensor:
 
     def _large_tare(self) -> Iterator[Hypothesis]:
         """Yield the hypothesis that the tare of the fit is far beyond its prior."""
-        tare = self.given.tare
+        tare = self.declared.tare
         if not tare:
             return
-        measured, predicted = self._scaled_by_sigma(DescribedWrench(self.given.wrench, 0.0))
+        measured, predicted = self._scaled_by_sigma(DescribedWrench(self.declared.wrench, 0.0))
         factor = 1.0 if self.scale_known else _slope(measured, predicted)
         differences = measured - factor * predicted
         is_measured = np.isfinite(differences).any(axis=0)
@@ -229,9 +229,9 @@ class _OneSensor:
             if is_measured.any()
             else 0.0
         )
-        if largest > FAR_TARE:
+        if largest > LARGEST_TARE:
             of = f"the wrench of '{self.part.segment.experiment.name}'"
-            yield Hypothesis("wrench-tare", of, strength=float(largest / FAR_TARE))
+            yield Hypothesis("wrench-tare", of, strength=float(largest / LARGEST_TARE))
 
     def misfit(self, trial: DescribedWrench) -> float:
         """Return the root mean square of the residuals of a description in standard
@@ -267,7 +267,7 @@ class _OneSensor:
         """Return the positive factor with which the samples of some columns fit best; NaN
         if there is none.
         """
-        measured, predicted = self._scaled_by_sigma(self.given)
+        measured, predicted = self._scaled_by_sigma(self.declared)
         slope = _slope(measured[:, columns], predicted[:, columns])
         # A common factor cannot be told where the scale is unknown, that of one kind can.
         if not self.scale_known:
@@ -281,7 +281,7 @@ class _OneSensor:
 
         About a point shifted by d, a torque is smaller by d × f.
         """
-        measured, predicted = self._scaled_by_sigma(self.given)
+        measured, predicted = self._scaled_by_sigma(self.declared)
         if not np.isfinite(measured[:, TORQUES]).any():
             return np.zeros(3)
         factor = 1.0
@@ -290,12 +290,12 @@ class _OneSensor:
             and not (factor := _slope(measured[:, FORCES], predicted[:, FORCES])) > 0
         ):
             return np.zeros(3)
-        wrench = self.given.wrench
+        wrench = self.declared.wrench
         forces = self._predicted(wrench)[:, FORCES]
         by_shift = np.cross(forces[:, None], np.eye(3)[None]) / wrench.sigmas[3]  # (S, shift, 3)
         by_shift = np.where(np.isfinite(measured[:, None, TORQUES]), by_shift, np.nan)
         slopes = np.stack(
-            [_without_tare(by_shift[:, k], self.given.tare) for k in range(3)], axis=2
+            [_without_tare(by_shift[:, k], self.declared.tare) for k in range(3)], axis=2
         )
         differences = (measured - factor * predicted)[:, TORQUES]
         is_measured = np.isfinite(differences)
@@ -308,10 +308,10 @@ class _OneSensor:
     def _mistakes(self) -> Iterator[Hypothesis]:
         """Yield each common mistake with the description that corrects it."""
         of = f"the wrench of '{self.part.segment.experiment.name}'"
-        wrench = self.given.wrench
+        wrench = self.declared.wrench
 
         def hypothesis(code: str, without: Wrench, handicap: float = 1.0, **data) -> Hypothesis:
-            return Hypothesis(code, of, data, replace(self.given, wrench=without), handicap)
+            return Hypothesis(code, of, data, replace(self.declared, wrench=without), handicap)
 
         values = np.array(wrench.values)
         yield hypothesis("wrench-sign", replace(wrench, values=-values))
@@ -353,7 +353,7 @@ class _OneSensor:
         for shift_s in np.linspace(-span_s, span_s, SHIFTS + 1):
             data = {"by_ms": 1e3 * abs(shift_s), "when": "later" if shift_s < 0 else "earlier"}
             yield hypothesis("wrench-clock", replace(wrench, t_s=wrench.t_s + shift_s), **data)
-        yield Hypothesis("wrench-tare", of, corrected=replace(self.given, tare=np.inf))
+        yield Hypothesis("wrench-tare", of, corrected=replace(self.declared, tare=np.inf))
 
 
 def _without_tare(values: Array, tare: float) -> Array:

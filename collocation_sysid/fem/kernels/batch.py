@@ -97,9 +97,9 @@ class CasadiEvaluator:
         )
         self._geometry = np.asfortranarray(batch.geometry.reshape(count * points, size).T)
         self._dofs = dofs_of(batch.cells).T
-        self._carried = None
+        self._point_data_columns = None
         if batch.data_columns is not None:
-            self._carried = batch.data_columns.reshape(count * points, -1).T
+            self._point_data_columns = batch.data_columns.reshape(count * points, -1).T
         destinations = batch.destinations.ravel()
         self._sum = sp.csr_array(
             (np.ones(len(destinations)), (destinations, np.arange(len(destinations)))),
@@ -118,8 +118,10 @@ class CasadiEvaluator:
         """Sum the kernel over elements and points into `out` (T, width); see `Evaluator`."""
         for t in range(len(out)):
             inputs = [field[t][self._dofs] for field in fields]
-            if self._carried is not None and data_of_points is not None:
-                point_data = [data_of_points[t if len(data_of_points) > 1 else 0][self._carried]]
+            if self._point_data_columns is not None and data_of_points is not None:
+                point_data = [
+                    data_of_points[t if len(data_of_points) > 1 else 0][self._point_data_columns]
+                ]
             else:
                 point_data = []
             outputs = self._mapped.call([*inputs, self._geometry, theta, *point_data])

@@ -69,9 +69,9 @@ class SimdEvaluator:
         self._width = batch.width
         self._points = batch.geometry.shape[1]
         self._fields = len(kernel.fields)
-        self._carried = None
+        self._point_data_columns = None
         if batch.data_columns is not None:
-            self._carried = _block_major(batch.data_columns[lane_element], by_block)
+            self._point_data_columns = _block_major(batch.data_columns[lane_element], by_block)
         tables = self._geometry, self._nodes, self._destinations
         self._tables = [address(table) for table in tables]
         key = f"{lanes} {self._points} {hashlib.sha256(kernel.serialized.encode()).hexdigest()}"
@@ -96,9 +96,9 @@ class SimdEvaluator:
         """Sum the kernel over elements and points into `out` (T, width); see `Evaluator`."""
         addresses = [address(field) for field in fields]
         constants = [*self._tables, address(theta), address(out)]
-        if self._carried is not None and data_of_points is not None:
+        if self._point_data_columns is not None and data_of_points is not None:
             length = data_of_points.shape[1] if len(data_of_points) > 1 else 0
-            constants += [length, address(self._carried), address(data_of_points)]
+            constants += [length, address(self._point_data_columns), address(data_of_points)]
         stride = fields[0].shape[1]
 
         def run(start: int, stop: int) -> None:
@@ -195,13 +195,13 @@ class _KernelEmitter:
         self.size = 3 * self.nodes
         # The kernel's own outputs come first among the totals.
         self.last = _PhaseLayout(kernel.phases[-1], 0)
-        self.earlier: list[_PhaseLayout] = []
+        self.previous_phases: list[_PhaseLayout] = []
         for phase in kernel.previous_phases:
-            before = self.earlier[-1] if self.earlier else self.last
-            self.earlier.append(_PhaseLayout(phase, before.outputs[-1]))
+            before = self.previous_phases[-1] if self.previous_phases else self.last
+            self.previous_phases.append(_PhaseLayout(phase, before.outputs[-1]))
         # What they hold for the coupling, and for later phases.
         self.own = len(kernel.contractions)
-        shared = [(phase, 0) for phase in self.earlier] + [(self.last, self.own)]
+        shared = [(phase, 0) for phase in self.previous_phases] + [(self.last, self.own)]
         self.sums = [at for phase, k in shared for at in phase.output_offsets(k, "none", 1)]
         self.vectors = [
             at for phase, k in shared for at in phase.output_offsets(k, "nodes", self.size)
@@ -209,8 +209,8 @@ class _KernelEmitter:
         self.coupling = kernel.coupling
         self.module = ir.Module()
         constants = [DOUBLES, I32S, I32S, DOUBLES, DOUBLES]
-        self.carried = kernel.point_data_count
-        if self.carried:
+        self.point_data_count = kernel.point_data_count
+        if self.point_data_count:
             constants += [I64, I32S, DOUBLES]
         kind = ir.FunctionType(ir.VoidType(), [I64] * 6 + [DOUBLES] * self.fields + constants)
         self.run = ir.Function(self.module, kind, "run")
@@ -227,7 +227,7 @@ class _KernelEmitter:
         field_rows = args[6 : 6 + self.fields]
         geometry, nodes, destinations, theta, out, *memory = args[6 + self.fields :]
         gathered = [self._buffer(self.size, f"field{k}") for k in range(self.fields)]
-        phases = [*self.earlier, self.last]
+        phases = [*self.previous_phases, self.last]
         outputs = self.last.outputs[self.own]
         total = max(phase.outputs[-1] for phase in phases)
         totals = self._buffer(total, "totals")
@@ -338,9 +338,9 @@ class _KernelEmitter:
         b = self.builder
         length, places, rows = memory
         row = b.gep(rows, [b.mul(t, length)])
-        first = b.mul(point, I64(self.carried * self.lanes))
+        first = b.mul(point, I64(self.point_data_count * self.lanes))
         values = []
-        for entry in range(self.carried):
+        for entry in range(self.point_data_count):
             value: Value = ir.Constant(self.vector, ir.Undefined)
             for lane in range(self.lanes):
                 position = b.gep(places, [b.add(first, I64(entry * self.lanes + lane))])

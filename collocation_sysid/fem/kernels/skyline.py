@@ -91,12 +91,12 @@ class SkylineFactorisation:
 
     def allocate(self, sides: int) -> FactorMemory:
         """Return memory for the sides of a matrix: one for a symmetric matrix, otherwise two."""
-        numbers = sides * math.prod(self.shape)
+        array_size = sides * math.prod(self.shape)
         size, width = self.shape
-        memory = np.zeros(numbers + LINE_BYTES // 8)
+        memory = np.zeros(array_size + LINE_BYTES // 8)
         start = -memory.ctypes.data % LINE_BYTES // 8
         return FactorMemory(
-            memory[start : start + numbers].reshape(sides, *self.shape),
+            memory[start : start + array_size].reshape(sides, *self.shape),
             np.zeros((2, size + width)),
         )
 

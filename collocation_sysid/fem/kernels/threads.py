@@ -53,7 +53,7 @@ def run_in_slices(run: Callable[[int, int], None], count: int, threads: int) -> 
     if (stop := getattr(_alone, "stop", None)) is not None and stop.is_set():
         raise KeyboardInterrupt
     threads = min(threads, count)
-    if threads <= 1 or getattr(_alone, "whole", False):
+    if threads <= 1 or getattr(_alone, "in_experiment", False):
         run(0, count)
         return
     bounds = [count * k // threads for k in range(threads + 1)]
@@ -92,12 +92,12 @@ def map_experiments(run: Callable[[T], R], items: Sequence[T], threads: int) -> 
 
 def run_single_threaded(run: Callable[..., R], *arguments: Any) -> R:
     """Return ``run(*arguments)``, and start no further threads from this thread from now on."""
-    _alone.whole = True
+    _alone.in_experiment = True
     return run(*arguments)
 
 
 def concurrent_count(items: int, threads: int) -> int:
     """Return how many of these items run at the same time."""
-    if threads == 1 or getattr(_alone, "whole", False):
+    if threads == 1 or getattr(_alone, "in_experiment", False):
         return 1
     return max(1, min(items, 2 * threads))

@@ -208,9 +208,9 @@ def minimise_cg_descent(
         x = x + step * d
         f = trial.value
         g = trial.gradient
-        reached_along = d
+        last_direction = d
         d = _next_direction(d, before, g, y, options.truncation)
-        state = CgState(k + 1, x, f, g, reached_along, slope, step)
+        state = CgState(k + 1, x, f, g, last_direction, slope, step)
         if callback is not None and callback(state):
             return result("stopped", k + 1)
     if np.abs(g).max(initial=0.0) <= options.tolerance:

@@ -277,8 +277,8 @@ class _QuadraticModel:
         """Block (positions, positions) of the matrix, without damping."""
         of_x = self._jacobian_blocks[0]
         positions = self._positions
-        curved = sp.csr_array(self.hessian)[positions][:, positions]
-        return sp.coo_array(self.rho * (of_x.T @ of_x) + curved)
+        position_hessian = sp.csr_array(self.hessian)[positions][:, positions]
+        return sp.coo_array(self.rho * (of_x.T @ of_x) + position_hessian)
 
     @cached_property
     def _band(self) -> Array:

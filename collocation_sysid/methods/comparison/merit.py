@@ -51,8 +51,12 @@ class PenaltyProblem:
         self.original = collocation
         self.stopwatch = stopwatch or Stopwatch()
         with self.stopwatch.building():
-            explicit = collocation.has_grasp_constraints
-            grasped = collocation if explicit else replace(collocation, has_grasp_constraints=True)
+            has_grasp_constraints = collocation.has_grasp_constraints
+            grasped = (
+                collocation
+                if has_grasp_constraints
+                else replace(collocation, has_grasp_constraints=True)
+            )
             self.nlp = grasped.with_lifted_variables()
             indptr, indices = self.nlp.jacobian_structure
             shape = (self.nlp.constraint_count, self.nlp.variable_count)
@@ -123,13 +127,13 @@ class PenaltyProblem:
     def to_original_multipliers(self, multipliers: Array) -> Array:
         """Return multipliers of the given problem from those of all constraints (constraints,)."""
         pairs = zip(self.original.transcriptions, self.nlp.transcriptions, strict=True)
-        rows = ((given, s, multipliers[s.rows]) for given, s in pairs)
+        rows = ((block, s, multipliers[s.rows]) for block, s in pairs)
         return np.concatenate(
             [
                 each
-                if given.constraints_per_time == s.constraints_per_time
-                else each.reshape(-1, s.dof_count)[:, given.constrained_dofs].ravel()
-                for given, s, each in rows
+                if values.constraints_per_time == s.constraints_per_time
+                else each.reshape(-1, s.dof_count)[:, values.constrained_dofs].ravel()
+                for values, s, each in rows
             ]
         )
 

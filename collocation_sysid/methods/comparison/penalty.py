@@ -140,8 +140,8 @@ class PenaltyOptions(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.last_rho < self.rho:
-            found = f"found {self.rho_max:g} with rho = {self.rho:g}"
-            raise InputError(f"{found}; expected no less than rho", None, "rho_max")
+            finding = f"found {self.rho_max:g} with rho = {self.rho:g}"
+            raise InputError(f"{finding}; expected no less than rho", None, "rho_max")
 
     def __call__(
         self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
@@ -256,11 +256,11 @@ class AugmentedLagrangian(PenaltyOptions):
         See `PenaltyOptions.next_stage`.
         """
         rho = stage.merit.rho
-        wanted = stage.tolerance
+        tolerance = stage.tolerance
         slack = stage.violation
         is_feasible = slack.relative <= self.violation
         is_last = rho >= self.rho_max or is_feasible
-        if is_last and wanted <= self.tolerance and slack.scaled > STUCK * before.scaled:
+        if is_last and tolerance <= self.tolerance and slack.scaled > STUCK * before.scaled:
             if stage.is_minimum:
                 raise SearchEnded(
                     Status.STALLED,
@@ -270,13 +270,13 @@ class AugmentedLagrangian(PenaltyOptions):
             raise SearchEnded(
                 Status.STALLED,
                 f"The last stage ended with a gradient of {stage.gradient:.2g}, above its "
-                f"tolerance {wanted:.2g}; another inner solver may get farther.",
+                f"tolerance {tolerance:.2g}; another inner solver may get farther.",
             )
         if not is_feasible and slack.scaled > FALL * before.scaled:
             rho = min(self.rho_factor * rho, self.rho_max)
         rows = stage.merit.problem.constraint_values(z)
         merit = replace(stage.merit, rho=rho, multipliers=stage.merit.multiplier_estimate(rows))
-        return Stage(merit, max(0.0 if is_feasible else TIGHTER * wanted, self.tolerance))
+        return Stage(merit, max(0.0 if is_feasible else TIGHTER * tolerance, self.tolerance))
 
 
 class _PenaltySolve:
@@ -320,8 +320,8 @@ class _PenaltySolve:
                 and is_feasible
                 and ended_stage.tolerance <= options.tolerance
             ):
-                said = "Converged: gradient and slack are within their tolerances."
-                return Status.CONVERGED, said
+                message = "Converged: gradient and slack are within their tolerances."
+                return Status.CONVERGED, message
             self.stage = options.next_stage(ended_stage, before, self.variables)
             before = ended_stage.violation
 

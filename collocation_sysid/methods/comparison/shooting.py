@@ -36,7 +36,7 @@ from ..solve_recorder import Recorder, SearchEnded
 # Relative decrease of the loss, or of one of a standard deviation, that is rounding.
 ROUNDING = 1e-14
 # A line search that ends in rounding has found the optimum where no slope of the loss is larger.
-FLAT = 1e-5
+LEAST_GRADIENT_TOLERANCE = 1e-5
 # Pairs of steps and gradients that L-BFGS-B remembers.
 MEMORY = 20
 
@@ -60,7 +60,7 @@ class Shooting(Options):
     """
 
     name: ClassVar[str] = "shooting"
-    needs_whole_start: ClassVar[bool] = True
+    needs_complete_start: ClassVar[bool] = True
 
     gradient: Literal["forward", "adjoint"] = "forward"
     tolerance: Positive = 1e-8
@@ -245,8 +245,10 @@ class _ShootingSearch:
         p = self.best.p
         slope = self.best.slope
         projected = np.clip(p - slope, self.lower, self.upper) - p
-        is_flat = np.abs(projected).max() <= max(FLAT, self.options.tolerance)
-        status = Status.ACCEPTABLE if is_flat else Status.STALLED
+        is_stationary = np.abs(projected).max() <= max(
+            LEAST_GRADIENT_TOLERANCE, self.options.tolerance
+        )
+        status = Status.ACCEPTABLE if is_stationary else Status.STALLED
         if result.success:
             status = Status.CONVERGED
         return status, f"{status.sentence} (SciPy: {result.message})"

@@ -188,10 +188,10 @@ def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
     for item in recording.problem.parameters.free:
         if is_field_coefficient(item.name):
             continue
-        stated = problem_table["parameters"].get(item.name)
+        section = problem_table["parameters"].get(item.name)
         guess = {"guess": design.after.values[item.name]}
         problem_table["parameters"][item.name] = (
-            stated if isinstance(stated, dict) else {}
+            section if isinstance(section, dict) else {}
         ) | guess
     return problem_table
 

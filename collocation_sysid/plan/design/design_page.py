@@ -46,15 +46,15 @@ def _error_table(design: Design) -> Table:
     after = design.after
     rows = []
     for name, relative in after.relative.items():
-        earlier = before.relative[name] if before is not None else np.nan
+        error_before = before.relative[name] if before is not None else np.nan
         rows.append(
             (
                 symbol_with_unit(name),
                 f"{after.values[name]:.4g}",
-                _percent(earlier),
+                _percent(error_before),
                 _percent(relative),
                 f"{_percent(after.lowest[name])} … {_percent(after.highest[name])}",
-                f"{earlier / relative:.2g}" if np.isfinite(earlier) else "",
+                f"{error_before / relative:.2g}" if np.isfinite(error_before) else "",
             )
         )
     return Table("", heads, tuple(rows))

@@ -18,7 +18,7 @@ from ...array_types import Array
 EXPLORED = 0.2
 FIRST_DEVIATION = 0.5
 # The deviation about a start that is known to be good.
-NEAR = 0.15
+SMALLEST_DISTANCE = 0.15
 
 # The value at coefficients; beyond the second number it need not be exact.
 Value = Callable[[Array, float], float]
@@ -102,7 +102,9 @@ def minimise(
             for _ in range(max(1, round(EXPLORED * evaluations))):
                 evaluate(rng.normal(size=dimension), best.value)
         assert best.coefficients is not None
-        strategy = EvolutionStrategy(best.coefficients, FIRST_DEVIATION if start is None else NEAR)
+        strategy = EvolutionStrategy(
+            best.coefficients, FIRST_DEVIATION if start is None else SMALLEST_DISTANCE
+        )
         bar = np.inf
         while len(best.history) < evaluations:
             count = min(strategy.offspring, evaluations - len(best.history))

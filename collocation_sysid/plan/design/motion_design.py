@@ -399,10 +399,10 @@ def _before(judge: MotionObjective, add: bool) -> ErrorBars | None:
         return None
     shipped = replace(recording, duration_s=template.duration_s)
     try:
-        told = [shipped.simulate_motion(template, q) for q in judge.draws]
+        simulations = [shipped.simulate_motion(template, q) for q in judge.draws]
     except SimulationError:
         return None
-    return _error_bars(judge, told)
+    return _error_bars(judge, simulations)
 
 
 def _error_bars(judge: MotionObjective, results: list[SimulatedMotion]) -> ErrorBars:

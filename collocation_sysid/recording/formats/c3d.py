@@ -10,7 +10,7 @@ from pathlib import Path
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...isolated_process import Failed, ProcessLimits, computed_apart
+from ...isolated_process import Failed, ProcessLimits, run_isolated
 from .raw_tracks import LabelChooser, RawTracks
 from .units import length_unit_of_text
 
@@ -57,20 +57,18 @@ def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
     """
     if find_spec("ezc3d") is None:
         raise InputError("reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'")
-    points_stated, frames_stated = _header_counts(content)
+    header_points, header_frames = _header_counts(content)
     try:
-        read = computed_apart(
-            _WORKER, str(Path(path).resolve()), limits=ProcessLimits.for_file(path)
-        )
+        read = run_isolated(_WORKER, str(Path(path).resolve()), limits=ProcessLimits.for_file(path))
     except Failed as error:
         raise InputError(f"is a damaged C3D file: ezc3d says '{error}'") from error
     points = read.pop("points")  # (3, points, frames)
-    for what, stated, count in (
-        ("points", points_stated, points.shape[1]),
-        ("frames", frames_stated, points.shape[2]),
+    for what, declared, count in (
+        ("points", header_points, points.shape[1]),
+        ("frames", header_frames, points.shape[2]),
     ):
-        if stated is not None and count != stated:
-            raise InputError(f"the header states {stated} {what}, but the file contains {count}")
+        if declared is not None and count != declared:
+            raise InputError(f"the header states {declared} {what}, but the file contains {count}")
     labels = _labels(read)
     if len(labels) != points.shape[1]:
         raise InputError(

@@ -243,7 +243,7 @@ def _read_npz(path: Path) -> DepthFileContent:
 def _standard_error_silenced() -> Iterator[None]:
     """Discard what compiled code writes to the standard error of this process."""
     try:
-        kept = os.dup(2)
+        saved_descriptor = os.dup(2)
     except OSError:  # it is closed
         yield
         return
@@ -252,8 +252,8 @@ def _standard_error_silenced() -> Iterator[None]:
             os.dup2(nowhere.fileno(), 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(saved_descriptor, 2)
+        os.close(saved_descriptor)
 
 
 def _read_exr(path: Path) -> Array:
@@ -307,8 +307,8 @@ def _read_pcd(path: Path) -> Array:
         rows = np.frombuffer(raw, form, int(head["POINTS"][0]), begins)
         columns = {name: rows[name][:, 0] for name in rows.dtype.names or ()}
     elif head["DATA"] == ["ascii"]:
-        numbers = np.loadtxt(raw[begins:].decode("ascii").splitlines(), ndmin=2)
-        columns = dict(zip(head["FIELDS"], numbers.T, strict=True))
+        values = np.loadtxt(raw[begins:].decode("ascii").splitlines(), ndmin=2)
+        columns = dict(zip(head["FIELDS"], values.T, strict=True))
     else:
         raise InputError(
             f"has DATA {' '.join(head['DATA'])}; expected ascii or binary: convert it, for example "

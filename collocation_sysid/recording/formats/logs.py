@@ -275,7 +275,7 @@ class _Dataset:
         for name, feature in info["features"].items():
             if feature["dtype"].startswith(("float", "int")) and "index" not in name:
                 self.topics[name] = feature["dtype"], int(info["total_frames"])
-                self.names[name] = _names_of_numbers(feature, name)
+                self.names[name] = _component_names(feature, name)
         self.topics.pop("timestamp", None)
         return self
 
@@ -302,7 +302,7 @@ class _Dataset:
             )
 
 
-def _names_of_numbers(feature: Any, name: str) -> list[str]:
+def _component_names(feature: Any, name: str) -> list[str]:
     """Return the names of the numbers of a feature; older datasets nest them in a dictionary."""
     names = feature.get("names")
     while isinstance(names, dict):

@@ -95,7 +95,7 @@ def _plain_columns(content: bytes) -> Mapping[str, Array] | None:
     return dict(zip(names, values.T, strict=True))
 
 
-def _refuse_short(expected: int, found: int) -> None:
+def _refuse_short(expected: int, count: int) -> None:
     raise InputError(
-        f"has {found} points; expected {expected}, as its header states: is the file truncated?"
+        f"has {count} points; expected {expected}, as its header states: is the file truncated?"
     )

@@ -24,8 +24,8 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     if "MARKER_NAMES" not in above:
         raise InputError("the header lacks MARKER_NAMES; expected a Qualisys TSV file with 3D data")
     labels = [cell for cell in above["MARKER_NAMES"].cells[1:] if cell]
-    stated = {key: ("".join(row.cells[1:2]), row.line) for key, row in above.items()}
-    header = Header(stated)
+    header_values = {key: ("".join(row.cells[1:2]), row.line) for key, row in above.items()}
+    header = Header(header_values)
     header.require_count("NO_OF_MARKERS", len(labels), "marker names")
     frames = rows[count:]
     leading = _leading_columns(frames, 3 * len(labels))

@@ -143,9 +143,11 @@ class Header:
         line : int, optional
             Line for the message; that of the key by default.
         """
-        stated = self.number(key)
-        if stated is not None and stated != count:
-            message = f"{key} is {stated:g}, but the file contains {count} {what}; is it truncated?"
+        declared = self.number(key)
+        if declared is not None and declared != count:
+            message = (
+                f"{key} is {declared:g}, but the file contains {count} {what}; is it truncated?"
+            )
             raise InputError(message, where=f"line {line or self.entries[key][1]}")
 
 

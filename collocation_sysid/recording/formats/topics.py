@@ -120,7 +120,7 @@ def topic_as_csv(address: TopicAddress) -> bytes:
             )
         times, ordered = sort_by_time(messages, log.start_ns)
         by_namespace = has_namespaces(ordered)
-        rows = [_message_numbers(each, by_namespace=by_namespace) for each in ordered]
+        rows = [_message_values(each, by_namespace=by_namespace) for each in ordered]
         unit = address.unit or log.unit
     columns = list(dict.fromkeys(name for row in rows for name in row))
     if not columns:
@@ -159,8 +159,8 @@ def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
             STATIC_TOPIC_SUFFIX
         ):
             serves += f", part of the chains of {name.removesuffix(STATIC_TOPIC_SUFFIX)}"
-    elif first and (held := depth_kind(first[0][1])):
-        serves = f"{held}: [[experiment.depth]]"
+    elif first and (depth_type := depth_kind(first[0][1])):
+        serves = f"{depth_type}: [[experiment.depth]]"
     elif first and is_camera_model(first[0][1]):
         serves = "matrix of the camera, for depth images in the same namespace"
         write = []
@@ -168,7 +168,7 @@ def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
         messages = [message for _, message in first]
         by_namespace = has_namespaces(messages)
         columns = set[str]().union(
-            *(_message_numbers(each, by_namespace=by_namespace) for each in messages)
+            *(_message_values(each, by_namespace=by_namespace) for each in messages)
         )
         serves = _possible_uses(columns, messages[0])
         if serves.startswith("positions"):
@@ -241,7 +241,7 @@ def _nanoseconds(stamp: Any) -> int:
     )
 
 
-def _message_numbers(message: Any, *, by_namespace: bool) -> Row:
+def _message_values(message: Any, *, by_namespace: bool) -> Row:
     """Return the numbers of a message by their columns.
 
     With `by_namespace` the names of markers begin with their namespace.

@@ -21,8 +21,8 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     if len(rows) < 5:
         raise InputError("ends within the header of a TRC file", where=f"line {rows[-1].line}")
     _, keys, values, names, axes, *frames = rows
-    stated = zip(values.cells, [values.line] * len(keys.cells), strict=False)
-    header = Header(dict(zip(keys.cells, stated, strict=False)))
+    header_values = zip(values.cells, [values.line] * len(keys.cells), strict=False)
+    header = Header(dict(zip(keys.cells, header_values, strict=False)))
     if missing := [key for key in _KEYS if key not in header.entries]:
         there = ", ".join(filter(None, keys.cells))
         message = f"the header lacks {', '.join(missing)}; found {there}"

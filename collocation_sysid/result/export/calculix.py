@@ -53,7 +53,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         card, limitation = _material_card(region, linear)
         limits += [f"{region.name}: {limitation}"] if limitation else []
         materials += (
-            f"*MATERIAL,NAME=M{k}\n{card}*DENSITY\n{_format_numbers(region.density_kg_m3)}\n"
+            f"*MATERIAL,NAME=M{k}\n{card}*DENSITY\n{_format_values(region.density_kg_m3)}\n"
             f"*SOLID SECTION,ELSET=E{k},MATERIAL=M{k}\n"
         )
     limits.append("damping is not exported: an equilibrium has none")
@@ -62,7 +62,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
             "CalculiX distributes the weight of an element with its shape functions, "
             "this program lumps it at the nodes"
         )
-    nodes = (f"{k},{_format_numbers(*point)}\n" for k, point in enumerate(body.nodes_m, start=1))
+    nodes = (f"{k},{_format_values(*point)}\n" for k, point in enumerate(body.nodes_m, start=1))
     mesh = f"*NODE,NSET=ALL\n{''.join(nodes)}"
     kind = "C3D10" if body.is_quadratic else "C3D4"
     for k, region in enumerate(body.regions):
@@ -100,22 +100,22 @@ def _obstacle_cards(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) 
     for k, wall in enumerate(obstacles):
         deck += f"*NODE,NSET=W{k}\n"
         numbered = enumerate(wall.start_points_m, start=wall.first_node + 1)
-        deck += "".join(f"{i},{_format_numbers(*point)}\n" for i, point in numbered)
+        deck += "".join(f"{i},{_format_values(*point)}\n" for i, point in numbered)
         deck += f"*ELEMENT,TYPE=C3D4,ELSET=W{k}\n"
         for i, nodes in enumerate(wall.tetrahedra + 1, start=wall.first_cell + 1):
             deck += f"{i},{','.join(map(str, nodes))}\n"
         touching = body.body.mesh.surface[wall.faces].tolist()
         sides = "".join(f"{faces[tuple(sorted(face))]}\n" for face in touching)
-        constants = _format_numbers(float(wall.obstacle.friction), wall.stiffness_pa_m / 2)
+        constants = _format_values(float(wall.obstacle.friction), wall.stiffness_pa_m / 2)
         stick = f"*FRICTION\n{constants}\n"
         deck += (
             f"*SOLID SECTION,ELSET=W{k},MATERIAL=WALL\n*SURFACE,NAME=W{k}\nW{k},S1\n"
             f"*SURFACE,NAME=B{k}\n{sides}"
             f"*SURFACE INTERACTION,NAME=W{k}\n*SURFACE BEHAVIOR,PRESSURE-OVERCLOSURE=LINEAR\n"
-            f"{_format_numbers(wall.stiffness_pa_m)}\n{stick if wall.obstacle.has_friction else ''}"
+            f"{_format_values(wall.stiffness_pa_m)}\n{stick if wall.obstacle.has_friction else ''}"
             f"*CONTACT PAIR,INTERACTION=W{k},TYPE=SURFACE TO SURFACE\nB{k},W{k}\n"
         )
-    material = f"*MATERIAL,NAME=WALL\n*ELASTIC\n{_format_numbers(body.regions[0].young_pa, 0.3)}\n"
+    material = f"*MATERIAL,NAME=WALL\n*ELASTIC\n{_format_values(body.regions[0].young_pa, 0.3)}\n"
     return f"{material}*DENSITY\n1.\n{deck}" if obstacles else ""
 
 
@@ -140,17 +140,17 @@ def _step_card(
     rows = np.concatenate(displacements_m)
     prescribed = np.argwhere(np.isfinite(rows))
     boundary = "".join(
-        f"{n + 1},{a + 1},{a + 1},{_format_numbers(float(rows[n, a]))}\n" for n, a in prescribed
+        f"{n + 1},{a + 1},{a + 1},{_format_values(float(rows[n, a]))}\n" for n, a in prescribed
     )
     prints = "".join(f"*NODE PRINT,NSET=W{k},TOTALS=ONLY\nRF\n" for k in range(len(obstacles)))
     loaded = np.argwhere(body.node_loads_n)
     loads = "".join(
-        f"{n + 1},{a + 1},{_format_numbers(float(body.node_loads_n[n, a]))}\n" for n, a in loaded
+        f"{n + 1},{a + 1},{_format_values(float(body.node_loads_n[n, a]))}\n" for n, a in loaded
     )
     pull = float(np.linalg.norm(body.experiment.gravity_m_s2))
     direction = body.experiment.gravity_m_s2 / pull if pull else np.zeros(3)
     weight = (
-        f"*DLOAD\nBODY,GRAV,{_format_numbers(pull)},{_format_numbers(*direction)}\n" if pull else ""
+        f"*DLOAD\nBODY,GRAV,{_format_values(pull)},{_format_values(*direction)}\n" if pull else ""
     )
     return (
         f"*STEP,INC=1000{'' if is_linear else ',NLGEOM'}\n"
@@ -161,7 +161,7 @@ def _step_card(
     )
 
 
-def _format_numbers(*values: float) -> str:
+def _format_values(*values: float) -> str:
     """Return numbers for a line of the deck, separated by commas.
 
     CalculiX cuts off a number after 20 characters, even within its exponent.
@@ -184,10 +184,10 @@ def _material_card(region: IdentifiedRegion, is_linear: bool) -> tuple[str, str]
                 "in an analysis with large displacements the linear material becomes that of St. "
                 "Venant and Kirchhoff"
             )
-        return f"*ELASTIC\n{_format_numbers(region.young_pa, region.poisson)}\n", limitation
+        return f"*ELASTIC\n{_format_values(region.young_pa, region.poisson)}\n", limitation
     if region.material == "mooney-rivlin":
-        numbers = _format_numbers(c["c10_pa"], c["c01_pa"], volume)
-        return f"*HYPERELASTIC,MOONEY-RIVLIN\n{numbers}\n", ""
+        constants = _format_values(c["c10_pa"], c["c01_pa"], volume)
+        return f"*HYPERELASTIC,MOONEY-RIVLIN\n{constants}\n", ""
     if region.material in ("yeoh", "gent"):
         if region.material == "yeoh":
             factors = (c["c10_pa"], c["c20_pa"], c["c30_pa"])
@@ -200,23 +200,23 @@ def _material_card(region: IdentifiedRegion, is_linear: bool) -> tuple[str, str]
                 "Gent's energy is exported as a series of three terms, accurate for Ī₁ − 3 well "
                 f"below {limit:.4g}"
             )
-        numbers = _format_numbers(
+        constants = _format_values(
             factors[0], factors[1], factors[2], volume, ABSENT_TERM, ABSENT_TERM
         )
-        return f"*HYPERELASTIC,YEOH\n{numbers}\n", limitation
+        return f"*HYPERELASTIC,YEOH\n{constants}\n", limitation
     if region.material == "arruda-boyce":
         stretch = c["chain_stretch"]
         slope = sum(
             2 * a / stretch ** (2 * i - 2) * i * 3 ** (i - 1)
             for i, a in enumerate(_ARRUDA_BOYCE_COEFFICIENTS, 1)
         )
-        numbers = _format_numbers(c["mu_pa"] / slope, stretch, volume)
-        return f"*HYPERELASTIC,ARRUDA-BOYCE\n{numbers}\n", (
+        constants = _format_values(c["mu_pa"] / slope, stretch, volume)
+        return f"*HYPERELASTIC,ARRUDA-BOYCE\n{constants}\n", (
             "its volumetric energy is ½ κ ((J² − 1)/2 − ln J) instead of ½ κ (J − 1)²: both "
             "agree for small changes of volume"
         )
-    numbers = _format_numbers(region.mu_pa / 2, volume)
-    return f"*HYPERELASTIC,NEO HOOKE\n{numbers}\n", (
+    constants = _format_values(region.mu_pa / 2, volume)
+    return f"*HYPERELASTIC,NEO HOOKE\n{constants}\n", (
         f"{region.material} becomes the neo-Hookean law of Ī₁ with ½ κ (J − 1)²: the same λ and μ "
         "at small strain, but stresses differ in second order of the strain"
     )

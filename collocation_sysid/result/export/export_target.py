@@ -205,7 +205,7 @@ def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
     if e.body.forces:
         yield f"custom forces are not exported: {', '.join(f.name for f in e.body.forces)}"
     if (
-        np.ptp(e.stated_node_forces_n(times), axis=0).any()
+        np.ptp(e.declared_node_forces_n(times), axis=0).any()
         or np.ptp(e.point_mass_at_nodes_kg(times), axis=0).any()
     ):
         yield "forces and point masses stay as they are at the first sample"
@@ -267,7 +267,7 @@ def linear_tetrahedra(body: IdentifiedBody) -> list[Index]:
     return [eight[region.cells].reshape(-1, 4) for region in body.regions]
 
 
-def numbers_as_text(values: Iterable[float] | Array, separator: str = " ") -> str:
+def values_as_text(values: Iterable[float] | Array, separator: str = " ") -> str:
     """Return numbers as text from which they are read back exactly."""
     return separator.join(repr(float(value)) for value in np.ravel(np.asarray(values)))
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...array_types import Index
-from .export_target import ExportedFiles, TargetCapabilities, comment_lines, numbers_as_text
+from .export_target import ExportedFiles, TargetCapabilities, comment_lines, values_as_text
 from .identified import IdentifiedBody, IdentifiedRegion
 from .obstacle_shapes import FacetedObstacle, faceted_obstacles
 
@@ -59,7 +59,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     xml += f"{_mesh_xml(body, obstacles)}{_prescribed_displacement_xml(body)}"
     xml += _contact_xml(obstacles)
     # A body load pushes against the vector that it is given.
-    against = numbers_as_text(-body.experiment.gravity_m_s2, ",")
+    against = values_as_text(-body.experiment.gravity_m_s2, ",")
     xml += (
         f'<Loads><body_load type="body force"><force lc="1">{against}</force></body_load></Loads>\n'
         '<LoadData><load_controller id="1" type="loadcurve"><interpolate>LINEAR</interpolate>'
@@ -123,7 +123,7 @@ def _mesh_xml(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) -> str
     solids, facets = _obstacle_mesh_xml(body, obstacles)
     xml = '<Mesh>\n<Nodes name="nodes">\n'
     for k, point in enumerate(body.nodes_m, 1):
-        xml += f'<node id="{k}">{numbers_as_text(point, ",")}</node>\n'
+        xml += f'<node id="{k}">{values_as_text(point, ",")}</node>\n'
     xml += f"</Nodes>\n{solids}"
     for region in body.regions:
         kind = "tet10" if body.is_quadratic else "tet4"
@@ -185,7 +185,7 @@ def _obstacle_mesh_xml(
     corners = body.body.mesh.surface
     for k, wall in enumerate(obstacles):
         nodes = "".join(
-            f'<node id="{i}">{numbers_as_text(point, ",")}</node>\n'
+            f'<node id="{i}">{values_as_text(point, ",")}</node>\n'
             for i, point in enumerate(wall.start_points_m, wall.first_node + 1)
         )
         cells = _numbered_elements("elem", wall.tetrahedra + 1, wall.first_cell)

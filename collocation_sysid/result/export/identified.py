@@ -295,7 +295,7 @@ class IdentifiedBody:
         of the body.
         """
         weight = self.point_masses_kg[:, None] * self.experiment.gravity_m_s2
-        return self.experiment.stated_node_forces_n([self.start_s])[0] + weight
+        return self.experiment.declared_node_forces_n([self.start_s])[0] + weight
 
     @cached_property
     def regions(self) -> tuple[IdentifiedRegion, ...]:

@@ -24,7 +24,7 @@ from .export_target import (
     TargetCapabilities,
     comment_lines,
     linear_tetrahedra,
-    numbers_as_text,
+    values_as_text,
     xml_attribute,
 )
 from .identified import IdentifiedBody
@@ -83,7 +83,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     step_s = _stable_step_s(body)
     x = comment_lines(body, limits, "<!-- ", " -->")
     x += f"<mujoco model={xml_attribute(body.title or 'body')}>\n"
-    gravity = numbers_as_text(body.experiment.gravity_m_s2)
+    gravity = values_as_text(body.experiment.gravity_m_s2)
     x += f'<option timestep="{step_s!r}" gravity="{gravity}" jacobian="sparse"/>\n'
     bodies = f"{_grasp_xml(body)}{_obstacle_xml(body, step_s)}{_node_xml(body)}"
     x += f"<worldbody>\n{bodies}</worldbody>\n"
@@ -105,7 +105,7 @@ def _grasp_xml(body: IdentifiedBody) -> str:
     inertia = float(mass * size**2)
     for k, grasp in enumerate(body.experiment.grasps):
         position, turn = _pose_at(grasp, body.start_s)
-        at = f'pos="{numbers_as_text(position)}" quat="{numbers_as_text(turn)}"'
+        at = f'pos="{values_as_text(position)}" quat="{values_as_text(turn)}"'
         lines += (
             f'<body name="hand{k}" mocap="true" {at}/>\n<body name="grasp{k}" {at} gravcomp="1">'
             f'<freejoint/><inertial pos="0 0 0" mass="{float(mass)!r}" '
@@ -125,12 +125,12 @@ def _obstacle_xml(body: IdentifiedBody, step_s: float) -> str:
     skin = RELATIVE_SKIN_RADIUS * _mean_edge_m(body)
     for k, each in enumerate(body.obstacles):
         position, turn = _pose_at(each, body.start_s)
-        rubs = float(each.friction)
+        friction = float(each.friction)
         geom = _geom_attributes(offset_solid(each.shape, -skin))
         lines += (
-            f'<body name="obstacle{k}" mocap="true" pos="{numbers_as_text(position)}" '
-            f'quat="{numbers_as_text(turn)}"><geom name={xml_attribute(each.name)} {geom} '
-            f'priority="1" condim="{3 if rubs else 1}" friction="{rubs!r} 0 0" '
+            f'<body name="obstacle{k}" mocap="true" pos="{values_as_text(position)}" '
+            f'quat="{values_as_text(turn)}"><geom name={xml_attribute(each.name)} {geom} '
+            f'priority="1" condim="{3 if friction else 1}" friction="{friction!r} 0 0" '
             f'solref="{2 * step_s!r} 1"/></body>\n'
         )
     return lines
@@ -139,11 +139,9 @@ def _obstacle_xml(body: IdentifiedBody, step_s: float) -> str:
 def _geom_attributes(solid: Solid) -> str:
     """Return the XML attributes of a solid: type, size and placement."""
     shape = Primitive.from_solid(solid)
-    turn = numbers_as_text(shape.rotation.as_quat(scalar_first=True))
-    size = numbers_as_text(shape.size_m) if len(shape.size_m) else "0 0 1"
-    return (
-        f'type="{shape.kind}" size="{size}" pos="{numbers_as_text(shape.centre_m)}" quat="{turn}"'
-    )
+    turn = values_as_text(shape.rotation.as_quat(scalar_first=True))
+    size = values_as_text(shape.size_m) if len(shape.size_m) else "0 0 1"
+    return f'type="{shape.kind}" size="{size}" pos="{values_as_text(shape.centre_m)}" quat="{turn}"'
 
 
 def _weld_xml(body: IdentifiedBody, step_s: float) -> str:
@@ -173,7 +171,7 @@ def _node_xml(body: IdentifiedBody) -> str:
         )
         inertia = max(1e-6 * float(mass[n]), 1e-12)  # a node does not turn, but must have some
         lines += (
-            f'<body name="node{n}" pos="{numbers_as_text(body.nodes_m[n])}">'
+            f'<body name="node{n}" pos="{values_as_text(body.nodes_m[n])}">'
             f'<inertial pos="0 0 0" mass="{float(mass[n])!r}" '
             f'diaginertia="{inertia!r} {inertia!r} {inertia!r}"/>{joints}</body>\n'
         )
@@ -195,7 +193,7 @@ def _flex_xml(body: IdentifiedBody) -> str:
         used, elements = np.unique(cells, return_inverse=True)
         lines += (
             f'<flex name="{region.name}" dim="3" radius="{skin!r}" body="{" ".join(names[used])}" '
-            f'vertex="{numbers_as_text(places[used])}" '
+            f'vertex="{values_as_text(places[used])}" '
             f'element="{" ".join(map(str, elements.ravel()))}">\n'
             '<contact contype="1" conaffinity="0" selfcollide="none"/>\n'
             f'<elasticity young="{region.young_pa!r}" poisson="{region.poisson!r}" '
@@ -218,8 +216,8 @@ def _keyframe_xml(body: IdentifiedBody) -> str:
     velocity = np.zeros_like(shape) if started is None else started
     grasps = body.experiment.grasps
     carriers = [np.concatenate(_pose_at(grasp, body.start_s)) for grasp in grasps]
-    places = numbers_as_text(np.concatenate([*carriers, (shape - body.nodes_m)[free].ravel()]))
-    speeds = numbers_as_text(np.concatenate([np.zeros(6 * len(grasps)), velocity[free].ravel()]))
+    places = values_as_text(np.concatenate([*carriers, (shape - body.nodes_m)[free].ravel()]))
+    speeds = values_as_text(np.concatenate([np.zeros(6 * len(grasps)), velocity[free].ravel()]))
     return f'<key name="start" qpos="{places}" qvel="{speeds}"/>\n'
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...errors import InputError
-from .export_target import ExportedFiles, TargetCapabilities, comment_lines, numbers_as_text
+from .export_target import ExportedFiles, TargetCapabilities, comment_lines, values_as_text
 from .identified import IdentifiedBody, IdentifiedRegion
 from .obstacle_shapes import Primitive, faceted_obstacles, offset_solid
 
@@ -66,18 +66,18 @@ def export(body: IdentifiedBody) -> ExportedFiles:
             "all grasps but the first hold the nodes at their undeformed positions, "
             "not at those of the recording"
         )
-    mass = numbers_as_text(body.total_node_mass_kg)
+    mass = values_as_text(body.total_node_mass_kg)
     grasped = " ".join(map(str, np.flatnonzero(body.is_node_prescribed)))
     cells = " ".join(map(str, body.body.cells.ravel()))
     x = '<?xml version="1.0"?>\n' + comment_lines(body, limits, "<!-- ", " -->")
     x += f'<Node name="root" dt="{body.experiment.timestep_s / 4!r}" '
-    x += f'gravity="{numbers_as_text(body.experiment.gravity_m_s2)}">\n'
+    x += f'gravity="{values_as_text(body.experiment.gravity_m_s2)}">\n'
     x += "".join(f'<RequiredPlugin name="Sofa.Component.{name}"/>\n' for name in PLUGINS)
     x += '<DefaultAnimationLoop/>\n<Node name="body">\n'
     x += f'<EulerImplicitSolver rayleighStiffness="{region.gamma_r_s!r}" '
     x += f'rayleighMass="{region.gamma_m_1_s!r}"/>\n'
     x += '<SparseLDLSolver template="CompressedRowSparseMatrixMat3x3d"/>\n'
-    x += f'<TetrahedronSetTopologyContainer position="{numbers_as_text(body.nodes_m)}" '
+    x += f'<TetrahedronSetTopologyContainer position="{values_as_text(body.nodes_m)}" '
     x += f'tetrahedra="{cells}"/>\n<TetrahedronSetGeometryAlgorithms template="Vec3d"/>\n'
     x += '<MechanicalObject template="Vec3d"/>\n'
     x += f'<DiagonalMass vertexMass="{mass}"/>\n{force}\n{_contact_xml(body)}'
@@ -100,11 +100,9 @@ def _contact_xml(body: IdentifiedBody) -> str:
         if shape.kind == "plane":
             normal = turn.as_matrix()[:, 2]
             level = float(normal @ place_m)
-            lines += (
-                f'<PlaneForceField normal="{numbers_as_text(normal)}" d="{level!r}" {stiff}/>\n'
-            )
+            lines += f'<PlaneForceField normal="{values_as_text(normal)}" d="{level!r}" {stiff}/>\n'
         elif shape.kind == "sphere":
-            ball = f'center="{numbers_as_text(place_m)}" radius="{float(shape.size_m[0])!r}"'
+            ball = f'center="{values_as_text(place_m)}" radius="{float(shape.size_m[0])!r}"'
             lines += f"<SphereForceField {ball} {stiff}/>\n"
     return lines
 
@@ -117,7 +115,7 @@ def _elastic_law_xml(region: IdentifiedRegion) -> str:
             f'youngModulus="{region.young_pa!r}" poissonRatio="{region.poisson!r}"/>'
         )
     name = CAPABILITIES.materials.get(region.material, "NeoHookean")
-    moduli = numbers_as_text((region.mu_pa, region.lambda_pa))
+    moduli = values_as_text((region.mu_pa, region.lambda_pa))
     return (
         f'<TetrahedronHyperelasticityFEMForceField materialName="{name}" ParameterSet="{moduli}"/>'
     )

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ...array_types import Array
-from ...files import safe_name, whole_file
+from ...files import replaced_file, safe_name
 from ...recording.measured_wrench import COMPONENTS, UNITS
 from ...runs.result_content import Result
 from ..figure_style import RESOLUTION_DPI
@@ -91,7 +91,7 @@ def _experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
         unit = replay.reading_units.get(name)
         units = [unit] * places if unit else []
         yield f"reading_{replay.name}_{name}", sensor_picture(values, names, units)
-    for name, points in replay.seen.items():
+    for name, points in replay.visible_points.items():
         yield f"depth_{replay.name}_{name}", depth_picture(points)
     if replay.has_shapes:
         yield f"shapes_{replay.name}", shapes_picture(replay)
@@ -126,7 +126,7 @@ def save_pictures(
         if say is not None:
             say(f"drawing picture {k} of {len(pictures)}: {file.name}")
         # Harder compression takes longer than drawing, for a tenth of the size.
-        with whole_file(file) as draft:
+        with replaced_file(file) as draft:
             figure.savefig(draft, dpi=RESOLUTION_DPI, pil_kwargs={"compress_level": 2})
         files.append(file)
     return files

@@ -7,7 +7,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from ...program.loss_of_stability import LostStability
+from ...program.loss_of_stability import StabilityLoss
 from ..figure_style import PAGE_MM, SMALL_PT
 from .projection import ParallelCamera
 from .scene import BodyDrawing, SheetView, aspect_ratio, draw_directions, draw_scale, sheet
@@ -21,7 +21,7 @@ MAX_BODY_HEIGHT_MM = 90.0
 RELATIVE_AMPLITUDE = 0.08
 
 
-def instability_picture(instability: LostStability) -> Figure:
+def instability_picture(instability: StabilityLoss) -> Figure:
     """Draw the body displaced along the unstable mode, coloured by the mode's amplitude."""
     extent_m = float(np.ptp(instability.positions_m, axis=0).max())
     shown_m = instability.positions_m + RELATIVE_AMPLITUDE * extent_m * instability.mode

@@ -61,17 +61,17 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     figure = framed_figure(PAGE_MM, 88, 12, 13, 10.5, 6)
     widths = (0.05 * max(1, nq), 1, 0.2, 0.95, 0.01, 0.03)
     grid = figure.add_gridspec(1, 6, width_ratios=widths, wspace=0.03)
-    left, middle, right, bar_axes = (figure.add_subplot(grid[k]) for k in (0, 1, 3, 5))
+    full_axes, middle, right, bar_axes = (figure.add_subplot(grid[k]) for k in (0, 1, 3, 5))
     if nq:
-        _draw_magnitudes(left, matrix[:, :nq], norm)
+        _draw_magnitudes(full_axes, matrix[:, :nq], norm)
     _draw_magnitudes(middle, band, norm)
     image = _draw_magnitudes(right, block, norm)
-    style_axes(left, "", "", "equations of motion")
-    left.set_xticks(
+    style_axes(full_axes, "", "", "equations of motion")
+    full_axes.set_xticks(
         np.arange(nq) + 0.5, [symbol_as_mathtext(p.name) for p in collocation.parameters.free]
     )
-    left.set_ylim(rows, 0)
-    _tick_blocks(left, "y", "c", range(first, steps), height)
+    full_axes.set_ylim(rows, 0)
+    _tick_blocks(full_axes, "y", "c", range(first, steps), height)
     style_axes(middle, f"{steps} of {total} timesteps", "node positions")
     _tick_blocks(middle, "x", "x", range(steps), width)
     _tick_blocks(middle, "y", "c", range(first, steps), height)
@@ -79,7 +79,7 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     name = rf"$\partial c_{{{steps - 1}}} / \partial x_{{{steps - 1}}}$"
     free = "" if segment.has_constraints_of_grasps else ", free dofs only"
     style_axes(right, f"{name}: connectivity of the mesh", "column, 3 node + axis", f"row{free}")
-    for axes in (left, middle, right):
+    for axes in (full_axes, middle, right):
         axes.grid(False)
         axes.spines[:].set_visible(True)
     bar = figure.colorbar(image, cax=bar_axes)

@@ -42,11 +42,11 @@ LETTER_MM = 1.4
 MAX_BODY_HEIGHT_MM = 70.0
 # Shortest distance on paper at which two marks are drawn apart: nearer ones cover each other.
 MIN_MARK_DISTANCE_MM = 0.4
-STATED_PLACE = "position given"
+DECLARED_POSITION = "position given"
 UNSTATED_PLACE = "position not given"
 TENDON = "tendons"
 MARK_STYLES: dict[str, dict[str, Any]] = {
-    STATED_PLACE: {"ls": "", "marker": "x", "ms": 3.2, "mec": BLUE, "mew": 0.8},
+    DECLARED_POSITION: {"ls": "", "marker": "x", "ms": 3.2, "mec": BLUE, "mew": 0.8},
     TENDON: {"color": BLUE, "lw": 1.0, "marker": ".", "ms": 2.0},
     UNSTATED_PLACE: {"ls": "", "marker": "s", "ms": 5.0, "mfc": "none", "mec": BLUE, "mew": 0.6},
 }
@@ -64,12 +64,12 @@ def mesh_picture(replay: MotionRecord) -> Figure:
     up = replay.up
     names = replay.marker_names
     places_m = replay.marker_places_m
-    stated_m = replay.given_places_m
-    is_grasped = np.asarray(replay.held.any(axis=0))
+    declared_m = replay.declared_places_m
+    is_grasped = np.asarray(replay.is_prescribed.any(axis=0))
     part_names = replay.part_names
     front = ParallelCamera.facing_motion(nodes_m[None], up)
     behind = front.raised(-ELEVATION_DEG).turned(180.0, up).raised(ELEVATION_DEG)
-    everything = np.vstack([nodes_m, places_m, stated_m])
+    everything = np.vstack([nodes_m, places_m, declared_m])
     aspect = aspect_ratio(front, everything)
     named = 0 < len(names) <= MAX_WRITTEN_NAMES
     margin = min(26.0, 4.0 + LETTER_MM * max(map(len, names))) if named else 2.0
@@ -77,7 +77,7 @@ def mesh_picture(replay: MotionRecord) -> Figure:
     room = COLUMN_MM - 2 * margin
     width = (room - GAP_MM) / 2 if is_side_by_side else room
     height = min(width / aspect, MAX_BODY_HEIGHT_MM / (1 if is_side_by_side else 2))
-    elsewhere = not np.array_equal(stated_m, places_m)
+    elsewhere = not np.array_equal(declared_m, places_m)
     marked = elsewhere or replay.tendons_m is not None
     head = HEAD_MM + LINE_MM * ((len(part_names) > 1) + marked)
     total = head + FOOT_MM + (height if is_side_by_side else 2 * height + GAP_MM)
@@ -94,7 +94,7 @@ def mesh_picture(replay: MotionRecord) -> Figure:
         BodyDrawing(axes, view, surface, replay.surface_parts, replay.surface_nodes).update(
             nodes_m, is_grasped, places_m
         )
-        marks |= _draw_stated_places(axes, view, places_m, stated_m)
+        marks |= _draw_declared_positions(axes, view, places_m, declared_m)
         if replay.tendons_m is not None:
             axes.plot(*view.to_sheet_mm(replay.tendons_m).T, zorder=5.5, **MARK_STYLES[TENDON])
             marks.add(TENDON)
@@ -119,14 +119,16 @@ def mesh_picture(replay: MotionRecord) -> Figure:
     return figure
 
 
-def _draw_stated_places(axes: Axes, view: SheetView, places_m: Array, stated_m: Array) -> set[str]:
+def _draw_declared_positions(
+    axes: Axes, view: SheetView, places_m: Array, declared_m: Array
+) -> set[str]:
     """Mark markers whose estimated place differs from the stated one, or that have no stated place.
 
     Parameters
     ----------
     axes : Axes
     view : DepthCameraModel
-    places_m, stated_m : (M, 3)
+    places_m, declared_m : (M, 3)
         Estimated and stated places; stated ones are NaN where there is none.
 
     Returns
@@ -135,18 +137,20 @@ def _draw_stated_places(axes: Axes, view: SheetView, places_m: Array, stated_m: 
         The kinds of marks that were drawn, for the legend.
     """
     estimated_mm = view.to_sheet_mm(places_m)
-    stated_mm = view.to_sheet_mm(stated_m)
+    declared_mm = view.to_sheet_mm(declared_m)
     drawn = set[str]()
-    unknown = np.isnan(stated_m[:, 0])
-    moved = np.linalg.norm(estimated_mm - stated_mm, axis=1) > MIN_MARK_DISTANCE_MM  # False for NaN
+    unknown = np.isnan(declared_m[:, 0])
+    moved = (
+        np.linalg.norm(estimated_mm - declared_mm, axis=1) > MIN_MARK_DISTANCE_MM
+    )  # False for NaN
     if unknown.any():
         axes.plot(*estimated_mm[unknown].T, zorder=6, **MARK_STYLES[UNSTATED_PLACE])
         drawn.add(UNSTATED_PLACE)
     if moved.any():
-        axes.plot(*stated_mm[moved].T, zorder=6, **MARK_STYLES[STATED_PLACE])
-        segments = np.stack([stated_mm[moved], estimated_mm[moved]], axis=1)
+        axes.plot(*declared_mm[moved].T, zorder=6, **MARK_STYLES[DECLARED_POSITION])
+        segments = np.stack([declared_mm[moved], estimated_mm[moved]], axis=1)
         axes.add_collection(LineCollection(list(segments), colors=BLUE, linewidths=0.5, zorder=6))
-        drawn.add(STATED_PLACE)
+        drawn.add(DECLARED_POSITION)
     return drawn
 
 

@@ -100,7 +100,7 @@ def _projected_extent(camera: ParallelCamera, points_m: Array) -> tuple[Array, A
     return np.nanmin(places, axis=0), np.nanmax(places, axis=0)
 
 
-def with_near_outlines(points_m: Array, outlines_m: Array | None) -> Array:
+def with_nearby_outlines(points_m: Array, outlines_m: Array | None) -> Array:
     """Return points (T, n, 3) of a body joined with outlines (T, o, 3) of obstacles near it.
 
     Outline points further away than half the body's extent are moved to that distance. Without

@@ -30,7 +30,7 @@ from .scene import (
     draw_scale,
     legend_handles,
     sheet,
-    with_near_outlines,
+    with_nearby_outlines,
 )
 
 SHOWN_SHAPES = 6
@@ -95,7 +95,7 @@ def shapes_picture(
     surface_m = positions_m[:, np.unique(replay.surface)]
     camera = camera or ParallelCamera.facing_motion(surface_m[finite], replay.up)
     outlines_m = None if replay.obstacles_m is None else replay.obstacles_m[shown]
-    extents_m = with_near_outlines(
+    extents_m = with_nearby_outlines(
         np.concatenate([surface_m[shown], measured_m[shown]], axis=1), outlines_m
     )
     places = camera.project(extents_m)
@@ -115,7 +115,7 @@ def shapes_picture(
         view = SheetView(camera, scale, np.array([start - scale * first, FOOT_MM - scale * low]))
         body = BodyDrawing(axes, view, replay.surface, replay.surface_parts, replay.surface_nodes)
         obstacles_m = None if replay.obstacles_m is None else replay.obstacles_m[t]
-        body.update(positions_m[t], replay.held[t], measured_m[t], colour, obstacles_m)
+        body.update(positions_m[t], replay.is_prescribed[t], measured_m[t], colour, obstacles_m)
         text = {"ha": "center", "va": "center", "fontsize": SMALL_PT}
         middle = start + scale * (last - first) / 2
         axes.text(middle, FOOT_MM / 2, f"{t_s[t] - t_s[0]:.3g} s", **text)

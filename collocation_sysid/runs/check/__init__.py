@@ -196,7 +196,9 @@ def _quick_fields(problem: Problem, positions_m: Mapping[str, Array]) -> dict[st
     return {
         "bodies": bodies,
         "recordings": tuple(check_recording(e, positions_m.get(e.name)) for e in experiments),
-        "holds": tuple(hold for e in experiments for hold in check_grasps(e, edges_m[e.name])),
+        "holds": tuple(
+            grasp_check for e in experiments for grasp_check in check_grasps(e, edges_m[e.name])
+        ),
     }
 
 
@@ -233,20 +235,20 @@ def check_problem(
     started_s = time.perf_counter()
     first = shortened_problem(problem).collocation()
     first_z, start_notes = initial_variables(first)
-    whole_s = (time.perf_counter() - started_s) * _grid_rows(collocation) / _grid_rows(first)
+    total_s = (time.perf_counter() - started_s) * _grid_rows(collocation) / _grid_rows(first)
     report_progress("comparing derivatives with differences")
     jacobian_error, hessian_error = derivative_errors(first, first_z)
     report_progress("estimating time and memory of the methods")
     program = _program_fields(problem, collocation, first, first_z)
     simulated = first
     z = first_z
-    if full or whole_s <= LONGEST_SIMULATION_S:
-        report_progress(f"simulating the recordings at the guess, about {max(1, round(whole_s))} s")
+    if full or total_s <= LONGEST_SIMULATION_S:
+        report_progress(f"simulating the recordings at the guess, about {max(1, round(total_s))} s")
         simulated = collocation
         (z, start_notes) = initial_variables(collocation)
     report_progress("computing natural modes and testing the description")
     causes = misspecification_hypotheses(problem)
-    fit_s = FIT_SIMULATIONS * whole_s * min(1.0, CHECKED_SAMPLES / _grid_rows(collocation))
+    fit_s = FIT_SIMULATIONS * total_s * min(1.0, CHECKED_SAMPLES / _grid_rows(collocation))
     sensed = any(e.wrenches and e.markers.sample_count for e in problem.experiments)
     if sensed and not causes and (full or fit_s <= LONGEST_SIMULATION_S):
         report_progress("comparing the wrenches with the prediction from the markers")
@@ -268,7 +270,7 @@ def check_problem(
     )
     # Nothing is said of contact by a body that was only carried.
     touching = (
-        () if start_notes else _contact_concerns(simulated, z, is_whole=simulated is not first)
+        () if start_notes else _contact_concerns(simulated, z, is_complete=simulated is not first)
     )
     concerns = (*_concerns(problem, findings, find_instabilities(simulated, z)), *touching)
     notes += [*start_notes, *(each for m in findings.motions for each in mode_notes(m))]
@@ -276,7 +278,7 @@ def check_problem(
     if simulated is first:
         notes.append(
             "only the first samples of the recordings were simulated at the guess; check --full "
-            f"simulates all of them, in about {whole_s:.2g} s"
+            f"simulates all of them, in about {total_s:.2g} s"
         )
     notes += [SUBSTEPS_NOTE] * (problem.substeps == "auto" and bool(findings.motions))
     findings = replace(findings, concerns=concerns)
@@ -371,7 +373,7 @@ def _concerns(
         *static_concerns(experiments, parameters),
         *scale_concerns(experiments, parameters),
         *(each for body in bodies for each in _body_concerns(body, len(bodies) == 1)),
-        *(each for hold in findings.holds for each in grasp_concerns(hold)),
+        *(each for grasp_check in findings.holds for each in grasp_concerns(grasp_check)),
         *(each for motion in findings.motions for each in mode_concerns(motion)),
         *stability_concerns(unstable),
         *(each for e in experiments for each in rotation_step_concerns(e, problem.first_substeps)),
@@ -380,14 +382,14 @@ def _concerns(
     )
 
 
-def _contact_concerns(simulated: Collocation, z: Array, is_whole: bool) -> list[Concern]:
+def _contact_concerns(simulated: Collocation, z: Array, is_complete: bool) -> list[Concern]:
     """Return concerns about contact at the guess.
 
-    `is_whole` is false if only the first samples were simulated: then only about penetration at the
-    start.
+    `is_complete` is false if only the first samples were simulated: then only about penetration at
+    the start.
     """
     concerns = contact_concerns(contact_summaries_of_parts(simulated.iterates(z)), AT_THE_GUESS)
-    return [each for each in concerns if is_whole or each.code == "contact/pressed"]
+    return [each for each in concerns if is_complete or each.code == "contact/pressed"]
 
 
 def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:

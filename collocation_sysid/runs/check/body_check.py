@@ -308,7 +308,7 @@ def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
 
 # Distance from the box of the held nodes, in mean edges, below which it is by chance whether a node
 # is held.
-NEAR_EDGES = 0.1
+NEARLY_GRASPED_EDGES = 0.1
 # Distance from that box, in mean edges, that is rounding.
 ROUND_OFF_EDGES = 1e-6
 # Largest distance from that box, in mean edges, of the neighbours of the held nodes.
@@ -327,7 +327,7 @@ class GraspCheck:
     low_m, high_m : (3,) corners of the box around them, on the undeformed body
     share : float
         Share of all nodes.
-    nearly_held : int
+    nearly_grasped : int
         Number of free nodes beside the box, less than a tenth of an edge beyond one of its faces.
     nearly_free : int
         Number of held nodes less than a tenth of an edge inside a face beyond which the body
@@ -341,7 +341,7 @@ class GraspCheck:
     low_m: tuple[float, ...]
     high_m: tuple[float, ...]
     share: float
-    nearly_held: int
+    nearly_grasped: int
     nearly_free: int
     axes: str = "xyz"
 
@@ -357,17 +357,17 @@ def check_grasps(experiment: Experiment, mean_edge_m: float) -> tuple[GraspCheck
 def _check_grasp(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -> GraspCheck:
     """Return the held nodes of one grasp."""
     nodes = grasp.nodes
-    held_m = points_m[nodes]
+    grasped_m = points_m[nodes]
     free_m = np.delete(points_m, nodes, axis=0)
-    low = held_m.min(axis=0)
-    high = held_m.max(axis=0)
+    low = grasped_m.min(axis=0)
+    high = grasped_m.max(axis=0)
     outside_m = np.concatenate([low - free_m, free_m - high], axis=1)
     is_neighbour = outside_m.max(axis=1, initial=-np.inf) < NEIGHBOUR_EDGES * mean_edge_m
     # Behind faces of the box that the body goes on beyond, as far as the nearest held node.
     inner = (outside_m > 0).any(axis=0)
-    depth_m = np.concatenate([held_m - low, high - held_m], axis=1)[:, inner]
+    depth_m = np.concatenate([grasped_m - low, high - grasped_m], axis=1)[:, inner]
     least_m = ROUND_OFF_EDGES * mean_edge_m
-    reach_m = NEAR_EDGES * mean_edge_m
+    reach_m = NEARLY_GRASPED_EDGES * mean_edge_m
     slightly_outside = (outside_m > least_m) & (outside_m < reach_m) & is_neighbour[:, None]
     slightly_inside = (depth_m > least_m) & (depth_m < reach_m)
     return GraspCheck(
@@ -397,10 +397,10 @@ def grasp_sentence(grasp_check: GraspCheck) -> str:
 
 def grasp_concerns(grasp_check: GraspCheck) -> list[Concern]:
     """Return a concern if rounding decides which nodes are held."""
-    by_chance = bool(grasp_check.nearly_held or grasp_check.nearly_free)
+    by_chance = bool(grasp_check.nearly_grasped or grasp_check.nearly_free)
     counts = {
         "nodes": grasp_check.nodes,
-        "nearly_held": grasp_check.nearly_held,
+        "nearly_grasped": grasp_check.nearly_grasped,
         "nearly_free": grasp_check.nearly_free,
     }
     return concern_if(

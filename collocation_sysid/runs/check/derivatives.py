@@ -150,9 +150,9 @@ def _deviation(function, exact: Array, point: Array, direction: Array, step: flo
     """Return the largest deviation of `exact` from differences along `direction`, relative to
     `exact`.
     """
-    ahead, behind, far_ahead, far_behind = (
+    after, before, two_after, two_before = (
         function(point + k * step * direction) for k in (1, -1, 2, -2)
     )
-    differences = (8 * (ahead - behind) - (far_ahead - far_behind)) / (12 * step)
+    differences = (8 * (after - before) - (two_after - two_before)) / (12 * step)
     largest = max(float(np.abs(exact).max()), np.finfo(float).tiny)
     return float(np.abs(differences - exact).max()) / largest

@@ -145,15 +145,15 @@ def recording_concerns(recording: RecordingCheck, body: BodyCheck) -> list[Conce
         return named | {"by_mm": by_mm, "missing": marker.missing, "frames": frames}
 
     farthest = recording.farthest_marker
-    least_seen = recording.most_missing_marker
+    most_missing = recording.most_missing_marker
     worst = max(recording.markers, key=lambda marker: marker.start_miss_m or 0.0)
-    unseen = least_seen.samples == 0
-    missing = not unseen and least_seen.missing > LARGEST_MISSING_SHARE * recording.frames
+    unseen = most_missing.samples == 0
+    missing = not unseen and most_missing.missing > LARGEST_MISSING_SHARE * recording.frames
     astray = (worst.start_miss_m or 0.0) > LARGEST_START_MISS_DIAGONALS * body.diagonal_m
     off = farthest.distance_m > LARGEST_DISTANCE_EDGES * body.edges_m[1]
     return [
         *concern_if(off, False, "markers/off", **of(farthest, farthest.distance_m)),
-        *concern_if(unseen, False, "markers/unseen", **of(least_seen)),
-        *concern_if(missing, False, "markers/missing", **of(least_seen)),
+        *concern_if(unseen, False, "markers/unseen", **of(most_missing)),
+        *concern_if(missing, False, "markers/missing", **of(most_missing)),
         *concern_if(astray, False, "markers/astray", **of(worst, worst.start_miss_m)),
     ]

@@ -112,12 +112,12 @@ def check_modes(experiment: Experiment, scheme: Scheme, step_s: float, theta: Ar
     theta : array
         Constants θ of the body.
     """
-    is_held = experiment.is_prescribed(experiment.t_s)
-    count = is_held.sum(axis=(1, 2))
+    is_prescribed = experiment.is_prescribed(experiment.t_s)
+    count = is_prescribed.sum(axis=(1, 2))
     least = int(np.flatnonzero(count == count.min())[-1])
     time_s = float(experiment.t_s[least])
-    x, about = _reference_state(experiment, is_held[least], time_s, theta)
-    free = np.flatnonzero(~is_held[least])
+    x, about = _reference_state(experiment, is_prescribed[least], time_s, theta)
+    free = np.flatnonzero(~is_prescribed[least])
     modes = natural_modes(Forces.from_experiment(experiment, time_s, theta), x, free, MODE_COUNT)
     findings = _mode_findings(modes, experiment, scheme, step_s)
     needed = None
@@ -139,15 +139,15 @@ def check_modes(experiment: Experiment, scheme: Scheme, step_s: float, theta: Ar
 
 
 def _reference_state(
-    experiment: Experiment, held: NDArray[np.bool_], time_s: float, theta: Array
+    experiment: Experiment, is_prescribed: NDArray[np.bool_], time_s: float, theta: Array
 ) -> tuple[Array, str]:
     """Return node positions (n, 3) [m] about which the body oscillates, and the name of this state.
 
     The equilibrium if it can be found, else the undeformed shape.
     """
-    if held.any():
+    if is_prescribed.any():
         try:
-            solver = NewtonSolver(experiment, prescribed=held)
+            solver = NewtonSolver(experiment, prescribed=is_prescribed)
             return equilibrium(experiment, theta, time_s, solver=solver), "rest state"
         except SimulationError:
             pass
