@@ -189,7 +189,7 @@ PROBLEM_FILE = [
         edit=replace_text(EXPERIMENT, EXPERIMENT + EXPERIMENT),
     ),
     bad(
-        "name-that-no-file-can-have", "name: found 'up/down'", "files",
+        "name-that-no-file-can-have", "name: found 'up/down'", "file name",
         edit=replace_text('name = "swing"', 'name = "up/down"'),
     ),
     bad(
@@ -310,7 +310,7 @@ PARAMETERS = [
         options=settings("parameters.mu_pa.fixed=300"),
     ),
     bad(
-        "bounds-of-a-fixed-value", "parameters.mu_pa", "fixed beside lower", "fixed alone",
+        "bounds-of-a-fixed-value", "parameters.mu_pa", "fixed together with lower", "fixed alone",
         edit=replace_text(MU, "mu_pa = { fixed = 300.0, lower = 10.0 }"),
     ),
     bad(
@@ -339,7 +339,7 @@ GRASPS = [
         edit=nodes('{ indices = [3], name = "top" }'),
     ),
     bad(
-        "overlapping-grasps", "node 3", "grasps 1 and 2", "once",
+        "overlapping-grasps", "node 3", "grasps 1 and 2", "one grasp",
         edit=replace_text(GRASP, f"[{GRASP}, {{ nodes = {{ indices = [3] }} }}]"),
     ),
     bad(
@@ -487,7 +487,7 @@ MARKER_FILES = [
         options=settings("experiment.0.markers.length_unit=mm"),
     ),
     bad(
-        "other-frame", "marker 'side'", "measured at (0.", "2 m from", "undeformed to current",
+        "other-frame", "marker 'side'", "measured at (0.", "2 m away from", "undeformed to current",
         edit=raised_markers,
     ),
     bad(

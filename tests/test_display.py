@@ -17,10 +17,10 @@ from collocation_sysid.display import (
     Line,
     Listing,
     Picture,
-    Section,
     Shown,
     Span,
     Table,
+    TitledParts,
     as_html,
     as_markdown,
     labelled,
@@ -33,13 +33,13 @@ from collocation_sysid.serialisation import as_json, content, read
 NUMBERS = Table(
     "Estimates", ("", "value", ""), (("E Pa", "1500", "a|b"), ("ν", "0.3", "")), texts=1
 )
-REPORT = Section(
+REPORT = TitledParts(
     "Foam & <silicone>",
     (
         Line((Span("Verdict: check", "strong"), Span(", see "), Span("why", to="#cure")), "check"),
         Cards((("E", "1500 Pa", "±3"),)),
         NUMBERS,
-        Section("Notes", (Items(("one", "two")), Listing("The file", "a = 1"))),
+        TitledParts("Notes", (Items(("one", "two")), Listing("The file", "a = 1"))),
     ),
     level=1,
 )
@@ -137,7 +137,7 @@ def markdown_tokens(name: str) -> list[Token]:
         Listing(name, name),
     )
     reader = MarkdownIt().enable(["table", "strikethrough"])
-    found = reader.parse(as_markdown([Section(name, parts, level=1)]))
+    found = reader.parse(as_markdown([TitledParts(name, parts, level=1)]))
     return [one for each in found for one in (each, *(each.children or ()))]
 
 

@@ -359,7 +359,7 @@ def test_images_are_rectified_where_a_word_of_their_topic_says_so(
             r"of 3 x 2 pixels, .* the images have 6 x 4 pixels; .* state camera.matrix",
         ),
         ({"shape": (4, 6), "binned": 2}, r"binned by \[2, 2\], .* state camera.matrix"),
-        ({"shape": (4, 6), "corner": 8}, r"from \[8, 8\] on, .* state camera.matrix"),
+        ({"shape": (4, 6), "corner": 8}, r"the offset \[8, 8\], .* state camera.matrix"),
         ({"shape": (4, 6), "distortion": np.ones(8)}, "8 numbers; .* state camera.distortion"),
     ],
 )

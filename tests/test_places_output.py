@@ -60,7 +60,7 @@ def test_the_record_has_places_with_errors_that_hold(result: dict):
 
 def test_the_record_says_what_was_known(result: dict):
     places = result["places"]["swing"]
-    assert {name: place["given"] for name, place in places.items()} == {
+    assert {name: place["is_declared"] for name, place in places.items()} == {
         "low": True, "mid": True, "side": False,
     }  # fmt: skip
     body_m = float(np.linalg.norm([0.06, 0.06, 0.09]))

@@ -197,7 +197,7 @@ def probe(relevance: float, told: bool = True, name: str = DRIFT, fall: float = 
 def test_a_probe_alarms_if_it_is_significant_and_relevant():
     assert is_alarming(probe(2 * RELEVANT))
     assert not is_alarming(probe(0.5 * RELEVANT))
-    assert not is_alarming(probe(2 * RELEVANT, sentences=False))
+    assert not is_alarming(probe(2 * RELEVANT, told=False))
     assert not is_alarming(replace(probe(2.0), kind="window"))
 
 
