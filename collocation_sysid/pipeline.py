@@ -212,10 +212,13 @@ def run(
     phases = {n: f for n, f in fields.items() if isinstance(f, TwoPhaseModes)}
     problem = problem.with_fields(phases) if phases else problem
     answer = Run(problem, solution, {}, None)
-    missing = "no forward simulation has checked the answer, and there are no error bars"
+    missing = "the result has no error bars and was not checked by a forward simulation"
     try:
         answer, fit = _checked(problem, answer.solution, say)
-        missing = "what comes after the error bars is left out: finer steps, causes of the misfit"
+        missing = (
+            "the steps after the error bars were skipped: a finer time step, and causes "
+            "of the misfit"
+        )
         if problem.substeps == "auto":
             answer, fit = _fine_enough(answer, fit, problem.solver(method), watch, say, scheduler)
         substeps = answer.solution.collocation.substeps
@@ -231,7 +234,7 @@ def run(
             answer = replace(answer, probes=_probes(answer, fit, changes, say, deep=probe))
         if not seek_causes or answer.solution.status is Status.INTERRUPTED:
             return timed(answer)
-        say("looking for causes of the misfit")
+        say("testing possible causes of the misfit")
         answer = replace(answer, causes=find_misspecifications(answer.solution))
         if problem.uncertainty.numerical and answer.uncertainty is not None:
             answer = refine(answer, report_progress=say)
@@ -248,16 +251,16 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
 
     The fit is None if the solution did not converge or cannot be linearised.
     """
-    say("checking the answer by a forward simulation")
+    say("checking the result by a forward simulation")
     rollouts = simulate_experiments(problem, solution)
     if not solution.status.converged:
         return Run(problem, solution, rollouts, None), None
-    say("finding the error bars")
+    say("computing the error bars")
     rows = _row_count(solution)
     try:
         with counted_phase(StepUnit.TIME_STEP, rows):
             fit = linearise_fit(solution.collocation, solution.z)
-        say("finding what noise of the poses does")
+        say("computing the effect of noise of the poses")
         with counted_phase(StepUnit.TIME_STEP, rows):
             fit, noises = with_pose_noise(fit, solution.collocation, solution.z)
     except SimulationError as error:
@@ -277,7 +280,7 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
 
 def _changes(answer: Run, say: Log) -> ResidualChanges:
     """Return the changes of the residuals by the systematic effects and by the routine probes."""
-    say("finding what is assumed is worth")
+    say("computing the effects of assumptions")
     solution = answer.solution
     deviations = probed_deviations(answer.problem.uncertainty.considered)
     # One sweep for the assumptions, and one for the nuisance parameters that are not estimated.
@@ -370,15 +373,18 @@ def _fine_enough(
     before = first.collocation.substeps
     factor = coarse.refinement.suggested_substeps(coarse.optimum, as_scheme(problem.scheme).order)
     substeps = min(before * factor, MOST_SUBSTEPS)
-    steps = "one step" if before == 1 else f"{before} steps"
+    steps = "one time step" if before == 1 else f"{before} time steps"
     worst, many = coarse.refinement.largest_correction(coarse.optimum)
-    why = f"with {steps} a sample, the step moves {worst} by {many:.2g} standard errors"
+    why = (
+        f"with {steps} per sample, the estimated time-step error of {worst} is {many:.2g} "
+        "standard errors"
+    )
     if fit.at_bound[: fit.shared_count].all():
         substeps = MOST_SUBSTEPS
-        why = f"with {steps} a sample, every parameter ends at a bound"
+        why = f"with {steps} per sample, every parameter ends at a bound"
     if substeps <= before:
         return coarse, fit
-    say(f"solving again with {substeps} steps a sample")
+    say(f"solving again with {substeps} steps per sample")
     again = replace(first.collocation, substeps=substeps)
     p, _ = first.collocation.unpack(first.z)
     p = np.where(fit.at_bound, again.guess_p, p)
@@ -398,8 +404,8 @@ def _fine_enough(
     if finer is not None and finer.status is Status.INTERRUPTED:
         raise KeyboardInterrupt  # the first answer is whole
     if finer is None or not finer.status.converged:
-        note = f"{why}; with {substeps} it was not solved: {message}"
+        note = f"{why}; the solve with {substeps} failed: {message}"
         return replace(coarse, notes=(note, *coarse.notes)), fit
-    most = ", the most that are chosen" if substeps == MOST_SUBSTEPS else ""
-    reason = f"{why}; so it was solved again with {substeps}{most}"
+    most = ", the largest number that is chosen automatically" if substeps == MOST_SUBSTEPS else ""
+    reason = f"{why}; therefore it was solved again with {substeps}{most}"
     return _checked(problem, finer.after(first, reason), say)

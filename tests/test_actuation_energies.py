@@ -213,7 +213,7 @@ def test_what_no_actuator_can_be_is_refused(make, message):
         (lambda: Tendon([(0, 0, 0), (30, 0, 0)], 1.0), "point 2 at .* is 29.97 m outside the body"),
         (lambda: Pressure([(0, 1, 60)], 1.0), "not all faces are on the boundary"),
         (lambda: Pressure(Named("lumen"), 1.0), 'no group of faces "lumen"; it has "wall"'),
-        (lambda: Pressure(Box((-1,) * 3, (1,) * 3), 1.0), "surround the body from outside"),
+        (lambda: Pressure(Box((-1,) * 3, (1,) * 3), 1.0), "are the outer surface of the body"),
         (lambda: Pressure(Ball((9, 9, 9), 1.0), 1.0), "holds no face of the boundary"),
     ],
 )

@@ -110,7 +110,7 @@ def thesis(folder: Path) -> None:
 PROBLEM_FILE = [
     bad("no-file", "problem.toml", "no such file", edit=remove("problem.toml")),
     bad("binary", "problem.toml", "not a text", edit=write("problem.toml", b"\xff\xfe\x00\x01")),
-    bad("empty", "object", "missing", "2 more to mend", edit=write("problem.toml", "")),
+    bad("empty", "object", "missing", "2 more mistakes", edit=write("problem.toml", "")),
     bad(
         "syntax", "problem.toml: line 20", "closing quote", 'name = "swing',
         edit=replace_text('name = "swing"', 'name = "swing'),
@@ -177,7 +177,7 @@ PROBLEM_FILE = [
         edit=replace_text("[[experiment]]", "[experiment]"),
     ),
     bad(
-        "several-slips", "object.fo", "unknown key", "and 2 more to mend",
+        "several-slips", "object.fo", "unknown key", "and 2 more mistakes",
         options=settings("object.density_kg_m3=-1", "transcription.scheme=x", "object.fo=3"),
     ),
     bad(
@@ -189,7 +189,7 @@ PROBLEM_FILE = [
         edit=replace_text(EXPERIMENT, EXPERIMENT + EXPERIMENT),
     ),
     bad(
-        "name-that-no-file-can-have", "name: found 'up/down'", "files",
+        "name-that-no-file-can-have", "name: found 'up/down'", "file name",
         edit=replace_text('name = "swing"', 'name = "up/down"'),
     ),
     bad(
@@ -256,7 +256,7 @@ OBJECT = [
         options=settings("object.surface=a.stl", "object.edge_length_m=0.02"),
     ),
     bad(
-        "surface-without-edge-length", "object", "edge_length_m belongs to surface",
+        "surface-without-edge-length", "object", "edge_length_m is used only with surface",
         edit=replace_text('mesh = "body.vtu"', 'surface = "a.stl"'),
     ),
     bad(
@@ -310,7 +310,7 @@ PARAMETERS = [
         options=settings("parameters.mu_pa.fixed=300"),
     ),
     bad(
-        "bounds-of-a-fixed-value", "parameters.mu_pa", "fixed beside lower", "fixed alone",
+        "bounds-of-a-fixed-value", "parameters.mu_pa", "fixed together with lower", "fixed alone",
         edit=replace_text(MU, "mu_pa = { fixed = 300.0, lower = 10.0 }"),
     ),
     bad(
@@ -339,7 +339,7 @@ GRASPS = [
         edit=nodes('{ indices = [3], name = "top" }'),
     ),
     bad(
-        "overlapping-grasps", "node 3", "grasps 1 and 2", "once",
+        "overlapping-grasps", "node 3", "grasps 1 and 2", "one grasp",
         edit=replace_text(GRASP, f"[{GRASP}, {{ nodes = {{ indices = [3] }} }}]"),
     ),
     bad(
@@ -357,7 +357,7 @@ GRASPS = [
         edit=replace_text(f"grasp = {GRASP}", ""),
     ),
     bad(
-        "equilibrium-on-a-hinge", "it can turn about x", "at least 3 nodes", "one line",
+        "equilibrium-on-a-hinge", "it can rotate about x", "at least 3 nodes", "one line",
         edit=nodes("{ box_m = [[-1, -1, 0.089], [1, 0.001, 1]] }"),
     ),
 ]  # fmt: skip
@@ -444,7 +444,7 @@ MARKER_FILES = [
             "".join((folder / MARKERS).read_text().splitlines(True)[k] for k in range(10) if k != 4)
         ),
     ),
-    bad("nothing-seen", "no marker sample", "window_s", edit=blank_markers),
+    bad("nothing-seen", "there is no marker sample", "window_s", edit=blank_markers),
     bad(
         "poses-end-at-once", POSES, MARKERS, "0 s to 0.01 s", "0 s to 0.08 s", "share 2", "clock",
         edit=keep_lines(POSES, 3),
@@ -487,7 +487,7 @@ MARKER_FILES = [
         options=settings("experiment.0.markers.length_unit=mm"),
     ),
     bad(
-        "other-frame", "marker 'side'", "measured at (0.", "2 m from", "undeformed to current",
+        "other-frame", "marker 'side'", "measured at (0.", "2 m away from", "undeformed to current",
         edit=raised_markers,
     ),
     bad(
@@ -609,7 +609,7 @@ OPTIONS = [
         options=settings("transcription.substeps=1000000000")),
     bad("endless-roll-out", "experiment 'swing'", "found steps of 1e-90 s", "at most 10000",
         options=settings("rollout.timestep_s=1e-90")),
-    bad("name-with-nul", "name", "expected a name that files can have",
+    bad("name-with-nul", "name", "expected a valid file name",
         options=settings('experiment.swing.name="a\\u0000b"')),
     bad("output-is-a-file", POSES, "is a file", "folder", options=["--out", POSES]),
     bad("output-in-a-file", POSES, "is a file", "folder", options=["--out", f"{POSES}/run"]),
@@ -681,7 +681,7 @@ def test_other_commands_refuse_alike(tiny, words, command):
 def test_simulation_without_a_marker_file_needs_places(tiny):
     both(remove(MARKERS), replace_text("mid = [0.03, 0.02, 0.03], ", ""))(tiny)
     names = settings('experiment.swing.markers.names=["low", "mid"]')
-    words = (MARKERS, "no place for mid", "markers.reference_m")
+    words = (MARKERS, "no position of mid", "markers.reference_m")
     assert_refused(tiny, words, "simulate", "problem.toml", "--out", "s", *names)
 
 

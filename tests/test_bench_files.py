@@ -155,14 +155,15 @@ BAD = {
     "two": (
         "Time (s),Load (N),Force (N)\n0,1,1\n1,2,2\n",
         {},
-        'Load (N), Force (N) may each be force; expected one, or columns = { force = "…" }',
+        "Load (N), Force (N) could all be force; expected one of them, or columns = { force = "
+        '"…" }',
     ),
     "only stress": ("Time (s),Stress (kPa)\n0,1\n1,2\n", {}, "a stress needs area_m2"),
     "no area": (PLAIN, {"area_m2": 1.0}, "expected t_s and any of stress_pa"),
     "true stress": (
         "Time (s),True Stress (kPa)\n0,1\n1,2\n",
         {"area_m2": 1.0, "columns": {"stress": "True Stress (kPa)"}},
-        "column True Stress (kPa) is of the deformed specimen; expected engineering stress",
+        "column True Stress (kPa) refers to the deformed specimen; expected engineering stress",
     ),
     "not there": (PLAIN, {"columns": {"force": "Forse (N)"}}, "did you mean 'Force (N)'"),
     "no such key": (PLAIN, {"columns": {"load": "Force (N)"}}, "the key 'load'; expected one of t"),
@@ -267,12 +268,13 @@ def test_loads_of_a_part_are_reported_for_the_whole_specimen(tmp_path):
     np.testing.assert_allclose(arrays[0][:, 1:], 4 * arrays[1][:, 1:], rtol=1e-6)
     said = plain_text(run_summary(found.result, tmp_path / "whole"))
     words = (
-        "loads of 'first' and 'second': of the whole specimen, 4 times those of the modelled part"
+        "loads of 'first' and 'second' are those of the whole specimen, 4 times those of the "
+        "modelled part"
     )
     assert words in said
     assert "specimen" not in plain_text(run_summary(alone.result, tmp_path / "part"))
     priors_n = [
-        float(re.search(r"tare up to \S+ N \(prior (\S+)\)", said)[1])
+        float(re.search(r"tare: up to \S+ N \(prior ±(\S+) N\)", said)[1])
         for each in (found.result, alone.result)
         if (said := each.fit.experiments["first"].notes[-1])
     ]
@@ -297,8 +299,10 @@ def test_a_sign_that_only_displacement_or_load_has_is_named(tmp_path):
     ):
         both = said(wrong)
         assert [sentence.partition(":")[0] for sentence in both] == ["'second'"]
-        assert "along z grasp 2 and the force that it gives go opposite ways" in both[0]
-        assert "set sign = -1 of its displacement or of its wrench" in both[0]
+        assert (
+            "along z the displacement of grasp 2 and its force on the body have opposite signs"
+        ) in both[0]
+        assert "set sign = -1 for the displacement or for the wrench" in both[0]
 
 
 def test_a_part_of_a_default_is_overridden_for_one_experiment(tmp_path):
@@ -326,7 +330,7 @@ def test_a_slip_in_what_is_shared_is_named_where_it_stands(tmp_path, old, new, w
     with pytest.raises(InputError) as caught:
         Problem.read(file)
     assert words in str(caught.value)
-    assert "more to mend" not in str(caught.value)
+    assert "more mistakes" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -508,7 +512,7 @@ def test_a_machines_own_file_takes_the_examples_place(tmp_path, monkeypatch):
     ("shape", "words"),
     [
         ("edge_length_m = 1e-5", "object.edge_length_m: makes 4.5e+11 elements; expected at most"),
-        ("mass_kg = 1.0", "edge_length_m belongs to surface, cylinder or box_m"),
+        ("mass_kg = 1.0", "edge_length_m is used only with surface, cylinder or box_m"),
         ('edge_length_m = 0.01\nmesh = "a.vtu"', "found mesh and cylinder; expected exactly one"),
     ],
 )

@@ -220,7 +220,7 @@ def test_terminal_page_and_pictures_show_the_budget(finished, tmp_path):
     assert run_command("report", folder).code == 0
     page = next(folder.glob("*.html")).read_text()
     assert "% of the variance" in page
-    assert "What the variance of each estimate is made of" in page
+    assert "Contributions to the variance of each estimate" in page
 
 
 @pytest.mark.parametrize(

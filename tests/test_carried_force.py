@@ -106,9 +106,9 @@ def test_a_law_that_leaves_something_else_is_refused_in_words():
     def pull(x, v, before, at, pull_n):
         return -pull_n * x, before[:2]
 
-    with pytest.raises(InputError, match="'pull' returns 2 numbers to carry; expected 3"):
+    with pytest.raises(InputError, match="'pull' returns 2 internal variables; expected 3"):
         cs.NodeForce.from_law(pull, carries=3)
-    with pytest.raises(InputError, match="returns three forces and what is carried"):
+    with pytest.raises(InputError, match="returns three forces and the new internal variables"):
         cs.NodeForce.from_law(lambda x, v, before, at, pull_n: -pull_n * x, carries=2, name="pull")
 
 
@@ -165,9 +165,16 @@ def test_a_strut_from_a_file_is_the_one_from_python(strutted):
             ("carries = 6", "carries = -1"),
             "object.force.0.carries: found -1; expected a number of at least 0",
         ),
-        (("carries = 6", "carries = 4"), "force 'maxwell' returns 6 numbers to carry; expected 4"),
-        (("carries = 6\n", ""), "force 'maxwell' takes something before at"),
-        (('"maxwell"', '"made"'), "object.force.0.carries: found 6, but the force 'made' says"),
+        (
+            ("carries = 6", "carries = 4"),
+            "force 'maxwell' returns 6 internal variables; expected 4",
+        ),
+        (("carries = 6\n", ""), "force 'maxwell' has an argument before `at`"),
+        (
+            ('"maxwell"', '"made"'),
+            "object.force.0.carries: found 6, but the number of internal "
+            "variables of the force 'made' is",
+        ),
     ],
 )
 def test_what_a_force_in_a_file_cannot_carry_is_one_message(strutted, edit, said):

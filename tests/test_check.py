@@ -89,7 +89,7 @@ def test_backward_euler_at_ten_milliseconds_is_warned_of_with_the_substeps_that_
     first = findings.motions[0].modes[0]
     assert first.frequency_hz == pytest.approx(7.7, abs=0.2)
     assert first.numerical_damping_ratio == pytest.approx(0.23, abs=0.02)
-    warning = about(findings, "backward-euler at 10 ms", "damping found will be too low")
+    warning = about(findings, "backward-euler at 10 ms", "estimated damping too low")
     assert 'set transcription.scheme = "midpoint"' in warning
     named = re.search(r"substeps = (\d+)", warning)
     assert named is not None
@@ -150,8 +150,8 @@ def test_a_scheme_that_takes_damping_away_is_warned_of(tiny: Path):
     motion = checked_motion(tiny, *SILICONE, "parameters.gamma_r_s.guess=0.02")
     first = replace(motion.modes[0], damping_ratio=0.3, numerical_damping_ratio=-0.05)
     said = mode_concerns(replace(motion, modes=(first,), duration_s=10.0))[0].message
-    assert "takes a damping ratio of 0.05 from the first mode" in said
-    assert "found will be too high" in said
+    assert "removes a damping ratio of 0.05 from the first mode" in said
+    assert "damping too high" in said
     assert f"set transcription.substeps = {motion.substeps_needed}" in said
 
 
@@ -161,9 +161,9 @@ def test_too_few_steps_or_samples_a_period_are_warned_of(tiny: Path):
     found = mode_concerns(replace(motion, modes=(first,), duration_s=10.0))
     assert [each.topic for each in found] == ["scheme", "information"]
     steps, samples = (each.message for each in found)
-    assert "only 5.0 steps a period" in steps
+    assert "only 5.0 time steps per period" in steps
     assert f"substeps = {motion.substeps_needed}" in steps
-    assert "only 2.5 samples a period" in samples
+    assert "only 2.5 samples per period" in samples
     assert re.search(r"record at 6\d Hz or more", samples)
 
 
@@ -237,7 +237,9 @@ def test_slender_bodies_need_several_linear_elements_across(size_m, divisions, e
     warnings = sentences(element_concerns(body, COMPRESSIBLE, shape, worst_elements(mesh)[0]))
     said = [warning for warning in warnings if "too stiff in bending" in warning]
     assert bool(said) == warned
-    assert all("of a real body" in each and "not of data simulated with" in each for each in said)
+    assert all(
+        "of a real body" in each and "not that of data simulated with" in each for each in said
+    )
 
 
 def test_as_many_elements_across_as_are_needed_are_enough():
@@ -296,7 +298,7 @@ def test_tracks_in_another_unit_are_warned_of(tiny: Path):
     replace_text('file = "swing_markers.csv"', 'file = "swing_markers.csv"\nlength_unit = "cm"')(
         tiny
     )
-    assert about(checked(tiny), "is first seen", "check length_unit")
+    assert about(checked(tiny), "is first measured", "check length_unit")
 
 
 # The cost ---------------------------------------------------------------------------------------
@@ -378,13 +380,13 @@ def test_a_long_simulation_is_left_out_and_told_unless_asked_for(tiny: Path, mon
     problem, told = Problem.read(tiny / "problem.toml"), []
     short = check_problem(problem, told.append)
     assert short.rms_at_guess_m is None
-    assert any("but for their first samples" in n and "check --full" in n for n in short.notes)
-    assert "markers are missed by" not in plain_text(full_check_tables(short))
+    assert any("only the first samples" in n and "check --full" in n for n in short.notes)
+    assert "deviates from the markers by" not in plain_text(full_check_tables(short))
     assert short.derivatives_agree
     assert not any("simulating the recordings" in each for each in told)
     whole = check_problem(problem, told.append, full=True)
     assert (whole.rms_at_guess_m or 0) > 0
-    assert "markers are missed by" in plain_text(full_check_tables(whole))
+    assert "deviates from the markers by" in plain_text(full_check_tables(whole))
     assert any("simulating the recordings at the guess" in each for each in told)
     assert short.jacobian_nonzeros == whole.jacobian_nonzeros
 

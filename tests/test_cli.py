@@ -286,7 +286,7 @@ def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(tiny, monkeypatc
     assert "written to run" in out
     assert result == result_in(tiny / "run")
     assert outcome.code == 130
-    assert "the answer is kept in run" in outcome.err
+    assert "the result is kept in run" in outcome.err
     assert "collocation-sysid plot run" in outcome.err
     assert json.loads(run_command("solve", "problem.toml", "--json").out)["elapsed_s"]["checks"] > 0
 
@@ -312,7 +312,7 @@ def test_an_interrupt_while_the_folder_is_written_loses_nothing(tiny, monkeypatc
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
     assert "Verdict: check" in outcome.out
-    assert "the answer is kept in run" in outcome.err
+    assert "the result is kept in run" in outcome.err
     assert result_in(tiny / "run")["status"] == "converged"
 
 
@@ -361,7 +361,7 @@ def test_an_answer_survives_an_interrupted_roll_out(tiny, monkeypatch):
     monkeypatch.setattr(forward_simulation, "simulate", interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
-    assert "Verdict: doubtful\n  interrupted: no forward simulation has checked" in outcome.out
+    assert "Verdict: doubtful\n  interrupted: the result has no error bars" in outcome.out
     result = result_in(tiny / "run")
     assert result["status"] == "converged"
     assert result["rollout"]["rms_m"] is None
@@ -376,7 +376,7 @@ def test_so_do_error_bars_an_interrupt_after_them(tiny, monkeypatch, late):
     monkeypatch.setattr(pipeline, late, interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
-    assert "interrupted: what comes after the error bars is left out" in outcome.out
+    assert "interrupted: the steps after the error bars were skipped" in outcome.out
     result = result_in(tiny / "run")
     assert result["trust"]["verdict"] == "doubtful"
     assert result["rollout"]["rms_m"] is not None
@@ -448,7 +448,9 @@ def test_elsewhere_long_work_leaves_a_line_now_and_then(monkeypatch):
     with progress_shown.SolveProgress(Console(file=Log())) as progress:
         progress.say("simulating the first samples")
         assert told.wait(30.0)
-    assert "finding a start" in lines[0] or "simulating the first samples" in lines[0]
+    assert (
+        "searching for an initial guess" in lines[0] or "simulating the first samples" in lines[0]
+    )
     assert "s so far)" in lines[0]
     with progress_shown.SolveProgress(Console(file=Log()), quiet=True) as progress:
         assert progress._heartbeat is None
@@ -527,7 +529,7 @@ def test_a_simulation_beside_the_problem_keeps_what_others_wrote(tiny: Path):
     recording.write_text("precious")
     refusal = run_command(*simulate)
     assert refusal.code == 2
-    assert "swing_markers.csv: is there and was not written by this program" in refusal.err
+    assert "swing_markers.csv: this file exists and was not written by this program" in refusal.err
     assert recording.read_text() == "precious"
 
 
@@ -655,7 +657,7 @@ def test_help_imports_nothing_that_solves():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-    assert re.search(r"^  report +Write one HTML page", done.stdout, re.MULTILINE)
+    assert re.search(r"^  report +Write a report of a run or a study", done.stdout, re.MULTILINE)
 
 
 def test_version_and_help():

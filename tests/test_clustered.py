@@ -130,7 +130,10 @@ def test_what_a_lost_worker_had_is_done_again(there):
         solution = ReducedSpace()(collocation, watch, workers=found)
     assert len(there.scheduler.workers) == 1
     *notes, said = solution.notes
-    assert said == "1 of 2 workers were lost on the way: what they had was done again on others"
+    assert said == (
+        "1 of 2 workers were lost during the solve: their recordings were computed "
+        "again by other workers"
+    )
     assert_alike(replace(solution, notes=tuple(notes)), ReducedSpace()(collocation))
 
 
@@ -170,7 +173,7 @@ def test_without_a_scheduler_left_the_best_is_kept(there, monkeypatch):
         solution = ReducedSpace()(Collocation(several(), GUESS), watch, workers=found)
     with dask.config.set({"distributed.comm.timeouts.connect": "0.5s"}):
         there.close()  # which looks for the scheduler
-    assert_best_is_kept(solution, "Its scheduler answers no more.")
+    assert_best_is_kept(solution, "Its scheduler no longer responds.")
 
 
 FAULTS = """
@@ -244,9 +247,9 @@ def apart(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen]]]:
 @pytest.mark.parametrize(
     ("ended", "status", "said"),
     [
-        (slice(1, 2), Status.CONVERGED, "1 of 2 workers were lost on the way"),
+        (slice(1, 2), Status.CONVERGED, "1 of 2 workers were lost during the solve"),
         (slice(1, 3), Status.CLUSTER_DISCONNECTED, "No worker is left."),
-        (slice(0, 1), Status.CLUSTER_DISCONNECTED, "Its scheduler answers no more."),
+        (slice(0, 1), Status.CLUSTER_DISCONNECTED, "Its scheduler no longer responds."),
     ],
     ids=["a worker", "all workers", "the scheduler"],
 )
@@ -304,7 +307,7 @@ def test_costly_experiments_are_shared_out_first():
 @pytest.mark.parametrize(
     ("method", "said"),
     [
-        ("interior-point", "interior-point does not share its experiments"),
+        ("interior-point", "interior-point cannot distribute its experiments"),
         ("reduced-space", "found 'tcp://127.0.0.1:1', where no scheduler answers"),
     ],
 )

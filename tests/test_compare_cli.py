@@ -164,7 +164,7 @@ def test_a_late_run_is_a_row(tiny, stand_in):
     assert outcome.code == 0
     rows = table(tiny / "out" / "runs.csv")
     assert [row["status"] for row in rows] == ["converged", "timeout", "converged"]
-    late = "reduced-space, start 1: timeout: ended after the time limit of 3 s"
+    late = "reduced-space, start 1: timeout: ended at the time limit of 3 s"
     assert late in outcome.out
     assert late in (tiny / "out" / "summary.md").read_text()
     (summary,) = table(tiny / "out" / "summary.csv")
@@ -185,7 +185,7 @@ def test_an_interrupted_study_says_how_to_resume(tiny, stand_in, monkeypatch):
     assert "interrupted: 1 of 2 runs are kept in out; go on with: " in outcome.err
     assert outcome.err.endswith("--out out --starts 2 --workers 2\n")
     assert [row["status"] for row in table(tiny / "out" / "runs.csv")] == ["converged", "missing"]
-    assert "1 of 2 runs are still to be done." in (tiny / "out" / "summary.md").read_text()
+    assert "1 of 2 runs remain to be done." in (tiny / "out" / "summary.md").read_text()
 
 
 def test_progress_is_one_line_on_a_terminal(tiny, stand_in, monkeypatch):

@@ -140,7 +140,9 @@ def test_a_stiffness_is_that_of_an_ever_stiffer_energy():
 
 def test_friction_is_refused():
     rough = pressed(cs.Plane(-UP, 0.03 * UP), friction=0.3)
-    with pytest.raises(cs.InputError, match="plate has friction, which contact as complementarity"):
+    with pytest.raises(
+        cs.InputError, match='plate has friction, which contact = "complementarity"'
+    ):
         solved(rough)
 
 

@@ -72,7 +72,7 @@ def test_an_inverted_pose_is_told_with_what_to_state():
     (mistake,) = camera_hypotheses(seeing(INVERTED))
     assert mistake.message.endswith(
         "hardly any points are near the body; they would be if camera.pose were inverted (state "
-        "the motion from the camera's frame to the world)"
+        "the transform from the camera's frame to the world)"
     )
 
 
@@ -94,7 +94,7 @@ def test_a_frame_of_no_convention_is_not_told_as_two_at_once():
 def test_a_camera_that_is_somewhere_else_is_told_to_see_nothing():
     elsewhere = moved(np.zeros(3), np.array([0.0, 0.0, 0.7]))
     (mistake,) = camera_hypotheses(seeing(elsewhere))
-    assert "only 0 % of the surface" in mistake.message
+    assert "only 0 % of the body's visible surface" in mistake.message
 
 
 def test_a_camera_that_is_20_mm_and_10_degrees_off_is_none_that_sees_nothing():
@@ -168,12 +168,12 @@ def test_a_solve_in_which_no_point_of_a_camera_counts_is_saved_with_its_pictures
     unknown = TRUTH | {"young_pa": cs.Unknown(2e5)}
     solved = run(cs.Problem([marked], cs.Parameters.from_mapping(unknown)), seek_causes=False)
     assert solved.parameters["young_pa"] == pytest.approx(TRUTH["young_pa"], rel=1e-3)
-    assert any("0 points of 'front' count" in note for note in solved.solution.notes)
+    assert any("0 points of 'front' are compared" in note for note in solved.solution.notes)
     with pictures_drawn():
         solved.save(tmp_path / "run", frames=False)
     assert (tmp_path / "run" / "depth_experiment_front.png").is_file()
     (text,) = depth_picture(np.zeros((0, 8))).axes[0].texts
-    assert text.get_text() == "no point is near enough to the body to count"
+    assert text.get_text() == "no point is near enough to the body to be compared"
 
 
 def test_cameras_whose_names_meet_in_one_file_name_have_a_picture_each(tmp_path):

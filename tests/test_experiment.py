@@ -106,7 +106,7 @@ def test_a_given_start_is_at_rest_unless_velocities_are_given():
         ({"t_s": TIMES**2}, "evenly spaced"),
         ({"markers": markers(TIMES[:4])}, "markers' times differ"),
         ({"markers": markers(TIMES + 0.003)}, "markers' times differ"),
-        ({"markers": markers(present=False)}, "no marker sample is present"),
+        ({"markers": markers(present=False)}, "there is no marker sample"),
         ({"markers": markers(node_count=9)}, "body of 9 nodes"),
         ({"t_s": TIMES + 1, "markers": markers(TIMES + 1)}, "poses run from"),
         ({"grasps": (lifted([0, 1, 7]),)}, "node 7, but the body has 5"),
@@ -117,8 +117,14 @@ def test_a_given_start_is_at_rest_unless_velocities_are_given():
         ({"start": "given"}, "needs start_positions_m"),
         ({"start_positions_m": NODES}, "but start is 'equilibrium'"),
         ({"start": "given", "start_positions_m": NODES[1:]}, "start_positions_m has the shape"),
-        ({"forces": (Force([5], [0, 0, 1]),)}, "force is on node 5, but the body has 5"),
-        ({"masses": (PointMass([7], 0.1),)}, "mass is tied to node 7, but the body has 5"),
+        (
+            {"forces": (Force([5], [0, 0, 1]),)},
+            "force acts on node 5, but the body has only 5 nodes",
+        ),
+        (
+            {"masses": (PointMass([7], 0.1),)},
+            "mass is attached to node 7, but the body has only 5 nodes",
+        ),
     ],
 )
 def test_inconsistent_experiments_are_refused(changes, message):
@@ -259,9 +265,9 @@ def test_poses_and_markers_are_cut_to_the_time_they_share():
     np.testing.assert_allclose(found.t_s, t[20:60])
     np.testing.assert_array_equal(found.table.positions_m, table.positions_m[20:60])
     assert found.notes == (
-        "the markers were cut to the time of the poses by 0.2 s at the start and 0.4 s at the end, "
-        "60 of 100 samples: poses run from 0.2 s to 0.59 s, markers ran from 0 s to 0.99 s; "
-        "start tells the state at 0.2 s now",
+        "the markers were cut to the time of the poses by 0.2 s at the start and 0.4 s at the "
+        "end, 60 of 100 samples: poses run from 0.2 s to 0.59 s, markers ran from 0 s to 0.99 s; "
+        "start now refers to the state at 0.2 s now",
     )
     resampled = align([moving_poses(t[20:60])], table, resample_hz=50)
     np.testing.assert_allclose(resampled.t_s, np.arange(0.2, 0.581, 0.02))

@@ -235,7 +235,7 @@ def test_a_constant_that_the_body_has_is_refused():
     def mine(x, v, at, mu_pa):
         return -mu_pa * v
 
-    with pytest.raises(InputError, match="'mu_pa', which another part of the body has"):
+    with pytest.raises(InputError, match="'mu_pa', whose name another part of the body uses"):
         cs.Body(hung_cube().body.mesh, density_kg_m3=30.0, forces=[cs.NodeForce.from_law(mine)])
 
 
@@ -243,5 +243,5 @@ def test_a_law_that_is_not_finite_at_rest_is_refused():
     def mine(x, v, at, drag_coefficient):
         return -drag_coefficient * ca.sqrt(ca.sumsqr(v)) * v
 
-    with pytest.raises(InputError, match="not finite where the node is at rest"):
+    with pytest.raises(InputError, match="not finite for a node at rest"):
         cs.NodeForce.from_law(mine)

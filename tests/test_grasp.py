@@ -177,7 +177,7 @@ def test_after_moves_by_the_matrix_first():
 
 
 def test_a_matrix_that_is_no_rigid_motion_is_refused():
-    with pytest.raises(InputError, match="mirrors: its determinant"):
+    with pytest.raises(InputError, match="is a reflection"):
         recorded(20).after(np.diag([1.0, 1.0, -1.0, 1.0]))
     with pytest.raises(InputError, match=r"^the quaternion has the norm 2; expected 1"):
         PoseSequence([0.0], [[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 2.0]])

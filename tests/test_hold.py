@@ -76,10 +76,10 @@ def test_nodes_beside_a_face_that_cuts_elements_are_counted(
     assert (found.nearly_grasped, found.nearly_free) == (nearly_held, nearly_free)
     (said, *more) = [each.message for each in grasp_concerns(found)] or [""]
     assert not more
-    assert ("cuts through elements" in said) == bool(nearly_held + nearly_free)
+    assert ("enlarged by a tenth of an element's edge" in said) == bool(nearly_held + nearly_free)
     if said:
-        assert f"larger it holds {nearly_held} nodes more than {found.nodes}" in said
-        assert f"as much smaller {nearly_free} less" in said
+        assert f"selects {found.nodes} nodes, but {nearly_held} more if" in said
+        assert f"or {nearly_free} fewer if it is reduced by as much" in said
 
 
 def test_a_grasp_is_told_with_its_nodes_its_size_and_where_it_is():

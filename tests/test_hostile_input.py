@@ -462,7 +462,7 @@ def test_a_signal_within_an_import_is_no_error_of_the_library(tiny: Path):
     assert done.returncode == 130, done.stderr
     assert "Verdict" in done.stdout
     assert done.stderr == (
-        "interrupted: the answer is kept in run, without all pictures; draw them with: "
+        "interrupted: the result is kept in run, but some pictures are missing; draw them with: "
         "collocation-sysid plot run\n"
     )
     assert json.loads((tiny / "run" / "result.json").read_text())["status"] == "converged"

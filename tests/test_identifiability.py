@@ -93,7 +93,7 @@ def test_confounded_parameters_are_told_by_the_combination_that_is_fixed():
         s for s in identifiability_sentences(found) if "confounded:" in s or "confounded (" in s
     ]
     assert sentence.startswith("young_pa and poisson are confounded (correlation -0.990)")
-    assert "combination young_pa · poisson is fixed" in sentence
+    assert "combination young_pa · poisson is determined" in sentence
     # Deviation of the sum of two logarithms: 0.15 √(2 (1 − 0.99)).
     assert f"to ±{100 * np.expm1(Z95 * 0.15 * np.sqrt(0.02)):.2g} %" in sentence
     assert "alone" not in sentence  # another note says how well each is known
@@ -146,7 +146,7 @@ def test_a_third_with_a_fifth_of_the_others_share_belongs_to_the_combination():
         s for s in identifiability_sentences(uncertainty(covariance)) if "only their" in s
     ]
     assert sentence.startswith("lambda_pa, mu_pa and gamma_r_s are confounded")
-    assert "lambda_pa · mu_pa · gamma_r_s^0.35 is fixed" in sentence
+    assert "lambda_pa · mu_pa · gamma_r_s^0.35 is determined" in sentence
 
 
 # The third's deviation is √2 times as large, and an interval of 25 % is still well fixed.
@@ -163,7 +163,7 @@ def test_of_three_that_are_known_well_each_no_combination_is_told(deviation, tol
 
 def test_the_other_elastic_pair_is_told_where_it_is_known_better():
     found = uncertainty(spread([0.7, 0.02, 0.02, 0.02]))
-    (sentence,) = [s for s in identifiability_sentences(found) if "other elastic pair" in s]
+    (sentence,) = [s for s in identifiability_sentences(found) if "other elastic constants" in s]
     assert "young_pa to ±" in sentence
     assert "poisson" in sentence
 

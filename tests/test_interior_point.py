@@ -165,7 +165,9 @@ def test_a_guess_that_cannot_be_simulated_starts_from_the_rigid_shape():
     np.testing.assert_allclose(collocation.unpack(start)[1][0], expected, atol=1e-15)
     assert len(notes) == 1
     assert notes[0].startswith("experiment 'hung cube': the simulation at the guess failed (")
-    assert notes[0].endswith("started from the rest shape carried rigidly by the grasp")
+    assert notes[0].endswith(
+        "the initial trajectory is the rest shape moving rigidly with the grasp"
+    )
     solution = replace(PRECISE, initial="simulation")(collocation)
     assert solution.notes == tuple(notes)
     assert solution.status is Status.CONVERGED
@@ -211,8 +213,8 @@ def test_ipopt_starts_near_the_optimum_and_the_notes_tell_how():
     solution = PRECISE(cube(), watch=seen.append)
     sweeps = len(ReducedSpace(tolerance=LARGEST_CORRECTION)(cube()).history)
     assert re.fullmatch(
-        r"initial point: \d+ sweeps of reduced space, to within 0.1 % of a parameter; "
-        "IPOPT solved the whole program from there",
+        r"initial point: \d+ sweeps of reduced space, which determined the parameters to 0.1 %; "
+        "IPOPT solved the complete program from there",
         note_of(solution),
     )
     assert solution.iterations <= 4
@@ -234,7 +236,7 @@ def test_where_reduced_space_finds_no_motion_ipopt_starts_without_it():
     collocation = Collocation([measured(hung_cube())], soft_guess())
     solution = PRECISE(collocation)
     assert "found none" in note_of(solution)
-    assert "started from the rest shape carried rigidly" in solution.notes[-1]
+    assert "the rest shape moving rigidly" in solution.notes[-1]
     assert solution.status is Status.CONVERGED
     assert np.abs(relative_errors(solution)).max() < 1e-5
 
@@ -333,7 +335,7 @@ def test_from_the_answer_of_reduced_space_five_iterations_suffice(tmp_path):
     assert found.collocation.substeps == substeps
     assert found.history[0].rms_m == pytest.approx(answer.solution.rms_m, rel=1e-2)
     again = solve(problem, InteriorPoint(), start=folder)
-    found_by = r"initial point: (the start given|1 sweep|[2-5] sweeps)\b"
+    found_by = r"initial point: (the given initial values|1 sweep|[2-5] sweeps)\b"
     assert re.match(found_by, note_of(again))
 
 

@@ -85,5 +85,7 @@ def test_what_touches_the_body_is_followed_to_where_the_batch_ends(name: str):
 
 def test_an_obstacle_whose_delay_is_estimated_is_refused():
     problem = touching("ball", cs.Nuisance.none(obstacle_time_s=1e-3))
-    with pytest.raises(cs.InputError, match="an obstacle whose delay is estimated cannot be live"):
+    with pytest.raises(
+        cs.InputError, match="live estimates do not support an obstacle whose delay is estimated"
+    ):
         LiveModel.from_problem(problem)

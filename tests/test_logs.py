@@ -190,7 +190,7 @@ def test_topics_offer_the_chains_of_frames_that_can_be_read(tmp_path: Path) -> N
     for address in addresses:  # each can be read as it is written
         np.testing.assert_allclose(read_poses(tmp_path / address).positions_m[:, 1], T_S, atol=1e-6)
     assert topics["/tf_static"].write == ()
-    assert topics["/tf_static"].serves == "frames that do not move, part of the chains of /tf"
+    assert topics["/tf_static"].serves == "static frames, part of the chains of /tf"
 
 
 def test_addresses_of_topics_are_lines_that_can_be_copied(tmp_path: Path, monkeypatch) -> None:
@@ -205,7 +205,7 @@ def test_addresses_of_topics_are_lines_that_can_be_copied(tmp_path: Path, monkey
     assert f"  {address}" in out.splitlines()
     row = next(line for line in out.splitlines() if line.startswith("/tf"))
     assert "TFMessage" in row
-    assert row.endswith("poses of one frame in another")
+    assert row.endswith("poses of one frame relative to another")
     file = io.StringIO()
     console = PlainConsole(file=file, width=40, force_terminal=True, color_system=None)
     monkeypatch.setattr(common, "PlainConsole", lambda: console)
@@ -280,7 +280,7 @@ def test_depth_images_of_a_topic_come_with_their_camera_and_times(
     assert topics[raw].serves == "depth images, 7 x 5: [[experiment.depth]]"
     assert topics[raw].write == (f"{log.name}#{raw}",)
     assert topics["/camera/camera_info"].serves == (
-        "the camera's matrix, for the depth images beside it"
+        "matrix of the camera, for depth images in the same namespace"
     )
 
 
@@ -300,7 +300,9 @@ def test_clouds_of_a_topic_are_read_with_their_normals(tmp_path: Path) -> None:
     np.testing.assert_allclose(normal, np.hstack([points, np.tile([0.0, 0, 1], (4, 1))]))
     with pytest.raises(InputError, match=r"/chamber has neither depth images \(16UC1"):
         read_depth(Path(f"{log}#/chamber"), None, 1.0)
-    with pytest.raises(InputError, match="holds clouds of points; expected one of numbers"):
+    with pytest.raises(
+        InputError, match="contains clouds of points; expected a topic with numbers"
+    ):
         read_poses(Path(f"{log}#/plain"))
 
 
@@ -352,9 +354,12 @@ def test_images_are_rectified_where_a_word_of_their_topic_says_so(
 @pytest.mark.parametrize(
     ("camera", "message"),
     [
-        ({"shape": (2, 3)}, r"of 3 x 2 pixels, .* beside images of 6 x 4; .* state camera.matrix"),
+        (
+            {"shape": (2, 3)},
+            r"of 3 x 2 pixels, .* the images have 6 x 4 pixels; .* state camera.matrix",
+        ),
         ({"shape": (4, 6), "binned": 2}, r"binned by \[2, 2\], .* state camera.matrix"),
-        ({"shape": (4, 6), "corner": 8}, r"from \[8, 8\] on, .* state camera.matrix"),
+        ({"shape": (4, 6), "corner": 8}, r"the offset \[8, 8\], .* state camera.matrix"),
         ({"shape": (4, 6), "distortion": np.ones(8)}, "8 numbers; .* state camera.distortion"),
     ],
 )
@@ -392,7 +397,10 @@ def bad_messages(of: Messages) -> dict[str, tuple]:
     ("bad", "message"),
     [
         ("short", "61 bytes in a message; expected 4 rows of 6 times 2"),
-        ("rvl", "'16UC1; compressedDepth rvl' that is no PNG .*: take the topic of images that"),
+        (
+            "rvl",
+            "'16UC1; compressedDepth rvl' that is not a PNG .*: use the topic of uncompressed",
+        ),
         ("flat", "has the columns u, v, rgb; expected x, y and z among them"),
         ("unknown", "has the columns x of type 11, .*; expected each once, of types 1 to 8"),
         ("beyond", "in points of 16 bytes; expected each once, of types 1 to 8, within these"),
@@ -440,10 +448,10 @@ def test_of_messages_of_one_time_the_first_counts(tmp_path: Path) -> None:
         ("trial#/wrenhc", "there is no topic '/wrenhc'; it has /tf, /wrench; did you mean"),
         ("trial#/tf", "has the frames base, arm, tool; expected two of them, as in trial#/tf#base"),
         ("trial#/tf#base>tol", "there is no frame 'tol'; it has base, arm, tool; did you mean"),
-        ("trial#/tf#base>tool#fast", "found 'fast' behind the topic; expected two frames"),
+        ("trial#/tf#base>tool#fast", "found 'fast' after the topic; expected two frames"),
         ("trial#/wrench", "expected t_s, x_m, y_m"),
-        ("broken.mcap#/tf", "is a damaged log, or not what it seems"),
-        ("notes#/tf", "is no log; expected a ROS bag"),
+        ("broken.mcap#/tf", "is damaged, or a file of another type"),
+        ("notes#/tf", "is not a log; expected a ROS bag"),
     ],
 )
 def test_what_a_log_does_not_hold_is_refused(tmp_path: Path, address: str, message: str) -> None:

@@ -230,7 +230,7 @@ def test_one_sigma_serves_all_markers():
         ({"names": ("a", "a")}, "'a' is given more than once"),
         ({"sigma_m": np.array([1e-3, 0.0])}, "sigma_m of marker 'm1' is 0"),
         ({"positions_m": np.zeros((3, 2, 3))}, r"marker positions has the shape \(3, 2, 3\)"),
-        ({"placement": vertex_placement(3)}, "3 places on the body for 2 markers"),
+        ({"placement": vertex_placement(3)}, "3 positions on the body for 2 markers"),
         ({"places_sigma_m": np.ones(3)}, r"places_sigma_m has the shape \(3,\)"),
     ],
 )

@@ -63,7 +63,7 @@ def test_a_branch_slower_than_the_recordings_is_told():
     assert "slower than the longest recording of 2 s" in note
     assert not memory_notes(slow, 8.0)
     (note,) = memory_notes(slow | {"prony_1.share": Estimate(0.0, at_bound=True)}, 8.0)
-    assert note.startswith("no memory found: the share of prony_1 ended at 0")
+    assert note.startswith("no memory was found: the share of prony_1 ended at 0")
 
 
 def test_constants_of_a_branch_have_symbols():
@@ -97,7 +97,7 @@ GUESSED = "parameters.prony_1.tau_s.guess=0.1"
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ('name = "prony_1"', 'name = "prony_1"\nregion = "core"', "is of region 'core'"),
+        ('name = "prony_1"', 'name = "prony_1"\nregion = "core"', "belongs to the region 'core'"),
         ("prony_1.share = 0.2", "prony_1.share = -0.2", "expected a number >= 0"),
         ("prony_1.share = 0.2", "prony_1.share = { lower = -1.0 }", "expected 0 <= lower < upper"),
         ("prony_1.share = 0.2", "", "prony_1.share is missing"),
@@ -128,7 +128,7 @@ def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
     assert {cost.method for cost in findings.costs} == {"reduced-space", "interior-point"}
     monkeypatch.setattr("collocation_sysid.runs.check.derivatives.MOST_LIFTED_NONZEROS", 0)
     checked = run_command("check", tiny / "problem.toml", *settings(GUESSED))
-    assert f"{findings.overstresses:,} more variables and constraints" in checked.out
+    assert f"{findings.overstresses:,} additional variables and constraints" in checked.out
     assert "τ prony_1" in checked.out
 
 

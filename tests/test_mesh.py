@@ -116,7 +116,7 @@ def test_unconnected_parts_are_noted_with_coincident_nodes():
     assert "2 unconnected parts" in far.notes[0]
     assert "merge" not in far.notes[0]
     torn = TetMesh(np.vstack([CORNERS, -CORNERS]), [[0, 1, 2, 3], [4, 6, 5, 7]])
-    assert "1 of 8 nodes lie exactly on others" in torn.notes[0]
+    assert "1 of 8 nodes coincide with others" in torn.notes[0]
 
 
 # --- refusals
@@ -425,7 +425,9 @@ def test_quadratic_tetrahedra_are_taken_by_their_corners(tmp_path, ending):
     np.testing.assert_array_equal(mesh.points_m, CORNERS)
     np.testing.assert_array_equal(mesh.tetrahedra, [[0, 1, 2, 3]])
     (note,) = mesh.notes
-    assert "6 of 10 nodes were dropped (node 4 is the first): they are no element's corner" in note
+    assert (
+        "6 of 10 nodes were dropped (node 4 is the first): they are not the corner of any element"
+    ) in note
 
 
 def test_linear_and_quadratic_tetrahedra_may_be_in_one_file(tmp_path):

@@ -190,7 +190,9 @@ def notes(deviations: tuple[float, ...], **options) -> tuple[str, ...]:
 def test_a_wrong_sigma_is_told_with_how_much():
     assert notes((1.0,)) == ()
     (large,) = notes((2.5,))
-    assert "times as large as sigma_m says; the error bars follow the residuals" in large
+    assert (
+        "times as large as expected from sigma_m; the error bars are computed from the residuals"
+    ) in large
     assert any(f"{factor:.2g} times" in large for factor in np.arange(2.2, 2.9, 0.1))
     (small,) = notes((1 / 3,))
     assert "only 0.3" in small

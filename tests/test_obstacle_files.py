@@ -127,7 +127,7 @@ def test_friction_is_refused_beside_complementarity_before_anything_is_done(
     outcome = run_command(*arguments)
     assert outcome.code == 2
     said = " ".join(outcome.err.split())
-    assert "experiment 'pressed': ball has friction, which contact as complementarity" in said
+    assert "experiment 'pressed': ball has friction, which contact = \"complementarity\"" in said
     assert 'expected friction = 0, or contact = "energy"' in said
     assert sorted(tmp_path.iterdir()) == before
 

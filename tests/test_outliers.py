@@ -47,7 +47,9 @@ def test_a_sample_that_spoils_the_rest_is_named():
     assert outlier.deviations == pytest.approx(158, rel=0.1)
     assert rest.measurement_count == fit.measurement_count - 3
     trust, _ = judged(with_outlier(RNG(0).normal(size=(60, 3, 3))))
-    assert any("swing 0/m1: the sample at t = 0.2 s, off by 1.5e+02" in r for r in trust.reasons)
+    assert any(
+        "swing 0/m1: the sample at t = 0.2 s deviates by 1.5e+02" in r for r in trust.reasons
+    )
 
 
 def test_noise_has_no_such_sample_be_it_white_or_not():
@@ -72,7 +74,7 @@ def test_it_hides_no_correlation_of_the_others():
         (_, alone), (trust, beside) = judged(errors), judged(with_outlier(errors))
         assert beside == pytest.approx(alone, abs=0.15)
         assert trust.verdict == "doubtful"
-        assert any("persist from sample to sample" in reason for reason in trust.reasons)
+        assert any("consecutive samples are correlated" in reason for reason in trust.reasons)
         assert any("swing 0/m1" in reason for reason in trust.reasons)
 
 
@@ -87,7 +89,7 @@ def test_several_are_set_apart_but_no_more_than_exceptions():
 def test_the_diagnosis_of_its_marker_names_it_in_place_of_a_pattern():
     fit, _ = fit_to(with_outlier(RNG(0).normal(size=(60, 3, 3))))
     (said,) = (each.sentence for each in diagnose_markers(fit) if each.marker == "m1")
-    assert "mm RMS; the sample at t = 0.2 s, off by 1.5e+02 sigma, alone has 94 %" in said
+    assert "mm RMS; the sample at t = 0.2 s deviates by 1.5e+02 sigma and contributes 94 %" in said
 
 
 def relaxing_bench() -> tuple[Experiment, dict[str, float]]:
@@ -120,5 +122,5 @@ def test_a_first_sample_that_is_no_rest_is_told():
     assert trust.verdict == "doubtful"
     (named,) = (reason for reason in trust.reasons if "block/force: the sample" in reason)
     assert "at t = 0.5 s" in named
-    assert "counts as relaxed at the first sample" in named
-    assert any("persist from sample to sample" in reason for reason in trust.reasons)
+    assert "is assumed to be relaxed at the first sample" in named
+    assert any("consecutive samples are correlated" in reason for reason in trust.reasons)

@@ -102,7 +102,7 @@ def test_a_run_tells_of_it_and_the_verdict_judges_it():
     assert abs(told[1].value - far * 0.02) < 3.5 * told[1].std_error < 0.01
     assert any("camera scale" in reason for reason in finished.trust.reasons)
     said = " ".join(plain_text(run_summary(finished.result, Path("run"))).split())
-    assert re.search(r"camera scale (9\.\d|10) % \(prior 2\)", said)
+    assert re.search(r"camera scale (9\.\d|10) % \(prior ±2 %\)", said)
 
 
 def test_without_it_the_answer_is_wrong():
@@ -121,15 +121,15 @@ def test_without_it_the_answer_is_wrong():
     ("row", "message"),
     [
         ({"reading": None}, "extra has to have a reading or a clock, one of both"),
-        ({"sigma": None}, "extra has no sigma; expected the deviation of its prior"),
-        ({"sigma": 0.0}, "extra is 0; expected a deviation above 0"),
+        ({"sigma": None}, "extra has no sigma; expected the standard deviation of its prior"),
+        ({"sigma": 0.0}, "extra is 0; expected a standard deviation above 0"),
         ({"name": "tare"}, "two nuisance parameters are named 'tare'"),
         ({"of": "load"}, "extra is of a load; expected of = 'recording' or 'marker'"),
         ({"reading": lambda y, v, t_s, data: y[:2]}, r"has the shape \(2, 1\); expected \(3, 1\)"),
         ({"reading": lambda y, v, t_s, data: y + v.nothing}, "the reading of extra failed"),
         (
             {"reading": lambda y, v, t_s, data: y + ca.sqrt(v)},
-            "the reading of extra or its slopes are not finite at zero",
+            "the reading of extra or its derivatives are not finite at zero",
         ),
         (
             {"reading": None, "clock": lambda v, t_s, data: ca.vertcat(v, v)},

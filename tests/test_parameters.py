@@ -507,7 +507,7 @@ SETS_OF_TWO = {
     "misspelt region": ({**OF_TWO, "coer.mu_pa": 2.0}, "coer.mu_pa: .* mean 'core.mu_pa'"),
     "unused": (
         {**OF_TWO, **{f"{region}.gamma_m_1_s": 2.0 for region in ("core", "skin")}},
-        "gamma_m_1_s: no part of the model uses it: every region has a value of its own",
+        "gamma_m_1_s: no part of the model uses it, because every region has its own value",
     ),
     "mixed in a region": (
         {**OF_TWO, "core.young_pa": 2.0},

@@ -148,20 +148,20 @@ def test_a_record_without_places_is_no_start(folder: Path, tmp_path: Path, resul
 
 def test_the_terminal_says_where_markers_are_and_the_priors(folder: Path):
     said = " ".join((folder / "printed.txt").read_text().split())
-    moved = re.search(r"markers sit off their places by up to ([\d.]+) mm \(mid; prior 3\)", said)
+    moved = re.search(r"stated positions: up to ([\d.]+) mm \(mid; prior ±3 mm\)", said)
     assert moved is not None
     assert float(moved[1]) == pytest.approx(4.0, abs=0.2)
-    assert re.search(r"1 marker without a place, found to ±[\d.]+ mm \(prior 124\)", said)
-    assert re.search(r"gravity tilted by [\d.e-]+° \(prior 1\)", said)
-    assert re.search(r"body turned in its grasp by [\d.e-]+° \(prior 0.5\)", said)
-    assert re.search(r"seen [\d.e-]+ ms (later|earlier) than their times say \(prior 5\)", said)
+    assert re.search(r"positions of 1 marker, estimated to ±[\d.]+ mm \(prior ±124 mm\)", said)
+    assert re.search(r"tilt of gravity: [\d.e-]+° \(prior ±1°\)", said)
+    assert re.search(r"rotation of the body in the gripper: [\d.e-]+° \(prior ±0.5°\)", said)
+    assert re.search(r"measured [\d.e-]+ ms (later|earlier) than stated \(prior ±5 ms\)", said)
 
 
 def test_the_page_has_places_and_nuisance_parameters_in_their_units(folder: Path):
     page = folder / "page.html"
     assert run_command("report", folder / "run", "--to", page).code == 0
     text = page.read_text()
-    assert "Places of the markers of &#39;swing&#39;" in text or "markers of 'swing'" in text
+    assert "Positions of the markers of &#39;swing&#39;" in text or "markers of 'swing'" in text
     assert "not given" in text
     assert ">3 mm<" in text
     assert ">5 ms<" in text
@@ -175,10 +175,10 @@ def test_pictures_have_what_was_given_and_what_was_found(folder: Path):
     assert seen.marker_places_m[1] == pytest.approx(PLACES_M["mid"], abs=1e-3)
     assert seen.declared_places_m[1] == pytest.approx([0.03, 0.024, 0.03], abs=1e-9)
     assert legend_of(seen.marker_places_m, seen.declared_places_m, seen) >= {
-        "no place given", "place given",
+        "position not given", "position given",
     }  # fmt: skip
     same = legend_of(seen.marker_places_m, seen.marker_places_m, seen)
-    assert not same & {"no place given", "place given"}
+    assert not same & {"position not given", "position given"}
 
 
 def legend_of(places_m: np.ndarray, given_m: np.ndarray, seen) -> set[str]:

@@ -285,7 +285,7 @@ def test_curves_tell_where_the_horizon_grows():
     lines = [replace(line, share=0.5 if k < 2 else 1.0) for k, line in enumerate(history())]
     figure = convergence(lines)
     panel = figure.axes[0]
-    assert panel.get_title() == "fitted: 50, 100 % of the timesteps in turn"
+    assert panel.get_title() == "continuation: 50, 100 % of the time steps in turn"
     curves = [line for line in panel.lines if line.get_marker() == "o"]
     assert [len(line.get_xdata()) for line in curves] == [2, 3]
     assert not convergence(history()).axes[0].get_title()

@@ -105,7 +105,7 @@ def test_the_unit_of_positions_is_in_their_columns_or_given(file):
     expected = read_poses(file(NAMED)).positions_m
     in_mm = read_poses(file(NAMED.replace("x_m,y_m,z_m", "x_mm,y_mm,z_mm"))).positions_m
     np.testing.assert_allclose(in_mm, expected / 1000)
-    assert "name no unit" in refusal(file(BARE))
+    assert "state no unit" in refusal(file(BARE))
     given = read_poses(file(BARE), length_unit="cm").positions_m
     np.testing.assert_allclose(given, expected / 100)
     message = refusal(file(NAMED), length_unit="mm")
@@ -126,7 +126,7 @@ def test_matrices_give_the_same_poses_as_quaternions(tmp_path, poses, name):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda m: 1.01 * m[:3, :3], ["is no rotation", "0.0201"]),
+        (lambda m: 1.01 * m[:3, :3], ["is not a rotation", "0.0201"]),
         (lambda m: m[:3, :3] * [[1, 1, -1]], ["mirrors", "determinant"]),
     ],
 )

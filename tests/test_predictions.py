@@ -63,7 +63,7 @@ def test_a_prediction_is_judged_by_its_misfit_over_sigma(softer, verdict):
     for concern in concerns:
         rms_mm = 1e3 * finished.rollouts["hung cube"].rms_m
         assert concern.grade == verdict
-        assert "misses the markers by" in concern.message
+        assert "deviates from the markers by" in concern.message
         assert f"{rms_mm:.3g} mm RMS" in concern.message
         assert concern.data["sigmas"] == pytest.approx(rms_mm / np.sqrt(3), rel=0.01)
 
@@ -134,7 +134,7 @@ def test_predicted_depth_is_compared_with_the_image_and_graded():
     assert good.rms_m == pytest.approx(DEPTH_NOISE_M, rel=0.25)
     assert good.share_beyond_gate == 0.0
     assert wrong.trust.verdict == "doubtful"
-    assert "misses the depth of front by" in wrong.trust.reasons[0]
+    assert "deviates from the depth of front by" in wrong.trust.reasons[0]
     assert bad.rms_m > 0.008
     found = stored(wrong)
     assert found["rollout"]["experiment"]["depth"]["front"]["rms_m"] == bad.rms_m
@@ -155,7 +155,7 @@ def test_gate_and_rms_of_depth_belong_to_the_same_points():
 def test_notes_of_a_depth_recording_do_not_speak_of_wrenches():
     notes = " ".join(image_predicted(0.3e5).result.notes)
     assert "wrench" not in notes
-    assert "points of depth cameras are missed by" in notes
+    assert "the residuals of the points of depth cameras are" in notes
 
 
 def test_points_that_are_nowhere_near_the_prediction_are_doubtful():
@@ -179,7 +179,7 @@ def test_depth_of_a_validation_recording_is_compared_drawn_and_judged():
     assert predicted.rms_m == pytest.approx(DEPTH_NOISE_M, rel=0.3)
     drawn = {replay.name: replay.visible_points for replay in replays(finished)}["away"]["front"]
     assert np.isfinite(drawn[:, 4]).sum() == predicted.points
-    assert "points of depth cameras have no counterparts" in shown(finished)
+    assert "points of depth cameras cannot be compared" in shown(finished)
     (concern,) = (c for c in finished.trust.concerns if c.code == "roll-out/predicted")
     assert concern.data["experiment"] == "wrong/front"
 
@@ -232,7 +232,7 @@ def test_a_prediction_stands_beside_the_copy_of_a_fitted_recording():
     assert copied.copied == "fitted"
     assert copied.error.rms_m == pytest.approx(np.sqrt(6) * 2e-4, rel=0.1)  # the noise of both
     assert stored(alike)["rollout"]["new"]["copied"]["copied"] == "fitted"
-    assert "the measurements of 'fitted' copied: " in shown(alike)
+    assert "the measurements of 'fitted' as the prediction: " in shown(alike)
 
 
 def test_the_nearest_recording_is_copied_or_the_output_says_why_none_is():

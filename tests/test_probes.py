@@ -149,7 +149,7 @@ def test_terminal_page_and_file_have_the_probes(tmp_path):
     result = Result.read(folder)
     assert {p.name for p in result.probes} == {p.name for p in solved.probes}
     said = plain_text(run_summary(result, folder))
-    assert "the data determine density gradient z: -0.1" in said
+    assert "the data determine density gradient z: with -0.1" in said
     assert "−Δχ²" in said
     assert run_command("report", folder).code == 0
     assert "the data determine density gradient z" in next(folder.glob("*.html")).read_text()
@@ -167,8 +167,9 @@ def test_a_solve_makes_two_probes_and_all_of_them_where_asked_to(tmp_path):
     assert not any(p.routine for p in deep)
     assert {p.kind for p in deep} == {"window", "assumption"}
     assert "solve --probe" not in probing.out
-    assert "in half widths of the statistical and of the combined interval" in " ".join(
-        probing.out.split()
+    assert (
+        "relative to the half widths of the statistical and of the combined interval"
+        in " ".join(probing.out.split())
     )
 
 

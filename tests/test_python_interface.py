@@ -111,7 +111,9 @@ def test_a_matrix_that_is_no_rigid_motion_is_refused():
     t_s = times(10)
     poses = lifted(t_s)
     poses[4, 0, 0] = 2.0
-    with pytest.raises(cs.InputError, match=r"matrix 5: the matrix at t_s = 0.04 is no rotation"):
+    with pytest.raises(
+        cs.InputError, match=r"matrix 5: the matrix at t_s = 0.04 is not a rotation"
+    ):
         cs.Experiment(box(), t_s, [cs.Grasp(TOP, poses)], seen(t_s))
 
 

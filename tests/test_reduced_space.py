@@ -304,7 +304,7 @@ def test_a_misfit_far_above_the_noise_is_noted():
     made = measured(hung_cube())
     shifted = with_markers(made, made.markers.positions_m + np.array([0.01, 0.0, 0.0]))
     solution = ReducedSpace()(Collocation([shifted], GUESS))
-    assert "of their standard deviations" in solution.notes[-1]
+    assert "times their standard deviations" in solution.notes[-1]
     assert not solved_cube().notes
 
 

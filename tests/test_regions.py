@@ -367,7 +367,10 @@ def test_names_that_cannot_be_told_apart_are_refused(slab):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"mass_kg": 1e-3}, r"mass_kg must be positive; the regions' densities make up 0\.1 kg"),
+        (
+            {"mass_kg": 1e-3},
+            r"mass_kg must be positive; the densities of the regions account for 0\.1 kg",
+        ),
         ({"density_kg_m3": 0.0}, "density_kg_m3 must be positive"),
         ({}, "exactly one of density_kg_m3 and mass_kg"),
     ],

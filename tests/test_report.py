@@ -237,7 +237,7 @@ def test_concerns_lead_to_what_cures_them(run_folder: Path, tmp_path: Path):
         assert page.count(f'href="#cure-{topic}"') == page.count(f'id="cure-{topic}"') == 1
     assert "<code>collocation-sysid explain scheme</code>" in page
     assert "mu_pa ended at its bound" in page
-    assert "usable after a look at the reasons" in page
+    assert "usable after checking the reasons below" in page
 
 
 def test_every_remedy_names_a_page_that_is_there():

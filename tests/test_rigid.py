@@ -98,7 +98,7 @@ def test_markers_left_on_one_line_count_as_missing(rng):
 
 def test_no_frame_with_three_markers_gives_no_poses():
     fit = fit_poses(CLUSTER_M, np.full((3, 4, 3), np.nan))
-    with pytest.raises(InputError, match="no frame has three markers"):
+    with pytest.raises(InputError, match="no frame contains three markers"):
         fit.poses([0.0, 0.1, 0.2])
 
 

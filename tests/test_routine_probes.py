@@ -188,16 +188,16 @@ def test_what_is_stated_as_exact_is_tested_too():
 # Judgement of a probe -----------------------------------------------------------------------------
 
 
-def probe(relevance: float, told: bool = True, name: str = DRIFT, fall: float = 20.0) -> Probe:
+def probe(relevance: float, is_significant: bool = True, name: str = DRIFT, fall: float = 20.0) -> Probe:
     moves = {"young_pa": EstimateChange(8100.0, 40.0, 100.0, 2.0, 0.5)}
-    own = (name,) if told else ()
+    own = (name,) if is_significant else ()
     return Probe("assumption", name, fall, moves, -0.05, 0.01, own, True, relevance)
 
 
 def test_a_probe_alarms_if_it_is_significant_and_relevant():
     assert is_alarming(probe(2 * RELEVANT))
     assert not is_alarming(probe(0.5 * RELEVANT))
-    assert not is_alarming(probe(2 * RELEVANT, sentences=False))
+    assert not is_alarming(probe(2 * RELEVANT, is_significant=False))
     assert not is_alarming(replace(probe(2.0), kind="window"))
 
 
@@ -208,8 +208,8 @@ def test_the_concern_names_the_assumption_and_every_corrected_estimate():
     assert Assessment.from_concerns([concern]).verdict == "check"
     assert concern.message == (
         "the data contradict the assumption that the stiffness is constant during a recording: "
-        "with stiffness drift = -0.05 ± 0.01 χ² falls by 20, and the estimates are "
-        "E = 8181 ± 40 Pa and ν not determined; less well also by clock rate (12)"
+        "with stiffness drift = -0.05 ± 0.01 χ² decreases by 20, and the estimates become E = "
+        "8181 ± 40 Pa and ν not determined; alternatives that decrease χ² less: clock rate (12)"
     )
     assert probe_concerns([probe(0.0)], {"young_pa": 1.0}) == []
 

@@ -180,8 +180,8 @@ def test_the_terminal_shows_nuisance_verdicts_and_residuals(two, tmp_path, monke
         "solve", two / "problem.toml", *REDUCED, *sigma, "--out", tmp_path / "run"
     )
     assert outcome.code == 0
-    assert "also estimated for 'swing': " in outcome.out
-    assert "mm (prior 3)" in outcome.out
+    assert "nuisance parameters of 'swing': " in outcome.out
+    assert "mm (prior ±3 mm)" in outcome.out
     assert "the data determine" in outcome.out
     assert "residuals: swing/" in outcome.out
     stored = json.loads((tmp_path / "run" / "result.json").read_text())

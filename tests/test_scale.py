@@ -98,7 +98,7 @@ def test_one_of_two_recordings_with_a_known_mass_is_enough():
 
 def test_it_is_said_before_the_solve_and_in_the_verdict():
     found = problem(OPEN)
-    said = "only the ratios of lambda_pa, mu_pa and density_kg_m3 can be told (E/ρ)"
+    said = "only the ratios of lambda_pa, mu_pa and density_kg_m3 are identifiable (E/ρ)"
     assert any(said in note and "fix a density" in note for note in found.notes)
     assert any(said in warning for warning in check_problem(found).warnings)
     finished = run(found, seek_causes=False)
@@ -120,7 +120,10 @@ def test_moduli_relative_to_a_density_as_stated_are_called_so():
     found = problem(STIFF | DAMPED)
     assert relative_moduli(found.experiments, found.parameters) == ("lambda_pa", "mu_pa")
     said = relative_scale_note(found.experiments, found.parameters)
-    assert said == ("no known force sets the scale: λ and μ are relative to the stated density")
+    assert said == (
+        "no known force sets the scale: the data determine λ and μ only relative to "
+        "the density; the values assume the stated density"
+    )
     cube = hung_cube()
     loaded = problem(STIFF | DAMPED, masses=[PointMass(tip(cube), 0.01)])
     assert relative_scale_note(loaded.experiments, loaded.parameters) is None
@@ -203,4 +206,4 @@ def test_densities_that_cannot_be_are_refused(tiny, edits, words):
 
 def test_the_terminal_says_what_moduli_rest_on(tiny):
     shown = run_command("solve", "problem.toml")
-    assert "relative to the stated density" in " ".join(shown.out.split())
+    assert "only relative to the density" in " ".join(shown.out.split())

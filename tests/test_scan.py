@@ -135,13 +135,13 @@ def test_several_regions_are_scaled_together():
 
 
 def test_a_constant_of_which_nothing_is_known_needs_a_guess():
-    with pytest.raises(InputError, match="stiffening: no guess is given and no usual value"):
+    with pytest.raises(InputError, match="stiffening: there is no guess, and no usual value"):
         Parameters.from_mapping({"stiffening": Unknown()})
     assert Parameters.from_mapping({"bulk_pa": Unknown()}).names_without_guess == ("bulk_pa",)
 
 
 def test_without_a_guess_values_are_refused_by_name():
-    with pytest.raises(InputError, match="lambda_pa: there is no guess of it; expected guess = "):
+    with pytest.raises(InputError, match="lambda_pa: it has no guess; expected guess = "):
         _ = Parameters.from_mapping(NOTHING).guesses
 
 
@@ -254,7 +254,9 @@ def test_a_guess_that_gives_more_force_than_there_is_is_replaced():
     bench = unseen(block("z"))
     collocation, found = start_problem(Problem([bench], guessed(mu_pa=9e3)).collocation())
     assert found is not None
-    assert "the measurements are missed by more than an undeformed body would" in found.sentence
+    assert (
+        "the simulation is farther from the measurements than an undeformed body" in found.sentence
+    )
     assert collocation.parameters.guesses["mu_pa"] < 2 * TRUTH["mu_pa"]
 
 
@@ -297,7 +299,9 @@ def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
     )
     collocation, found = start_problem(cube(guessed(mu_pa=1e4)).collocation())
     assert found is not None
-    assert found.sentence.startswith("at the guess the measurements are missed by more than")
+    assert found.sentence.startswith(
+        "at the guess, the simulation is farther from the measurements"
+    )
     assert collocation.parameters.guesses["mu_pa"] == pytest.approx(
         found.young_pa[found.best] / 2.6
     )
@@ -318,7 +322,11 @@ def too_soft() -> dict[str, Unknown | float]:
 def test_a_body_that_can_never_be_simulated_is_refused():
     with pytest.raises(InputError) as caught:
         solve(cube(too_soft()))
-    for part in ("no start was found", "check grasp, mass and units, or give guesses", "t = 0 s"):
+    for part in (
+        "no initial values were found",
+        "check grasp, mass and units, or give guesses",
+        "t = 0 s",
+    ):
         assert part in str(caught.value)
 
 
@@ -357,7 +365,7 @@ def test_a_search_that_is_lost_begins_again_from_a_scan(second, scanned):
     solution = solve(cube(GUESS), method)
     assert starts[0] == GUESS.guesses["mu_pa"] != starts[1]
     assert (solution.status is Status.CONVERGED, solution.scan is not None) == (scanned, scanned)
-    said = "the search from the guess was lost (stalled): started from E = "
+    said = "the search from the guess failed (stalled): started from E = "
     assert [note for note in solution.notes if said in note][:1] == list(solution.notes[:scanned])
     assert solution.collocation.parameters.guesses["mu_pa"] == starts[scanned]
 

@@ -80,7 +80,7 @@ def test_recordings_that_disagree_widen_the_interval_of_what_they_disagree_on():
     assert found.quantiles[1] == pytest.approx(t.ppf(0.975, RECORDINGS - 1))
     assert (ratio[[0, 2, 3]] < 1.3).all()
     (note,) = [note for note in found.notes if "disagree on mu_pa" in note]
-    assert "model error decides" in note
+    assert "model errors exceed the noise" in note
     assert any("disagree on mu_pa" in each.message for each in fit_concerns(found))
     assert not any("disagree" in note for note in calm.notes)
 

@@ -210,7 +210,7 @@ OTHERS = {
     "prior": (
         PLACES,
         lambda e: replace(e, nuisance=replace(e.nuisance, marker_offset_m=0.004)),
-        r"'hung cube', where the place of m0, x \[m\] has the prior 0.002; expected the one here",
+        r"'hung cube', where the place of m0, x \[m\] has the prior 0.002; expected the same prior",
     ),
     "gravity": (
         {"gravity_rad": "shared"},

@@ -105,7 +105,9 @@ def test_where_newton_fails_the_load_is_applied_in_steps():
     hurried = NewtonOptions(max_iterations=5)
     in_steps = equilibrium(cube, soft, solver=NewtonSolver(cube, hurried))
     np.testing.assert_allclose(in_steps, direct, atol=1e-9)
-    with pytest.raises(SimulationError, match="rest state failed: Newton took more than 5"):
+    with pytest.raises(
+        SimulationError, match="rest state failed: Newton's method took more than 5"
+    ):
         equilibrium(cube, soft, solver=NewtonSolver(cube, replace(hurried, max_halvings=0)))
 
 

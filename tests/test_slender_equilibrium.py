@@ -67,7 +67,9 @@ def test_a_notched_bar_finds_its_equilibrium_in_few_factorisations(element, pois
 def test_a_limit_on_the_iterations_ends_the_search_with_an_explanation():
     bar = notched_bar("tet4")
     solver = NewtonSolver(bar, NewtonOptions(max_iterations=2, max_halvings=1))
-    with pytest.raises(SimulationError, match="finding the rest state failed: Newton took more"):
+    with pytest.raises(
+        SimulationError, match="finding the rest state failed: Newton's method took more"
+    ):
         equilibrium(bar, theta_of(bar.body, 0.45), solver=solver)
 
 

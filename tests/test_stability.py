@@ -201,8 +201,8 @@ def test_what_grows_is_told_with_its_rate(law, told):
     if told:
         (concern,) = concerns
         sentence = concern.message
-        assert "'bar' is not stable" in sentence
-        assert "disturbances grow by" in sentence
+        assert "the motion of 'bar' is unstable" in sentence
+        assert "disturbances grow at a rate of" in sentence
 
 
 def test_a_body_without_damping_is_stable():

@@ -70,7 +70,7 @@ def test_the_scan_is_drawn_in_the_run_folder_and_on_the_page(folder):
     assert image[..., :3].std() > 0.05
     page = folder / "page.html"
     assert run_command("report", folder / "run", "--to", page).code == 0
-    assert "Scan of the stiffness for a start" in page.read_text()
+    assert "Scan of the stiffness for an initial guess" in page.read_text()
     assert run_command("plot", folder / "run", "--out", folder / "again").code == 0
     assert np.array_equal(imread(folder / "again" / "scan.png"), image)
 
@@ -101,7 +101,7 @@ def test_starts_need_something_to_spread_about(folder):
     command = ("compare", folder / "problem.toml", "--methods", "reduced-space", *UNGUESSED)
     outcome = run_command(*command, "--starts", 2, "--dry-run")
     assert outcome.code == 2
-    assert "parameters.lambda_pa: has neither a guess nor a truth" in outcome.err
+    assert "parameters.lambda_pa: has neither a guess nor a true value" in outcome.err
     alone = run_command(*command, "--dry-run")
     assert (alone.code, "– – – –" in alone.out) == (0, True)
 

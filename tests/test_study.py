@@ -312,7 +312,7 @@ def test_a_late_run_is_killed(stand_in):
     tries = stand_in("hangs")
     record = run_execution.execute(planned_runs(1)[0].as_dict(), time_limit_s=0.5)
     assert (record["outcome"], tries("key0")) == ("timeout", 1)
-    assert record["message"] == "ended after the time limit of 0.5 s"
+    assert record["message"] == "ended at the time limit of 0.5 s"
 
 
 OBEDIENT = """

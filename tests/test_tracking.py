@@ -119,7 +119,7 @@ def test_frames_without_three_of_the_grippers_markers_are_counted(tracked):
     driven_by_markers(tracked)
     notes = " ".join(load(tracked).notes)
     assert "base1 and base2: each 1 of 9 samples missing (1 blank)" in notes
-    assert "1 of 9 frames lack three of base1, base2, base3, base4" in notes
+    assert "1 of 9 frames contain fewer than three of base1, base2, base3, base4" in notes
 
 
 @pytest.mark.parametrize(
@@ -213,7 +213,7 @@ def test_a_template_brings_the_cameras_frame_to_the_bodys(filmed):
     folder, markers, expected = filmed
     problem = load(folder, *settings(markers))
     assert_same_motion(problem.experiments[0], expected)
-    assert "moved rigidly to the template; left over: base1 " in problem.notes[0]
+    assert "moved rigidly to the template; remaining distances: base1 " in problem.notes[0]
 
 
 def test_a_template_that_does_not_fit_is_refused(filmed):
@@ -260,8 +260,8 @@ def test_a_weight_divides_the_variance(tiny):
 def test_a_weight_of_zero_leaves_a_marker_out(tiny):
     problem = load(tiny, "experiment.0.markers.weights.mid=0.0")
     assert problem.experiments[0].markers.names == ("low", "side")
-    assert problem.notes == ("experiment 'swing': left out, with the weight 0: mid",)
-    with pytest.raises(InputError, match="none is left of low, mid, side"):
+    assert problem.notes == ("experiment 'swing': markers excluded by a weight of 0: mid",)
+    with pytest.raises(InputError, match="no marker remains of low, mid, side"):
         load(tiny, "experiment.0.markers.weights={ low = 0.0, mid = 0.0, side = 0.0 }")
 
 

@@ -79,7 +79,7 @@ def test_the_gravest_concern_gives_the_verdict():
 def test_a_concern_keeps_its_code_and_its_numbers_in_files():
     found = Assessment.from_concerns(nuisance_concerns(["time"], [4.0], [-9.0], [9.0]))
     stored = json.loads(as_json(found))
-    assert stored["reasons"] == ["time is 4.0 deviations of its prior away from zero"]
+    assert stored["reasons"] == ["time is 4.0 standard deviations of its prior away from zero"]
     (concern,) = stored["concerns"]
     assert concern["code"] == "nuisance/far"
     assert concern["data"] == {"name": "time", "deviations": 4.0}
@@ -104,9 +104,9 @@ def test_white_residuals_of_the_stated_size_are_good():
 @pytest.mark.parametrize(
     ("factors", "words"),
     [
-        ([2.5, 2.5, 2.5], "times as large as sigma_m says"),
+        ([2.5, 2.5, 2.5], "times as large as expected from sigma_m"),
         ([0.3, 0.3, 0.3], "times too large"),
-        ([4.0, 1.0, 1.0], "swing 0/m0 is off by"),
+        ([4.0, 1.0, 1.0], "the residuals of swing 0/m0 are"),
     ],
 )
 def test_a_wrong_sigma_is_to_be_checked(factors, words):
@@ -122,7 +122,7 @@ def test_persistent_residuals_are_to_be_checked_and_gross_ones_doubtful():
         errors = autoregressive(RNG(seed), 80, 3, 0.8)
         found = verdict_of_fit(1.2 * errors)
         assert found.verdict == "check"
-        assert "persist" in found.reasons[0]
+        assert "consecutive samples are correlated" in found.reasons[0]
         assert verdict_of_fit(5 * errors).verdict == "doubtful"
         assert verdict_of_fit(0.02 * errors).verdict != "doubtful"
 
@@ -247,7 +247,7 @@ def test_a_wrong_sigma_of_a_whole_run_is_to_be_checked(factor, words):
     assert found.uncertainty is not None
     assert found.uncertainty.noise == "estimated"
     said = [diagnosis.sentence for diagnosis in found.diagnoses]
-    assert not any("as noise should be" in sentence for sentence in said)
+    assert not any("consistent with noise" in sentence for sentence in said)
 
 
 @pytest.mark.parametrize(("substeps", "verdict"), [(1, "check"), slow(2, "good")])
@@ -267,14 +267,16 @@ def test_the_verdict_is_shown_stored_and_fed():
     assert content(found.result)["trust"] == {"verdict": "good", "reasons": [], "concerns": []}
     lines = plain_text(run_summary(found.result, Path("runs"))).splitlines()
     assert lines[1] == "Verdict: good"
-    assert "γ_r refers to the damping law rayleigh, which also brakes rotation" in lines
+    assert "γ_r refers to the damping law rayleigh, which also damps rigid rotation" in lines
     (markers,) = [line for line in lines if line.startswith("markers: ")]
-    assert "mm from noise alone" in markers
+    assert "mm expected from noise alone" in markers
     noise_mm = float(markers.partition("RMS, ")[2].partition(" mm")[0])
     assert noise_mm == pytest.approx(1e3 * np.sqrt(3) * NOISE_M, rel=0.1)
     caused = replace(found, causes=(Hypothesis("wrench-tare", "the wrench", strength=9.0),))
     assert caused.trust.verdict == "doubtful"
-    assert caused.trust.reasons[0].startswith("likely: the wrench: it seems zeroed with the body")
+    assert caused.trust.reasons[0].startswith(
+        "likely: the wrench: the sensor was probably zeroed while it carried the body"
+    )
 
 
 def test_an_answer_that_did_not_converge_is_doubtful():

@@ -261,7 +261,7 @@ def test_two_fields_of_two_phases_are_refused():
 
 
 def test_live_refuses_phases_that_nobody_knows_yet():
-    with pytest.raises(cs.InputError, match="phases of young_pa are not known"):
+    with pytest.raises(cs.InputError, match="phases of young_pa are unknown"):
         LiveEstimator(problem(3.0))
 
 

@@ -249,7 +249,7 @@ def test_residuals_larger_than_sigma_are_pointed_out():
     experiment = with_sigma(noisy(measured(hung_cube()), 1e-4, seed=1), 1e-5)
     collocation, z = simulated([experiment])
     (note,) = uncertainty_at(collocation, z).notes
-    assert "times as large as sigma_m" in note
+    assert "times as large as expected from sigma_m" in note
     assert uncertainty_at(collocation, z, ErrorModel("estimated")).notes == ()
 
 

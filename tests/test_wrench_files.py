@@ -61,11 +61,11 @@ BAD = {
     ),
     "unknown column": (
         lines("t_s,fx_n,fy_n,fz_n,mx_nm,ty_nm,tz_nm"),
-        ["mx_nm is none of them", "did you mean 'tx_nm'"],
+        ["mx_nm is not among them", "did you mean 'tx_nm'"],
     ),
     "twice": (
         lines("t_s,fx_n,fx_n,fz_n,tx_nm,ty_nm,tz_nm"),
-        ["the columns fx_n, fx_n may each be fx"],
+        ["the columns fx_n, fx_n could all be fx"],
     ),
     "no time": (
         lines("time,fx_n,fy_n,fz_n,tx_nm,ty_nm,tz_nm"),

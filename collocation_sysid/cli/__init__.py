@@ -99,9 +99,9 @@ app = typer.Typer(
     help="Identify the material parameters of a soft object from motion capture.\n\n"
     "\b\nStart with\n"
     "  collocation-sysid new my_object                    a commented problem file\n"
-    "  collocation-sysid check my_object/problem.toml     what will go wrong\n"
+    "  collocation-sysid check my_object/problem.toml     find mistakes before a solve\n"
     "  collocation-sysid solve my_object/problem.toml     parameters with error bars\n"
-    "  collocation-sysid report runs/my_object            everything found, as a page",
+    "  collocation-sysid report runs/my_object            all results as a web page",
     no_args_is_help=True,
     add_completion=False,  # see the command `completion`
     pretty_exceptions_enable=False,

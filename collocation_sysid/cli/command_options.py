@@ -48,19 +48,26 @@ ProblemPath = Annotated[Path, typer.Argument(metavar="PROBLEM.toml", help="The p
 Overrides = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="KEY=VALUE", help="Override a key, such as parameters.mu_pa.guess=200."
+        "--set",
+        metavar="KEY=VALUE",
+        help="Override a key of the problem file, such as parameters.mu_pa.guess=200.",
     ),
 ]
 AllowCode = Annotated[
-    bool, typer.Option("--allow-code", help="Run Python files that the problem names.")
+    bool,
+    typer.Option(
+        "--allow-code", help="Allow the Python files named in the problem file to be executed."
+    ),
 ]
 OneExperiment = Annotated[
     str | None,
-    typer.Option("--experiment", metavar="NAME", help="Experiment; by default the first."),
+    typer.Option(
+        "--experiment", metavar="NAME", help="Name of the experiment; by default the first one."
+    ),
 ]
-OutputFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Where to write.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+OutputFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Output folder.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Do not show progress.")]
 
 
 def command(group: typer.Typer, *examples: str) -> Callable[[Callable[[Any], None]], Any]:

@@ -27,20 +27,20 @@ class DesignCommand(ProblemOptions, OutputOptions):
     Attributes
     ----------
     duration : SECONDS
-        How long the motion takes.
+        Duration of the motion [s].
     limits : FILE
-        A file (TOML) with what the robot may do and what cameras see.
+        TOML file with the limits of the robot and the views of the cameras.
     criterion : str
-        What to minimise: worst, the largest error bar; A, their mean square; D, the volume of
-        their ellipsoid.
+        Criterion that is minimised: worst, the largest error bar; A, the mean square of the error
+        bars; D, the volume of the confidence ellipsoid.
     for_ : A,B,…
-        Parameters and moduli that count; all by default.
+        Parameters and moduli whose error bars are minimised; all by default.
     over : str
-        Over draws from the prior: their mean, or the worst.
+        How draws from the prior are combined: mean or worst.
     add : bool
-        Complement the problem's recordings; they are fitted first.
+        Design a motion in addition to the problem's recordings, which are fitted first.
     film : bool
-        Film the motion.
+        Make a film of the motion.
     """
 
     duration: float
@@ -64,9 +64,10 @@ class DesignCommand(ProblemOptions, OutputOptions):
 def design(options: DesignCommand) -> None:
     """Find the motion of the grasp that makes the error bars smallest.
 
-    It begins and ends at rest in the first pose, keeps to the limits, and is judged over a prior
-    of the parameters. The folder gets poses.csv, error bars before and after, pictures, a film and
-    a problem that simulates it. Ctrl-C keeps the best motion so far.
+    The motion begins and ends at rest in the first pose, keeps to the limits, and is optimised for
+    a prior of the parameters. The output folder contains poses.csv, the error bars before and
+    after, pictures, a film and a problem file that simulates the motion. Ctrl-C stops the search
+    and keeps the best motion so far.
     """
     from ..plan.design.design_folder import DESIGN_FILE, design_json, write_design
     from ..plan.design.design_page import design_summary

@@ -40,13 +40,13 @@ class SolveCommand(ProblemOptions, OutputOptions):
     Attributes
     ----------
     method : str
-        The method, instead of the problem's.
+        The method to use instead of that in the problem file.
     start : RUN
-        Start from the answer in this run folder.
+        Start from the result in this run folder.
     scheduler : ADDRESS
-        A dask.distributed scheduler to run on.
+        Address of a dask.distributed scheduler whose workers compute the experiments.
     verbose : -v
-        A line per iteration.
+        Print a line per iteration.
     strict : bool
         Exit code 1 if the verdict is doubtful.
     budget : bool
@@ -54,7 +54,7 @@ class SolveCommand(ProblemOptions, OutputOptions):
     probe : bool
         Deeper check: refit subsets of the data, and relax each assumption.
     pictures : bool
-        Draw pictures into the run folder; the command plot draws them later.
+        Draw pictures into the run folder; the command plot can draw them later.
     """
 
     method: str | None = None
@@ -78,13 +78,13 @@ class SolveCommand(ProblemOptions, OutputOptions):
 def solve(options: SolveCommand) -> None:
     """Identify the parameters and write a run folder.
 
-    Parameters need no guess: a scan of the stiffness finds where to start. --start takes an earlier
-    answer instead, also of another mesh or timestep.
+    Parameters need no guess: a scan over the stiffness finds initial values. --start begins with
+    the result of an earlier run instead, also one with another mesh or time step.
 
-    --scheduler shares the experiments among the workers of a cluster.
+    --scheduler distributes the experiments to the workers of a cluster.
 
-    Set a method's options in its table of the file, [solver.reduced-space] and so on, or with
-    --set, as in --set solver.reduced-space.tolerance=1e-6; the command methods lists them.
+    Options of a method are set in its table of the problem file, such as [solver.reduced-space], or
+    with --set, as in --set solver.reduced-space.tolerance=1e-6. The command methods lists them.
     """
     from ..result.run_sections import run_summary
     from ..result.solve_progress import SolveProgress
@@ -143,7 +143,7 @@ def _draw_pictures(finished: Run, folder: Path, options: SolveCommand) -> Result
             return draw_run(finished, folder, progress.say)
     except KeyboardInterrupt:
         again = shlex.join(["collocation-sysid", "plot", str(folder)])
-        message = f"interrupted: the answer is kept in {folder}, without all pictures"
+        message = f"interrupted: the result is kept in {folder}, but some pictures are missing"
         error_console.print(Text(f"{message}; draw them with: {again}"), soft_wrap=True)
         return finished.result
 
@@ -155,7 +155,7 @@ class SimulateCommand(ProblemOptions, OutputOptions):
     Attributes
     ----------
     out : DIR
-        Where to write.
+        Output folder.
     """
 
     out: Path
@@ -170,8 +170,8 @@ class SimulateCommand(ProblemOptions, OutputOptions):
 def simulate(options: SimulateCommand) -> None:
     """Simulate at the guesses and write markers and poses as CSV.
 
-    The markers' places are their reference_m, or follow from their file. The parameters are the
-    guesses or fixed values: set others with --set.
+    The positions of the markers are their reference_m, or follow from their file. The parameters
+    are the guesses or fixed values; set other values with --set.
     """
     from ..result.solve_progress import SolveProgress
 
@@ -215,9 +215,9 @@ class CheckCommand(ProblemOptions, OutputOptions):
     Attributes
     ----------
     full : bool
-        Simulate whole recordings, however long that takes.
+        Simulate the complete recordings, however long that takes.
     out : DIR
-        Where pictures of what depth cameras see are written; runs/<problem>_check by default.
+        Folder for pictures of the depth cameras' images; runs/<problem>_check by default.
     """
 
     full: bool = False
@@ -232,12 +232,13 @@ class CheckCommand(ProblemOptions, OutputOptions):
     "check problem.toml --set transcription.scheme=backward-euler",
 )
 def check(options: CheckCommand) -> None:
-    """Check a problem before solving it, and say what will go wrong.
+    """Check a problem before solving it, and report probable mistakes.
 
-    Bodies, recordings and grasps are shown at once. Derivatives, costs and the simulation at the
-    guess follow, of the first samples only where whole recordings take more than ten seconds.
+    Bodies, recordings and grasps are shown immediately. Derivatives, costs and a simulation at the
+    guess follow. If simulating the complete recordings takes more than ten seconds, only their
+    first samples are simulated.
 
-    Of each depth camera a picture shows the first image and the undeformed body over it.
+    For each depth camera, a picture shows the first image and the undeformed body.
     """
     from ..result.check_sections import full_check_tables, quick_check_tables
     from ..result.solve_progress import SolveProgress

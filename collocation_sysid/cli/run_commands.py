@@ -35,7 +35,7 @@ class RefineCommand(RunFolderOptions, OutputOptions):
     Attributes
     ----------
     levels : int
-        2, or 3 to observe the orders of convergence, which takes much longer.
+        Number of grids: 2, or 3 to observe the orders of convergence, which takes much longer.
     """
 
     levels: int = 2
@@ -46,10 +46,9 @@ class RefineCommand(RunFolderOptions, OutputOptions):
 def refine(options: RefineCommand) -> None:
     """Solve again with half the step and a finer mesh, to measure the discretisation error.
 
-    Each solve starts from the run's answer. The folder gets refinement.json, and result.json gets
-    the
-    discretisation error of each parameter, with corrected values and combined intervals. After an
-    interruption the same command continues where it stopped.
+    Each solve starts from the result of the run. The errors are written to refinement.json in the
+    run folder, and added to result.json with corrected values and combined intervals. After an
+    interruption, the same command continues where it stopped.
     """
     from ..result.run_refinement import refine_run
     from ..result.run_sections import refinement_table, verdict_section
@@ -62,7 +61,9 @@ def refine(options: RefineCommand) -> None:
     try:
         refinement, result = refine_run(options.run_folder, options.levels, options.allow_code, say)
     except KeyboardInterrupt:
-        raise interruption_exit(f"what was solved is kept in {options.run_folder}") from None
+        raise interruption_exit(
+            f"the solves that were completed are kept in {options.run_folder}"
+        ) from None
     report = {**content(refinement), "trust": result.trust}
     options.print_result(report, [refinement_table(result), verdict_section(result.trust)])
 
@@ -76,7 +77,7 @@ class ExportCommand(RunFolderOptions):
     to : TARGET
         mujoco, usd, newton, sofa, febio, calculix or json; rerun for a viewer.
     verify : bool
-        Simulate the exported body in the target, and compare.
+        Simulate the exported body in the target, and compare the results.
     """
 
     to: str
@@ -93,8 +94,9 @@ class ExportCommand(RunFolderOptions):
 def export(options: ExportCommand) -> None:
     """Write the identified body for another simulator: mesh, material, damping, grasp.
 
-    What the target cannot express is printed. The files go to export-TARGET in the run folder.
-    The target rerun is a recording of the motion, of all experiments or one, for the Rerun viewer.
+    Properties that the target cannot represent are printed. The files are written to export-TARGET
+    in the run folder by default. The target rerun is a recording of the motion, of all experiments
+    or one, for the Rerun viewer.
     """
     if options.to == "rerun":
         _export_recording(options)
@@ -176,9 +178,9 @@ class ReportCommand:
     Attributes
     ----------
     folder : FOLDER
-        A run folder, or one of compare or sweep.
+        A run folder, or an output folder of compare or sweep.
     to : FILE
-        An .html or .md; report.html in the folder by default.
+        Output file, .html or .md; report.html in the folder by default.
     """
 
     folder: Annotated[Path, typer.Argument()]
@@ -187,9 +189,9 @@ class ReportCommand:
 
 @command(commands, "report runs/swing", "report runs/compare --to comparison.html")
 def report(options: ReportCommand) -> None:
-    """Write one HTML page about a run or a study, or a Markdown file.
+    """Write a report of a run or a study as one HTML page or a Markdown file.
 
-    It has all results and the pictures; Markdown links to them.
+    The report contains all results and the pictures; a Markdown file links to the pictures.
     """
     from ..result.report import comparison_report, report_text
     from ..result.run_sections import run_report
@@ -210,11 +212,11 @@ class AnimateCommand(RunFolderOptions):
     Attributes
     ----------
     to : FILE
-        A .gif, or an .mp4, which needs ffmpeg.
+        Output file: .gif, or .mp4, which needs ffmpeg.
     fps : float
         Frames per second.
     slow : float
-        How many times slower than in reality.
+        Slow-motion factor: how many times slower than in reality.
     """
 
     to: Path | None = None
@@ -226,7 +228,7 @@ class AnimateCommand(RunFolderOptions):
 
 @command(commands, "animate runs/swing --to swing.mp4", "animate runs/swing --slow 4")
 def animate(options: AnimateCommand) -> None:
-    """Film a run: the body as fitted beside its forward simulation."""
+    """Make a film of a run: the fitted body beside its forward simulation."""
     from rich.progress import Progress
 
     from ..result.animation import animate as film
@@ -253,7 +255,7 @@ class ViewCommand(RunFolderOptions):
     Attributes
     ----------
     field : str
-        The field of the frames that colours the body; von_mises_pa, or on a page strain.
+        Field of the frames that colours the body; von_mises_pa by default, strain on a web page.
     html : FILE
         Write a web page; no window opens.
     """
@@ -267,7 +269,8 @@ class ViewCommand(RunFolderOptions):
 def view(options: ViewCommand) -> None:
     """Show a run in 3-D.
 
-    It opens a window, which needs pyvista, or writes a web page, which needs nothing.
+    The command opens a window, which needs pyvista, or writes a web page, which needs no further
+    package.
     """
     from ..result.interactive_view import DEFAULT_FIELD, export_page
     from ..result.interactive_view import view_run as opened

@@ -29,9 +29,9 @@ class LiveEstimationOptions(Options):
     Attributes
     ----------
     budget_ms : float
-        Time that a frame may take; by default 80 % of the time between samples.
+        Computing time per frame [ms]; by default 80 % of the time between samples.
     window_s : float
-        How far back earlier frames are revisited.
+        Time span before the present frame in which earlier frames are recomputed [s].
     """
 
     budget_ms: Positive | None = None
@@ -53,7 +53,7 @@ class LiveCommand(LiveEstimationOptions):
     Attributes
     ----------
     udp : PORT
-        Read a UDP port of this machine instead.
+        Read frames from this UDP port instead of standard input.
     """
 
     problem: ProblemPath
@@ -64,12 +64,13 @@ class LiveCommand(LiveEstimationOptions):
     commands, "live problem.toml < frames.jsonl", "live problem.toml --udp 9870 > estimates.jsonl"
 )
 def live(options: LiveCommand) -> None:
-    """Identify while the recording is made: frames in, a line of JSON for each out, one at the end.
+    """Estimate the parameters while a recording is made.
 
-    A frame is a line: {"t_s": 0.01, "pose": {"position_m": [x, y, z], "quaternion_xyzw": [x, y, z,
-    w]}, "markers": {"tip": [x, y, z]}}, or a row of a table whose first line is t_s, x_m, y_m,
-    z_m, qx, qy, qz, qw, tip_x, tip_y, tip_z and so on. A line that is no frame is reported
-    and left out, and the exit code is then 2. An empty datagram ends it.
+    The command reads frames and prints a line of JSON for each, and one at the end. A frame is a
+    line: {"t_s": 0.01, "pose": {"position_m": [x, y, z], "quaternion_xyzw": [x, y, z, w]},
+    "markers": {"tip": [x, y, z]}}, or a row of a table whose first line is t_s, x_m, y_m, z_m, qx,
+    qy, qz, qw, tip_x, tip_y, tip_z and so on. A line that is not a frame is reported and ignored,
+    and the exit code is then 2. An empty datagram ends the recording.
     """
     from ..live.frames import FrameReader
     from ..live.sources import (
@@ -127,11 +128,11 @@ class ReplayCommand(LiveEstimationOptions, OutputOptions):
     Attributes
     ----------
     recording : RUN_OR_PROBLEM
-        A problem file, or a run's folder.
+        A problem file, or a run folder.
     rate : HZ
-        Frames a second: by default as recorded, with 0 without a pause.
+        Frames per second; by default as recorded, 0 for as fast as possible.
     film : FILE
-        Write the estimates as a .gif.
+        Write a film of the estimates, a .gif.
     """
 
     recording: Annotated[Path, typer.Argument()]
@@ -146,7 +147,7 @@ class ReplayCommand(LiveEstimationOptions, OutputOptions):
     "replay problem.toml --json --rate 0",
 )
 def replay(options: ReplayCommand) -> None:
-    """Stream a recording as if it were made now, and estimate from it live."""
+    """Stream a recording as if it were being made, and estimate the parameters live."""
     from rich.live import Live
 
     from ..display import on_terminal

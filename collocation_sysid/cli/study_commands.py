@@ -39,7 +39,7 @@ class StudyOptions(ProblemOptions, OutputOptions):
     Attributes
     ----------
     dry_run : bool
-        Only list the runs.
+        List the runs without computing them.
     """
 
     limits: RunOptions
@@ -54,11 +54,11 @@ class CompareCommand(StudyOptions):
     Attributes
     ----------
     methods : A,B,…
-        Methods to compare, each with its options in the file.
+        Methods to compare, each with its options in the problem file.
     materials : A,B,…
-        Materials to compare, in place of the object's.
+        Materials to compare, instead of the object's.
     damping : A,B,…
-        Laws of damping to compare, in place of the object's.
+        Laws of damping to compare, instead of the object's.
     prony : 0,1,…
         Numbers of viscoelastic branches to compare.
     region : NAME
@@ -69,7 +69,7 @@ class CompareCommand(StudyOptions):
     truth : FILE|NAME=VALUE
         True parameters: a TOML file, or values.
     within : float
-        Relative error up to which a run is a success.
+        Largest relative error of a successful run.
     """
 
     methods: str | None = None
@@ -91,14 +91,14 @@ class CompareCommand(StudyOptions):
     "compare problem.toml --damping kelvin-voigt,material,rayleigh",
 )
 def compare(options: CompareCommand) -> None:
-    """Compare methods from many starts, or fit several models and say which to use.
+    """Compare methods from several initial guesses, or fit several models and recommend one.
 
-    With --materials, --damping, --prony or --with each model is fitted to all recordings, and to
-    all but each of them, which it then predicts; of one recording the last third is held out. In a
-    body with regions all of it has the model, or --region. --with takes other problem files as
-    models, each with all of the materials, laws of damping and numbers of branches.
+    With --materials, --damping, --prony or --with, each model is fitted to all recordings, and then
+    to all but one, which it predicts; of a single recording, the last third is held out. A model
+    applies to the whole body, or to the region named by --region. --with adds other problem files
+    as models, each combined with all stated materials, laws of damping and numbers of branches.
 
-    Finished runs are kept in the output folder: the same command resumes.
+    Finished runs are kept in the output folder: the same command resumes the study.
     """
     methods = parse_methods(options.methods) if options.methods is not None else ()
     problem = options.read_problem()
@@ -165,9 +165,9 @@ class SweepCommand(StudyOptions):
     Attributes
     ----------
     over : KEY=VALUES
-        Key and its values: a,b,c or first:last:count or first:last:log:count.
+        Key and its values: key=a,b,c, key=first:last:count or key=first:last:log:count.
     method : str
-        The method, instead of the problem's.
+        The method to use instead of that in the problem file.
     """
 
     over: list[str]
@@ -180,7 +180,7 @@ class SweepCommand(StudyOptions):
     "sweep problem.toml --over parameters.mu_pa.guess=50:5000:log:9",
 )
 def sweep(options: SweepCommand) -> None:
-    """Solve for every combination of values of some keys."""
+    """Solve the problem for every combination of the values of some keys."""
     method = parse_methods(options.method, "--method")[0] if options.method else None
     over = parse_varied_keys(options.over)
     overrides = options.set_ or ()

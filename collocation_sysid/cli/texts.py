@@ -49,7 +49,7 @@ class MethodsCommand:
 
 @command(commands, "methods", "methods interior-point")
 def methods(options: MethodsCommand) -> None:
-    """List the methods, or the options of one: defaults, values, and what they do."""
+    """List the methods, or the options of one method: defaults, allowed values and meaning."""
     from ..methods import METHODS, method_options_schema, method_summary, require_method
 
     name = options.name
@@ -82,7 +82,7 @@ class ExplainCommand:
     Attributes
     ----------
     topics : TOPIC
-        The pages that are shown.
+        Topics of the pages to show.
     """
 
     topics: Annotated[list[str] | None, typer.Argument()] = None
@@ -92,7 +92,8 @@ class ExplainCommand:
 def explain(options: ExplainCommand) -> None:
     """Show pages of the documentation, or list their topics.
 
-    Pages are part of the installation; no network is needed. In a pipe they are Markdown.
+    Pages are part of the installation; no network is needed. If the output is not a terminal, they
+    are printed as Markdown.
     """
     if not options.topics:
         print_result(
@@ -129,7 +130,7 @@ class TopicsCommand:
 
 @command(commands, "topics run.mcap", "topics bags/2026-05-04 --json")
 def topics(options: TopicsCommand) -> None:
-    """List what is in a robot's log, what it can serve as, and what to write for it."""
+    """List the topics of a robot's log, their uses, and how a problem file names them."""
     from ..recording.formats.topics import list_topics
 
     with located(options.log):
@@ -147,9 +148,9 @@ def topics(options: TopicsCommand) -> None:
         )
         for each in listed
     )
-    heads = ("topic", "type", "messages", "Hz", "serves as")
+    heads = ("topic", "type", "messages", "Hz", "use")
     addresses = [f"  {address}" for each in listed for address in each.write]
-    what = ["", "In place of a file write:", *addresses] if addresses else []
+    what = ["", "In place of a file name write:", *addresses] if addresses else []
     print_result([Table("", heads, rows, names=2, texts=1), *what])
 
 
@@ -162,7 +163,7 @@ class NewCommand:
     name : str
         Name of the new folder.
     kind : str
-        With a simulated recording of this kind, so that it runs as it is.
+        Add a simulated recording of this kind, so that the problem runs as it is.
     """
 
     name: Annotated[str, typer.Argument()]
@@ -173,7 +174,7 @@ class NewCommand:
     commands, "new my_object", "new silicone --kind compression", "check silicone/problem.toml"
 )
 def new(options: NewCommand) -> None:
-    """Write a commented problem file to start from."""
+    """Write a commented problem file as a starting point."""
     from ..problem.new_problem import create_problem
 
     folder = Path(options.name)
@@ -182,8 +183,11 @@ def new(options: NewCommand) -> None:
     typer.echo(file)
     for each in data:
         typer.echo(each)
-    yours = "put your mesh, poses and marker tracks beside it and name them in it"
-    example = "it runs as it is, on simulated data; then put your own in their place"
+    yours = (
+        "put your mesh, poses and marker tracks into the same folder and write their names "
+        "into the problem file"
+    )
+    example = "the problem runs as it is, with simulated data; then replace them by your own"
     error_console.print(f"Next: {yours if kind is None else example}.", soft_wrap=True)
     for next_ in ("check", "solve"):
         error_console.print(f"  collocation-sysid {next_} {shlex.quote(str(file))}", soft_wrap=True)

@@ -492,7 +492,7 @@ class Body(Discretisation):
             return None
         part = self.parts[masses[:, node].argmin()]
         density = part.full_name(DENSITY.name)
-        remedy = "give a density above zero"
+        remedy = "state a density above zero"
         if part.field is not None and part.stress_field is None:
             remedy = "lower the amplitude of its field to 0.3 or less, or its field_1, field_2, …"
         return (

@@ -76,7 +76,7 @@ YOUNG = Constant("young_pa", "E", "Young's modulus", STIFFNESS)
 POISSON = Constant("poisson", "ν", "Poisson's ratio", (1e-3, 0.495), "linear", 0.1, 0.3, 0.5)
 GAMMA_R = Constant("gamma_r_s", "γ_r", "stiffness-proportional damping", (1e-7, 10.0), usual=3e-3)
 GAMMA_M = Constant("gamma_m_1_s", "γ_m", "mass-proportional damping", (1e-4, 1e4), usual=0.3)
-C10 = Constant("c10_pa", "C₁₀", "half the shear modulus, or a share of it", STIFFNESS)
+C10 = Constant("c10_pa", "C₁₀", "half the shear modulus, or a part of it", STIFFNESS)
 C01 = Constant("c01_pa", "C₀₁", "factor of the second invariant", STIFFNESS)
 C20 = Constant("c20_pa", "C₂₀", "factor of (Ī₁ − 3)²", (-1e9, 1e9), "linear")
 C30 = Constant("c30_pa", "C₃₀", "factor of (Ī₁ − 3)³", (-1e9, 1e9), "linear")
@@ -86,8 +86,8 @@ CHAIN_STRETCH = Constant(
 )
 # Constants of a branch of the memory, preceded by the name of the branch: ``prony_1.share``.
 SHARE = Constant(
-    "share", "g", "stiffness that relaxes, over the long-term one", (0.0, 20.0), "linear", 0.1, 0.1,
-    at_least=0.0,
+    "share", "g", "stiffness that relaxes, relative to the long-term one",
+    (0.0, 20.0), "linear", 0.1, 0.1, at_least=0.0,
 )  # fmt: skip
 TAU = Constant("tau_s", "τ", "relaxation time", (1e-4, 1e3), usual=0.3)
 DENSITY = Constant("density_kg_m3", "ρ", "density", (1.0, 1e5))
@@ -98,11 +98,13 @@ FRICTION = Constant(
     "friction", "friction", "coefficient of friction", (0.0, 2.0), "linear", 0.1, 0.3, at_least=0.0
 )
 # Coefficient of a shape of a field, see `spatial_field`; names are field_1, field_2, ….
-MODE = Constant("field", "", "share of a shape", (-1e3, 1e3), "linear", 1.0, 0.0)
+MODE = Constant("field", "", "coefficient of a shape", (-1e3, 1e3), "linear", 1.0, 0.0)
 # Contrast of a field with prior "two-phase", see `two_phase`; 1 in a body of one material.
-CONTRAST = Constant("contrast", "contrast", "inclusion over surroundings", (0.02, 50.0), usual=1.0)
+CONTRAST = Constant(
+    "contrast", "contrast", "ratio of inclusion to surroundings", (0.02, 50.0), usual=1.0
+)
 INSTANTANEOUS = Constant(
-    "instantaneous_young_pa", "E₀", "Young's modulus at once, before anything has relaxed"
+    "instantaneous_young_pa", "E₀", "instantaneous Young's modulus, before relaxation"
 )
 
 # The constants that have a symbol, by name: what tables and pictures look up.

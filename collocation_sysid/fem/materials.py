@@ -133,8 +133,9 @@ class Material:
             worst = np.abs(residual).max()
             if not worst <= REST_TOLERANCE * scale:
                 raise InputError(
-                    f"material {self.name!r} has the {what} {worst:.3g} {unit} undeformed, with "
-                    f"{self._describe_values(sample_values)}; expected none at F = I: subtract it"
+                    f"material {self.name!r} has the {what} {worst:.3g} {unit} in the undeformed "
+                    f"state, with {self._describe_values(sample_values)}; expected zero at F = I: "
+                    "subtract it"
                 )
 
     def _describe_values(self, values: list[float]) -> str:

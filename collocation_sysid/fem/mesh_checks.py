@@ -141,7 +141,7 @@ def clean_mesh(
     if len(dropped):
         notes.append(
             f"{len(dropped)} of {len(points_m)} nodes were dropped (node {dropped[0]} is the "
-            "first): they are no element's corner."
+            "first): they are not the corner of any element."
         )
     if len(reversed_elements):
         notes.append(
@@ -255,7 +255,7 @@ def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
         return ()
     sizes = ", ".join(str(size) for size in np.sort(np.bincount(label))[:-6:-1])
     twins = n - len(np.unique(points, axis=0))
-    hint = f"; {twins} of {n} nodes lie exactly on others: merge them" if twins else ""
+    hint = f"; {twins} of {n} nodes coincide with others: merge them" if twins else ""
     return (f"The mesh is in {parts} unconnected parts (the largest have {sizes} nodes){hint}.",)
 
 
@@ -292,9 +292,8 @@ def straightening_notes(points_m: np.ndarray, cells: np.ndarray) -> tuple[str, .
         raise InputError(
             f"quadratic element {e}: mid node {mid} lies {offset[e, k]:.3g} m off the middle of "
             f"the edge from node {a} to node {b}, which is {length[e, k]:.3g} m long; expected at "
-            f"most {LARGEST_SIDE_CURVATURE:.0%} of that ({len(bad)} such in all), since sides "
-            "are taken "
-            "as straight: refine the mesh, or save it with linear tetrahedra"
+            f"most {LARGEST_SIDE_CURVATURE:.0%} of that ({len(bad)} such in all), because sides "
+            "are assumed to be straight: refine the mesh, or save it with linear tetrahedra"
         )
     is_curved = offset > ROUND_OFF * length
     if not is_curved.any():

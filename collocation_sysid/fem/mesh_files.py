@@ -214,8 +214,8 @@ def _unreadable_error(done: str, reason: str, path: str | Path) -> InputError:
     path : str or Path
     """
     return InputError(
-        f"the file cannot be {done} as a mesh ({reason}); formats such as .vtu, .vtk, .msh, "
-        ".mesh and .inp are known, told by the file's ending",
+        f"the file cannot be {done} as a mesh ({reason}); formats such as .vtu, .vtk, .msh, .mesh "
+        "and .inp are known, recognised by the file's ending",
         path,
     )
 

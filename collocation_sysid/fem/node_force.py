@@ -142,8 +142,8 @@ class NodeForce:
         arguments = list(inspect.signature(law).parameters)[4 if carries else 3 :]
         if "at" in arguments:
             raise InputError(
-                f"force {name!r} takes something before at, as what carries numbers from step to "
-                "step does; expected carries to say how many"
+                f"force {name!r} has an argument before `at`, as forces with internal variables "
+                "have; expected carries = the number of internal variables"
             )
         if unused := sorted(set(definitions) - set(arguments)):
             raise InputError(
@@ -251,7 +251,9 @@ class NodeForce:
             force, after = self._evaluate_law(x, v, before, at, named)
             _ = self._symbols
         except (Exception, SystemExit) as error:
-            internal_text = " and what is carried" if self.internal_variable_count else ""
+            internal_text = (
+                " and the new internal variables" if self.internal_variable_count else ""
+            )
             raise InputError(
                 f"force {self.name!r} cannot be evaluated ({reason(error)}); expected a function "
                 "of x, v, at and named constants in CasADi operations that returns three forces"
@@ -261,8 +263,8 @@ class NodeForce:
             raise InputError(f"force {self.name!r} has the shape {force.shape}; expected (3, 1)")
         if after.shape != (self.internal_variable_count, 1):
             raise InputError(
-                f"force {self.name!r} returns {after.numel()} numbers to carry; expected "
-                f"{self.internal_variable_count}, as carries says"
+                f"force {self.name!r} returns {after.numel()} internal variables; expected "
+                f"{self.internal_variable_count}, as stated by carries"
             )
         at_rest = np.zeros(self.input_size(dofs))
         at_rest[:dofs] = TRIANGLE_M[:dofs]
@@ -272,7 +274,7 @@ class NodeForce:
             for e in self._force_and_jacobian(at_rest, np.ones(CONTEXT_SIZE))
         ):
             raise InputError(
-                f"force {self.name!r} or its slope is not finite where the node is at rest; "
+                f"force {self.name!r} or its derivative is not finite for a node at rest; "
                 "expected a smooth law, such as sqrt(v·v + 1e-12) in place of |v|"
             )
 

@@ -54,8 +54,8 @@ class Region:
     def __post_init__(self) -> None:
         if not self.name or not self.name.replace("_", "").replace("-", "").isalnum():
             raise InputError(
-                f"the region's name is {self.name!r}; expected letters, digits, - and _, which "
-                "stand before the names of its parameters"
+                f"the region's name is {self.name!r}; expected letters, digits, - and _, because "
+                "it precedes the names of its parameters"
             )
 
 
@@ -184,7 +184,8 @@ def parts_from_regions(
     )
     if field is not None and not rest.size:
         raise InputError(
-            "the field is of what no region claims, and all is claimed; expected it of a region"
+            "the field applies to the cells outside all regions, but there are none; expected "
+            "the field of a region"
         )
     parts = [_with_field(remainder, field, mesh)] if rest.size else []
     for region, cells, density in zip(regions, claimed, densities[1:], strict=True):
@@ -234,8 +235,8 @@ def _densities(
         remaining_m3 = mesh.volume_m3 - sum(v for density, v in known if density is not None)
         if remaining_m3 <= 1e-12 * mesh.volume_m3:
             raise InputError(
-                "every cell is in a region with a density of its own, so mass_kg says nothing; "
-                "leave one density out"
+                "every cell is in a region with a density of its own, so mass_kg has no effect; "
+                "omit one of the densities"
             )
         default_density = (float(mass_kg or 0.0) - known_kg) / remaining_m3
         key = "mass_kg"
@@ -244,7 +245,11 @@ def _densities(
         key = "density_kg_m3"
         known_kg = 0.0
     if not default_density > 0:
-        hint = f"; the regions' densities make up {known_kg:.4g} kg of it" if known_kg else ""
+        hint = (
+            f"; the densities of the regions account for {known_kg:.4g} kg of it"
+            if known_kg
+            else ""
+        )
         raise InputError(f"{key} must be positive{hint}")
     region_densities = [
         default_density if region.density_kg_m3 is None else region.density_kg_m3
@@ -335,15 +340,15 @@ class ConstantsModel:
             for constant in force.constants:
                 if constant.name in self.parameter_names:
                     raise InputError(
-                        f"force {force.name!r} has the constant {constant.name!r}, which another "
-                        "part of the body has; expected a name of its own"
+                        f"force {force.name!r} has the constant {constant.name!r}, whose name "
+                        "another part of the body uses; expected another name"
                     )
                 self.constants[constant.name] = constant
         for constant in frictions:
             if constant.name in self.parameter_names:
                 raise InputError(
-                    f"a friction is called {constant.name!r}, as another constant of the body; "
-                    "expected a name of its own"
+                    f"a friction is called {constant.name!r}, like another constant of the body; "
+                    "expected another name"
                 )
             self.constants[constant.name] = constant
 

@@ -126,8 +126,8 @@ class UnderGravity:
         if not valid or not 0 < np.linalg.norm(gravity) <= LARGEST_GRAVITY_M_S2:
             raise InputError(
                 f"found {self.gravity_m_s2!r}; expected the gravity of the scan [x, y, z] in the "
-                f"axes of the mesh, not zero and at most {LARGEST_GRAVITY_M_S2:g} m/s²; of a mesh "
-                'that is free of stress state rest_shape = "stress_free"',
+                f"axes of the mesh, not zero and at most {LARGEST_GRAVITY_M_S2:g} m/s²; if the "
+                'mesh is free of stress, state rest_shape = "stress_free"',
                 where="scan.gravity_m_s2",
             )
         gravity.setflags(write=False)
@@ -690,9 +690,9 @@ class InverseEquilibrium:
         return (
             "found no stress-free shape whose equilibrium under gravity is the mesh, with "
             f"{moduli} and {self.body.mass_of_dofs(theta)[::3].sum():.4g} kg: elements would be "
-            f"inverted beyond {reached:.0%} of the weight; expected a body that bears its weight "
-            "as it was scanned: check gravity_m_s2 and nodes of the scan, the mass, the unit of "
-            "the mesh, and give stiffer guesses"
+            f"inverted beyond {reached:.0%} of the weight; expected a body that carries its "
+            "weight in the pose of the scan: check gravity_m_s2 and nodes of the scan, the mass, "
+            "the unit of the mesh, and give stiffer guesses"
         )
 
 

@@ -205,8 +205,9 @@ class Indices:
         dropped = np.setdiff1d(requested, mesh.file_index)
         if len(dropped):
             raise InputError(
-                f"indices: node {dropped[0]} was dropped from the mesh because it is no element's "
-                "corner; leave it out (a node on an edge is selected when both of its ends are)"
+                f"indices: node {dropped[0]} was dropped from the mesh because it is not the "
+                "corner of an element; leave it out (a node on an edge is selected when both of "
+                "its ends are)"
             )
         chosen = nodes.with_mid_nodes(np.isin(mesh.file_index, requested))
         return _indices_or_error(chosen, mesh, "an empty list of indices")

@@ -186,5 +186,5 @@ def _run_ftetwild(
     except Failed as error:
         raise InputError(f"pytetwild could not fill the surface ({error})") from error
     if not len(mesh["tetrahedra"]):
-        raise InputError("pytetwild found no inside: the surface encloses no volume")
+        raise InputError("pytetwild found no interior: the surface encloses no volume")
     return mesh["points_m"], mesh["tetrahedra"].astype(np.int64)

@@ -161,8 +161,8 @@ def _require_phases(problem: Problem) -> None:
     for name, modes in problem.two_phase_fields.items():
         if not modes.has_phases:
             raise InputError(
-                f"the phases of {name} are not known, and are not searched for while live; "
-                "expected the problem of an answer, `cs.run(problem).problem`, or prior = 'smooth'"
+                f"the phases of {name} are unknown, and a live estimate does not search for them; "
+                "expected the problem of a result, `cs.run(problem).problem`, or prior = 'smooth'"
             )
 
 
@@ -290,10 +290,14 @@ class LiveEstimator:
         frame, notes = self._checked_frame(frame)
         if self.intake.is_motion_unknown(frame.t_s):
             if frame.pose is None:
-                notes.append("the grasp is lost: nothing is read until its pose is back")
+                notes.append(
+                    "the pose of the grasp is missing: frames are ignored until it is back"
+                )
             else:
                 self._restart()
-                notes.append("begun anew after a gap: the body is assumed to be at rest here")
+                notes.append(
+                    "restarted after a gap in the poses, assuming that the body is at rest"
+                )
         rows, readings, new_notes = self.intake.add_frame(
             frame.t_s, frame.pose, frame.tracks_m, frame.instrument_samples
         )
@@ -341,7 +345,7 @@ class LiveEstimator:
             square distance of all markers. None if there was no frame.
         """
         began = self.clock()
-        notes = ["settled after the last frame"]
+        notes = ["final estimate after the last frame"]
         if self.last is None or self.first_pass is None:
             return self.last
         last = self.last
@@ -374,7 +378,7 @@ class LiveEstimator:
         try:
             return None if recording is None else solve_recording(self.problem, recording)
         except InputError as error:
-            notes.append(f"the recording cannot be solved as a whole: {error.message}")
+            notes.append(f"the final estimate from the complete recording failed: {error.message}")
             return None
 
     def _repeat_until_settled(self, began: float, notes: list[str]) -> int:
@@ -394,7 +398,7 @@ class LiveEstimator:
         if frame.has_wrench and not self.model.wrenches:
             self.counts["with a wrench"] += 1
             if self.counts["with a wrench"] == 1:
-                notes.append("wrenches are left out: no grasp of the problem has a sensor")
+                notes.append("wrenches are ignored: no grasp of the problem has a sensor")
         if frame.pose is not None:
             self._last_positions_m = frame.pose[0]
         distances_m = np.linalg.norm(frame.tracks_m[:, None] - self._last_positions_m, axis=2)
@@ -411,7 +415,7 @@ class LiveEstimator:
         """Count outliers given by a mask (M,) of the markers; return a note."""
         self.counts["wild"] += int(wild.sum())
         names = ", ".join(self.names[m] for m in np.flatnonzero(wild))
-        return f"left out, far from where they can be: {names}"
+        return f"markers ignored as outliers: {names}"
 
     def _compute_rows(
         self, rows: Sequence[LoggedRow], squares: list[Array]
@@ -428,7 +432,7 @@ class LiveEstimator:
         except SimulationError as error:
             if track is None:
                 self.intake.reset()
-                return 1, [f"the start of the motion cannot be computed: {error}"]
+                return 1, [f"the initial state of the motion cannot be computed: {error}"]
             track.has_failed = True
             notes = [f"the body cannot be simulated with these parameters: {error}"]
         for k, row in enumerate(rows[:done], 1):
@@ -744,7 +748,7 @@ class LiveEstimator:
         at_start = track.start[0] is None
         if search is None and track.has_failed and at_start:
             search = self.search = self._new_search()
-            notes.append("searching for initial values over a range of stiffness")
+            notes.append("searching for initial values over a range of stiffnesses")
         p = self.p
         base = track
         if search is not None:
@@ -754,7 +758,7 @@ class LiveEstimator:
             base = None
             if p is None:
                 self.search = None
-                notes.append("found no initial values over a range of stiffness")
+                notes.append("found no initial values over a range of stiffnesses")
                 return None
         elif track.has_failed:
             return None
@@ -821,7 +825,7 @@ class LiveEstimator:
             self._trust = INITIAL_RADIUS if was_search else min(2 * self._trust, LARGEST_RADIUS)
             self._rejected = 0
             if was_search:
-                notes.append("restarted from another stiffness")
+                notes.append("restarted with another stiffness")
             self.scatter = CombinedPasses.from_passes(again, None).scatter(again.sweep.transformed)
         else:
             reach = self.model.collocation.reach_p
@@ -841,7 +845,7 @@ class LiveEstimator:
                 self.search = self._new_search()
                 notes.append(
                     "the estimation does not converge: searching for other initial values over a "
-                    "range of stiffness"
+                    "range of stiffnesses"
                 )
         self._update_estimate()
 

@@ -141,7 +141,7 @@ class FrameBuffer:
         notes = []
         if any(abs(t_s - other) <= TIME_TOLERANCE_SAMPLES * sample_s for other in self._times):
             self.counts["doubled"] += 1
-            return [], [], [f"a frame at {t_s:.6g} s was received before: ignored"]
+            return [], [], [f"a frame at {t_s:.6g} s was received before: this one is ignored"]
         late = t_s < self.last_s
         if late:
             if self.last_s - t_s > LARGEST_SAMPLE_DELAY * sample_s:
@@ -166,7 +166,9 @@ class FrameBuffer:
         if not late:
             if pose is not None and self._is_jump(t_s, pose[0]):
                 pose = None
-                notes.append(f"the pose at {t_s:.6g} s is too far from the last one: ignored")
+                notes.append(
+                    f"the pose at {t_s:.6g} s is implausibly far from the last one: ignored"
+                )
             notes += self._note_gaps(t_s)
             self.last_s = t_s
             if pose is not None:
@@ -200,7 +202,7 @@ class FrameBuffer:
             if not self.counts["off the grid"]:
                 notes.append(
                     f"the frame at {t_s:.6g} s lies between samples: markers are evaluated at the "
-                    "times of their frames"
+                    "times of their frames, by interpolation"
                 )
             self.counts["off the grid"] += 1
         return notes

@@ -415,9 +415,11 @@ def _parse_json(text: str) -> Mapping[str, Any]:
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
-        raise InputError(f"no JSON: {error.msg} at column {error.colno}") from error
+        raise InputError(f"not valid JSON: {error.msg} at column {error.colno}") from error
     except (ValueError, RecursionError) as error:  # Python's limits of digits and of depth
-        raise InputError("no frame: a number is too long, or brackets too deep") from error
+        raise InputError(
+            "not a frame: a number is too long, or brackets are nested too deeply"
+        ) from error
 
 
 def parse_time(time: Any) -> float:

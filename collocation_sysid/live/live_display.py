@@ -53,9 +53,9 @@ def display_of(updates: Sequence[LiveUpdate]) -> list[Shown]:
         history = sparkline([update.estimates[name].value for update in updates[-COLUMNS:]])
         rows.append((name, f"{estimate.value:.5g}", error, unit_of(name), history))
     return [
-        f"t = {last.t_s:.2f} s   markers missed by {millimetres(last.marker_rms_m)}   "
+        f"t = {last.t_s:.2f} s   marker error {millimetres(last.marker_rms_m)} RMS   latency "
         f"{1e3 * last.latency_s:.1f} ms",
-        Table("", ("", "estimate", "±", "unit", "so far"), tuple(rows), names=5),
+        Table("", ("", "estimate", "±", "unit", "history"), tuple(rows), names=5),
         verdict_section(last.trust, max_reasons=SHOWN_REASONS),
     ]
 
@@ -65,9 +65,9 @@ def final_display(updates: Sequence[LiveUpdate], settled: LiveUpdate) -> list[Sh
     took_ms = 1e3 * np.array([update.latency_s for update in updates])
     median, late = np.percentile(took_ms, [50, 99])
     latency_text = (
-        f"{len(updates)} frames, latency {median:.1f} ms in the median, {late:.1f} ms at 99 %; "
+        f"{len(updates)} frames, latency {median:.1f} ms (median), {late:.1f} ms (99 % quantile); "
     )
-    latency_text += f"settled {1e3 * settled.latency_s:.0f} ms after the last"
+    latency_text += f"final estimate {1e3 * settled.latency_s:.0f} ms after the last frame"
     return [*display_of([*updates, settled]), latency_text]
 
 

@@ -417,8 +417,8 @@ def _only_experiment(problem: Problem) -> Experiment:
 
     if len(fitted) != 1:
         raise InputError(
-            f"{len(fitted)} experiments are fitted; live there is one, expected the others to be "
-            "left out or for validation",
+            f"{len(fitted)} experiments are fitted; a live estimate has one, expected the others "
+            "to be removed or validation = true",
             problem.path,
             "experiment",
         )
@@ -426,7 +426,7 @@ def _only_experiment(problem: Problem) -> Experiment:
     for feature, is_present, expected in _unsupported_features(experiment):
         if is_present:
             where = f"experiment '{experiment.name}'"
-            message = f"{feature} cannot be live"
+            message = f"live estimates do not support {feature}"
             raise InputError(f"{message}; expected {expected}", problem.path, where)
     return experiment
 
@@ -438,15 +438,19 @@ def _unsupported_features(experiment: Experiment) -> Iterator[tuple[str, object,
     nuisance = experiment.nuisance
     yield "a static experiment", experiment.is_static, "a motion"
     has_declared_start = experiment.start == "given"
-    yield "a start that is given", has_declared_start, "one in equilibrium, or undeformed"
+    yield 'start = "given"', has_declared_start, 'start = "equilibrium" or "undeformed"'
     yield "a material with memory", body.has_memory, "one without Prony branches"
     yield "a mesh made under gravity", body.scan_conditions is not None, "a stress-free one"
     has_internal_variables = any(
         placed.force.internal_variable_count for placed in body.placed_forces
     )
-    yield "a force that carries something from step to step", has_internal_variables, "none"
-    yield "tensions and pressures, which frames do not bring,", experiment.actuators, "none"
-    yield "depth cameras, which frames do not bring,", experiment.depths, "none"
+    yield "a force with internal variables", has_internal_variables, "none"
+    yield (
+        "tendons and pressures, because frames do not contain their values",
+        experiment.actuators,
+        "none",
+    )
+    yield "depth cameras, because frames do not contain their images", experiment.depths, "none"
     delayed = experiment.obstacles and nuisance.obstacle_time_s
     yield "an obstacle whose delay is estimated", delayed, "one whose clock is known"
     filtered = nuisance.sensor_lag_s and experiment.wrenches
@@ -456,7 +460,11 @@ def _unsupported_features(experiment: Experiment) -> Iterator[tuple[str, object,
     yield "a force that depends on time", depends_on_time, "one that does not"
     yield "an experiment without markers", not experiment.markers.names, "markers"
     is_temporary = any(np.isfinite([g.from_s, g.until_s]).any() for g in grasps)
-    yield "a grasp that holds for a while only", is_temporary, "grasps throughout"
+    yield (
+        "a grasp that holds during a part of the recording",
+        is_temporary,
+        ("grasps that hold throughout"),
+    )
     has_zero = any(grasp.zero for grasp in grasps)
     yield "a grasp whose zero is estimated", has_zero, "one whose zero is known"
     moves = any(len(grasp.poses.t_s) > 1 for grasp in grasps)
@@ -466,7 +474,7 @@ def _unsupported_features(experiment: Experiment) -> Iterator[tuple[str, object,
         for each in (experiment.point_mass_at_nodes_kg, experiment.declared_node_forces_n)
     )
     changing = not all(np.allclose(each, each[:1]) for each in loads)
-    yield "a load that joins, leaves or changes", changing, "loads that are always there"
+    yield "a load that changes in time", changing, "constant loads"
 
 
 def _still_experiment(experiment: Experiment, collocation: Collocation) -> Experiment:

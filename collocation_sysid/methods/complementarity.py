@@ -43,8 +43,8 @@ def require_frictionless(obstacles: Iterable[Obstacle]) -> None:
     for each in obstacles:
         if each.has_friction:
             raise InputError(
-                f"{each.name} has friction, which contact as complementarity leaves out; expected "
-                'friction = 0, or contact = "energy" of the method interior-point'
+                f'{each.name} has friction, which contact = "complementarity" does not support; '
+                'expected friction = 0, or contact = "energy" of the method interior-point'
             )
 
 
@@ -77,8 +77,8 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
         if not solution.status.converged:
             break
     note = (
-        f"contact as complementarity: {len(RELAXED)} solves after that with its energy bring "
-        f"pressure times gap down to {share:g} κδ²"
+        f"contact as complementarity: after the solve with a contact energy, {len(RELAXED)} "
+        f"further solves reduced pressure times gap to {share:g} κδ²"
     )
     # Multipliers that balance pressures which follow from gaps: the solver's leave its rounding.
     return replace(solution, initial_multipliers=None, notes=(*solution.notes, note))

@@ -152,8 +152,12 @@ class DaskExecutor:
         """See `ExperimentExecutor`."""
         with self._end_search_if_disconnected():
             failed_workers = self._first - self.client.nthreads().keys()
-        note = f"{len(failed_workers)} of {len(self._first)} workers were lost on the way: "
-        return [f"{note}what they had was done again on others"] if failed_workers else []
+        note = f"{len(failed_workers)} of {len(self._first)} workers were lost during the solve: "
+        return (
+            [f"{note}their recordings were computed again by other workers"]
+            if failed_workers
+            else []
+        )
 
     def _result(self, future: Any) -> Any:
         """Return the result of a future, and check from time to time that workers exist."""
@@ -171,7 +175,7 @@ class DaskExecutor:
             yield
         except dask.scheduler.KilledWorker as error:
             raise _disconnection(
-                "A recording ended every worker that had it: mind their memory."
+                "A recording terminated every worker that computed it: check the workers' memory."
             ) from error
         except (Exception, dask.client.CancelledError) as error:
             is_disconnected = isinstance(error, (OSError, dask.client.CancelledError))
@@ -179,7 +183,7 @@ class DaskExecutor:
                 self.client.status == "running" and not is_disconnected
             ):
                 raise
-            raise _disconnection("Its scheduler answers no more.") from error
+            raise _disconnection("Its scheduler no longer responds.") from error
 
     def _submit(self, home: str, run: Callable[..., Any], *arguments: Any) -> Any:
         """Return a future of a function on a worker; Dask may choose another worker if that is

@@ -81,17 +81,21 @@ def compute_initial_point(
     is_usable = reached_end and coarse.status not in UNUSABLE and bool(np.isfinite(coarse.z).all())
     is_close = is_usable and coarse.status is Status.CONVERGED
     count = coarse.iterations
-    sweeps = f"{count} sweep{'s' * (count != 1)} of reduced space" if count else "the start given"
-    continuation = "IPOPT solved the whole program from there"
+    sweeps = (
+        f"{count} sweep{'s' * (count != 1)} of reduced space"
+        if count
+        else ("the given initial values")
+    )
+    continuation = "IPOPT solved the complete program from there"
     if is_close:
         note = (
-            f"initial point: {sweeps}, to within {100 * LARGEST_CORRECTION:g} % of a parameter; "
-            f"{continuation}"
+            f"initial point: {sweeps}, which determined the parameters to "
+            f"{100 * LARGEST_CORRECTION:g} %; {continuation}"
         )
     elif is_usable:
         note = f"initial point: {sweeps} ({coarse.status.value}); {continuation}"
     else:
-        note = f"initial point: reduced space found none ({coarse.message.rstrip('.')})"
+        note = f"initial point: the method reduced-space found none ({coarse.message.rstrip('.')})"
     return InitialPoint(coarse, is_usable, is_close, note)
 
 

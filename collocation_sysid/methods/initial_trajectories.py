@@ -67,7 +67,8 @@ def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
             positions.append(rigid_trajectory(segment, theta))
             notes.append(
                 f"experiment '{segment.experiment.name}': the simulation at the guess failed "
-                f"({error}); started from the rest shape carried rigidly by the grasp"
+                f"({error}); the initial trajectory is the rest shape moving rigidly with the "
+                "grasp"
             )
     return collocation.pack(p, positions), notes
 

@@ -32,7 +32,7 @@ def _require_ipopt_value(value: Any) -> Any:
     """Return an IPOPT option if it is text or a number; raise `ValueError` otherwise."""
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise ValueError(
-            f"found {str(value).lower()}; expected text or a number, as IPOPT's manual has it: its "
+            f"found {str(value).lower()}; expected text or a number as in IPOPT's manual; its "
             'switches are "yes" and "no"'
         )
     return value

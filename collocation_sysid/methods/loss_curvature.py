@@ -93,14 +93,13 @@ def require_second_derivatives(collocation: Collocation) -> None:
     """
     if collocation.has_eliminated_histories:
         raise InputError(
-            "hessian = 'exact' has no second derivatives of materials with memory (prony), nor of "
-            "forces that carry something; expected 'gauss-newton'"
+            "hessian = 'exact' is not available for materials with memory (prony) and forces "
+            "with internal variables; expected 'gauss-newton'"
         )
     if any(len(segment.sensed_dofs) for segment in collocation.transcriptions):
         raise InputError(
-            "hessian = 'exact' has no second derivatives of measured wrenches, nor of readings of "
-            "grasps; expected "
-            "'gauss-newton'"
+            "hessian = 'exact' is not available for measured wrenches and readings of grasps; "
+            "expected 'gauss-newton'"
         )
 
 

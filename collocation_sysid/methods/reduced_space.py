@@ -86,7 +86,7 @@ class ReducedSpace(SearchOptions):
             require_second_derivatives(collocation)
             if workers is not None:
                 raise InputError(
-                    "hessian = 'exact' needs every trajectory in one place; expected "
+                    "hessian = 'exact' needs all trajectories in one process; expected "
                     "'gauss-newton' with a scheduler"
                 )
         workers = workers or LocalExecutor(collocation.threads)
@@ -153,8 +153,8 @@ def _notes(collocation: Collocation, indefinite_steps: int, z: Array, status: St
     if indefinite_steps:
         steps = sum(segment.constraint_times for segment in collocation.transcriptions)
         notes.append(
-            f"the equations of {indefinite_steps} of {steps} timesteps are not positive definite "
-            "at the answer: the body is near buckling, or damped more than its motion allows"
+            f"the equations of {indefinite_steps} of {steps} time steps are not positive definite "
+            "at the solution: the body is near buckling, or the estimated damping is too large"
         )
     if status in (Status.CONVERGED, Status.STALLED):
         squares = sum(part.loss for part in collocation.iterates(z))
@@ -164,8 +164,8 @@ def _notes(collocation: Collocation, indefinite_steps: int, z: Array, status: St
             measurements, noise_key = _main_measurement(collocation)
             are_markers = noise_key == "sigma_m"
             notes.append(
-                f"the {measurements} are missed by {misfit:.3g} of their standard deviations"
-                f"{size if are_markers else ''}: {noise_key}, the model or the recording is off, "
-                "or a better fit lies elsewhere; another guess may tell"
+                f"the residuals of the {measurements} are {misfit:.3g} times their standard "
+                f"deviations{size if are_markers else ''}: {noise_key}, the model or the "
+                "recording may be wrong, or there is a better fit elsewhere; try another guess"
             )
     return notes

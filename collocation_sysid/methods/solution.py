@@ -57,21 +57,21 @@ class Status(Enum):
 
 _SENTENCES = {
     Status.CONVERGED: "Converged: the optimality conditions hold to the tolerance.",
-    Status.ACCEPTABLE: "Converged to the acceptable tolerance only; progress ended before the "
-    "desired one.",
+    Status.ACCEPTABLE: "Converged to the acceptable tolerance only; the desired tolerance was "
+    "not reached.",
     Status.ITERATION_LIMIT: "Stopped at the iteration limit; raise max_iterations or start from a "
     "better guess.",
     Status.TIME_LIMIT: "Stopped at the time limit.",
     Status.INFEASIBLE: "The equations of motion could not be satisfied from this start; check "
     "grasp, mass and units, or start from another guess.",
-    Status.STALLED: "The steps became too small to make progress; look at the likely causes, "
-    "and at the guess where one is given.",
+    Status.STALLED: "The steps became too small to make progress; check the likely causes below, "
+    "and the guess if one is given.",
     Status.DIVERGED: "The iterates grew without bound; check units and bounds.",
     Status.NUMERICAL_FAILURE: "A step could not be computed or a function was not finite; another "
     "guess or linear solver may help.",
     Status.INTERRUPTED: "Interrupted; this is the best iterate so far.",
     Status.CLUSTER_DISCONNECTED: "The cluster was lost; this is the best iterate so far, "
-    "simulated here, from which --start goes on.",
+    "simulated on this machine. Continue from it with --start.",
     Status.NOT_SIMULABLE: "The body cannot be simulated at the guess; start from stiffer or less "
     "damped parameters or without a guess, or use interior-point, which needs no simulation.",
     Status.REFUSED: "The solver refused the problem or one of its options.",
@@ -305,7 +305,7 @@ class Solution:
                     estimates[full] = value
         if len(estimates) == 1:
             return next(iter(estimates.values()))
-        which = f"{name!r} stands for several" if estimates else f"no nuisance parameter {name!r}"
+        which = f"{name!r} is ambiguous" if estimates else f"no nuisance parameter {name!r}"
         expected = ", ".join(map(repr, estimates or dict.fromkeys(known)))
         raise InputError(f"{which}; expected one of {expected or '(none)'}{hint_at(name, known)}")
 

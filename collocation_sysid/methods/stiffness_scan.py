@@ -142,7 +142,9 @@ def start_problem(
         return collocation, None
     reason = f"the body cannot be simulated at the guess ({failure})"
     if failure is None:
-        reason = "at the guess the measurements are missed by more than an undeformed body would"
+        reason = (
+            "at the guess, the simulation is farther from the measurements than an undeformed body"
+        )
     result = rescue(collocation, reason, is_complete)
     if result is None:
         return collocation, None  # the method will tell what it needs
@@ -212,8 +214,8 @@ def scan_stiffness(
     ]
     if not candidates:
         raise InputError(
-            f"no start was found: the body cannot be simulated at any of {len(young_pa)} "
-            f"stiffnesses from E = {young_pa[-1]:.3g} to {young_pa[0]:.3g} Pa "
+            "no initial values were found: the body cannot be simulated at any of "
+            f"{len(young_pa)} stiffnesses from E = {young_pa[-1]:.3g} to {young_pa[0]:.3g} Pa "
             f"({trial.failure}); check grasp, mass and units, or give guesses",
             None,
             "parameters",

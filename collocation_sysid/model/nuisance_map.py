@@ -234,7 +234,7 @@ class NuisanceMap:
         )
         evaluated = slopes([0.1, 0.2, 0.3], 0.0, self.interval_s)
         if not all(np.isfinite(part.full()).all() for part in evaluated):
-            raise InputError(f"the {what} of {row.name} or its slopes are not finite at zero")
+            raise InputError(f"the {what} of {row.name} or its derivatives are not finite at zero")
 
     @property
     def size(self) -> int:

@@ -233,7 +233,7 @@ def complete_parameter(name: str, user_statement: Unknown | Tied | float) -> Par
         and usual_value(name, 1.0) is None
     ):
         raise InputError(
-            "no guess is given and no usual value is known of it; expected guess = a value",
+            "there is no guess, and no usual value of it is known; expected guess = a value",
             None,
             name,
         )
@@ -244,8 +244,8 @@ def complete_parameter(name: str, user_statement: Unknown | Tied | float) -> Par
     if scale == "linear" and typical == 0:
         statement = "no guess" if user_statement.guess is None else "guess = 0"
         raise InputError(
-            f"{statement} of a linear parameter does not tell its size; expected typical, what it "
-            "may change by in a step",
+            f"{statement} of a linear parameter does not determine its scale; expected typical, "
+            "the size of its changes in a step",
             None,
             name,
         )
@@ -503,7 +503,9 @@ class Parameters:
         for name in self.names:
             if name not in used:
                 raise InputError(
-                    "no part of the model uses it: every region has a value of its own", None, name
+                    "no part of the model uses it, because every region has its own value",
+                    None,
+                    name,
                 )
         for item in self.items:
             stiff = without_region(item.name) in ("mu_pa", "young_pa")
@@ -516,7 +518,7 @@ def _guess(item: Parameter) -> float:
     """Return the guess of a parameter, or raise an `InputError` if there is none."""
     if item.guess is None:
         raise InputError(
-            "there is no guess of it; expected guess = a value here (solve and check find one)",
+            "it has no guess; expected guess = a value here (solve and check find one)",
             None,
             item.name,
         )

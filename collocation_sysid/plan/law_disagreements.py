@@ -57,8 +57,10 @@ class Disagreement:
         high = max(self.values.values())
         symbol = symbol_of(self.name)
         unit = symbol_with_unit(self.name).removeprefix(symbol)
-        range_text = f"By those that predict alike, {symbol} is {low:.3g} to {high:.3g}{unit}"
-        conclusion = f"{range_text}: these recordings do not tell it better."
+        range_text = (
+            f"The models that predict equally well have {symbol} from {low:.3g} to {high:.3g}{unit}"
+        )
+        conclusion = f"{range_text}: these recordings do not determine it better."
         if self.chosen_budget is None or self.combined95 is None:
             return conclusion
         ends, least = (
@@ -66,7 +68,8 @@ class Disagreement:
         )
         share = f"{self.share:.0%} of the variance"
         return (
-            f"{conclusion} Its combined interval is {ends} with the law ({share}), {least} without."
+            f"{conclusion} Its combined interval is {ends} if the choice of the law is included "
+            f"({share}), otherwise {least}."
         )
 
 
@@ -125,5 +128,5 @@ def law_table(differences: Sequence[Disagreement]) -> Table:
         rows.append(
             (symbol_with_unit(each.name), *cells, f"{spread:.0f} %", *(w or "" for w in intervals))
         )
-    heads = ("", *laws, "spread", "combined interval", "with the law")
-    return Table("Which law?", heads, tuple(rows))
+    heads = ("", *laws, "spread", "combined interval", "including the law")
+    return Table("Estimates by material law", heads, tuple(rows))

@@ -221,13 +221,13 @@ def advice(rows: Sequence[Row]) -> str:
     if chosen["held_out_rms"] is None:
         rival = min(others, key=lambda row: row["delta_aic"])
         return (
-            f"{use}, by AIC alone, as nothing could be predicted: it is {rival['delta_aic']:.3g} "
-            f"ahead of {rival['model']}."
+            f"{use}, by AIC alone, because nothing could be predicted: its AIC is "
+            f"{rival['delta_aic']:.3g} lower than that of {rival['model']}."
         )
     predicted = [row for row in others if row["log_ratio"] is not None]
     failures = [_failed_prediction(row, chosen) for row in others if row["log_ratio"] is None]
     if not predicted:
-        return " ".join([f"{use}: no other predicts what is held out.", *failures])
+        return " ".join([f"{use}: no other model predicts the held-out samples.", *failures])
     rival = min(predicted, key=lambda row: row["log_ratio"])
     sentences = [f"{use}: {_comparison(chosen, rival)}.", _certainty(chosen, rival), *failures]
     return " ".join([*sentences, *(each.sentence for each in law_disagreements(rows))])
@@ -248,14 +248,14 @@ def _failed_prediction(row: Row, chosen: Row) -> str:
     if (more := chosen["delta_aic"] - row["delta_aic"]) <= NO_SUPPORT:
         return f"{sentence}."
     return (
-        f"{sentence}, but fits all of them better (AIC puts it {more:.3g} ahead): only there was "
-        "seen what its parameters need, and more such recordings would decide."
+        f"{sentence}, but fits all recordings better (its AIC is {more:.3g} lower): only the "
+        "held-out samples determine its parameters, and more such recordings would decide."
     )
 
 
 def _comparison(chosen: Row, rival: Row) -> str:
     """Return the comparison of the chosen model with its closest rival, in words."""
-    prediction = f"it predicts what is held out to {_prediction_text(chosen)}"
+    prediction = f"its prediction error for held-out samples is {_prediction_text(chosen)}"
     ratio, error = _log_ratio_between(chosen, rival)
     more = chosen["free"] - rival["free"]
     count = f"{abs(more)} parameter{'s' * (abs(more) > 1)}"
@@ -263,10 +263,9 @@ def _comparison(chosen: Row, rival: Row) -> str:
     support = rival["delta_aic"] - chosen["delta_aic"]
     better, worse = (chosen, rival) if support > 0 else (rival, chosen)
     return (
-        f"{prediction}{size}, {rival['model']} to {_prediction_text(rival)}, {exp(ratio):.3g} "
-        "times as far "
-        f"off (±{100 * error:.2g} %). AIC puts {better['model']} {abs(support):.3g} ahead of "
-        f"{worse['model']}"
+        f"{prediction}{size}, that of {rival['model']} is {_prediction_text(rival)}, "
+        f"{exp(ratio):.3g} times as large (±{100 * error:.2g} %). The AIC of {better['model']} is "
+        f"{abs(support):.3g} lower than that of {worse['model']}"
     )
 
 
@@ -294,17 +293,17 @@ def _certainty(chosen: Row, rival: Row) -> str:
     ratio, error = _log_ratio_between(chosen, rival)
     support = rival["delta_aic"] - chosen["delta_aic"]
     if ratio > SURE * error and support > NO_SUPPORT:
-        return "These recordings leave no doubt about that."
+        return "The difference is significant."
     if ratio > LIKELY * error and support > SUPPORT:
-        return "That is likely, but not sure."
+        return "The difference is likely, but not certain."
     if support < -NO_SUPPORT:
         return (
             f"{rival['model']} fits better, but does not predict better: more recordings, or "
             "larger motions, would decide."
         )
     return (
-        "These recordings hardly tell them apart: of models that predict alike the one with the "
-        "fewest parameters is taken."
+        "These recordings hardly distinguish the models: of those that predict equally well, the "
+        "one with the fewest parameters is chosen."
     )
 
 
@@ -316,10 +315,13 @@ def model_notes(rows: Sequence[Row]) -> list[str]:
     evidence = next((row["evidence"] for row in rows if row["evidence"]), None)
     equivalent = ""
     if counted is not None and evidence is not None:
-        equivalent = f" The {evidence['measurements']} measurements tell as much as {counted:.0f} "
-        equivalent += "independent ones would."
+        equivalent = (
+            f" The {evidence['measurements']} measurements contain as much information "
+            f"as {counted:.0f} "
+        )
+        equivalent += "independent ones."
     return [
-        f"Held out is {test_data}; ± is the standard error of the ratio to the best.{equivalent}",
+        f"Held out: {test_data}; ±: standard error of the ratio to the best.{equivalent}",
         *(f"{row['model']}: {row['status']}" for row in rows if not row["converged"]),
         *(
             f"{row['model']} without '{name}': {why}"

@@ -144,13 +144,13 @@ def _watch(
                 process.terminate()  # as Ctrl-C: it may write what it has
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(GRACE_S)
-                message = f"ended after the time limit of {time_limit_s:g} s"
+                message = f"ended at the time limit of {time_limit_s:g} s"
                 return {"outcome": TIMEOUT, "message": message}
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(min(remaining_s, LOOK_EVERY_S))
                 return None
             if is_stopped():
-                return {"outcome": STOPPED, "message": "stopped with the study"}
+                return {"outcome": STOPPED, "message": "stopped when the study was stopped"}
     finally:
         with contextlib.suppress(OSError):
             process.stdin.close()
@@ -224,11 +224,11 @@ class RunOptions(Options):
     Attributes
     ----------
     workers : int
-        Number of runs at once; by default the number of cores.
+        Number of runs computed in parallel; by default the number of cores.
     scheduler : ADDRESS
-        A dask.distributed scheduler to run on; its workers need the same files.
+        Address of a dask.distributed scheduler; its workers need the same files.
     time_limit_s : --time-limit SECONDS
-        A run is stopped after this, loading included, and counts as a failure.
+        Time after which a run is stopped, loading included [s]; it counts as a failure.
     """
 
     workers: AtLeastOne | None = None
@@ -239,7 +239,8 @@ class RunOptions(Options):
         super().__post_init__()
         if self.workers is not None and self.scheduler is not None:
             raise InputError(
-                "the scheduler has workers of its own; leave out one of the two",
+                "the scheduler has workers of its own; state either a scheduler or a number of "
+                "workers",
                 None,
                 "workers",
             )

@@ -98,7 +98,7 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
         raise InputError(f"cannot be read: {error}", path, "--truth") from error
     table = content.get("parameters", content)
     if not isinstance(table, Mapping):
-        raise InputError("parameters is no table; expected true values by name", path, "--truth")
+        raise InputError("parameters is not a table; expected true values by name", path, "--truth")
     return path, table
 
 

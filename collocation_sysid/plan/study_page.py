@@ -34,7 +34,7 @@ SHOWN_FAILURES = 8
 # Heads of the tables where there is room, on pages.
 WORDS = {
     **{column.head: column.words for column in COLUMNS.values()},
-    "": "to use",
+    "": "chosen",
     "success": "successes",
     "95 %": "95 % interval of the rate",
     "free": "parameters estimated",
@@ -42,10 +42,10 @@ WORDS = {
     "fit N": "forces, RMS [N]",
     "held out mm": "held out, RMS [mm]",
     "held out N": "held out, RMS [N]",
-    "times best": "held out, times the best",
+    "relative to best": "held out, relative to the best",
 }
 UNITS = ("Pa", "s", "1/s", "kg/m³")
-MEDIANS_NOTE = "Errors, misfits and costs are medians over the runs with an answer."
+MEDIANS_NOTE = "Errors, misfits and costs are medians over the runs with a result."
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ class StudyReport:
     def notes(self) -> list[str]:
         """Notes that explain the tables."""
         missing = len(self.planned) - len(self.records)
-        notes = [f"{missing} of {len(self.planned)} runs are still to be done."] if missing else []
+        notes = [f"{missing} of {len(self.planned)} runs remain to be done."] if missing else []
         if self.kind == "models":
             return [*model_notes(self.rows), *notes]
         return [
@@ -236,7 +236,7 @@ def as_csv(rows: Sequence[Row]) -> str:
 def report_section(report: StudyReport) -> TitledParts:
     """Return tables and failures as a section for a paper's appendix or an issue."""
     failures = (Items(tuple(report.failures)),) if report.failures else ()
-    without = tuple(TitledParts("Runs without an answer", (each,)) for each in failures)
+    without = tuple(TitledParts("Runs without a result", (each,)) for each in failures)
     parts = (*report.headline, *report.notes, *report.views, *without)
     return TitledParts(report.title, parts, level=1)
 
@@ -295,9 +295,9 @@ def _method_sentence(row: Row) -> str:
     sentence = f"{row['method']} succeeded in {row['successes']} of {row['runs']} runs"
     sentence += f" (95 % interval of the rate: {low:.0f} to {high:.0f} %)"
     if row["total_s"] is None:
-        return f"{sentence}, and gave no answer."
-    misfit = f"with the markers {1e3 * row['rms_m']:.2g} mm off"
-    return f"{sentence}, {misfit} and in {row['total_s']:.2g} s at the median."
+        return f"{sentence}, and gave no result."
+    misfit = f"with a marker error of {1e3 * row['rms_m']:.2g} mm"
+    return f"{sentence}, {misfit} and a time of {row['total_s']:.2g} s (medians)."
 
 
 def sweep_sentences(rows: Sequence[Row]) -> list[str]:
@@ -308,10 +308,10 @@ def sweep_sentences(rows: Sequence[Row]) -> list[str]:
         values = [row[f"value_{name}"] for row in converged]
         errors = [e for row in converged if (e := row[f"std_error_{name}"]) is not None]
         if len(values) > 1:
-            spread = f"; the standard errors are {max(errors):.2g} at most" if errors else ""
+            spread = f"; the largest standard error is {max(errors):.2g}" if errors else ""
             low = f"{min(values):.4g}"
             high = f"{max(values):.4g} {unit_of(name)}".strip()
-            sentences.append(f"{symbol_of(name)} is {low} to {high} over them{spread}.")
+            sentences.append(f"Their {symbol_of(name)} is from {low} to {high}{spread}.")
     return sentences
 
 
@@ -337,7 +337,7 @@ def model_views(rows: Sequence[Row]) -> list[Table]:
         f"fit {unit}": _number_cell("rms", factor, ".3g"),
         "ΔAIC": _number_cell("delta_aic", 1, ".1f"),
         f"held out {unit}": _number_cell("held_out_rms", factor, ".3g"),
-        "times best": lambda row: _ratio_text(row),
+        "relative to best": lambda row: _ratio_text(row),
         "total s": _number_cell("total_s"),
     }
     moduli: dict[str, Cell] = {}

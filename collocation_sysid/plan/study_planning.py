@@ -107,11 +107,11 @@ class Starts(Options):
     Attributes
     ----------
     starts : int
-        Number of starts; the first is the file's guess.
+        Number of initial guesses; the first is that of the problem file.
     spread : float
-        Starts lie within this factor of the guess.
+        Largest factor between an initial guess and the guess of the problem file.
     seed : int
-        Seed of the random starts.
+        Seed of the random initial guesses.
     """
 
     starts: AtLeastOne = 1
@@ -146,8 +146,8 @@ class Starts(Options):
             centre = truth.get(item.name, item.guess)
             if centre is None:
                 raise InputError(
-                    "has neither a guess nor a truth that starts could be spread about; expected "
-                    "one, or --starts 1",
+                    "has neither a guess nor a true value around which initial guesses could be "
+                    "distributed; expected one, or --starts 1",
                     problem.path,
                     f"parameters.{item.name}",
                 )
@@ -190,8 +190,8 @@ def plan_comparison(
     starts = starts or Starts()
     if problem.path is None:
         raise InputError(
-            "this problem has no file, which a study's processes read; write one, and take "
-            "Problem.read"
+            "this problem has no file, but the processes of a study read the problem from a "
+            "file; write one, and use Problem.read"
         )
     if problem.substeps == "auto":  # or each method would choose for itself
         overrides = [*overrides, f"transcription.substeps={problem.first_substeps}"]
@@ -280,8 +280,8 @@ def plan_models(
         if not (each.validation or each.markers.sample_count or each.wrenches):
             raise InputError(
                 f"'{each.name}' has neither markers nor a measured wrench; expected one of these, "
-                "by which models are told apart: predictions are not compared with depth images or "
-                "readings"
+                "because models are compared by their predictions of these, not of depth images "
+                "or readings"
             )
     planned = []
     for test_name in ("", *fitted_recordings(problem)):

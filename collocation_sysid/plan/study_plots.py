@@ -102,7 +102,9 @@ def convergence_in_time(rows: Sequence[Row], records: Mapping[str, Record]) -> F
                 label = None if k else method
                 axes.plot(times, values, label=label, alpha=max(0.2, len(runs) ** -0.5), **style)
     style_axes(panels[0], "Loss", "time [s]", "Σ (residual / σ)²")
-    style_axes(panels[1], "Violated dynamics", "time [s]", "largest residual [N]")
+    style_axes(
+        panels[1], "Violation of the equations of motion", "time [s]", "largest residual [N]"
+    )
     for axes in panels:
         make_log_axis(axes)
         axes.set_xscale("log", nonpositive="mask")
@@ -144,8 +146,8 @@ def success_by_distance(
         axes.errorbar(
             places, rates, np.abs(np.array(bars)).T, color=colour, label=method, **style
         )  # fmt: skip
-    title = f"Success by distance from the {'truth' if known_rows else 'best answer'}"
-    style_axes(axes, title, "factor of the guess that is farthest off", "success [%]")
+    title = f"Success over distance from the {'true values' if known_rows else 'best estimate'}"
+    style_axes(axes, title, "factor by which the worst guess is wrong", "success [%]")
     axes.set_xscale("log")
     axes.set_xticks(edges, [f"{edge:.2g}" for edge in edges])
     axes.xaxis.set_minor_locator(NullLocator())
@@ -174,12 +176,14 @@ def basins(rows: Sequence[Row], centre: Mapping[str, float], known_rows: bool) -
                     s=9, marker=marker, color=colour, linewidths=0.8,
                     label="success" if success else "failure",
                 )  # fmt: skip
-            axes.plot(1, 1, "+", color=BLACK, ms=6, label="truth" if known_rows else "best answer")
+            axes.plot(
+                1, 1, "+", color=BLACK, ms=6, label="truth" if known_rows else "best estimate"
+            )
             style_axes(axes, method if axes is line[0] else "", "", symbol_as_mathtext(second))
     for axes, (first, _) in zip(panels[-1], pairs, strict=True):
         axes.set_xlabel(symbol_as_mathtext(first), fontsize=TEXT_PT)
     _ratio_axes(panels[0, 0], max(guess_distance(row, centre) for row in rows))
-    title = f"guesses over the {'truth' if known_rows else 'best answer'}"
+    title = f"guesses relative to the {'true values' if known_rows else 'best estimate'}"
     add_figure_legend(
         figure, 3, loc="outside upper right", fontsize=SMALL_PT, title=title,
         title_fontsize=SMALL_PT, alignment="right",
@@ -221,7 +225,7 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
         if not track.get("rolled_out_m"):
             continue
         rolled = 1e3 * np.array(track["rolled_out_m"], dtype=float)
-        off = f", off by at most {1e3 * track['max_m']:.2g} mm" if track["max_m"] else ""
+        off = f", error at most {1e3 * track['max_m']:.2g} mm" if track["max_m"] else ""
         for axis, axes in enumerate(panels):
             axes.plot(track["t_s"], rolled[:, axis], color=colour, lw=LINE_PT, label=method + off)
     add_figure_legend(figure, 2)

@@ -97,14 +97,16 @@ class DesignProgress(Watched):
         log_size : float
             Logarithm of the smallest relative error bar.
         """
-        best = "none possible yet" if log_size >= FORBIDDEN else f"{100 * np.exp(log_size):.3g} %"
-        line = f"{number} of {self.evaluations} motions tried, smallest error bar: {best}"
+        best = "none feasible yet" if log_size >= FORBIDDEN else f"{100 * np.exp(log_size):.3g} %"
+        line = f"{number} of {self.evaluations} motions evaluated, smallest error bar: {best}"
         seldom = number % EVERY == 0 or number == self.evaluations
-        self.update(Text(f"{line} (Ctrl-C keeps it)", style="dim"), line if seldom else "")
+        self.update(
+            Text(f"{line} (Ctrl-C stops and keeps the best)", style="dim"), line if seldom else ""
+        )
 
     def show_activity(self, what: str) -> None:
         """Show the present activity."""
-        self.update(Text(f"{what} (Ctrl-C keeps the best)", style="dim"), what)
+        self.update(Text(f"{what} (Ctrl-C stops and keeps the best)", style="dim"), what)
 
 
 def remaining_time_s(

@@ -103,9 +103,9 @@ class BenchTable:
             there = self.columns.setdefault(name, in_unit)
             if not np.array_equal(there, in_unit, equal_nan=True):
                 raise InputError(
-                    f"two grasps read the column {name}, to which a simulation gives different "
-                    "values; expected columns = { … } that names one for each, or files of their "
-                    "own"
+                    f"two grasps read the column {name}, but a simulation writes different values "
+                    "for them; expected columns = { … } that names one for each, or files of "
+                    "their own"
                 )
 
 

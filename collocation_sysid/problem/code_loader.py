@@ -35,7 +35,7 @@ def existing_file(folder: Path, name: str, key: str) -> Path:
     if not stored_files(file):
         fault = "is a folder" if file.is_dir() else "does not exist"
         hint = folder / "README.md"
-        see = f"; see {hint} for how to get it" if hint.is_file() else ""
+        see = f"; {hint} explains how to get it" if hint.is_file() else ""
         message = f"{file} {fault}; expected a file, named from the problem file's folder{see}"
         raise InputError(message, where=key)
     return file
@@ -84,8 +84,11 @@ class CodeLoader:
         carries = section.carries
         if isinstance(loaded, NodeForce):
             if carries not in (0, loaded.internal_variable_count):
-                message = f"found {carries}, but the force {name!r} says that it carries"
-                message += f" {loaded.internal_variable_count}; expected the key to be left out"
+                message = (
+                    f"found {carries}, but the number of internal variables of the force "
+                    f"{name!r} is"
+                )
+                message += f" {loaded.internal_variable_count}; expected the key to be omitted"
                 raise InputError(message, where=f"{key}.carries")
             return loaded if nodes is None else replace(loaded, nodes=nodes)
         with located(file):

@@ -63,9 +63,9 @@ def transform_to_body_frame(
     limit_m = markers.max_template_residual_m
     if limit_m is not None and residuals_m[worst] > limit_m:
         raise InputError(
-            f"marker {names[worst]!r} is {residuals_m[worst]:.3g} m from its place after the rigid "
-            f"fit; max_template_residual_m is {limit_m:g}. Check template_m, labels and "
-            "length_unit, and that the body rests in template_window_s"
+            f"marker {names[worst]!r} is {residuals_m[worst]:.3g} m away from its template "
+            f"position after the rigid fit; max_template_residual_m is {limit_m:g}. Check "
+            "template_m, labels and length_unit, and that the body rests in template_window_s"
         )
     residual_list = ", ".join(
         f"{name} {_mm(off)}"
@@ -73,7 +73,7 @@ def transform_to_body_frame(
         if np.isfinite(off)
     )
     return fit.apply(table), [
-        f"the markers were moved rigidly to the template; left over: {residual_list}"
+        f"the markers were moved rigidly to the template; remaining distances: {residual_list}"
     ]
 
 
@@ -103,8 +103,8 @@ def poses_from_markers(
     notes = []
     if incomplete_frames := int((fit.missing & is_in_window).sum()):
         notes.append(
-            f"{incomplete_frames} of {is_in_window.sum()} frames lack three of "
-            f"{', '.join(names)}; poses between others are interpolated there"
+            f"{incomplete_frames} of {is_in_window.sum()} frames contain fewer than three of "
+            f"{', '.join(names)}; their poses are interpolated"
         )
     residual_m = np.where(is_in_window, fit.residual_m, np.nan)
     if np.isfinite(residual_m).any():

@@ -84,7 +84,7 @@ def _prior_section(key: str, rows: list[NuisanceRow]) -> type[Section]:
         description = f"Standard deviation [{row.unit}]."
         fields[row.prior] = (kind, Field(known, description=description))
     name = "".join(word.title() for word in key.split("_")) + "Prior"
-    description = f"How well it is known: {rows[0].description}."
+    description = f"Prior of a nuisance parameter: {rows[0].description}."
     section = create_model(name, __base__=NuisancePriorSection, __doc__=description, **fields)
     section.usual = any(row.sigma is not None for row in rows)
     return section
@@ -101,15 +101,15 @@ def _nuisance_section() -> type[Section]:
         kind: Any = Annotated[Literal["none"] | _prior_section(key, rows), ByForm(str)]
         fields[key] = (kind | None, Field(None, description=description))
     description = (
-        "[[experiment.nuisance.own]] tables: what a Python file makes of markers' readings."
+        "[[experiment.nuisance.own]] tables: custom nuisance parameters, defined in Python files."
     )
     fields["own"] = (
         list[CustomNuisanceSection],
         Field(default_factory=list, description=description),
     )
     description = (
-        "What is estimated of this recording alone, each with a prior around zero.\n\n"
-        'What has a prior by default is estimated unless it is "none".'
+        "Nuisance parameters of this recording, each with a prior whose mean is zero.\n\nA "
+        'parameter that has a default prior is estimated unless it is "none".'
     )
     return create_model("NuisanceSection", __base__=Section, __doc__=description, **fields)
 

@@ -101,7 +101,7 @@ def _beyond_limits(error: Exception) -> str:
     """Return the message for a file that exceeds the parser's limits."""
     if isinstance(error, RecursionError):
         return "nests tables or lists too deeply; expected a few levels"
-    return "holds a whole number of too many digits; expected fewer than 4,300"
+    return "contains an integer with too many digits; expected fewer than 4,300"
 
 
 def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
@@ -203,7 +203,10 @@ def _item_key(place: Any, iterate: str, key: str) -> str | int:
     if isinstance(place, dict):
         return iterate
     if not isinstance(place, list):
-        raise InputError(f"{key} leads into the plain value {place!r}; expected a key of a table")
+        raise InputError(
+            f"{key} goes beyond the value {place!r}, which is not a table; expected "
+            "a key of a table"
+        )
     names = [item.get("name") if isinstance(item, dict) else None for item in place]
     if iterate in names:
         return names.index(iterate)

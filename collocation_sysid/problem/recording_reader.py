@@ -127,8 +127,8 @@ class RecordingReader:
         grasps = [self._grasp(k, sequence, t_s) for k, sequence in enumerate(poses)]
         if len(prescribed_dofs(grasps)) == 3 * (n := len(self.body.nodes_m)):
             message = (
-                f"the selected nodes are all {n} there are, so nothing can move; select fewer, and "
-                "check length_unit of the object"
+                f"all {n} nodes of the body are selected, so that nothing can move; select fewer, "
+                "and check length_unit of the object"
             )
             raise InputError(message, where="grasp")
         loads: dict[str, Any] = {
@@ -179,7 +179,7 @@ class RecordingReader:
         """Return the file of a displacement or a wrench, its own or that of the experiment."""
         key = "file" if table.file is None and self.section.file else key
         return self._require_existing(
-            self.section.file_of(table), key, "a file here, or of the experiment"
+            self.section.file_of(table), key, "a file here, or a file of the experiment"
         )
 
     @property
@@ -313,7 +313,9 @@ class RecordingReader:
         count = len(depth_file.images_m) or len(depth_file.clouds_m)
         t_s = section.t_s if section.t_s is not None else depth_file.t_s
         if t_s is None and count > 1 and not self._is_static:
-            message = f"{section.file} says no times of its {count} images; expected them here"
+            message = (
+                f"{section.file} does not contain times of its {count} images; expected them in t_s"
+            )
             raise InputError(message, where=f"depth.{k}.t_s")
         times = np.arange(float(count)) if t_s is None else np.array(t_s, dtype=float).ravel()
         if len(times) != count:
@@ -409,9 +411,9 @@ class RecordingReader:
         names_without_position = [name for name in names if name not in markers.reference_m]
         if names_without_position or not names:
             message = (
-                f"there is no {markers.file or 'file'} yet and no place for "
-                f"{names_without_position[0] if names_without_position else 'any marker'}; "
-                "to simulate, expected an entry name = [x, y, z] for each marker"
+                f"there is no {markers.file or 'file'} yet and no position of "
+                f"{names_without_position[0] if names_without_position else 'any marker'}; to "
+                "simulate, expected an entry name = [x, y, z] for each marker"
             )
             raise InputError(message, where="markers.reference_m")
         times = self._sample_times(poses)
@@ -442,8 +444,8 @@ class RecordingReader:
         fewest = 1 if self._is_static else 3
         if len(times) < fewest:
             message = (
-                f"neither markers.file nor poses with at least {fewest} times are there; "
-                "expected one of them, to simulate at its times"
+                f"there is neither a markers.file nor a poses file with at least {fewest} times; "
+                "expected one of them, whose times the simulation uses"
             )
             raise InputError(message, where="grasp")
         return times
@@ -462,7 +464,7 @@ class RecordingReader:
                 _require_known_markers(by_name, table.names, f"markers.{key}")
         unweighted = [name for name in table.names if markers.weights.get(name) == 0]
         if unweighted:
-            self._add_notes(f"left out, with the weight 0: {', '.join(unweighted)}")
+            self._add_notes(f"markers excluded by a weight of 0: {', '.join(unweighted)}")
         # Markers that only the gripper or the template needs are read, and not fitted.
         fitted_names = set(markers.names or set(table.names) - gripper_markers(self.section))
         indices = [
@@ -470,8 +472,8 @@ class RecordingReader:
         ]
         if not indices:
             message = (
-                f"none is left of {', '.join(table.names)}: all are the gripper's or have the "
-                "weight 0; expected at least one that the body's motion is compared with"
+                f"no marker remains of {', '.join(table.names)}: all are on the gripper or have "
+                "the weight 0; expected at least one on the body"
             )
             raise InputError(message, where="markers")
         names = tuple(table.names[k] for k in indices)
@@ -525,8 +527,8 @@ class RecordingReader:
         self._add_notes(*aligned.notes)
         if rate_hz and rate_hz > 1.01 / np.median(np.diff(table.t_s)):
             self._add_notes(
-                "resample_hz is above the markers' own rate; interpolated samples count as "
-                "measured, so error bars come out too small"
+                "resample_hz is above the markers' own rate; interpolated samples are treated as "
+                "measured, so that error bars are too small"
             )
         return aligned.t_s, aligned.poses, aligned.table
 
@@ -613,11 +615,10 @@ def _implausible_markers(experiment: Experiment) -> str | None:
         name = markers.names[np.flatnonzero(is_measured)[worst]]
         return (
             f"at t = {experiment.t_s[k]:.6g} s marker {name!r} is measured at "
-            f"{point_text(measured[worst])} m, {miss_m[worst]:.3g} m from where the grasp "
-            "carries its "
-            f"place on the body, {point_text(rigid_positions[worst])} m; check length_unit, the "
-            "marker's reference_m, that poses and markers share frame and clock, and that "
-            "the poses map undeformed to current positions"
+            f"{point_text(measured[worst])} m, {miss_m[worst]:.3g} m away from the position that "
+            f"follows from the pose of the grasp, {point_text(rigid_positions[worst])} m; check "
+            "length_unit, the marker's reference_m, that poses and markers share frame and "
+            "clock, and that the poses map undeformed to current positions"
         )
     return None
 

@@ -150,8 +150,8 @@ class MovedSection(Section):
             raise ValueError(f"found {' and '.join(sources)}; expected one of them")
         if self.gripper_to_body is not None and self.markers is not None:
             raise ValueError(
-                "found gripper_to_body and markers; expected no gripper_to_body, since the places "
-                "in markers are on the undeformed body already"
+                "found gripper_to_body and markers; expected no gripper_to_body, because the "
+                "positions in markers already refer to the undeformed body"
             )
         for section, keys in (
             ("poses", ("quaternion", "length_unit", "gripper_to_body")),
@@ -159,7 +159,9 @@ class MovedSection(Section):
         ):
             present = [key for key in keys if getattr(self, key)]
             if present and getattr(self, section) is None:
-                raise ValueError(f"found {present[0]} without {section}; it belongs to {section}")
+                raise ValueError(
+                    f"found {present[0]} without {section}; it is only used together with {section}"
+                )
         _require_three(self.markers, "markers")
         for name in self.weights:
             if name not in (names := self.markers or ()):
@@ -276,8 +278,8 @@ def _require_file_name(name: str) -> str:
         or any(mark in name for mark in '/\\:*?"<>|')
     ):
         raise ValueError(
-            f"found {name!r}; expected a name that files can have: not empty, no dot in front, "
-            'none of / \\ : * ? " < > |'
+            f"found {name!r}; expected a valid file name: not empty, no leading dot, none of / \\ "
+            ': * ? " < > |'
         )
     return name
 
@@ -432,8 +434,8 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
             moving.append("nuisance.time_shift")
         if moving:
             raise ValueError(
-                f'found {moving[0]} beside kind = "static"; expected none, since each sample is an '
-                "equilibrium of its own and nothing moves"
+                f'found {moving[0]} together with kind = "static"; expected none, because each '
+                "sample is a separate equilibrium"
             )
         return self
 
@@ -442,5 +444,5 @@ def _require_three(places: dict[str, Any] | None, key: str) -> None:
     """Raise `ValueError` for fewer than three positions, which do not determine a rotation."""
     if places is not None and len(places) < 3:
         raise ValueError(
-            f"found {len(places)} in {key}; expected at least three, to fix a rotation"
+            f"found {len(places)} in {key}; expected at least three, to determine a rotation"
         )

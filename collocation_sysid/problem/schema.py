@@ -214,8 +214,8 @@ class ObjectSection(Section):
         require_one(self, "mesh", "surface", "cylinder", "box_m")
         if (self.mesh is None) != (self.edge_length_m is not None):
             raise ValueError(
-                "edge_length_m belongs to surface, cylinder or box_m; expected it with one of "
-                "these, and not with mesh"
+                "edge_length_m is used only with surface, cylinder or box_m; expected one of "
+                "these, or no edge_length_m"
             )
         if len(used_keys(self, "mass_kg", "density_kg_m3")) > 1:
             require_one(self, "mass_kg", "density_kg_m3")
@@ -227,8 +227,12 @@ class ObjectSection(Section):
         regions = [region.name for region in self.region]
         for branch in self.prony:
             if branch.region is not None and branch.region not in regions:
-                one = f"one of {', '.join(regions)}" if regions else "none, as there are no regions"
-                finding = f"prony '{branch.name}' is of region {branch.region!r}"
+                one = (
+                    f"one of {', '.join(regions)}"
+                    if regions
+                    else ("no region, because the object has none")
+                )
+                finding = f"prony '{branch.name}' belongs to the region {branch.region!r}"
                 raise ValueError(f"{finding}; expected {one}")
         return self
 
@@ -286,9 +290,10 @@ class ParameterSection(section_of(Unknown, "ParameterSection")):
         kind = next((key for key in of_kind if getattr(self, key) is not None), "guess")
         others = {key for keys in of_kind.values() for key in keys} - set(of_kind[kind])
         if useless := used_keys(self, *(n for n in type(self).model_fields if n in others)):
-            alternative = "guess or nothing in its place to estimate the parameter"
+            alternative = "guess instead, or nothing, to estimate the parameter"
             raise ValueError(
-                f"found {kind} beside {', '.join(useless)}; expected {kind} alone, or {alternative}"
+                f"found {kind} together with {', '.join(useless)}; expected {kind} alone, or "
+                f"{alternative}"
             )
         return self
 

@@ -41,7 +41,7 @@ def explain_validation_error(
     where = _fault_location(fault, content, root)
     others = {_fault_location(other, content, root) for other in faults} - {where}
     if others:
-        message += f" (and {len(others)} more to mend)"
+        message += f" (and {len(others)} more mistakes)"
     return InputError(message, path, where or None)
 
 

@@ -84,21 +84,21 @@ class StabilityLoss:
         """Message for the user: the mode, where it is largest, and what to change."""
         x, y, z = (1e3 * self.place_m).tolist()
         where = (
-            f"it moves most at ({x:.4g}, {y:.4g}, {z:.4g}) mm, where the stretches of the surface "
-            f"are {self.smaller_stretch:.3g} and {self.larger_stretch:.3g}, with a wavelength of "
-            f"{1e3 * self.wavelength_m:.3g} mm"
+            f"the largest motion is at ({x:.4g}, {y:.4g}, {z:.4g}) mm, where the stretches of the "
+            f"surface are {self.smaller_stretch:.3g} and {self.larger_stretch:.3g}, with a "
+            f"wavelength of {1e3 * self.wavelength_m:.3g} mm"
         )
         if self.is_surface_instability:
             return (
                 f"the body loses its stability: {where}. Rubber wrinkles at a surface stretch of "
-                f"{self.critical_stretch:.3g} there (Biot): a physical instability of the surface, "
-                "which a finer mesh does not remove. End the recording before that, or use a "
-                "material that stiffens"
+                f"{self.critical_stretch:.3g} there (Biot): a physical instability of the "
+                "surface, which a finer mesh does not remove. End the recording before that, or "
+                "use a strain-stiffening material"
             )
         return (
-            f"the body loses its stability: {where}. It buckles; surfaces wrinkle only at "
-            f"{self.critical_stretch:.3g} (Biot). End the recording before that, "
-            "or support the body there"
+            f"the body loses its stability: {where}. It buckles, since its surface would wrinkle "
+            f"only at a stretch of {self.critical_stretch:.3g} (Biot). End the recording before "
+            "that, or support the body there"
         )
 
 

@@ -174,7 +174,9 @@ class NewtonSolver:
                 x[self.free] += step
                 return x
             x, factor, step = self._backtrack(x, step, factor, residual, linearise, keep_definite)
-        raise NewtonFailure(x, f"Newton took more than {self.options.max_iterations} iterations")
+        raise NewtonFailure(
+            x, f"Newton's method took more than {self.options.max_iterations} iterations"
+        )
 
     def _simplified_newton(
         self, x: Array, residual: Residual, linearise: Linearise
@@ -282,7 +284,7 @@ class NewtonSolver:
                     except NewtonFailure:
                         pass
             share /= 2
-        raise NewtonFailure(x, "no step along Newton's direction makes progress")
+        raise NewtonFailure(x, "no step along the Newton direction decreases the residual")
 
     @cached_property
     def _retraction(self) -> Retraction:

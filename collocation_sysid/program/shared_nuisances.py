@@ -110,13 +110,15 @@ def _require_same_prior(
     label = second.label
     if not np.isclose(first.sigma, second.sigma, rtol=1e-9):
         difference = f"'{leader.name}', where the {label} has the prior {first.sigma:g}"
-        raise _sharing_error(experiment, row, difference, f"the one here, {second.sigma:g}")
+        raise _sharing_error(
+            experiment, row, difference, f"the same prior as here, {second.sigma:g}"
+        )
     if row == PLACE:
         places = [_declared_place(*one), _declared_place(*other)]
         if not np.allclose(*places, rtol=0, atol=1e-9, equal_nan=True):
-            difference = f"'{leader.name}', which gives another {label.partition(',')[0]}"
+            difference = f"'{leader.name}', which states another {label.partition(',')[0]}"
             raise _sharing_error(
-                experiment, row, difference, "the same place given in both, or in neither"
+                experiment, row, difference, "the same position in both, or in neither"
             )
 
 
@@ -132,7 +134,7 @@ def _sharing_error(
 ) -> InputError:
     """Return the error message for a parameter that cannot be shared."""
     key = row.key or row.name
-    message = f"{key} is shared with {result}; expected {expected}, or a scope of its own"
+    message = f"{key} is shared with {result}; expected {expected}, or a separate scope"
     return InputError(message, None, f"experiment '{experiment.name}'")
 
 

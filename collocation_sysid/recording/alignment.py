@@ -167,7 +167,7 @@ def _cut_to_poses(
         f"{_span_text(t_s)}"
     )
     if cut[0] > t_s[0]:
-        note += f"; start tells the state at {cut[0]:.9g} s now"
+        note += f"; start now refers to the state at {cut[0]:.9g} s now"
     return MarkerTable(cut, table.names, table.positions_m[is_inside]), [note]
 
 

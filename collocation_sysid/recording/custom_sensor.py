@@ -55,8 +55,8 @@ _COLUMNS = Key("columns", list[Text], default=[])
 _GRASP = Key(
     "grasp",
     AtLeastOne | None,
-    description="In place of points: the number of the grasp, from 1, whose force and torque it "
-    "looks at.",
+    description="Instead of points: the number of the grasp, from 1, whose force and torque the "
+    "sensor measures.",
 )
 
 
@@ -124,7 +124,9 @@ class Gauge:
             raise InputError(f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}")
         if (self.grasp is None) == (not len(points)):
             both = "both points_m and grasp" if len(points) else "neither points_m nor grasp"
-            raise InputError(f"{where} has {both}; expected one of them to look at")
+            raise InputError(
+                f"{where} has {both}; expected exactly one of them, as the measured quantity"
+            )
         count = self._count_of_values()
         names = [f"{self.name}_{k + 1}" for k in range(count)] if count > 1 else [self.name]
         vars(self).update(values=self._checked_values(count), columns=tuple(self.columns or names))
@@ -141,7 +143,7 @@ class Gauge:
         if np.isinf(values).any():
             raise InputError(f"{where} holds an infinite value; expected numbers, NaN if missing")
         if not np.isfinite(values).any():
-            raise InputError(f"{where} has no sample; leave it out, or check its file")
+            raise InputError(f"{where} has no sample; remove it, or check its file")
         if values.shape[1] != count:
             raise InputError(
                 f"the expression of {where} gives {count} numbers; expected {values.shape[1]}, as "
@@ -216,15 +218,15 @@ class Gauge:
         except (Exception, SystemExit) as error:
             raise InputError(
                 f"the reading '{self.name}' cannot be evaluated ({reason(error)}); expected a "
-                f"function of at, which has t_s, {', '.join(names)}, and of its unknowns "
-                f"{', '.join(self.unknowns) or '(none)'}, in CasADi operations"
+                f"function of an argument `at` with the attributes t_s, {', '.join(names)}, and "
+                f"of its unknowns {', '.join(self.unknowns) or '(none)'}, in CasADi operations"
             ) from error
         u = ca.veccat(*observables, own)
         slopes = ca.Function("slopes", [t_s, u], [read, ca.jacobian(read, u)])
         at_rest = np.concatenate([*(each.ravel("F") for each in rest), np.zeros(own.numel())])
         if not all(np.isfinite(e.full()).all() for e in slopes(self.sample_times_s[0], at_rest)):
             raise InputError(
-                f"the reading '{self.name}' or its slope is not finite where the body is at rest; "
+                f"the reading '{self.name}' or its derivative is not finite for the body at rest; "
                 "expected a smooth expression, such as sqrt(v·v + 1e-12) in place of |v|"
             )
         return read.numel()

@@ -234,7 +234,7 @@ class Depth:
             )
         clouds = tuple(self._thin_cloud(np.asarray(cloud, dtype=float)) for cloud in self.clouds)
         if not any(len(cloud) for cloud in clouds):
-            raise InputError(f"{where} has no point; check its file and the unit of its depth")
+            raise InputError(f"{where} has no points; check its file and the unit of its depth")
         vars(self).update(t_s=times, clouds=clouds, images_m=self._check_images(len(times)))
 
     def _check_images(self, count: int) -> tuple[Array | None, ...]:
@@ -400,7 +400,9 @@ def points_from_image(image_m: Array, camera: DepthCamera) -> Array:
         If the camera has no matrix.
     """
     if camera.matrix is None:
-        raise InputError("a depth image needs the matrix of its camera; a cloud does without")
+        raise InputError(
+            "a depth image needs the matrix of its camera; only a point cloud does not"
+        )
     depth = np.where(np.isfinite(image_m) & (image_m > 0), image_m, np.nan)
     is_inner = np.isfinite(depth)
     for axis in (0, 1):

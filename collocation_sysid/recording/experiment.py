@@ -480,7 +480,7 @@ class Experiment:
             is_within_experiment(gauge.sample_times_s, self.t_s, what, self.is_static)
             if gauge.grasp is not None and not 1 <= gauge.grasp <= len(self.grasps):
                 raise InputError(
-                    f"{what} looks at grasp {gauge.grasp}; expected the number of a grasp, 1 to "
+                    f"{what} refers to grasp {gauge.grasp}; expected the number of a grasp, 1 to "
                     f"{len(self.grasps)}"
                 )
 
@@ -492,9 +492,8 @@ class Experiment:
             distance_s = np.abs(depth.sample_times_s[:, None] - self.t_s).min(axis=1)
             if self.is_static and distance_s.max() > TIME_TOLERANCE_S:
                 raise InputError(
-                    f"{what} sees at {depth.sample_times_s[distance_s.argmax()]:g} s, where the "
-                    "static "
-                    "experiment has no sample; expected times among its own"
+                    f"{what} has an image at {depth.sample_times_s[distance_s.argmax()]:g} s, but "
+                    "the static experiment has no sample then; expected times of its samples"
                 )
 
     def _require_measurements(self) -> None:
@@ -502,23 +501,29 @@ class Experiment:
             return
         if not self.markers.names:
             message = "nothing is measured: there are no markers, no wrench and no reading"
-            raise InputError(f"{message}; expected one of them at least")
-        raise InputError("no marker sample is present; check the marker file and window_s")
+            raise InputError(f"{message}; expected at least one of them")
+        raise InputError("there is no marker sample; check the marker file and window_s")
 
     def _check_nodes(self) -> None:
         n = len(self.body.nodes_m)
         grasped = prescribed_dofs(self.grasps)
         if grasped.size and grasped[-1] >= 3 * n:
-            raise InputError(f"a grasp holds node {grasped[-1] // 3}, but the body has {n}")
-        for what, loads in (("point mass is tied to", self.masses), ("force is on", self.forces)):
+            raise InputError(
+                f"a grasp holds node {grasped[-1] // 3}, but the body has only {n} nodes"
+            )
+        for what, loads in (
+            ("point mass is attached to", self.masses),
+            ("force acts on", self.forces),
+        ):
             beyond = [load.nodes[-1] for load in loads if load.nodes[-1] >= n]
             if beyond:
-                raise InputError(f"a {what} node {beyond[0]}, but the body has {n}")
+                raise InputError(f"a {what} node {beyond[0]}, but the body has only {n} nodes")
         placed = self.markers.placement.node_count
         own = len(self.body.nodes.points_m)
         if placed not in (own, n):
             raise InputError(
-                f"the markers were placed on a body of {placed} nodes, but this one has {own}"
+                f"the markers were associated with a body of {placed} nodes, but this body has "
+                f"{own}"
             )
 
     def _check_obstacles(self) -> None:
@@ -546,8 +551,8 @@ class Experiment:
     def _check_start(self) -> None:
         if np.isfinite(self.loaded_since_s) and self.start != "equilibrium":
             raise InputError(
-                f"loaded_since_s is given, but start is '{self.start}'; it says how long a body "
-                "that starts in equilibrium has been loaded"
+                f"loaded_since_s is given, but start is '{self.start}'; loaded_since_s is the "
+                "time for which a body that starts in equilibrium has been loaded"
             )
         has_initial_state = (
             self.start_positions_m is not None or self.start_velocities_m_s is not None
@@ -592,7 +597,7 @@ class Experiment:
             raise InputError(
                 "start = 'equilibrium' needs grasps that leave the body no rigid motion, but it "
                 f"can {' and '.join(motions)}, so that its rest state is not unique; "
-                f"{int(is_prescribed.any(axis=1).sum())} nodes are held then. "
-                "Grasp at least 3 nodes that do not lie on one line, or more axes, "
-                "or start 'undeformed'"
+                f"{int(is_prescribed.any(axis=1).sum())} nodes are held at the start. Grasp at "
+                "least 3 nodes that are not on one line, hold more axes, or use start = "
+                "'undeformed'"
             )

@@ -160,8 +160,8 @@ def prescribed_dofs(grasps: Sequence[Grasp]) -> Index:
             node, axis = divmod(int(shared[0]), 3)
             on_axis = "" if first.axes == second.axes == "xyz" else f" along {'xyz'[axis]}"
             raise InputError(
-                f"node {node} is held by the grasps {i} and {j} at the same time{on_axis}; "
-                "select nodes so that each is held once"
+                f"node {node} is held by the grasps {i} and {j} at the same time{on_axis}; select "
+                "the nodes so that each is held by one grasp"
             )
     return np.unique(
         np.concatenate([np.zeros(0, dtype=np.int64), *(g.prescribed_dofs for g in grasps)])
@@ -183,7 +183,7 @@ def free_rigid_motions(points_m: Array, is_prescribed: NDArray[np.bool_]) -> lis
         Whether each coordinate is prescribed.
     """
     if not is_prescribed.any():
-        return ["move and turn as a whole"]
+        return ["translate and rotate as a rigid body"]
     about = points_m[is_prescribed.any(axis=1)].mean(axis=0)
     arms = points_m - about
     size_m = float(np.linalg.norm(arms[is_prescribed.any(axis=1)], axis=1).max()) or 1.0
@@ -200,8 +200,8 @@ def free_rigid_motions(points_m: Array, is_prescribed: NDArray[np.bool_]) -> lis
     shifts = _null_space(free[:, 3:].T) @ free[:, :3]
     rotations = free[:, 3:]
     return [
-        *(f"move along {_direction_text(d)}" for d in _axis_aligned_basis(shifts)),
-        *(f"turn about {_direction_text(d)}" for d in _axis_aligned_basis(rotations)),
+        *(f"translate along {_direction_text(d)}" for d in _axis_aligned_basis(shifts)),
+        *(f"rotate about {_direction_text(d)}" for d in _axis_aligned_basis(rotations)),
     ]
 
 

@@ -85,9 +85,9 @@ class TimeSeries:
         (start, end) = t_s[[0, -1]]
         if first > start + TIME_TOLERANCE_S or last < end - TIME_TOLERANCE_S:
             raise InputError(
-                f"{name} is given from {first:.6g} s to {last:.6g} s, the recording lasts from "
-                f"{start:.6g} s to {end:.6g} s; expected rows over all of it, on the same clock: "
-                "add rows or narrow window_s"
+                f"{name} is given from {first:.6g} s to {last:.6g} s, but the recording lasts "
+                f"from {start:.6g} s to {end:.6g} s; expected rows over all of it, on the same "
+                "clock: add rows or narrow window_s"
             )
 
 
@@ -116,8 +116,7 @@ class Load:
     def __post_init__(self) -> None:
         if not self.from_s < self.until_s:
             raise InputError(
-                f"a {self.description_name} is there from {self.from_s:g} s until "
-                f"{self.until_s:g} s; "
+                f"a {self.description_name} acts from {self.from_s:g} s until {self.until_s:g} s; "
                 "expected from_s < until_s"
             )
         if isinstance(self.nodes, Selection):

@@ -145,10 +145,10 @@ def _label_chooser(names: Sequence[str] | None, renamed: Mapping[str, str]) -> L
                 raise InputError(f"holds unlabelled markers only; {remedy}")
             return chosen
         if not names:
-            raise InputError("no markers are asked for; leave the names out to take all of them")
+            raise InputError("no markers are requested; omit the names to use all markers")
         for name in names:
             _require_one_of(name, known, "marker")
-        _require_distinct(names, "asked for more than once: marker")
+        _require_distinct(names, "requested more than once: marker")
         index_of = {name: k for k, name in enumerate(known)}
         return [index_of[name] for name in names]
 

@@ -33,7 +33,7 @@ _PLACES = Key(
     "places",
     Literal["free", "surface"],
     lambda word: word == "surface",
-    description="Places that are estimated may be anywhere, or stay on the surface.",
+    description="Whether estimated positions may be anywhere, or stay on the surface.",
     default="free",
 )
 
@@ -115,11 +115,11 @@ class Markers:
         known = self.located
         if places_m is not None and placement is not None:
             raise InputError(
-                "the markers have places_m and a placement; expected one of them, or neither "
-                "where the places are to be estimated"
+                "the markers have places_m and a placement; expected one of them, or neither if "
+                "the positions are to be estimated"
             )
         if placement is not None and len(placement.nodes) != m:
-            raise InputError(f"{len(placement.nodes)} places on the body for {m} markers")
+            raise InputError(f"{len(placement.nodes)} positions on the body for {m} markers")
         if placement is None:
             places_m = np.full((m, 3), np.nan) if places_m is None else places_m
             places_m = read_only_floats(places_m, (m, 3), "places_m", finite=False)
@@ -170,8 +170,8 @@ class Markers:
             for m in np.flatnonzero(~known).tolist():
                 if not self.is_present[:, m].any():
                     raise InputError(
-                        f"marker '{self.names[m]}' is never seen and has no place on the body; "
-                        "give its reference_m, or leave it out"
+                        f"marker '{self.names[m]}' is never visible and has no position on the "
+                        "body; give its reference_m, or remove it"
                     )
                 nodes, weights = shape.weights_at_nearest_point(back[m])
                 places[m] = weights @ body.nodes_m[nodes]

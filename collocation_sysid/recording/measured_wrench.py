@@ -72,7 +72,7 @@ class Wrench:
 
     def __post_init__(self) -> None:
         if not len(self.t_s):
-            raise InputError("a wrench without samples; expected some")
+            raise InputError("a wrench without samples; expected at least one")
         shape = len(self.t_s), 6
         values = read_only_floats(self.values, shape, "values of the wrench", finite=False)
         vars(self)["values"] = values

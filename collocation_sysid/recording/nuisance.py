@@ -253,7 +253,7 @@ PLACE = NuisanceRow(
     reach=UNLIMITED_REACH,
     step=_largest_place_step_m,
     label="place of {which}, {axis}",
-    description="errors of the places in reference_m without a reference_sigma_m; they turn "
+    description="errors of the positions in reference_m without a reference_sigma_m; they rotate "
     "with the body",
     same=lambda e: {"body": id(e.body), "kind of places": e.markers.on_surface},
 )
@@ -267,7 +267,7 @@ OFFSET = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="length",
     label="camera offset of {which}, {axis}",
-    sentence="camera offsets up to {size}",
+    sentence="camera offset of markers: up to {size}",
     description="a constant offset of each marker in the cameras' frame",
     reading=_shift_position,
 )
@@ -278,8 +278,8 @@ CALIBRATION_SCALE = NuisanceRow(
     key="calibration_scale",
     considered=2e-3,
     label="scale of the cameras",
-    sentence="cameras see lengths {signed}",
-    description="a factor on all lengths that the cameras see, how far from one",
+    sentence="scale error of the cameras: {signed}",
+    description="scale error of all lengths that the cameras measure: the factor minus one",
     applies=_has_markers,
     reading=lambda y, values, t_s, data: y + values * (y - ca.DM(data.pivot_m)),
 )
@@ -291,7 +291,7 @@ CALIBRATION_DISTORTION = NuisanceRow(
     considered=0.02,
     applies=_has_markers,
     label="distortion of the cameras",
-    sentence="cameras' distortion {signed}",
+    sentence="distortion of the cameras: {signed}",
     description="radial distortion of first order about the body's middle: a factor 1 + k r²",
     reading=_distort_position,
 )
@@ -303,8 +303,8 @@ TIME = NuisanceRow(
     changes=("clock",),
     applies=_is_motion,
     label="time shift",
-    sentence="markers seen {size} {way} than their times say{limit}",
-    description="how much later than their times say markers were seen, on the grasps' clock",
+    sentence="markers measured {size} {way} than stated{limit}",
+    description="how much later than stated the markers were measured, on the grasps' clock",
     same=lambda e: {"time between samples": round(e.timestep_s, 12)},
     clock=lambda values, t_s, data: values,
 )
@@ -317,8 +317,8 @@ CLOCK_RATE = NuisanceRow(
     changes=("clock",),
     applies=lambda experiment: _is_motion(experiment) and _has_markers(experiment),
     label="rate of the markers' clock",
-    sentence="the markers' clock {signed} slow",
-    description="how much slower than the grasps' clock that of the markers goes",
+    sentence="the markers' clock is slow by {signed}",
+    description="how much slower than the grasps' clock that of the markers runs",
     clock=lambda values, t_s, data: values * (t_s - data.recorded_s[0]),
 )
 POSE_TURN = NuisanceRow(
@@ -330,10 +330,9 @@ POSE_TURN = NuisanceRow(
     changes=("reading", "gravity"),
     by="length",
     label="turn of the pose, {axis}",
-    sentence="poses turned by {size}",
-    description="a constant turn of grasps and body in the cameras' frame, which turns gravity "
-    "in the "
-    "body's",
+    sentence="rotation of the poses: {size}",
+    description="a constant rotation of grasps and body in the cameras' frame, which rotates "
+    "gravity in the body's frame",
     reading=_rotate_position,
 )
 POSE_SHIFT = NuisanceRow(
@@ -345,8 +344,8 @@ POSE_SHIFT = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="length",
     label="shift of the pose, {axis}",
-    sentence="poses shifted by {size}",
-    description="a constant shift of both",
+    sentence="translation of the poses: {size}",
+    description="a constant translation of grasps and body in the cameras' frame",
     reading=_shift_position,
 )
 TILT = NuisanceRow(
@@ -359,7 +358,7 @@ TILT = NuisanceRow(
     applies=lambda experiment: bool(np.any(experiment.gravity_m_s2)),
     by="length",
     label="tilt of gravity, {axis}",
-    sentence="gravity tilted by {size}",
+    sentence="tilt of gravity: {size}",
     description="a tilt of the direction of gravity",
     same=lambda e: {"gravity": tuple(e.gravity_m_s2)},
 )
@@ -373,8 +372,8 @@ GRASP_TURN = NuisanceRow(
     applies=_has_observable_hand_eye,
     by="length",
     label="turn in the grasp, {axis}",
-    sentence="body turned in its grasp by {size}",
-    description="a constant turn of the body in its grasps",
+    sentence="rotation of the body in the gripper: {size}",
+    description="a constant rotation of the body in its grasps",
     same=_hand_eye_sharing_key,
 )
 GRASP_SHIFT = NuisanceRow(
@@ -387,9 +386,9 @@ GRASP_SHIFT = NuisanceRow(
     applies=_has_observable_hand_eye,
     by="length",
     label="shift in the grasp, {axis}",
-    sentence="body shifted in its grasp by {size}",
-    description="a constant shift of it there; both where the start is an equilibrium and "
-    "markers see it",
+    sentence="translation of the body in the gripper: {size}",
+    description="a constant translation of the body in its grasps; both if the start is an "
+    "equilibrium and markers measure it",
     same=_hand_eye_sharing_key,
 )
 ZERO = NuisanceRow(
@@ -402,7 +401,7 @@ ZERO = NuisanceRow(
     changes=("grasps",),
     by="worst",
     label="zero of grasp {which}, {axis}",
-    sentence="zero of a displacement off by {size}",
+    sentence="zero error of a displacement: up to {size}",
     description="a constant offset of each displacement along each of its axes",
 )
 OBSTACLE_OFFSET = NuisanceRow(
@@ -415,9 +414,9 @@ OBSTACLE_OFFSET = NuisanceRow(
     by="worst",
     applies=lambda experiment: bool(experiment.obstacles),
     label="place of {which}",
-    sentence="an obstacle is off by {size}",
+    sentence="position error of an obstacle: up to {size}",
     description="a constant offset of each obstacle along its normal, or along the axis of its "
-    "displacement: where contact begins",
+    "displacement, which changes the beginning of the contact",
 )
 OBSTACLE_TILT = NuisanceRow(
     "obstacle_tilt_rad",
@@ -431,8 +430,8 @@ OBSTACLE_TILT = NuisanceRow(
     considered=0.2 * DEGREE,
     applies=lambda experiment: any(each.shape.has_tilt for each in experiment.obstacles),
     label="tilt of {which}, {axis}",
-    sentence="an obstacle is tilted by {size}",
-    description="a constant tilt of each plane or box that may be touched, about its point or "
+    sentence="tilt of an obstacle: {size}",
+    description="a constant tilt of each obstacle that is a plane or a box, about its point or "
     "middle",
 )
 OBSTACLE_TIME = NuisanceRow(
@@ -446,8 +445,8 @@ OBSTACLE_TIME = NuisanceRow(
     considered=1e-3,
     applies=lambda experiment: any(len(each.poses.t_s) > 1 for each in experiment.obstacles),
     label="delay of {which}",
-    sentence="an obstacle is late by {size}",
-    description="how much later than stated each obstacle moves, to first order",
+    sentence="delay of an obstacle: up to {size}",
+    description="delay of each obstacle's motion, to first order",
 )
 TENSION_FACTOR = NuisanceRow(
     "tension_factor",
@@ -458,7 +457,7 @@ TENSION_FACTOR = NuisanceRow(
     changes=("drives",),
     label="{which}, more than stated",
     sentence="{which} by {signed}",
-    description="a factor on the tension of each tendon, how far from one",
+    description="scale error of the tension of each tendon: the factor minus one",
 )
 TENSION_OFFSET = NuisanceRow(
     "tension_lost_n",
@@ -469,7 +468,7 @@ TENSION_OFFSET = NuisanceRow(
     changes=("drives",),
     label="{which}, lost",
     sentence="{which} {signed}",
-    description="tension of each tendon that friction takes",
+    description="tension of each tendon that is lost by friction",
 )
 PRESSURE_FACTOR = NuisanceRow(
     "pressure_factor",
@@ -480,7 +479,7 @@ PRESSURE_FACTOR = NuisanceRow(
     changes=("drives",),
     label="{which}, more than stated",
     sentence="{which} by {signed}",
-    description="a factor on each pressure, how far from one",
+    description="scale error of each pressure: the factor minus one",
 )
 PRESSURE_OFFSET = NuisanceRow(
     "pressure_lost_pa",
@@ -491,7 +490,7 @@ PRESSURE_OFFSET = NuisanceRow(
     changes=("drives",),
     label="{which}, lost",
     sentence="{which} {signed}",
-    description="an offset that each pressure lacks",
+    description="offset by which each pressure is lower than stated",
 )
 JOINING = NuisanceRow(
     "joining_s",
@@ -503,9 +502,8 @@ JOINING = NuisanceRow(
     step=lambda experiment: SAMPLES_A_STEP * experiment.timestep_s,
     label="{which}",
     sentence="{which} {number}{error}{unit} {way} than {stated}",
-    description="how much later than stated each point mass or force joins or leaves, where it "
-    "does so "
-    "within the recording",
+    description="delay with which each point mass or force begins or ends, if it does so within "
+    "the recording",
 )
 TARE = NuisanceRow(
     "tare",
@@ -517,8 +515,8 @@ TARE = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="worst",
     label="tare{which} of {axis}",
-    sentence="tare up to {size}",
-    description="a constant offset of each component of a wrench, in its sigmas",
+    sentence="tare: up to {size}",
+    description="a constant offset of each component of a wrench, in multiples of its sigma",
 )
 SENSOR_TIME = NuisanceRow(
     "sensor_time_s",
@@ -532,9 +530,8 @@ SENSOR_TIME = NuisanceRow(
     high=3.0,
     by="worst",
     label="time shift of the sensor{which}",
-    sentence="sensor late by {size}",
-    description="how much later than their times say wrenches were measured; three deviations "
-    "at most",
+    sentence="delay of the sensor: {size}",
+    description="delay of the measured wrenches; at most three standard deviations",
 )
 SENSOR_LAG = NuisanceRow(
     "sensor_lag_s",
@@ -548,9 +545,9 @@ SENSOR_LAG = NuisanceRow(
     high=3.0,
     by="worst",
     label="lag of the sensor{which}",
-    sentence="lag of the sensor {size}",
+    sentence="time constant of the sensor: {size}",
     description="time constant of a first-order low-pass in the sensor; from zero to three "
-    "deviations",
+    "standard deviations",
 )
 TOOL_MASS = NuisanceRow(
     "tool_kg",
@@ -562,8 +559,8 @@ TOOL_MASS = NuisanceRow(
     low=0.0,
     by="worst",
     label="mass of the tool{which}",
-    sentence="tool of {size}",
-    description="a mass between a sensor and the body",
+    sentence="mass of the tool: {size}",
+    description="mass of the tool between a sensor and the body",
 )
 TOOL_CENTRE = NuisanceRow(
     "tool_m",
@@ -577,9 +574,9 @@ TOOL_CENTRE = NuisanceRow(
     by="worst",
     reference=0.05,
     label="centre of the tool{which}, {axis}",
-    sentence="its centre off by {size}",
-    description="its centre about the sensor's point; in the world's frame that of the grasped "
-    "nodes",
+    sentence="offset of the tool's centre: up to {size}",
+    description="centre of the tool relative to the sensor's point; in the world's frame, "
+    "relative to that of the grasped nodes",
 )
 DEPTH_TURN = NuisanceRow(
     "depth_turn_rad",
@@ -594,8 +591,9 @@ DEPTH_TURN = NuisanceRow(
     high=4.0,
     by="length",
     label="turn of {which}, {axis}",
-    sentence="a depth camera is turned by {size}",
-    description="a turn of each depth camera about the middle of the body, along its own axes",
+    sentence="rotation of a depth camera: {size}",
+    description="rotation of each depth camera about the middle of the body, along the camera's "
+    "axes",
     same=_camera_sharing_key,
 )
 DEPTH_SHIFT = NuisanceRow(
@@ -613,9 +611,9 @@ DEPTH_SHIFT = NuisanceRow(
     step=lambda experiment: CAMERA_SHIFT_A_STEP_M,
     by="length",
     label="shift of {which}, {axis}",
-    sentence="a depth camera is shifted by {size}",
-    description="a shift of it; where neither is given, the first image is aligned to the body "
-    "first",
+    sentence="translation of a depth camera: {size}",
+    description="translation of each depth camera; if neither is given, the first image is first "
+    "aligned with the body",
     same=_camera_sharing_key,
 )
 DEPTH_BIAS = NuisanceRow(
@@ -632,8 +630,8 @@ DEPTH_BIAS = NuisanceRow(
     step=lambda experiment: CAMERA_SHIFT_A_STEP_M,
     by="worst",
     label="bias of {which}",
-    sentence="depth is off by {size}",
-    description="what is to be added to each depth of an image",
+    sentence="offset of the depth: {size}",
+    description="offset that is added to each depth of an image",
 )
 DEPTH_SCALE = NuisanceRow(
     "depth_scale",
@@ -648,8 +646,8 @@ DEPTH_SCALE = NuisanceRow(
     reach=4.0,
     by="worst",
     label="scale of {which}",
-    sentence="depth is off by {size} of itself",
-    description="a factor on each depth of an image, how far from one",
+    sentence="scale error of the depth: {size}",
+    description="scale error of each depth of an image: the factor minus one",
 )
 DEPTH_TIME = NuisanceRow(
     "depth_time_s",
@@ -663,8 +661,8 @@ DEPTH_TIME = NuisanceRow(
     high=3.0,
     by="worst",
     label="time shift of {which}",
-    sentence="a depth camera is late by {size}",
-    description="how much later than its times say a depth camera saw; three deviations at most",
+    sentence="delay of a depth camera: {size}",
+    description="delay of a depth camera; at most three standard deviations",
 )
 DEPTH_EDGE = NuisanceRow(
     "depth_edge_px",
@@ -679,10 +677,9 @@ DEPTH_EDGE = NuisanceRow(
     reach=UNLIMITED_REACH,
     by="worst",
     label="edge of {which}",
-    sentence="silhouettes end {size} inside the body",
-    description="how many pixels inside the outline of the body its silhouette ends in the "
-    "images of each "
-    "depth camera, all around",
+    sentence="silhouettes end {size} inside the body's outline",
+    description="distance by which silhouettes in the images of each depth camera end inside the "
+    "outline of the body, in pixels",
 )
 
 # In the order of φ; neighbours of one component stand together.
@@ -705,7 +702,7 @@ class _NuisanceBase:
         for row in self.kinds:
             value = self.sigma(row)
             if value is not None and not value > 0:
-                raise InputError(f"{row.name} is {value:g}; expected a deviation above 0")
+                raise InputError(f"{row.name} is {value:g}; expected a standard deviation above 0")
         names = [row.name for row in self.kinds]
         for name, word in self.scope.items():
             if name not in names:
@@ -736,7 +733,7 @@ def _check_custom_kind(row: NuisanceRow) -> None:
     if row.of not in ("recording", "marker"):
         raise InputError(f"{row.name} is of a {row.of}; expected of = 'recording' or 'marker'")
     if row.sigma is None:
-        raise InputError(f"{row.name} has no sigma; expected the deviation of its prior")
+        raise InputError(f"{row.name} has no sigma; expected the standard deviation of its prior")
     if (row.reading is None) == (row.clock is None):
         raise InputError(f"{row.name} has to have a reading or a clock, one of both")
 

@@ -107,8 +107,8 @@ def place_markers(
     unplaced = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if unplaced.size:
         raise InputError(
-            f"marker '{labels[unplaced[0]]}' has no position from which to find its place on the "
-            "body; give its reference_m"
+            f"marker '{labels[unplaced[0]]}' has no sample from which its position on the body "
+            "could be determined; give its reference_m"
         )
     shape = LocatedBody(nodes_m, body)
     snap_m = {"auto": VERTEX_SNAP_EDGES * shape.mean_edge_m, "vertex": np.inf, "embedded": -1.0}[

@@ -144,7 +144,7 @@ def _position_columns(grid: TextTable, length_unit: str | None) -> tuple[list[in
     named = ", ".join(grid.columns[k] for k in axes)
     if length_unit is None and None in units:
         raise grid.error_at(
-            f"the columns {named} name no unit; expected length_unit, one of "
+            f"the columns {named} state no unit; expected length_unit, one of "
             f"{', '.join(METRES_PER_UNIT)}, or columns such as x_m, y_m, z_m"
         )
     if length_unit and any(
@@ -182,7 +182,7 @@ def _quaternion_columns(grid: TextTable, order: str | None, columns: list[int]) 
         raise _column_error(grid)
     if order is None:
         raise grid.error_at(
-            f"the columns {', '.join(numbered)} do not say which is the scalar; expected "
+            f"the columns {', '.join(numbered)} do not state which one is the scalar; expected "
             "quaternion = 'xyzw' or 'wxyz', or columns qx, qy, qz, qw"
         )
     return [place[numbered[order.index(axis)]] for axis in "xyzw"]

@@ -273,16 +273,16 @@ def first_matrix_fault(t_s: Array, matrices: Array) -> tuple[int, str] | None:
         if last[k] > _LAST_ROW_TOLERANCE:
             row = ", ".join(f"{value:.4g}" for value in matrices[k, 3])
             hint = (
-                "; is it written column by column?" if last_column[k] <= _LAST_ROW_TOLERANCE else ""
+                "; is it stored column by column?" if last_column[k] <= _LAST_ROW_TOLERANCE else ""
             )
             return k, f"{at} has the last row {row}; expected 0, 0, 0, 1{hint}"
         if gram[k] > _ORTHONORMALITY_TOLERANCE:
             return k, (
-                f"{at} is no rotation: its RᵀR differs from the identity by {gram[k]:.3g}; "
+                f"{at} is not a rotation: its RᵀR differs from the identity by {gram[k]:.3g}; "
                 f"expected at most {_ORTHONORMALITY_TOLERANCE:g}"
             )
         if np.linalg.det(rotations[k]) < 0:
-            return k, f"{at} mirrors: its determinant is −1; expected a rotation"
+            return k, f"{at} is a reflection (determinant −1); expected a rotation"
     return None
 
 
@@ -368,9 +368,9 @@ def require_determined_motion(
     step_s = _typical_step_s(poses, first_s, last_s)
     if poses.interpolation == "smooth" and step_s > LONGEST_STEP_S:
         raise InputError(
-            f"the poses move and are {step_s:.6g} s apart, and {lasts}; expected several a second, "
-            "with t_s in seconds and not in milliseconds; or interpolation = 'linear' or 'hold' if "
-            "that is how it moves between them",
+            f"the poses move and are {step_s:.6g} s apart, and {lasts}; expected several a "
+            "second, with t_s in seconds and not in milliseconds; or interpolation = 'linear' or "
+            "'hold' if the grasp moves so between them",
             file,
         )
     start_s, end_s = poses.t_s[[0, -1]]

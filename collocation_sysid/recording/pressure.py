@@ -110,8 +110,8 @@ class Pressure(Actuator[EnclosedVolume]):
         volume = EnclosedVolume(wall, len(body.nodes_m))
         if not volume.rim.size and volume.evaluate(body.nodes_m.reshape(1, -1))[0] <= 0:
             raise InputError(
-                f"{self.name}: the faces surround the body from outside; expected the wall of a "
-                "cavity in it, or an open patch whose rim is held"
+                f"{self.name}: the faces are the outer surface of the body; expected the wall of "
+                "a cavity in it, or an open patch whose rim is held"
             )
         return volume
 
@@ -164,8 +164,9 @@ class Pressure(Actuator[EnclosedVolume]):
                 apex[axis] = plane.mean()
         if free:
             raise InputError(
-                f"{self.name}: the faces are not closed, and {free} of the {len(volume.rim)} edges "
-                "of their rim move; expected the whole wall of a cavity, or a rim that is held or "
-                "slides in one plane across an axis: the force on other patches has no energy"
+                f"{self.name}: the faces are not closed, and {free} of the {len(volume.rim)} "
+                "edges of their rim move; expected the complete wall of a cavity, or a rim that "
+                "is held or slides in a plane perpendicular to an axis: the pressure on other "
+                "patches has no potential energy"
             )
         return replace(self, body_measure=BodyMeasure(placed.body, volume.with_apex(apex)))

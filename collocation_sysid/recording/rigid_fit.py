@@ -65,7 +65,9 @@ class RigidFit:
         times = np.asarray(t_s, dtype=np.float64)
         there = np.flatnonzero(~self.missing)
         if not there.size:
-            raise InputError("no frame has three markers of the grasp that are not on one line")
+            raise InputError(
+                "no frame contains three markers of the grasp that are not on one line"
+            )
         known = PoseSequence(times[there], self.positions_m[there], self.quaternions_xyzw[there])
         if len(there) == 1:
             return known
@@ -191,8 +193,8 @@ def align_to_template(
     weight = (count > 0).astype(np.float64)[None]
     if not _fixes_rotation(places[None], weight)[0]:
         raise InputError(
-            f"{np.count_nonzero(count)} of the template's markers have samples in the window and "
-            "do not fix a rotation; expected at least three that are not on one line"
+            f"{np.count_nonzero(count)} of the template's markers have samples in the window, "
+            "which do not determine a rotation; expected at least three that are not on one line"
         )
     rotations, translations = _best_motions(means[None], places[None], weight)
     moved = means @ rotations[0].T + translations[0]

@@ -103,7 +103,7 @@ def _read_limited(
     for row in (~((values >= at_least) & (abs(values) <= largest))).nonzero()[0]:
         is_so = f"{quantity.column} is {values[row]:g}"
         if abs(values[row]) > largest:
-            why = ", which no soft body bears; check the unit of the column"
+            why = ", which is too large for a soft body; check the unit of the column"
         else:
             why = "; expected 0 or more, since a tendon only pulls: take the sensor's offset off"
         raise table.grid.error_at(is_so + why, int(row))
@@ -320,9 +320,9 @@ def is_within_experiment(
     hint = (
         f"{name} seems to be in milliseconds"
         if 300 < ratio < 3000
-        else "both need one clock, in seconds; subtract where they began"
+        else "both need the same clock, in seconds; subtract their starting times"
     )
     raise InputError(
         f"{name} runs from {span[0]}, the experiment from {span[1]}: {int(is_inside.sum())} "
-        f"samples are in common; expected {fewest} at least. {hint}"
+        f"samples are common to both; expected at least {fewest}. {hint}"
     )

@@ -308,7 +308,7 @@ class FilmFigure:
             squares = np.sum((markers - self.replay.measured_m) ** 2, axis=2)
             style = {"color": colour, "lw": LINE_PT, "ls": "-" if colour == BLUE else (0, (4, 2))}
             panel.plot(t_s, 1e3 * rms_over_markers(squares), label=name, **style)
-        style_axes(panel, "", "time [s]", "markers, RMS [mm]")
+        style_axes(panel, "", "time [s]", "marker error, RMS [mm]")
         panel.set_ylim(bottom=0.0)
         add_legend_above(panel, columns=1)
         return panel.axvline(0.0, color=BLACK, lw=0.8)
@@ -322,7 +322,7 @@ class FilmFigure:
         named = ["grasped", "measured", "behind the body"]
         if self.replay.visible_points:
             markers = named[1:] if len(self.replay.marker_names) else []
-            named = ["grasped", *markers, "seen in depth"]
+            named = ["grasped", *markers, "depth image"]
         draw_legend(
             axes, legend_handles(*named), (FILM_WIDTH_MM * (0.42 if len(named) < 4 else 0.35), 5.5)
         )
@@ -385,7 +385,7 @@ def _find_ffmpeg(file: Path) -> str:
         except RuntimeError:
             pass
     raise InputError(
-        "MP4 needs ffmpeg, which is not there: pip install 'collocation-sysid[film]', install "
+        "MP4 needs ffmpeg, which was not found: pip install 'collocation-sysid[film]', install "
         "ffmpeg, or choose a file ending in .gif",
         file,
         "--to",

@@ -49,12 +49,17 @@ def full_check_tables(findings: CheckResult) -> list[Shown]:
 def _check_verdict(findings: CheckResult) -> Line:
     """Return the conclusion of a check: valid, wrong derivatives, or a suspect description."""
     if not findings.derivatives_agree:
-        return Line("The derivatives do not agree with differences at the guess.", "doubtful")
+        return Line(
+            "The derivatives do not agree with finite differences at the guess.", "doubtful"
+        )
     if findings.causes:
         likeliest = findings.causes[0].message
-        sentence = f"The derivatives agree, but the description looks wrong: {likeliest}"
+        sentence = (
+            "The derivatives are correct, but the description in the problem file looks wrong: "
+            f"{likeliest}"
+        )
         return Line(sentence, "doubtful")
-    return Line("The problem is valid and the derivatives agree.", "good")
+    return Line("The problem is valid and its derivatives agree with finite differences.", "good")
 
 
 def _body_section(body: BodyCheck) -> Table:
@@ -73,8 +78,8 @@ def _body_section(body: BodyCheck) -> Table:
         | ({} if body.rest_shape == "stress_free" else {"rest shape": _rest_shape(body)})
         | {
             f"field of {symbol_of(name)}": f"{each.modes} shapes with {each.share:.0%} of the "
-            f"variance, of length {1e3 * each.length_m:.3g} mm; details above "
-            f"{1e3 * each.detail_m:.3g} mm"
+            f"prior variance, correlation length {1e3 * each.length_m:.3g} mm; resolved details: "
+            f"above {1e3 * each.detail_m:.3g} mm"
             for name, each in body.fields.items()
         },
     )
@@ -83,11 +88,13 @@ def _body_section(body: BodyCheck) -> Table:
 def _rest_shape(body: BodyCheck) -> str:
     """Return what is known of the stress-free shape, which is not the mesh."""
     if body.rest_shape is None:
-        return "not stated: see object.rest_shape"
+        return "not stated; set object.rest_shape"
     if np.isnan(body.rest_shape_change_m):
-        return "the mesh was made under gravity; no stress-free shape at the guess"
+        return "the mesh was made under gravity; no stress-free shape was found at the guess"
     change = f"{1e3 * body.rest_shape_change_m:.3g} mm"
-    return f"the mesh was made under gravity; the stress-free shape is up to {change} away"
+    return (
+        f"the mesh was made under gravity; the stress-free shape differs from it by up to {change}"
+    )
 
 
 def _motion_section(findings: CheckResult) -> list[Shown]:
@@ -96,7 +103,14 @@ def _motion_section(findings: CheckResult) -> list[Shown]:
         return []
     motion, *others = findings.motions
     title = f"Modes of '{motion.experiment}' about its {motion.about} (they depend on the guess)"
-    heads = ("  Hz", "samples/period", "steps/period", "damping", "scheme adds", "period error")
+    heads = (
+        "  Hz",
+        "samples/period",
+        "steps/period",
+        "damping",
+        "numerical damping",
+        "period error",
+    )
     rows = tuple(
         (
             f"{mode.frequency_hz:.3g}",
@@ -112,7 +126,7 @@ def _motion_section(findings: CheckResult) -> list[Shown]:
         f"'{m.experiment}' {m.first_mode.frequency_hz:.3g} Hz" for m in others if m.first_mode
     ]
     firsts = [*firsts[:SHOWN_RECORDINGS], *["…"] * (len(firsts) > SHOWN_RECORDINGS)]
-    more = [f"  first modes elsewhere: {', '.join(firsts)}"] if firsts else []
+    more = [f"  first modes of the other recordings: {', '.join(firsts)}"] if firsts else []
     return [Table(title, heads, rows, names=0), *more]
 
 
@@ -183,20 +197,23 @@ def _solve_section(findings: CheckResult) -> Table:
         for body in findings.bodies
     }
     if findings.samples and findings.rms_at_guess_m is not None:
-        rows["at the guess"] = f"markers are missed by {1e3 * findings.rms_at_guess_m:.3g} mm RMS"
+        rows["at the guess"] = (
+            "the simulation deviates from the markers by "
+            f"{1e3 * findings.rms_at_guess_m:.3g} mm RMS"
+        )
     rows |= {
         "program": f"{findings.variables:,} variables, {findings.constraints:,} constraints, "
         f"{findings.jacobian_nonzeros + findings.hessian_nonzeros:,} nonzeros"
     }
     if findings.overstresses:
         rows["memory"] = (
-            f"{findings.overstresses:,} more variables and constraints in interior-point, for the "
-            "viscoelastic stress of every point; the nonzeros count them"
+            f"{findings.overstresses:,} additional variables and constraints of the method "
+            "interior-point for the viscoelastic stresses, included in the nonzeros"
         )
     if findings.wrenches:
         rows["wrenches"] = (
-            f"{findings.wrenches:,} more variables and constraints in interior-point, for the "
-            "wrenches of grasps with a sensor; the nonzeros count them"
+            f"{findings.wrenches:,} additional variables and constraints of the method "
+            "interior-point for the measured wrenches, included in the nonzeros"
         )
     for cost in findings.costs:
         chosen = ", chosen" if cost.method == findings.method else ""
@@ -205,7 +222,7 @@ def _solve_section(findings: CheckResult) -> Table:
         )
         rows[cost.method] = f"about {duration(cost.time_s)} and {memory}{chosen}"
     rows["derivatives"] = (
-        f"Jacobian and Hessian within {findings.jacobian_error:.0e} and "
-        f"{findings.hessian_error:.0e} of finite differences"
+        f"relative errors of Jacobian and Hessian: {findings.jacobian_error:.0e}, "
+        f"{findings.hessian_error:.0e}"
     )
     return labelled("Solve", rows)

@@ -153,14 +153,14 @@ def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
     if listing is None:
         raise InputError(
             f"experiment '{experiment}' of this run has no {FRAMES_FILE}: only fitted experiments "
-            "have frames; use --html to look at others",
+            "have frames; use --html to view others",
             run,
         )
     with _damaged_frames_refused(run):
         sets = ElementTree.parse(listing).getroot().iter("DataSet")
         frames = [(float(s.attrib["timestep"]), listing.parent / s.attrib["file"]) for s in sets]
         if not frames or not all(is_own(run, file) for _, file in (*frames, (0.0, listing))):
-            raise ValueError("it names no frames, or frames that are not in the folder")
+            raise ValueError("it lists no frames, or frames that are not in the folder")
         return frames
 
 

@@ -51,8 +51,9 @@ def probe_section(result: Result) -> TitledParts:
         for p in result.probes
     ]
     read = (
-        "changes of the estimates; in brackets in half widths of the statistical and of the "
-        "combined interval; to first order, but of significant assumptions"
+        "Changes of the estimates, in parentheses relative to the half widths of the statistical "
+        "and of the combined interval. They are first-order estimates, except those of "
+        "significant assumptions."
     )
     return TitledParts(
         "Probes", (Table("", heads, tuple(rows), texts=1), read, *_conclusions(result))
@@ -157,13 +158,12 @@ def _conclusions(result: Result) -> Iterator[str]:
         size = short(first.size or 0.0)
         error = short(first.size_error or 0.0)
         yield (
-            f"the data determine {source_label(first.name)}: {size} ± {error}, with which χ² "
-            "falls by "
-            f"{first.chi_squared:.3g} and the estimates change by {listed(moved)}: measure it, or "
-            "estimate it"
+            f"the data determine {source_label(first.name)}: with {size} ± {error}, χ² decreases "
+            f"by {first.chi_squared:.3g} and the estimates change by {listed(moved)}; measure it, "
+            "or estimate it"
         )
         if others := [f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in relaxed[1:]]:
-            yield f"alternatively {listed(others)}: these assumptions have similar effects"
+            yield f"alternative explanations with similar effects: {listed(others)}"
     elif not significant:
         tested = " or ".join(_size_and_gain(p) for p in result.probes)
         nothing = "no subset of the data and no relaxed assumption changes the fit significantly"
@@ -193,8 +193,7 @@ def _most_important_assumption(result: Result) -> Iterator[str]:
         if source is not None:
             share = result.budget[name][source]
             yield (
-                f"of the assumptions not determined by the data, {source_label(source)} matters "
-                "most: "
-                f"{share:.0%} of {symbol_of(name)}'s variance"
+                f"of the assumptions that the data do not determine, {source_label(source)} "
+                f"contributes most: {share:.0%} of the variance of {symbol_of(name)}"
             )
             return

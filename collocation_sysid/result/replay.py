@@ -325,7 +325,7 @@ class MotionRecord:
         if len(stored["marker_names"]) != len(stored["marker_places_m"]):
             raise ValueError(f"{len(stored['marker_names'])} marker_names")
         if parts.min() < 0 or parts.max() >= len(stored["part_names"]):
-            raise ValueError("surface_parts names parts that are not there")
+            raise ValueError("surface_parts contains parts that do not exist")
         return cls(name=name, **stored)
 
 
@@ -389,12 +389,12 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
         if any(
             size not in (None, size_here) for size, size_here in zip(expected, here, strict=True)
         ):
-            raise ValueError(f"{key} has shape {here}, which does not go with the others")
+            raise ValueError(f"{key} has shape {here}, which does not match the other arrays")
         sizes |= {x: size for x, size in zip(letters, here, strict=True) if not x.isdigit()}
         if kinds == "f" and not (key in ARRAYS_WITH_NAN or np.isfinite(array).all()):
-            raise ValueError(f"{key} holds numbers that are not finite")
+            raise ValueError(f"{key} contains numbers that are not finite")
         if kinds == "f" and float(np.nanmax(np.abs(array), initial=0.0)) > LARGEST_NUMBER:
-            raise ValueError(f"{key} holds numbers above {LARGEST_NUMBER:g}")
+            raise ValueError(f"{key} contains numbers above {LARGEST_NUMBER:g}")
     elements = len(arrays["tetrahedra"])
     fits = {
         "readings": lambda shape: len(shape) == 2 and shape[0] and shape[1] % 3 == 1 < shape[1],
@@ -409,9 +409,9 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
                 )
     for key in ("tetrahedra", "surface", "surface_nodes"):
         if arrays[key].min() < 0 or arrays[key].max() >= sizes["n"]:
-            raise ValueError(f"{key} names nodes that are not there")
+            raise ValueError(f"{key} contains nodes that do not exist")
     if not (np.diff(arrays["t_s"]) > 0).all() or not np.isclose(np.linalg.norm(arrays["up"]), 1.0):
-        raise ValueError("t_s does not increase, or up is no direction")
+        raise ValueError("t_s does not increase, or up is not a direction")
 
 
 def read_run(folder: str | Path) -> tuple[Result, list[MotionRecord]]:

@@ -28,11 +28,14 @@ from ..serialisation import read
 
 SUMMARY_FILE = "summary.json"
 CAPTIONS = {
-    "convergence": "Loss and violated dynamics over the time of the solve, a line for each run.",
-    "success": "Share of successes against how far the worst guess of a start is off.",
-    "basins": "The starts: pairs of guesses over the truth, or over the best answer.",
-    "tip": "The tip as measured, and simulated with the best answer of each method.",
-    "sweep": "Estimates with their 95 % intervals against what is swept; crosses did not converge.",
+    "convergence": "Loss and violation of the equations of motion over the time of the solve, "
+    "one line per run.",
+    "success": "Success rate over the error of the worst initial guess.",
+    "basins": "Initial guesses: pairs of guesses relative to the true values, or to the best "
+    "estimate.",
+    "tip": "Motion of the tip: measured, and simulated with the best estimate of each method.",
+    "sweep": "Estimates with their 95 % intervals over the values of the swept key; crosses: not "
+    "converged.",
 }
 
 
@@ -74,10 +77,10 @@ def comparison_report(folder: str | Path) -> TitledParts:
     """
     folder = Path(folder)
     content = read_json(folder / SUMMARY_FILE, "a folder of compare or sweep")
-    with damage_refused(folder, SUMMARY_FILE, "repeat the study, finished runs are kept"):
+    with damage_refused(folder, SUMMARY_FILE, "repeat the study; finished runs are kept"):
         study = read(StudySummary, content)
         pictures = [Picture(f, CAPTIONS.get(f.stem, f.stem)) for f in own_pictures(folder)]
-        ended = {"Runs without an answer": [Items(study.failures)] if study.failures else []}
+        ended = {"Runs without a result": [Items(study.failures)] if study.failures else []}
         titled = {**ended, "Pictures": pictures}
         return TitledParts(
             study.title,

@@ -74,7 +74,7 @@ def refine_run(
     levels_file = run / REFINEMENT_FILE
     home = before.problem_folder(file, "use collocation_sysid.refine")
     if not before.converged:
-        raise InputError("the run did not converge: there is no answer to refine", file)
+        raise InputError("the run did not converge: there is no result to refine", file)
     problem = Problem.read(run / "problem.toml", allow_code=allow_code, folder=home)
     problem = replace(problem, substeps=before.problem.substeps)
     estimates = _estimates_at_optimum(before, problem.parameters)

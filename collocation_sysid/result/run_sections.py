@@ -49,8 +49,8 @@ from .probe_sections import (
 from .replay import LARGEST_NUMBER, damaged_run_refused, read_arrays
 
 VERDICT_MEANINGS = {
-    "good": "nothing speaks against the answer and its error bars",
-    "check": "usable after a look at the reasons",
+    "good": "no reason for doubt about the estimates and their error bars was found",
+    "check": "usable after checking the reasons below",
     "doubtful": "something is wrong with the data, the model or the solve",
 }
 # Number of largest errors shown.
@@ -69,12 +69,12 @@ SMALLEST_SHOWN_SHARE = 0.01
 SYSTEMATIC_RATIO = 1.5
 
 PICTURE_CAPTIONS = {
-    "depth": "Points of a depth camera with outlines of the fitted surface, at up to four samples, "
-    "and distances of the points behind the surface; grey points do not count.",
-    "shapes": "The body at times of the recording; orange: measured markers.",
+    "depth": "Points of a depth camera with the outline of the fitted surface, at up to four "
+    "samples, and the distance of each point behind the surface; grey points are not compared.",
+    "shapes": "The fitted body at several times of the recording; orange: measured markers.",
     "field": "Spatially varying constant between the ends of its 95 % interval; below, a cut "
-    "through the body. Pale where the data add little to the prior.",
-    "mesh": "The mesh, its grasped nodes and the estimated places of the markers.",
+    "through the body. Pale colours: the data add little to the prior.",
+    "mesh": "The mesh, its grasped nodes and the estimated positions of the markers.",
     "pressure": "Contact pressure of obstacles on the body.",
     "gap": "Gap between the body's surface and obstacles.",
     "tracks": "Measured, fitted and simulated markers, the residual below.",
@@ -82,11 +82,13 @@ PICTURE_CAPTIONS = {
     "reading": "Custom sensor: measured, fitted and simulated.",
     "error": "Distance of the markers from their measurements over time.",
     "spectrum": "Spectrum of the motion against the body's first natural frequencies.",
-    "confidence": "95 % confidence ellipses of pairs of parameters, for the noise.",
+    "confidence": "95 % confidence ellipses of pairs of parameters, for the measurement noise "
+    "only.",
     "correlation": "Correlation of the estimates.",
-    "budget": "What the variance of each estimate is made of.",
+    "budget": "Contributions to the variance of each estimate.",
     "convergence": "Loss, violation of the dynamics and parameters over the iterations.",
-    "scan": "Scan of the stiffness for a start: misfit of the first part of the recordings.",
+    "scan": "Scan of the stiffness for an initial guess: misfit of the first part of the "
+    "recordings.",
     "elements": "Size and quality of the elements.",
     "jacobian": "Structure of the constraints' Jacobian.",
 }
@@ -231,7 +233,9 @@ def _parameter_section(result: Result) -> TitledParts:
     if any(each.combined95 for each in values.values()):
         parts.append(_coverage_sentence(result))
     elif any(each.statistical95 for each in values.values()):
-        parts.append("combined intervals are missing: systematic effects were not evaluated")
+        parts.append(
+            "there are no combined intervals, because systematic effects were not evaluated"
+        )
     if "mesh" in result.discretisation_kinds:
         parts.append(refinement_table(result))
     elif corrected := [
@@ -245,7 +249,9 @@ def _parameter_section(result: Result) -> TitledParts:
         for name, each in values.items()
         if each.known_correction and each.value
     ]:
-        parts.append(f"corrected for grip layer and machine as stated: {', '.join(known)}")
+        parts.append(
+            f"corrected for the stated grip layer and machine compliance: {', '.join(known)}"
+        )
     parts += _undetermined_sentence(result)
     return TitledParts("Parameters", (*parts, *_largest_contributions(result), *result.basis))
 
@@ -260,10 +266,14 @@ def _undetermined_sentence(result: Result) -> list[str]:
     for name, shares in result.budget.items():
         if name in result.values and not result.values[name].is_determined:
             source, share = next(iter(shares.items()))
-            sources.append(f"{symbol_of(name)} (mostly {source_label(source)}, {share:.0%})")
+            sources.append(
+                f"{symbol_of(name)} (largest contribution: {source_label(source)}, {share:.0%})"
+            )
     if not sources:
         return []
-    return [f"not determined, as the interval is wider than the value: {listed(sources)}"]
+    return [
+        f"not determined, because the combined interval is wider than the value: {listed(sources)}"
+    ]
 
 
 def _coverage_sentence(result: Result) -> str:
@@ -272,11 +282,11 @@ def _coverage_sentence(result: Result) -> str:
     """
     moving = any(not each.static for each in result.fit.experiments.values())
     kinds = ("step", "mesh") if moving else ("mesh",)
-    covered = [f"the {kind}" for kind in kinds if kind in result.discretisation_kinds]
-    missing = [f"the {kind}" for kind in kinds if kind not in result.discretisation_kinds]
+    covered = [f"the {kind} error" for kind in kinds if kind in result.discretisation_kinds]
+    missing = [f"the {kind} error" for kind in kinds if kind not in result.discretisation_kinds]
     parts = listed(["noise", *covered, "systematic effects"])
     sentence = f"± (standard uncertainty) and intervals combine {parts}"
-    return sentence + (f", not {listed(missing)}: see refine" if missing else "")
+    return sentence + (f", but not {listed(missing)} (measured by refine)" if missing else "")
 
 
 def _largest_contributions(result: Result) -> list[str]:
@@ -380,7 +390,7 @@ def _fit_section(result: Result) -> TitledParts:
     experiments = result.fit.experiments
     marked = any(each.samples for each in experiments.values())
     markers = f"markers: {_millimetres(fit.rms_m)} mm RMS, "
-    markers += f"{_millimetres(fit.noise_rms_m)} mm from noise alone; "
+    markers += f"{_millimetres(fit.noise_rms_m)} mm expected from noise alone; "
     dynamics = (
         f"equations of motion violated by at most {result.dynamics.max_violation_n:.1e} N "
         f"({result.dynamics.max_violation_relative:.1e} of the largest force)"
@@ -399,7 +409,7 @@ def _fit_section(result: Result) -> TitledParts:
             energy = f"{short(friction.dissipated_j)} {unit}"
             lines.append(
                 f"friction of {obstacle} in '{name}': at most {friction.used:.0%} of its limit, "
-                f"slips {friction.slipping:.0%} of the time, takes {energy}"
+                f"slip during {friction.slipping:.0%} of the time, {energy} dissipated"
             )
         for camera, error in (each.depth or {}).items():
             lines.append(f"depth of {camera} in '{name}': {_depth_text(error)}")
@@ -408,12 +418,13 @@ def _fit_section(result: Result) -> TitledParts:
     for parts in sorted({*(fit.symmetry or {}).values()}):
         names = listed(f"'{name}'" for name, each in (fit.symmetry or {}).items() if each == parts)
         lines.append(
-            f"loads of {names}: of the whole specimen, {parts} times those of the modelled part"
+            f"loads of {names} are those of the whole specimen, {parts} times those of the "
+            "modelled part"
         )
     lines += [f"time: {_elapsed_text(result.elapsed_s)}", _iterations_text(result)]
     for name, each in experiments.items():
         if each.notes:
-            lines.append(f"also estimated for '{name}': {'; '.join(each.notes)}")
+            lines.append(f"nuisance parameters of '{name}': {'; '.join(each.notes)}")
     return TitledParts("Fit", tuple(lines))
 
 
@@ -459,7 +470,7 @@ def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str
         depth=simulated.depth,
     )
     units = simulated.reading_unit
-    yield f"{kind} '{name}': {_errors_text(own, units) or 'compared with nothing'}"
+    yield f"{kind} '{name}': {_errors_text(own, units) or 'no measurements to compare with'}"
     if simulated.fitted:
         return
     if simulated.blind is not None:
@@ -467,9 +478,12 @@ def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str
         yield f"  with the nuisance parameters of the fitted recordings (blind): {blind}"
     if simulated.copied is not None:
         copied = simulated.copied
-        yield f"  the measurements of '{copied.copied}' copied: {_errors_text(copied.error, units)}"
+        yield (
+            f"  for comparison, the measurements of '{copied.copied}' as the prediction: "
+            f"{_errors_text(copied.error, units)}"
+        )
     elif simulated.not_copied:
-        yield f"  no copy as a yardstick: {simulated.not_copied}"
+        yield f"  no copied measurements for comparison: {simulated.not_copied}"
 
 
 def _errors_text(error: PredictionErrors, units: Mapping[str, str] | None) -> str:
@@ -503,7 +517,7 @@ def _unit_text(units: Mapping[str, str] | None, reading: str) -> str:
 def _depth_text(error: DepthError) -> str:
     """Return the distances of a depth camera's points from the surface, in words."""
     if error.rms_m is None:
-        return "has no point near the body"
+        return "no point near the body"
     sentence = f"{1e3 * error.rms_m:.3g} mm RMS of {error.points} points"
     if not error.share_beyond_gate:
         return f"{sentence}, all within the gate of {1e3 * error.gate_m:.3g} mm"
@@ -543,13 +557,13 @@ def _cards(result: Result) -> Cards:
     interval = values[name].combined95
     value = f"{number(values[name].value, 4)} {unit_of(name)}"
     known = "{:.4g} to {:.4g} (95 %)".format(*interval) if interval else "no error bar"
-    alone = f"RMS; noise alone leaves {millimetres(fit.noise_rms_m)}"
+    alone = f"RMS; expected from noise alone: {millimetres(fit.noise_rms_m)}"
     most = f"RMS; {millimetres(simulated.max_m)} at most"
     return Cards(
         (
             (symbol_of(name), value.strip(), known),
             ("markers, fitted", millimetres(fit.rms_m), alone),
-            ("markers, re-simulated", millimetres(simulated.rms_m), most),
+            ("markers, forward simulation", millimetres(simulated.rms_m), most),
         )
     )
 
@@ -571,7 +585,7 @@ def _error_bars(result: Result) -> Iterator[Shown]:
     """
     if (known := result.uncertainty) is not None:
         yield (
-            f"Error bars for {known.errors} errors, noise {known.noise}; reduced χ² "
+            f"Error bars for {known.errors} errors, noise level {known.noise}; reduced χ² "
             f"{number(known.reduced_chi_squared, 3)}."
         )
     if result.budget:
@@ -581,8 +595,8 @@ def _error_bars(result: Result) -> Iterator[Shown]:
 def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
     """Yield for each experiment a table of the estimated places of its markers [mm]."""
     explanation = (
-        "On the undeformed body, in millimetres, each with its standard error. Those that were not "
-        "given have a prior as wide as the body."
+        "Positions on the undeformed body in millimetres, each with its standard error. "
+        "Positions that were not given have a prior as wide as the body."
     )
     for experiment, places in result.places.items():
         rows = []
@@ -596,14 +610,15 @@ def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
         heads = ("", "x", "±", "y", "±", "z", "±", "prior ±", "")
         if rows:
             table = Table("", heads, tuple(rows), texts=1)
-            title = f"Places of the markers of '{experiment}'"
+            title = f"Positions of the markers of '{experiment}'"
             yield TitledParts(title, (Line(explanation, "quiet"), table))
 
 
 def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
     """Yield for each experiment a table of its other nuisance parameters, in mm, ms or degrees."""
     explanation = (
-        "Of this recording alone, estimated beside the parameters with a prior about zero."
+        "Estimated for this recording alone, together with the parameters; the prior has a mean "
+        "of zero."
     )
     for experiment, named in result.nuisance.items():
         rows = []
@@ -630,10 +645,10 @@ def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
             )
             for each in result.residuals
         )
-        yield Table("", ("marker", "RMS", "samples", "suggests"), rows, texts=1)
+        yield Table("", ("marker", "RMS", "samples", "diagnosis"), rows, texts=1)
     if worst := _largest_errors(run):
         rows = tuple((w, f"{number(t_s, 4)} s", millimetres(m)) for m, t_s, w in worst)
-        yield from ("The largest errors:", Table("", ("marker", "time", "error"), rows))
+        yield from ("Largest errors:", Table("", ("marker", "time", "error"), rows))
 
 
 def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
@@ -657,7 +672,7 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
         residuals_m = arrays[key]
         largest = float(np.nanmax(np.abs(residuals_m), initial=0.0))
         if residuals_m.shape != shape or largest > LARGEST_NUMBER:
-            raise ValueError(f"{key} does not go with its times and markers")
+            raise ValueError(f"the shape of {key} does not match its times and markers")
         errors = np.nan_to_num(np.linalg.norm(residuals_m, axis=2))
         for _ in range(SHOWN_ERRORS if errors.size else 0):
             t, m = np.unravel_index(int(errors.argmax()), errors.shape)

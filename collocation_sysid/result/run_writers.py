@@ -255,7 +255,8 @@ def replaced_folder(
         with suppress(OSError):
             temporary = temporary.rename(backup)
         raise InputError(
-            f"the finished run cannot be put there ({error}); it is kept in {temporary}", target
+            f"the finished run cannot be moved to this folder ({error}); it is kept in {temporary}",
+            target,
         ) from error
 
 
@@ -335,8 +336,8 @@ def require_no_link(folder: Path) -> None:
     """
     if folder.is_symlink():
         raise InputError(
-            f"is a link to {os.readlink(folder)}, and nothing is written through links; give that "
-            "folder itself or another, or remove the link",
+            f"is a link to {os.readlink(folder)}, and nothing is written through links; use the "
+            "folder itself or another one, or remove the link",
             folder,
         )
 
@@ -359,7 +360,7 @@ def require_only_written(folder: Path) -> None:
     elif (folder / LIST_FILE).is_file():
         why = f"{name} in it was not written by this program, or was changed since"
     else:
-        why = f"it has no {LIST_FILE}, which lists what this program wrote, but has {name}"
+        why = f"it has no {LIST_FILE}, which lists what this program wrote, but it contains {name}"
     raise InputError(
         f"{why}, so the folder is left alone; choose another, or move that away", folder
     )

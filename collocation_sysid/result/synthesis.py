@@ -58,17 +58,16 @@ class Recipe(Options):
     integrator : str
         newmark, or a scheme: midpoint, backward-euler, bdf2.
     timestep_s : float
-        The step of newmark; chosen so that the motion does not depend on it by default.
+        Time step of newmark [s]; by default so small that the motion does not depend on it.
     noise_m : float
         Standard deviation of the markers' noise.
     noise_n : float
-        Standard deviation of the noise of measured forces, as the sensor measures them: of a
-        modelled
-        quarter, for which the problem states ``symmetry = 4``, that of the whole.
+        Standard deviation of the noise of measured forces [N]. If a quarter of the specimen is
+        modelled (``symmetry = 4``), that of the force on the whole specimen.
     noise_nm : float
         Standard deviation of the noise of measured torques.
     noise_own : float
-        Standard deviation of the noise of custom readings, in their sigmas.
+        Standard deviation of the noise of custom sensors, in multiples of their sigma.
     seed : int
         Seed of the noise.
     frames : --frames/--no-frames
@@ -294,13 +293,13 @@ def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> Non
         if file.exists() and file.resolve() in read:
             raise InputError(
                 f"{problem.path} reads this file, so it is not overwritten; choose another "
-                "folder, or move it away",
+                "folder, or move the file",
                 file,
             )
         if (file.exists() or file.is_symlink()) and not is_written_here(file):
             raise InputError(
-                "is there and was not written by this program, or was changed since, so it is "
-                "not overwritten; choose another folder, or move it away",
+                "this file exists and was not written by this program, or was changed since, so "
+                "it is not overwritten; choose another folder, or move the file",
                 file,
             )
     at_home = problem.path is not None and problem.path.resolve().parent == place.resolve()
@@ -358,7 +357,7 @@ def _require_separate_files(problem: Problem, names: Sequence[Mapping[str, str]]
         for name in files.values():
             if name in owners:
                 raise InputError(
-                    f"is read by '{owners[name]}' too, and a simulation gives each its own; "
+                    f"is read by '{owners[name]}' too, but a simulation writes a file for each; "
                     f"expected another file than {name}",
                     problem.path,
                     f"experiment '{experiment.name}': file",

@@ -138,7 +138,7 @@ def _solve_refined_problem(problem: Problem, start: WarmStart, what: str) -> Sol
     if not solution.unless_interrupted().status.converged:
         raise InputError(
             f"the problem with the {what} was not solved ({solution.status.value}: "
-            f"{solution.message}); solve it by itself to see why"
+            f"{solution.message}); solve it separately to find the cause"
         )
     return solution
 

@@ -246,7 +246,7 @@ def _reason_against_copy(experiment: Experiment, other: Experiment) -> str:
     own = experiment.markers
     others = other.markers
     if not (own.sample_count or experiment.wrenches or experiment.readings):
-        return "points of depth cameras have no counterparts"
+        return "points of depth cameras cannot be compared between recordings"
     if set(own.names) != set(others.names):
         return "other markers"
     if len(experiment.wrenches) != len(other.wrenches):

@@ -124,7 +124,7 @@ def _reference_sentences(problem: Problem) -> Iterator[str]:
     parts = [part for body in problem.bodies for part in body.parts]
     laws = dict.fromkeys(part.damping.name for part in parts if GAMMA_R in part.damping.constants)
     law_names = [
-        law + (", which also brakes rotation" if law == "rayleigh" else "") for law in laws
+        law + (", which also damps rigid rotation" if law == "rayleigh" else "") for law in laws
     ]
     if law_names:
         yield f"{GAMMA_R.symbol} refers to the damping law {' and '.join(law_names)}"
@@ -316,14 +316,17 @@ def _place_sentences(places: Mapping[str, MarkerPlace]) -> Iterator[str]:
     if moved:
         worst = max(moved, key=moved.__getitem__)
         yield (
-            f"markers sit off their places by up to {short(1e3 * moved[worst])} mm ({worst}; "
-            f"prior {short(1e3 * places[worst].prior_m)})"
+            "displacement of markers from their stated positions: up to "
+            f"{short(1e3 * moved[worst])} mm ({worst}; prior "
+            f"±{short(1e3 * places[worst].prior_m)} mm)"
         )
     if unknown := [place for place in places.values() if not place.is_declared]:
         count = f"{len(unknown)} marker" + ("s" if len(unknown) > 1 else "")
         errors = [float(p.std_error_m.max()) for p in unknown if p.std_error_m is not None]
-        known = f", found to ±{short(1e3 * max(errors))} mm" if len(errors) == len(unknown) else ""
-        yield f"{count} without a place{known} (prior {short(1e3 * unknown[0].prior_m)})"
+        known = (
+            f", estimated to ±{short(1e3 * max(errors))} mm" if len(errors) == len(unknown) else ""
+        )
+        yield f"positions of {count}{known} (prior ±{short(1e3 * unknown[0].prior_m)} mm)"
 
 
 def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Iterator[str]:
@@ -385,9 +388,9 @@ def _nuisance_sentence(
         error="" if np.isnan(error) else f" ± {short(factor * error)}",
         way="later" if values[0] > 0 else "earlier",
         which=entry.label.rpartition(" [")[0],
-        limit="" if allowed else ", the most that is allowed",
+        limit="" if allowed else ", the largest value allowed",
         stated=f"{nuisance.timed_loads[entry.number].declared_s:g} s"
         if entry.row == JOINING
         else "",
     )
-    return f"{sentence} (prior {short(factor * entry.sigma)})"
+    return f"{sentence} (prior ±{short(factor * entry.sigma)}{unit})"

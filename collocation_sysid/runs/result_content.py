@@ -176,16 +176,19 @@ class FieldResult:
             return (
                 f"{sentence}: two phases, contrast {contrast:.3g} ({lower:.3g} to {upper:.3g}), "
                 f"inclusion {1e6 * volume_m3:.3g} cm³ ({1e6 * least_m3:.3g} to "
-                f"{1e6 * most_m3:.3g}); "
-                f"the phase of {self.determined_share:.0%} of the volume is known"
+                f"{1e6 * most_m3:.3g}); the phase is determined in {self.determined_share:.0%} of "
+                "the volume"
             )
-        shapes = f"{self.identified} of {self.shapes.modes} shapes of its field"
-        share = f"{self.determined_share:.0%} of the volume better than the prior by half"
-        details = [f"details above {short(1e3 * self.shapes.detail_m)} mm"]
+        shapes = f"{self.identified} of the {self.shapes.modes} shapes of its field"
+        share = f"halve the prior uncertainty in {self.determined_share:.0%} of the volume"
+        details = [f"resolved details: above {short(1e3 * self.shapes.detail_m)} mm"]
         if len(self.likelier) > 1:
             each = ", ".join(f"{length} m {gain:+.1f}" for length, gain in self.likelier.items())
-            details.append(f"length {self.shapes.length_m:g} m, ln evidence of {each}")
-        return f"{sentence}: the data tell {shapes}, and {share} ({'; '.join(details)})"
+            details.append(
+                f"correlation length {self.shapes.length_m:g} m; relative log evidence of the "
+                f"lengths: {each}"
+            )
+        return f"{sentence}: the data determine {shapes} and {share} ({'; '.join(details)})"
 
 
 @dataclass(frozen=True)
@@ -559,5 +562,5 @@ class Result:
             If the run was not made from a problem file.
         """
         if self.provenance.problem_file is None:
-            raise InputError(f"the run is of no problem file, {purpose}", run)
+            raise InputError(f"the run has no problem file, {purpose}", run)
         return Path(self.provenance.problem_file).parent

@@ -106,10 +106,11 @@ def follow_starts(
         f"{each:.4g} from E = {scan.young_pa[number]:.3g} Pa" for each, number, _ in candidates
     )
     note = (
-        f"{len(candidates)} starts of the scan were followed to the end, with the losses {losses}"
+        f"{len(candidates)} initial values of the scan were solved to the end, with the losses "
+        f"{losses}"
     )
     if max(each for each, _, _ in candidates) - loss > SAME_LOSS:
-        note += ": local minima, of which the lowest counts"
+        note += ": there are local minima; the lowest one is reported"
     chosen = replace(scan, best=best, parameters=scan.starts[best])
     started = replace(collocation, parameters=scan.starts[best])
     return CompletedStart(started, chosen, solution if is_own else None, note)

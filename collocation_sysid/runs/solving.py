@@ -80,8 +80,8 @@ def solve(
     solver = problem.solver(method)
     if scheduler is not None and not isinstance(solver, ReducedSpace):
         raise InputError(
-            f"{getattr(solver, 'name', solver)} does not share its experiments; expected "
-            "the method 'reduced-space', or leave the scheduler out",
+            f"{getattr(solver, 'name', solver)} cannot distribute its experiments to workers; "
+            "expected the method 'reduced-space', or no scheduler",
             None,
             "--scheduler",
         )
@@ -199,22 +199,22 @@ def _depth_notes(solution: Solution) -> Iterator[str]:
             excluded = ", ".join(
                 f"{count} {why}" for why, count in sighting.excluded_counts.items() if count
             )
-            distances = "count, as none is near enough to the body"
+            distances = "are compared, because none is near enough to the body"
             if sighting.is_compared.any():
                 distances = (
-                    f"are off by {1e3 * np.sqrt(np.nanmean(distance_m**2)):.3g} mm (RMS; half of "
-                    f"them by less than {1e3 * np.nanmedian(np.abs(distance_m)):.3g})"
+                    f"deviate from the surface by {1e3 * np.sqrt(np.nanmean(distance_m**2)):.3g} "
+                    f"mm (RMS; median {1e3 * np.nanmedian(np.abs(distance_m)):.3g} mm)"
                 )
             yield (
                 f"experiment '{part.segment.experiment.name}': {sighting.is_compared.sum()} "
-                "points of "
-                f"'{sighting.camera.depth.name}' {distances}; left out: {excluded or 'none'}"
+                f"points of '{sighting.camera.depth.name}' {distances}; excluded: "
+                f"{excluded or 'none'}"
             )
         for outline, distance_px in part.outline_distances_px:
             if len(distance_px):
                 yield (
                     f"experiment '{part.segment.experiment.name}': {len(distance_px)} points of "
-                    "the body's outline are off the edges in "
+                    "the model's outline deviate from the edges in "
                     f"'{outline.correspondences.camera.depth.name}' by "
                     f"{np.sqrt(np.mean(distance_px**2)):.2g} pixels (RMS)"
                 )
@@ -241,7 +241,7 @@ def _solve_from_scan(
     solution : Solution
         The new solution, or the failed one.
     """
-    reason = f"the search from the guess was lost ({failed.status.value})"
+    reason = f"the search from the guess failed ({failed.status.value})"
     needs_complete_start = getattr(solver, "needs_complete_start", False)
     scan = rescue(failed.collocation, reason, needs_complete_start)
     if scan is None:
@@ -269,8 +269,7 @@ def _best_of_second_start(solver: Method, first: Solution, watch: Watch | None) 
         return first
     note = (
         f"Poisson's ratio ended near one half; a second start, from the usual {USUAL_POISSON}, "
-        "found an "
-        f"answer that fits better (χ² lower by {gain:.3g})"
+        f"found a better fit (χ² lower by {gain:.3g})"
     )
     return replace(second, notes=(note, *second.notes))
 

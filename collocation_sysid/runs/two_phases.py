@@ -171,7 +171,7 @@ def solve_two_phases(
     note = (
         f"two phases of {search.name}: started from a smooth field (χ² per measurement "
         f"{smooth.misfit:.3g}), {rounds} rounds of phases and parameters; the inclusion has "
-        f"{int(final.sum())} of {len(final)} elements; samples are of a posterior tempered by "
+        f"{int(final.sum())} of {len(final)} elements; the posterior is tempered by "
         f"{temperature:.3g}, the lack of fit per shape of the smooth field"
     )
     return replace(best, notes=(note, *best.notes))

@@ -299,7 +299,7 @@ def probe_concerns(probes: Iterable[Probe], corrections: Mapping[str, float]) ->
         "size_error": short(worst.size_error or 0.0),
         "chi_squared": worst.chi_squared,
         "estimates": [_relaxed_estimate(worst, *each) for each in corrections.items()],
-        "instead": f"; less well also by {instead}" if others else "",
+        "instead": f"; alternatives that decrease χ² less: {instead}" if others else "",
     }
     return [Concern("assumption/contradicted", data=data)]
 

@@ -37,7 +37,7 @@ FRAMES = {
     "x forward, y to the left, z up": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]],
     "x to the left, y down, z backwards": [[-1, 0, 0], [0, 1, 0], [0, 0, -1]],
 }
-EXPECTED = "state that of one with x to the right, y down, z forward"
+EXPECTED = "state the pose of a frame with x to the right, y down, z forward"
 MILLI = 1e-3
 # Largest power of ten of wrong units that are tried.
 LARGEST_POWER = 4
@@ -89,14 +89,13 @@ Undo = Callable[[CameraDescription], CameraDescription]
 # likelier kinds come first.
 MISTAKES: tuple[dict[str, Undo], ...] = (
     {
-        "camera.pose were inverted (state the motion from the camera's frame to the world)": (
+        "camera.pose were inverted (state the transform from the camera's frame to the world)": (
             lambda s: replace(s, pose=np.linalg.inv(s.pose))
         ),
     },
     {
-        "camera.poses were inverted (state the motions from what carries it to the world)": (
-            lambda s: replace(s, carrier=np.linalg.inv(s.carrier))
-        ),
+        "camera.poses were inverted (state the transforms from the camera's carrier to the "
+        "world)": (lambda s: replace(s, carrier=np.linalg.inv(s.carrier))),
     },
     {
         f"camera.pose were of a frame with {axes} ({EXPECTED})": partial(_rotated, rotation=turn)
@@ -143,10 +142,10 @@ def require_depth_units(experiment: Experiment) -> None:
         raise InputError(
             f"the points of the depth camera '{depth.name}' of '{experiment.name}' are "
             f"{view.points_m:.3g} m away (median), the body {view.body_m:.3g} m, a factor of "
-            f"{1 / factor:g}: their unit is wrong; expected metres: multiply "
-            f"count_m by {factor:g} (integer images such as .png, "
-            "0.001 where it is not stated; in an .npz its own count_m), give depth_m in metres, or "
-            "state length_unit of a cloud",
+            f"{1 / factor:g}: their unit is wrong; expected metres: multiply count_m by "
+            f"{factor:g} (of integer images such as .png, 0.001 if not stated; an .npz has "
+            "its own count_m), give depth_m in metres, or state the length_unit of a point "
+            "cloud",
             where="experiment.depth",
         )
 

@@ -40,8 +40,8 @@ class Topic:
 MODE = "the first mode of '{experiment}' ({frequency_hz:.3g} Hz at the guess)"
 TURN = "the grasp of '{experiment}' turns by {angle_rad:.2g} rad within a step of {step_ms:.3g} ms"
 SAMPLE = (
-    "the sample at t = {t_s:.4g} s, off by {deviations:.2g} sigma, alone has {percent:.0f} % of "
-    "the residuals' power: "
+    "the sample at t = {t_s:.4g} s deviates by {deviations:.2g} sigma and contributes "
+    "{percent:.0f} % of the sum of squared residuals: "
 )
 NO_DAMPING = "no information on damping"
 FIX_DAMPING = "fix {damping}, or add a recording of a motion"
@@ -53,159 +53,168 @@ TOPICS: Mapping[str, Topic] = {
         "Measure a force, attach a known mass, or fix a density: motion alone determines only "
         "ratios.",
         {
-            "unknown": "only the ratios of {names} can be told (E/ρ): no known force or mass sets "
-            "their scale; fix a density, give a known mass, or measure a wrench",
+            "unknown": "only the ratios of {names} are identifiable (E/ρ), because no known "
+            "force or mass sets their scale; fix a density, state a known mass, or measure a "
+            "wrench",
         },
     ),
     "description": Topic(
         "The description",
         "wrong_description",
-        "Compare units, frames, labels and clocks of the problem file with the laboratory's notes; "
-        "check tests the recordings for mistakes before any solve.",
+        "Compare units, frames, labels and clocks of the problem file with the laboratory's "
+        "notes. The command check tests the recordings for common mistakes before a solve.",
         {
-            "poses-inverted": "the markers move as if the poses were inverted: invert them, they "
-            "are to map the undeformed body to where it is",
+            "poses-inverted": "the markers move as if the poses were inverted: invert them; a "
+            "pose must map the undeformed body to its current position",
             "rotation-inverted": "the markers move as if the poses' rotations were inverted: "
-            "transpose the matrices or conjugate the quaternions, and leave the positions",
+            "transpose the matrices or conjugate the quaternions, and leave the positions "
+            "unchanged",
             "quaternion-order": "the markers move as if the quaternions were in another order: set "
             'grasp.quaternion = "{order}" or swap the columns',
             "length-unit": "{who} were {factor:g} times as large: {remedy}",
             "length-unit/size": "the body is {size_m:.3g} m large; expected {least:g} to {most:g} "
             "m: check {likely}",
             "density": "the body's density is {density_kg_m3:.4g} kg/m³; expected {least:g} to "
-            "{most:g}: set object.density_kg_m3 or mass_kg, {likely}, and check object.length_unit",
-            "density/metal": "the body is as dense as metal, {density_kg_m3:.4g} kg/m³, and as "
-            "soft as rubber, E = {young_pa:.3g} Pa: a thousandth of both, if the mass was in g; "
-            "check object.density_kg_m3 or mass_kg",
+            "{most:g}: correct object.density_kg_m3 or mass_kg ({likely}), and check "
+            "object.length_unit",
+            "density/metal": "the body is as dense as metal ({density_kg_m3:.4g} kg/m³) and as "
+            "soft as rubber (E = {young_pa:.3g} Pa): both are 1000 times too large if the mass "
+            "was stated in g instead of kg; check object.density_kg_m3 or mass_kg",
             "gravity": "the markers hang as if gravity were along {axis}: set gravity_m_s2 = "
             "[{vector}]",
-            "gripper-frame": "the markers move with the poses, but at another place relative to "
-            "them: the poses are of the gripper's own frame, or the mesh is in another one; "
+            "gripper-frame": "the markers move with the poses, but with a constant transform "
+            "between them: the mesh is not given in the frame whose poses were recorded; "
             "multiply every pose on the right by the transform from the mesh's frame to the "
             "gripper's, or fit the poses by grasp.markers",
-            "camera-frame": "the markers fit if all are moved rigidly: cameras and robot have "
-            "different frames; set markers.template_m and template_window_s",
-            "clock": "the markers' clock is {when} by about {by_ms:.3g} ms against the poses': "
-            "{do} that to t_s of the poses, or estimate it with nuisance.time_shift",
-            "grasp-layer": "the fit is better if the grasp holds one layer of nodes {deep}: check "
-            "the box of grasp.nodes against where the fingers end",
-            "grasp": "the grasp of '{experiment}' cuts through elements: with its box a tenth of "
-            "an edge larger it holds {nearly_grasped} nodes more than {nodes}, or as much smaller "
-            "{nearly_free} less, and the stiffness found depends on them; move the edge of "
-            "grasp.nodes between layers of nodes, or mesh the body with a layer where the fingers "
-            "end",
-            "markers-exchanged": "markers have each other's names: {names}; correct markers.labels "
-            "or reference_m",
-            "markers-exchanged/later": "markers have each other's names {when}: {names}; exchange "
-            "them back there, or leave these samples out",
+            "camera-frame": "the markers fit after one rigid motion of all of them: cameras and "
+            "robot use different world frames; set markers.template_m and template_window_s",
+            "clock": "the markers' clock is {when} by about {by_ms:.3g} ms relative to that of the "
+            "poses: {do} this to t_s of the poses, or estimate it with nuisance.time_shift",
+            "grasp-layer": "the fit is better if the grasp holds one layer of nodes {deep}: "
+            "compare the box of grasp.nodes with the ends of the fingers",
+            "grasp": "the box of the grasp of '{experiment}' selects {nodes} nodes, but "
+            "{nearly_grasped} more if it is enlarged by a tenth of an element's edge, or "
+            "{nearly_free} fewer if it is reduced by as much, and the estimated stiffness "
+            "depends on them; move the faces of the box grasp.nodes midway between layers of "
+            "nodes, or mesh the body with a layer of nodes where the fingers end",
+            "markers-exchanged": "the names of markers are exchanged: {names}; correct "
+            "markers.labels or reference_m",
+            "markers-exchanged/later": "the names of markers are exchanged {when}: {names}; "
+            "correct them there, or remove these samples",
             "marker-slip": "marker {marker} slips at about t = {t_s:.4g} s: give it "
             "markers.weights = 0, or end window_s before",
             "marker-slip/alone": "marker {marker} slips by {by_mm:.2g} mm at t = {t_s:.4g} s, the "
             "others do not: give it markers.weights = 0, or end window_s before",
             "pose-jump": "the poses jump by {by_mm:.2g} mm at t = {t_s:.4g} s and the markers do "
             "not: repair the poses there, or end window_s before",
-            "markers-jump": "all markers jump together, by {by_mm:.3g} mm at t = {t_s:.4g} s, and "
-            "the poses do not: the tracks do not move like a grasped body; a simulation that fails "
-            "and restarts, or two recordings in one file, look so: end window_s before",
-            "markers-axes": "the markers fit with ({axes}) in the place of (x, y, z): the axes of "
-            "their file are exchanged or reversed; reorder its columns, or turn the tracks",
+            "markers-jump": "all markers jump by {by_mm:.3g} mm at t = {t_s:.4g} s and the poses "
+            "do not, which a grasped body cannot do: a simulation may have failed and restarted, "
+            "or the file holds two recordings; end window_s before",
+            "markers-axes": "the markers fit with ({axes}) in place of (x, y, z): the axes in "
+            "their file are exchanged or reversed; reorder the columns, or rotate the tracks",
             "poses-constant": "the markers move by {by_mm:.3g} mm, but the poses are constant and "
             "nothing else drives the body, which starts at rest: check the file and the columns of "
             "grasp.poses, and whether they are those of this recording",
-            "unlike": "the tracks do not move like a grasped body: whatever its stiffness, they "
-            "are {by_mm:.3g} mm (RMS) from where the grasp carries the markers, on a body of "
-            "{size_mm:.3g} mm, and no single usual mistake explains it; check frames, poses and "
-            "labels, and that a simulation that made them was stable",
-            "mesh-parts": "the mesh is in {parts} parts that no element joins, and no grasp holds "
-            "{loose} of them, the largest of {nodes} nodes: merge nodes that lie on each other, or "
-            "leave loose parts out of the mesh",
+            "unlike": "the tracks do not move like a grasped body: for every stiffness they are "
+            "{by_mm:.3g} mm (RMS) away from markers that move with the grasp, on a body of "
+            "{size_mm:.3g} mm, and no single common mistake explains this; check frames, "
+            "poses and labels, and if the tracks were simulated, that the simulation was "
+            "stable",
+            "mesh-parts": "the mesh consists of {parts} unconnected parts, and no grasp holds "
+            "{loose} of them, the largest with {nodes} nodes: merge coincident nodes, or remove "
+            "loose parts from the mesh",
             "obstacle-normal": "obstacle '{obstacle}' contains {percent:.0f} % of the undeformed "
-            "body at the first time, and with its normal reversed none of it: its normal points "
-            "out of the solid, to the side of the body",
+            "body at the first sample, and none of it with the opposite normal: reverse the "
+            "normal, which points out of the solid towards the body",
             "obstacle-place": "obstacle '{obstacle}' contains {percent:.0f} % of the undeformed "
-            "body at the first time: check its place, size, unit and the sign of its motion",
-            "sign": "along {axis} grasp {grasp} and the force that it gives go opposite ways "
-            "(correlation {correlation:.2f}), as if the body gave work: one of both signs is "
-            "wrong; set sign = -1 of its displacement or of its wrench",
-            "wrench-sign": "all of it fits with the other sign: it is what the body gives the "
-            "grasp; change its sign",
-            "wrench-sign/part": "its {what} fit with the other sign, the rest does not: change "
-            "the sign of these columns",
-            "wrench-axes": "its axes are exchanged or reversed: it fits with ({axes}) in the place "
-            "of (x, y, z), forces and torques alike; reorder the columns, or turn the sensor's "
+            "body at the first sample: check its position, size, unit and the sign of its motion",
+            "sign": "along {axis} the displacement of grasp {grasp} and its force on the body have "
+            "opposite signs (correlation {correlation:.2f}), as if the body produced energy: "
+            "one of the signs is wrong; set sign = -1 for the displacement or for the wrench",
+            "wrench-sign": "it fits with the opposite sign: it is the force of the body on the "
+            "grasp instead of that of the grasp on the body; change its sign",
+            "wrench-sign/part": "its {what} fit with the opposite sign, the other components do "
+            "not: change the sign of these columns",
+            "wrench-axes": "its axes are exchanged or reversed: it fits with ({axes}) in place "
+            "of (x, y, z), both forces and torques; reorder the columns, or rotate the sensor's "
             "axes",
             "wrench-gain": "its {what} fit if multiplied by {factor:.3g}: check the calibration of "
             "the sensor, and the density or mass of the body",
-            "wrench-point": "its torques are about a point {by_mm:.3g} mm from point_m: they fit "
-            "with point_m = {point}",
-            "wrench-frame": 'it is in the frame of the {other}: set frame = "{other}"',
+            "wrench-point": "its torques refer to a point {by_mm:.3g} mm away from point_m: they "
+            "fit with point_m = {point}",
+            "wrench-frame": 'it is expressed in the frame of the {other}: set frame = "{other}"',
             "wrench-unit": "its {what} seem to be in {unit}: multiply by {factor:g}",
-            "wrench-clock": "it was measured about {by_ms:.3g} ms {when} than its times say: its "
-            "clock is not that of the poses",
-            "camera": "only {percent:.0f} % of the surface have points within {within_mm:.3g} mm: "
-            "check camera.pose, that it is of a frame with x to the right, y down, z forward, and "
-            "the unit of the depth; see the picture that check draws",
+            "wrench-clock": "it was measured about {by_ms:.3g} ms {when} than its times t_s "
+            "state: its clock differs from that of the poses",
+            "camera": "only {percent:.0f} % of the body's visible surface have measured points "
+            "within {within_mm:.3g} mm: check camera.pose (camera frame: x to the right, y down, "
+            "z forward) and the unit of the depth; check draws a picture of both",
             "camera/likely": "hardly any points are near the body; they would be if {mistakes}",
-            "wrench-tare": "it seems zeroed with the body in hand: zero it before, or widen "
-            "nuisance.tare",
+            "wrench-tare": "the sensor was probably zeroed while it carried the body: zero it "
+            "before the grasp, or widen nuisance.tare",
         },
     ),
     "noise": Topic(
-        "The size of the noise",
+        "Size of the noise",
         "verdict",
-        "Error bars follow the residuals. State the sensor's noise in sigma where it is known; "
-        "where one marker alone is off, look at its track for swaps and reflections.",
+        "The error bars are computed from the residuals. State the sensor's noise as sigma "
+        "if it is known. If a single marker deviates, look for exchanged labels and "
+        "reflections in its track.",
         {
-            "larger": "the residuals are {factor:.2g} times as large as {stated} says",
+            "larger": "the residuals are {factor:.2g} times as large as expected from {stated}",
             "smaller": "{stated} seems {factor:.2g} times too large for these residuals",
-            "marker": "{marker} is off by {factor:.2g} times sigma_m",
-            "markers": "{count} markers, most of all {marker}, are off by {factor:.2g} times "
-            "sigma_m",
-            "allowance": "sigma_m = {sigma_mm:.3g} mm is {share:.2g} of the body's size, more than "
-            "cameras miss: if the model's error decides, error bars of independent errors are too "
-            "short",
+            "marker": "the residuals of {marker} are {factor:.2g} times sigma_m",
+            "markers": "the residuals of {count} markers are larger than sigma_m, most of all "
+            "those of {marker} ({factor:.2g} times)",
+            "allowance": "sigma_m = {sigma_mm:.3g} mm is {share:.2g} of the body's size, more "
+            "than the error of cameras: if it is an allowance for model errors, the error bars "
+            "are too short, because they assume independent errors",
         },
     ),
     "residuals": Topic(
         "Residuals that are not noise",
         "trust",
-        "Look at the residuals over time: a constant part means a wrong place or offset, a large "
-        "beginning a wrong time of release, an oscillation a wrong stiffness or damping. "
-        "compare --materials tests whether another model predicts better.",
+        "Look at the residuals over time: a constant part indicates a wrong position or "
+        "offset, large residuals at the beginning a wrong time of release, an oscillation a "
+        "wrong stiffness or damping. The command compare --materials tests whether another "
+        "material law predicts better.",
         {
-            "outline": "at {percent:.0f} % of its points the outline of the body is more than "
-            "{pixels:.0f} pixels off its edge in the images of {camera}: the body may be grasped "
-            "or hidden elsewhere, or have another stiffness; where depths are missing on the body "
-            'itself, state background = "unknown"',
-            "outlier": f"{SAMPLE}leave it out, or set solver.huber",
-            "first": f"{SAMPLE}the body counts as relaxed at the first sample; let the recording "
-            "begin before the load does, or leave the sample out",
-            "persist": "the residuals are not noise: they persist from sample to sample "
-            "(autocorrelation {autocorrelation:.2f})",
-            "shared": "the residuals are not noise: they are correlated among markers or axes",
-            "recordings": "the recordings disagree on {names}: model error decides, not noise",
-            "wild": "{percent:.0f} % of the samples are beyond Huber's threshold",
-            "far": "{percent:.0f} % of the markers' samples lie far from where they can be",
+            "outline": "{percent:.0f} % of the model's outline are more than {pixels:.0f} pixels "
+            "away from the edge of the body in the images of {camera}: the body may be grasped "
+            "at another place, be partly hidden, or have another stiffness; if depths are "
+            'missing on the body itself, state background = "unknown"',
+            "outlier": f"{SAMPLE}remove it, or set solver.huber",
+            "first": f"{SAMPLE}the body is assumed to be relaxed at the first sample; start the "
+            "recording before the load, or remove the sample",
+            "persist": "the residuals are not independent noise: consecutive samples are "
+            "correlated (autocorrelation {autocorrelation:.2f})",
+            "shared": "the residuals are not independent noise: they are correlated between "
+            "markers or axes",
+            "recordings": "the recordings disagree on {names}: model errors exceed the noise",
+            "wild": "{percent:.0f} % of the samples are outliers, beyond the threshold of the "
+            "Huber loss",
+            "far": "{percent:.0f} % of the marker samples are outliers, implausibly far from the "
+            "body or from the prediction",
         },
     ),
     "assumption": Topic(
         "Assumptions that the data contradict",
         "budget",
-        "Find out whether the assumption is wrong, for instance by repeating the first recording "
-        "at the end, or whether the model lacks something that looks alike, such as memory, which "
-        "looks like a drift. solve --probe follows the effect beyond one linear step and relaxes "
-        "the other assumptions.",
+        "Find out whether the assumption is wrong, for instance by repeating the first "
+        "recording at the end, or whether the model lacks an effect with similar "
+        "consequences, as a missing memory resembles a drift. The command solve --probe "
+        "computes the effect beyond first order and relaxes the other assumptions.",
         {
-            "contradicted": "the data contradict the assumption that {assumption}: with "
-            "{name} = {size} ± {size_error} χ² falls by {chi_squared:.3g}, and the estimates are "
+            "contradicted": "the data contradict the assumption that {assumption}: with {name} = "
+            "{size} ± {size_error} χ² decreases by {chi_squared:.3g}, and the estimates become "
             "{estimates}{instead}",
         },
     ),
     "information": Topic(
-        "What the data do not determine",
+        "Parameters that the data do not determine",
         "budget",
         "Fix such a parameter at a known value, give it a prior or wider bounds, or record a "
-        "motion that it matters to.",
+        "motion that depends on it.",
         {
             "bound": "{names} ended at its bound",
             "bounds": "{names} ended at their bounds",
@@ -218,8 +227,8 @@ TOPICS: Mapping[str, Topic] = {
             "static": f"{{names}} {{verb}} static: {NO_DAMPING}; {FIX_DAMPING}",
             "still": f"nothing moves in {{names}}: {NO_DAMPING}, and information on stiffness only "
             f"from the sag; {FIX_DAMPING}",
-            "rate": f"{MODE} has only {{samples:.1f}} samples a period, too few to see it: record "
-            "at {needed_hz:.2g} Hz or more",
+            "rate": f"{MODE} has only {{samples:.1f}} samples per period, too few to resolve it: "
+            "record at {needed_hz:.2g} Hz or more",
             "short": f"one period of {MODE} is longer than the {{duration_s:.3g}} s recorded, "
             "which leaves the damping uncertain: record longer",
         },
@@ -227,38 +236,40 @@ TOPICS: Mapping[str, Topic] = {
     "markers": Topic(
         "The markers",
         "motion_capture",
-        "Check the markers' labels, unit, frame and places, and when each is visible.",
+        "Check labels, unit, frame and positions of the markers, and when each marker is visible.",
         {
-            "off": "marker '{marker}' of '{experiment}' lies {by_mm:.3g} mm from its place on the "
-            "body and is extrapolated: give its reference_m, or check the frame and unit",
+            "off": "marker '{marker}' of '{experiment}' lies {by_mm:.3g} mm outside the body, so "
+            "that its motion is extrapolated: give its reference_m, or check the frame and "
+            "unit",
             "unseen": "marker '{marker}' of '{experiment}' is never visible: leave it out of names",
             "missing": "marker '{marker}' of '{experiment}' is missing in {missing} of {frames} "
             "samples: shorten window_s to where it is visible, or leave it out of names",
-            "astray": "marker '{marker}' of '{experiment}' is first seen {by_mm:.3g} mm from where "
-            "the guess has it: check length_unit, the frame of the poses, reference_m, and whether "
-            "the guess is far too soft",
+            "astray": "marker '{marker}' of '{experiment}' is first measured {by_mm:.3g} mm away "
+            "from its position simulated at the guess: check length_unit, the frame of the "
+            "poses, reference_m, and whether the guess is far too soft",
         },
     ),
     "nuisance": Topic(
-        "What is not known of a recording",
+        "Nuisance parameters of a recording",
         "motion_capture",
-        "Check whether the value is possible: are gravity, clock, grasp and places as the file "
-        "describes them? If it is possible, widen its prior in [experiment.nuisance].",
+        "Check whether the value is possible: are gravity, clocks, grasps and positions as "
+        "stated in the problem file? If it is possible, widen its prior in "
+        "[experiment.nuisance].",
         {
             "limit": "{name} ended at the largest value allowed",
-            "far": "{name} is {deviations:.1f} deviations of its prior away from zero",
-            "camera": "{name} is {deviations:.1f} deviations of its prior away from the pose "
-            "stated: a body of another stiffness may fit as well with the camera elsewhere; "
-            "measure the pose, or state how well it is known (nuisance.depth_pose)",
-            "clock": "the markers of '{experiment}' were seen {shift_ms:.2g} ms {when} than their "
-            "times say: the estimates allow for it; better find out why",
+            "far": "{name} is {deviations:.1f} standard deviations of its prior away from zero",
+            "camera": "{name} is {deviations:.1f} standard deviations of its prior away from the "
+            "stated pose: another stiffness may fit equally well with another pose of the "
+            "camera; measure the pose, or state how well it is known (nuisance.depth_pose)",
+            "clock": "the markers of '{experiment}' were measured {shift_ms:.2g} ms {when} than "
+            "their times state: the estimates are corrected for this, but find the cause",
         },
     ),
     "scheme": Topic(
         "Step and scheme",
         "scheme",
-        "Raise transcription.substeps, or take the midpoint scheme, which damps least. "
-        "refine RUN measures what is left.",
+        "Raise transcription.substeps, or use the midpoint scheme, which damps least. The "
+        "command refine RUN measures the remaining error.",
         {
             "step": "the estimated time-step error dominates the uncertainty of {name}: it was "
             "corrected by {percent:+.2g} %, {errors:.2g} standard uncertainties; raise "
@@ -266,50 +277,52 @@ TOPICS: Mapping[str, Topic] = {
             "damping": "the scheme adds a damping ratio of {added:.2g} to the {damping:.2g} of the "
             "first mode of '{experiment}'",
             "period": "the scheme changes the first period of '{experiment}' by {change:+.1%}",
-            "adds": f"{{scheme}} at {{step_ms:.3g}} ms adds a damping ratio of {{ratio:.2g}} to "
-            f"{MODE}, by which the damping found will be too low: {{remedy}}",
-            "takes": f"{{scheme}} at {{step_ms:.3g}} ms takes a damping ratio of {{ratio:.2g}} "
-            f"from {MODE}, by which the damping found will be too high: {{remedy}}",
-            "coarse": f"{MODE} has only {{steps:.1f}} steps a period and is slowed down by "
-            "{error:.0%}: {remedy}",
+            "adds": "{scheme} at {step_ms:.3g} ms adds a damping ratio of {ratio:.2g} to "
+            f"{MODE}, which makes the estimated damping too low: {{remedy}}",
+            "takes": "{scheme} at {step_ms:.3g} ms removes a damping ratio of {ratio:.2g} "
+            f"from {MODE}, which makes the estimated damping too high: {{remedy}}",
+            "coarse": f"{MODE} has only {{steps:.1f}} time steps per period, which makes its "
+            "period {error:.0%} too long: {remedy}",
             "turn": TURN,
             "turns": f"{TURN} at t = {{time_s:.4g}} s ({{rate_rad_s:.3g}} rad/s). Steps follow "
-            "the chord of a rotation, which biases the estimates, damping most of all: {remedy}",
+            "the chord of a rotation instead of its arc, which biases the estimates, especially "
+            "damping: {remedy}",
         },
     ),
     "stability": Topic(
-        "States that are not stable",
+        "Unstable states",
         "material",
         "Does the body buckle there? If not, the damping law generates energy: use damping = "
         '"kelvin-voigt", which cannot, and make sure that moduli and densities are plausible.',
         {
-            "grows": "'{experiment}' is not stable at {time_s:.3g} s: disturbances grow by "
-            "{growth_1_s:.2g} 1/s",
+            "grows": "the motion of '{experiment}' is unstable at t = {time_s:.3g} s: disturbances "
+            "grow at a rate of {growth_1_s:.2g} 1/s",
         },
     ),
     "contact": Topic(
         "Contact",
         "contact",
-        "Check the place, the normal and the motion of the obstacle, and the mesh in the contact "
-        "area.",
+        "Check the position, the normal and the motion of the obstacle, and the mesh in the "
+        "contact area.",
         {
-            "never": "'{experiment}'{more} never touches {obstacle}{guess}; the smallest gap is "
-            "{mm:.3g} mm: its force and friction carry no information",
+            "never": "in '{experiment}'{more} the body never touches {obstacle}{guess}; the "
+            "smallest gap is {mm:.3g} mm: its force and friction carry no information",
             "coarse": "in '{experiment}'{more} only {faces:.2g} faces, {face_mm:.2g} mm large, "
-            "touch {obstacle} at a time{guess}: the width of the contact is that of the mesh; "
+            "touch {obstacle} at a time{guess}: the mesh is too coarse for the contact area; "
             "refine it there",
-            "pressed": "in '{experiment}'{more} {obstacle} touches already at the first "
-            "sample{guess}: the first contact is not recorded; start the recording earlier",
-            "lost": "in '{experiment}'{more} {obstacle} is touched no more at t = "
-            "{t_s:.4g} s{guess}: if it was, check its motion and the guess, or let window_s end "
-            "before",
+            "pressed": "in '{experiment}'{more} the body touches {obstacle} already at the first "
+            "sample{guess}: the beginning of the contact is not recorded; start the "
+            "recording earlier",
+            "lost": "in '{experiment}'{more} the body leaves {obstacle} at t = {t_s:.4g} s{guess}: "
+            "if it remained in contact, check the motion of the obstacle and the guess, or "
+            "end window_s before",
         },
     ),
     "mesh": Topic(
         "The mesh",
         "mesh",
-        'Refine it, and take element = "tet10", or "tet10-p0" from ν = 0.45 on. '
-        "refine RUN measures what is left.",
+        'Refine it, and use element = "tet10", or "tet10-p0" for ν ≥ 0.45. The command '
+        "refine RUN measures the remaining error.",
         {
             "refined": "step and mesh dominate the uncertainty of {name}: it was corrected by "
             "{percent:+.2g} %, {errors:.2g} standard uncertainties",
@@ -317,11 +330,11 @@ TOPICS: Mapping[str, Topic] = {
             "ratio {aspect_ratio:.0f}), which makes the body stiffer and Newton's steps short: "
             "improve the mesh there",
             "locks": "Poisson's ratio is {poisson:.3g} at the guess and {element} elements lock "
-            "from {limit:g} on, so that the stiffness found will be too low: {remedy}",
-            "few": "only about {cells:.1f} {element} elements lie across the body's "
-            "{thickness_mm:.3g} mm, too {off} in bending, so that the stiffness found of a real "
-            "body will be too {level} (not of data simulated with these elements, which are as "
-            "{off}): {remedy} the mesh to {needed:.0f} or more",
+            "from {limit:g} on, so that the estimated stiffness will be too low: {remedy}",
+            "few": "only about {cells:.1f} {element} elements lie across the body's thickness of "
+            "{thickness_mm:.3g} mm, which makes it too {off} in bending, so that the "
+            "estimated stiffness of a real body will be too {level} (not that of data "
+            "simulated with the same elements): {remedy} the mesh to {needed:.0f} or more",
         },
     ),
     "roll-out": Topic(
@@ -331,10 +344,10 @@ TOPICS: Mapping[str, Topic] = {
         "predicted badly, the model lacks an effect that this recording contains.",
         {
             "failed": "the forward simulation of '{experiment}' failed: {why}",
-            "misses": "the forward simulation of '{experiment}' misses by {rms_mm:.2g} mm, the fit "
-            "by {fit_mm:.2g} mm",
-            "predicted": "'{experiment}' is predicted {times:.2g} times worse than the others are "
-            "fitted",
+            "misses": "the forward simulation of '{experiment}' deviates from the measurements by "
+            "{rms_mm:.2g} mm, the fit by {fit_mm:.2g} mm",
+            "predicted": "the prediction error of '{experiment}' is {times:.2g} times the fit "
+            "error of the other recordings",
         },
     ),
     "prediction": Topic(
@@ -344,8 +357,8 @@ TOPICS: Mapping[str, Topic] = {
         "that sigma is the sensor's noise. Then check which effects the model lacks, or estimate a "
         "parameter.",
         {
-            "misses": "the prediction of '{experiment}' misses {what} by {size}{sigmas:.2g} times "
-            "{stated}",
+            "misses": "the prediction of '{experiment}' deviates from {what} by {size}{sigmas:.2g} "
+            "times {stated}",
             "unseen": "none of the {seen} points of {camera} is near the predicted surface of "
             "'{experiment}'",
         },
@@ -353,7 +366,7 @@ TOPICS: Mapping[str, Topic] = {
     "memory": Topic(
         "RAM",
         "large",
-        "Take reduced-space, fewer timesteps or a coarser mesh.",
+        "Use the method reduced-space, fewer time steps or a coarser mesh.",
         {
             "short": "{method} will take about {needed_gb:.2g} GB, more than this machine's "
             "{there_gb:.2g} GB: {remedy}",
@@ -365,41 +378,44 @@ TOPICS: Mapping[str, Topic] = {
         "State the amplitude or lengths that the data suggest, or use regions where constants are "
         "known to differ: a prior that is too tight makes intervals too narrow.",
         {
-            "amplitude": "{name} differs more from place to place than its field allows for: the "
-            "data want an amplitude of about {likely:.2g}, not {stated:.2g}",
+            "amplitude": "{name} varies more within the body than the prior of its field allows: "
+            "the data suggest an amplitude of about {likely:.2g}, not {stated:.2g}",
             "one-phase": "the data do not show two materials: the contrast of {name} is "
-            "{median:.3g} ({lower:.3g} to {upper:.3g}), which contains 1; take prior = 'smooth' or "
-            "no field",
-            "few": "the smaller phase of {name} has only {elements} elements: with fewer than "
-            "{fewest} the contrast was found too low and its interval too narrow; refine the mesh "
-            "there",
+            "{median:.3g} ({lower:.3g} to {upper:.3g}), which contains 1; use prior = 'smooth' "
+            "or no field",
+            "few": "the smaller phase of {name} has only {elements} elements: in tests with fewer "
+            "than {fewest}, the estimated contrast was too low and its interval too narrow; "
+            "refine the mesh there",
             "phases": "two phases of {name} do not describe the body: χ² per measurement is "
-            "{misfit:.3g}, with a smooth field {smooth:.3g}; more than two materials, or one that "
-            "changes gradually: take prior = 'smooth', or regions",
-            "negative": "{name} is not above zero in {below} of {elements} elements, down to "
-            "{least:.3g}: lower the amplitude of its field, {stated:.2g}, or raise its length_m",
-            "shapes": "the {modes} shapes of the field of {name} have only {share:.0%} of its "
-            "variance with a length of {length_m:.2g} m: variations finer than {detail_m:.2g} m "
-            "are covered by the intervals only; raise modes or length_m",
+            "{misfit:.3g}, with a smooth field {smooth:.3g}; there may be more than two "
+            "materials, or a gradual change: use prior = 'smooth', or regions",
+            "negative": "{name} is zero or negative in {below} of {elements} elements (minimum "
+            "{least:.3g}): lower the amplitude of its field, {stated:.2g}, or raise its "
+            "length_m",
+            "shapes": "the {modes} shapes of the field of {name} represent only {share:.0%} of its "
+            "variance for a length of {length_m:.2g} m: variations finer than {detail_m:.2g} "
+            "m are covered by the intervals only; raise modes or length_m",
             "length": "{name} changes over less than the length of its field: the data suggest "
-            "about {likely:.2g} m, not {stated:.2g} m; give length_m several to choose from",
+            "about {likely:.2g} m, not {stated:.2g} m; give several lengths in length_m to "
+            "choose from",
         },
     ),
     "solve": Topic(
         "The solve",
         "trust",
-        "Start from another guess, or from none, and make sure that check finds nothing wrong.",
+        "Start from another guess, or without one, and make sure that the command check "
+        "reports no mistake.",
         {
             "lost": "the solve did not converge: {why}",
-            "no-start": "there is no start yet: the first frame needs a pose",
+            "no-start": "there is no initial state yet: the first frame needs a pose",
             "not-simulable": "the body cannot be simulated with these parameters",
             "grasp-lost": "the grasp is lost",
-            "seeking": "the start is still being searched",
+            "seeking": "initial values are still being searched for",
             "acceptable": "the solve converged to the acceptable tolerance only",
-            "no-error-bars": "no error bars could be found",
+            "no-error-bars": "no error bars could be computed",
             "interrupted": "interrupted: {left_out}",
-            "moves": "the estimate still moves: it is farther than its error bar from where it was "
-            "simulated",
+            "moves": "the estimate is not settled: it differs by more than its error bar from the "
+            "parameters of the last simulation",
             "anew": "restarted {times}, assuming that the body was at rest there",
         },
     ),
@@ -415,7 +431,9 @@ def message_of(code: str, data: Mapping[str, Any]) -> str:
     topic, _, rest = code.partition("/")
     shown = {k: listed(v) if isinstance(v, (list, tuple)) else v for k, v in data.items()}
     message = TOPICS[topic].messages[rest].format(**shown)
-    distance_text = f" ({data['nearer']:.2g} times nearer)" if "nearer" in data else ""
+    distance_text = (
+        f" (the misfit becomes {data['nearer']:.2g} times smaller)" if "nearer" in data else ""
+    )
     return f"{data['of']}: {message}{distance_text}" if data.get("of") else message
 
 

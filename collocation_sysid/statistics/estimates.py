@@ -244,7 +244,7 @@ def _scaled_estimate(estimate: Estimate, ratio: float) -> Estimate:
 def _estimate_at_bound(value: float) -> Estimate:
     """Return the estimate of a value at a bound, without error bars."""
     return Estimate(
-        value, at_bound=True, reason="it ended at a bound, or follows from one that did"
+        value, at_bound=True, reason="it ended at a bound, or follows from a parameter that did"
     )
 
 
@@ -281,16 +281,16 @@ def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -
                 ("lower", "upper"), key=lambda side: abs(getattr(item, side) - estimate.value)
             )
             notes.append(
-                f"{name} ended at its {nearest} bound {getattr(item, nearest):g}: it has no error "
-                "bar, and the others' allow for other values of it; widen the bound, or fix it "
-                "if it is known"
+                f"{name} ended at its {nearest} bound {getattr(item, nearest):g}: it has no "
+                "error bar, and the error bars of the others include its uncertainty; widen "
+                "the bound, or fix it if it is known"
             )
         elif estimate.statistical95 is None:
             damping = is_damping(name)
             by = ": no information on damping in these data" if damping else " by these data"
             notes.append(
-                f"{name} is not determined{by}; fix it, give it a prior, or move the body"
-                f"{'' if damping else ' differently'}"
+                f"{name} is not determined{by}; fix it, give it a prior, or record a "
+                f"motion{'' if damping else ' differently'}"
             )
         elif estimate.statistical_std_error is None:
             reasons[name] = str(estimate.reason)
@@ -333,19 +333,19 @@ def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[st
         tau = estimates.get(f"{branch}.{TAU.name}")
         if share.at_bound and share.value < 1e-6:
             notes.append(
-                f"no memory found: the share of {branch} ended at 0, and its relaxation time "
-                "means nothing; leave that branch out"
+                f"no memory was found: the share of {branch} ended at 0, so that its "
+                "relaxation time has no meaning; remove that branch"
             )
         elif share.statistical95 is not None and share.statistical95[0] <= 0:
             notes.append(
-                f"no memory is told from none: the share of {branch} may be 0, and is at most "
-                f"{share.statistical95[1]:.2g} (95 %)"
+                f"the data do not determine whether there is memory: the share of {branch} "
+                f"may be 0, and is at most {share.statistical95[1]:.2g} (95 %)"
             )
         elif (share.at_bound or share.statistical95) and tau and tau.value > LONG * longest_s:
             notes.append(
-                f"{branch} relaxes within {tau.value:.2g} s, slower than the longest recording of "
-                f"{longest_s:.2g} s: its share and long-term moduli follow from its beginning "
-                "only; record for longer"
+                f"{branch} relaxes within {tau.value:.2g} s, slower than the longest "
+                f"recording of {longest_s:.2g} s: its share and the long-term moduli are "
+                "extrapolated from the beginning of the relaxation; record for longer"
             )
     return notes
 
@@ -373,23 +373,26 @@ def noise_notes(requested: str, kind: Noise, level: NoiseLevel, errors: str) -> 
     if level.is_unequal and level.factors[high] > NOTEWORTHY**2 * level.factors[low]:
         least = f"{level.factors[low]:.2g} ({low})"
         most = f"{level.factors[high]:.2g} ({high})"
-        size = f"between {least} and {most} times as large as {sigma_key} says"
+        size = f"between {least} and {most} times as large as expected from {sigma_key}"
     elif factor > NOTEWORTHY:
-        size = f"{factor:.2g} times as large as {sigma_key} says"
+        size = f"{factor:.2g} times as large as expected from {sigma_key}"
     elif factor < 1 / NOTEWORTHY:
-        size = f"only {factor:.2g} times as large as {sigma_key} says: it seems {1 / factor:.2g} "
+        size = (
+            f"only {factor:.2g} times as large as expected from {sigma_key}, which seems "
+            f"{1 / factor:.2g} "
+        )
         size += "times too large"
     else:
         return []
     if kind != "given" or (factor > 1 and errors == "autocorrelated"):
-        so = f"the error bars follow the residuals. Check {sigma_key} and the model"
+        so = f"the error bars are computed from the residuals. Check {sigma_key} and the model"
     elif factor > 1:
         so = "the error bars are too small by about that much; check "
         so += f"{sigma_key} and the model, or use noise = 'auto'"
     elif requested == "given":
-        so = f"the error bars keep to {sigma_key}, as asked for"
+        so = f"the error bars are computed from {sigma_key}, as requested"
     else:
-        so = f"the residuals are not independent, so the error bars keep to {sigma_key}"
+        so = f"the residuals are not independent, so the error bars are computed from {sigma_key}"
     return [f"the residuals are {size}; {so}"]
 
 
@@ -397,19 +400,22 @@ def correlation_notes(requested: str, errors: str, dependence: Dependence) -> li
     """Return notes on correlated residuals, and how the error bars account for that."""
     if not dependence.is_correlated or (errors != "autocorrelated" and requested != "independent"):
         return []
-    pattern = "have parts that markers or axes share"
+    pattern = "are correlated between markers or axes"
     if dependence.is_correlated_in_space:
-        pattern = "are alike where they are near each other on the surface"
+        pattern = "are correlated between neighbouring points of the surface"
     if dependence.is_correlated_in_time:
-        pattern = f"persist from sample to sample (autocorrelation {dependence.lag1:.2f})"
+        pattern = (
+            f"are correlated between consecutive samples (autocorrelation {dependence.lag1:.2f})"
+        )
     if errors == "autocorrelated":
         return [
-            f"the residuals {pattern}: noise seldom does, so something is missing in the "
-            "model or in the experiment's description. The error bars are widened by a model of "
-            "autocorrelated errors; a bias is not covered"
+            f"the residuals {pattern}, unlike the noise of most sensors, so the model or the "
+            "description of the experiment lacks an effect. The error bars are widened by a "
+            "model of autocorrelated errors, but do not cover a bias"
         ]
     return [
-        f"the residuals {pattern}, but error bars for independent errors were asked for: too small"
+        f"the residuals {pattern}, but error bars for independent errors were requested: they "
+        "are too small"
     ]
 
 
@@ -419,10 +425,8 @@ def disagreement_notes(fit: LinearisedFit, scatter: RecordingComparison | None) 
         return []
     return [
         f"the recordings disagree on {display_name(fit.names[k])} (χ² "
-        f"{scatter.chi_squared[k]:.3g} for "
-        f"{scatter.degrees_of_freedom[k]} degrees of freedom): model error decides, and its "
-        "interval holds "
-        "what they disagree by"
+        f"{scatter.chi_squared[k]:.3g} for {scatter.degrees_of_freedom[k]} degrees of "
+        "freedom): model errors exceed the noise, and its interval includes the disagreement"
         for k in np.flatnonzero(scatter.is_disagreeing).tolist()
     ]
 

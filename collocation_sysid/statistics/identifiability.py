@@ -94,10 +94,13 @@ def _combination_sentence(
     if len(members) == 2:
         how = f" (correlation {uncertainty.correlation[members[0], members[1]]:.3f})"
     if any(uncertainty.estimates[name].value <= 0 for name in names):  # no powers of these
-        return f"{listed(names)} are confounded{how}: these data fix one combination of them"
+        return (
+            f"{listed(names)} are confounded{how}: these data determine only one combination "
+            "of them"
+        )
     return (
         f"{listed(names)} are confounded{how}: only their combination "
-        f"{_product_text(names, weights / weights[largest])} is fixed, to "
+        f"{_product_text(names, weights / weights[largest])} is determined, to "
         f"{_precision_text(float(fixed))} (95 %)"
     )
 
@@ -115,7 +118,11 @@ def _other_convention(uncertainty: Uncertainty) -> list[str]:
             parts.append(
                 f"{name} {'only ' if factor > WELL_FIXED else ''}to {_precision_text(factor)}"
             )
-    return [f"in the other elastic pair: they fix {listed(parts)} (95 %)"] if parts else []
+    return (
+        [f"expressed as other elastic constants, the data determine {listed(parts)} (95 %)"]
+        if parts
+        else []
+    )
 
 
 def _interval_factor(estimate: Estimate) -> float | None:

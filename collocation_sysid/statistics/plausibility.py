@@ -65,9 +65,9 @@ def size_and_density_hypotheses(body: Body) -> tuple[Hypothesis, ...]:
         "density_kg_m3": density_kg_m3,
         "least": thin,
         "most": dense,
-        "likely": f"1000 times as much, {1e3 * density_kg_m3:.4g}, if it was in g/cm³"
+        "likely": f"probably {1e3 * density_kg_m3:.4g} kg/m³, if the value is in g/cm³"
         if density_kg_m3 < thin
-        else f"a thousandth, {density_kg_m3 / 1e3:.4g}, if the mass was in g",
+        else f"probably {density_kg_m3 / 1e3:.4g} kg/m³, if the mass is in g",
     }
     tried = (
         Hypothesis("length-unit/size", data=size, strength=_excess_factor(size_m, SIZES_M)),

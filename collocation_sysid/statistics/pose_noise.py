@@ -67,7 +67,7 @@ class PoseNoise:
         """Message for the user about the assumed pose noise."""
         how = "estimated from their roughness" if self.is_estimated else "as stated"
         return (
-            f"the error bars of '{self.experiment}' allow for noise of the poses of "
+            f"the error bars of '{self.experiment}' include noise of the poses of "
             f"{1e3 * self.sigma_m:.2g} mm and {np.degrees(self.sigma_rad):.2g}°, {how}"
         )
 

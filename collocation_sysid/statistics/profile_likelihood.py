@@ -130,7 +130,10 @@ def compute_profile(
     message = _message(parameter, (lower, upper), bounds)
     if losses.min() < loss - 1e-3 * max(1.0, abs(loss)):
         better = values[int(np.argmin(losses))]
-        message += f"; at {better:.4g} the loss is lower than at the answer: solve again from there"
+        message += (
+            f"; at {better:.4g} the loss is lower than at the estimate: solve again with "
+            "this value as the guess"
+        )
     return Profile(parameter, values, losses, threshold, (lower, upper), message)
 
 
@@ -167,8 +170,8 @@ def _message(
         )
     least = lower is not None
     return (
-        f"{parameter} is at {'least' if least else 'most'} {lower if least else upper:.4g} {how}; "
-        f"{'upwards' if least else 'downwards'} the data do not limit it within its bound "
+        f"{parameter} is at {'least' if least else 'most'} {lower if least else upper:.4g} "
+        f"{how}; the data give no {'upper' if least else 'lower'} limit within its bound "
         f"{bounds[least]:.4g}"
     )
 

@@ -24,13 +24,14 @@ REMEDIES: Mapping[str, str] = {
     "anisotropy": "record a second motion with the body held the other way round, or press a cube "
     "along each of its axes",
     "stiffness_drift": "repeat the first recording at the end",
-    "time_scale": "compare the clocks with a reference",
+    "time_scale": "compare all clocks with a reference clock",
     "poisson": "measure Poisson's ratio in a tension test, or estimate it",
     "damping_law": "compare the laws with compare --damping on faster and slower motions, or state "
     'damping_law = "none" where the law is known',
     "rayleigh_damping": "compare the laws with compare --damping on motions that rotate the body",
-    "grip_layer_m": "glue the body to a stiff plate, or put markers beside the grip",
-    "machine_compliance_m_n": "press the platens on each other and state the slope",
+    "grip_layer_m": "glue the body to a stiff plate, or attach markers to the body beside the grip",
+    "machine_compliance_m_n": "press the platens against each other without a specimen and state "
+    "the slope of displacement over force",
     "platen_friction": "lubricate the platens, or glue the specimen to them",
     "contact_stiffness": "refine the mesh at the contact, or state a larger stiffness_pa_m and a "
     "smaller width_m of the obstacle",

@@ -159,8 +159,8 @@ def _diagnose_marker(
     message = _message(diagnosis, pairs, block, motion, estimated_kinds)
     if diagnosis.wild > MOST_WILD * samples:
         message += (
-            f"; {diagnosis.wild} samples are beyond Huber's threshold: exchanged labels, or "
-            "reflections taken for the marker"
+            f"; {diagnosis.wild} samples are outliers, beyond the threshold of the Huber "
+            "loss: exchanged labels, or reflections mistaken for the marker"
         )
     return replace(diagnosis, sentence=message)
 
@@ -219,7 +219,7 @@ def _message(
     name = f"{diagnosis.experiment}/{diagnosis.marker}"
     size = f"{1e3 * diagnosis.rms_m:.2g} mm RMS"
     if diagnosis.rms_m < ROUNDING_M:
-        return f"{name}: fits to rounding"
+        return f"{name}: residuals are at the level of rounding errors"
     persistent = pairs > 0 and abs(diagnosis.lag1) > normal_isf(SIGNIFICANCE / 2) / np.sqrt(
         3 * pairs
     )
@@ -229,29 +229,30 @@ def _message(
     if diagnosis.constant_share > DOMINANT:
         offset = 1e3 * np.linalg.norm(diagnosis.offset_m)
         cause = (
-            f"{100 * diagnosis.constant_share:.0f} % of its power is constant: its place on the "
-            "body "
-            f"is off by {offset:.2g} mm; {'widen the prior of' if estimated[0] else 'estimate'} "
-            "marker_offsets"
+            f"{100 * diagnosis.constant_share:.0f} % of the squared residuals is a constant "
+            f"part: its position on the body is wrong by {offset:.2g} mm; "
+            f"{'widen the prior of' if estimated[0] else 'estimate'} marker_offsets"
         )
     elif diagnosis.early_share > DOMINANT:
         end_s = EARLY_TIME * (t_s[-1] - t_s[0])
         cause = (
-            f"{100 * diagnosis.early_share:.0f} % of its power is in the first {end_s:.2g} s: the "
-            "start state or the release time is off"
+            f"{100 * diagnosis.early_share:.0f} % of the squared residuals occurs in the "
+            f"first {end_s:.2g} s: the initial state or the release time is wrong"
         )
         cause += "" if estimated[1] else "; estimate time_shift"
     elif diagnosis.oscillating_share > DOMINANT:
         cause = _oscillation_message(diagnosis, t_s, motion)
     elif persistent and diagnosis.lag1 > DOMINANT:
-        cause = "it drifts slowly: creep of the material, or slip in the grasp, is not modelled"
+        cause = (
+            "the residuals drift slowly: the model lacks creep of the material or slip in the grasp"
+        )
         if block.is_static:
             cause = (
-                "it changes with the load: the material law or the boundary conditions at the "
-                "grasps are wrong"
+                "the residuals change with the load: the material law or the boundary "
+                "conditions at the grasps are wrong"
             )
     else:
-        cause = "a mixture, little of which is white noise"
+        cause = "the residuals are correlated in time, without a dominant cause"
     return f"{name}: {size}; {cause}"
 
 
@@ -262,28 +263,30 @@ def _white_noise_message(diagnosis: MarkerDiagnosis) -> str:
     factor = diagnosis.noise_factor
     chance = normal_isf(SIGNIFICANCE / 2) / np.sqrt(6 * diagnosis.samples)
     if factor > max(LARGEST_AGREEING_RATIO, 1 + chance):
-        return f"white, but {factor:.2g} times as large as sigma_m says"
+        return f"uncorrelated, but {factor:.2g} times as large as expected from sigma_m"
     if factor < min(1 / LARGEST_AGREEING_RATIO, 1 - chance):
-        return f"white, and only {factor:.2g} times as large as sigma_m says"
-    return "white, as noise should be"
+        return f"uncorrelated, and only {factor:.2g} times as large as expected from sigma_m"
+    return "uncorrelated, consistent with noise"
 
 
 def _oscillation_message(diagnosis: MarkerDiagnosis, t_s: Array, motion: Array) -> str:
     """Return the description of oscillating residuals, compared with the frequency of the
     motion.
     """
-    share = f"{100 * diagnosis.oscillating_share:.0f} % of its power"
+    share = f"{100 * diagnosis.oscillating_share:.0f} % of the squared residuals"
     record_s = (t_s[1] - t_s[0]) * len(t_s)
     if diagnosis.frequency_hz * record_s < FEWEST_PERIODS:
         return (
-            f"{share} is a slow drift: creep of the material, or slip in the grasp, is not in "
-            "the model"
+            f"{share} is a slow drift: the model lacks creep of the material or slip in the grasp"
         )
     message = f"{share} oscillates at {diagnosis.frequency_hz:.3g} Hz"
     of_motion, _ = _largest_peak(motion - motion.mean(axis=0), t_s)
     if abs(diagnosis.frequency_hz - of_motion) <= SAME_FREQUENCY * of_motion:
-        return f"{message}, with the motion: the model's stiffness, damping or mass differ"
-    return f"{message}, unlike the motion: a vibration or a mode that the model lacks"
+        return (
+            f"{message}, the frequency of the motion: stiffness, damping or mass of the model "
+            "are wrong"
+        )
+    return f"{message}, unlike the motion: the model lacks a vibration or a natural mode"
 
 
 # Probability of reporting any sample of noise as an outlier.

@@ -56,9 +56,12 @@ def relative_scale_note(experiments: Iterable[Experiment], parameters: Parameter
     names = relative_moduli(experiments, parameters)
     if not names or parameters_of_open_scale(experiments, parameters):
         return None
-    verb = "is" if len(names) == 1 else "are"
+    verb = "the value assumes" if len(names) == 1 else "the values assume"
     symbols = [symbol_of(name) for name in names]
-    return f"no known force sets the scale: {listed(symbols)} {verb} relative to the stated density"
+    return (
+        f"no known force sets the scale: the data determine {listed(symbols)} only relative "
+        f"to the density; {verb} the stated density"
+    )
 
 
 def _scaled_parameters(

@@ -664,38 +664,44 @@ def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
 ASSUMPTIONS = (
     Assumption("body_scale", "1", 0.01, "size of the mesh", _size),
     Assumption("rest_shape", "1", 0.58,
-        "weight under which a mesh hung that nothing is stated of, along each axis", _rest_shape,
+        "weight under which the mesh was deformed when it was made, along each axis, if "
+            "object.rest_shape is not stated", _rest_shape,
         "x y z"),
     Assumption("surface", "1", 0.005,
-        "place of the surface along its normal over the thickness", _surface, _MODES),
-    Assumption("mass", "1", 0.01, "mass of the body, where it is not estimated", _mass),
+        "displacement of the surface along its normal, relative to the thickness",
+        _surface, _MODES),
+    Assumption("mass", "1", 0.01, "mass of the body, if it is not estimated", _mass),
     Assumption("density_gradient", "1", 0.05,
-        "density at one end of the body over that in its middle", _density_gradient, "x y z"),
+        "density at one end of the body relative to that in its middle", _density_gradient, "x y "
+        "z"),
     Assumption("anisotropy", "1", 0.05,
-        "stiffness along one axis over that across", _anisotropy, "x y z"),
+        "stiffness along one axis relative to that across it", _anisotropy, "x y z"),
     Assumption("stiffness_drift", "1", 0.02,
-        "stiffness at the end over that at the beginning", _drift),
-    Assumption("time_scale", "1", 1e-4, "pace of all clocks", _time_scale),
-    Assumption("poisson", "", 0.02, "Poisson's ratio, where it is stated", _poisson),
+        "stiffness at the end of a recording relative to that at its beginning", _drift),
+    Assumption("time_scale", "1", 1e-4, "rate of all clocks", _time_scale),
+    Assumption("poisson", "", 0.02, "Poisson's ratio, if it is stated", _poisson),
     Assumption("damping_law", "1", 1.0,
-        "damping force of another objective law, in its difference from the stated one",
+        "damping force of another objective law, as a fraction of its difference from the "
+            "stated law",
         _objective_damping, " ".join(OBJECTIVE_DAMPINGS)),
     Assumption("rayleigh_damping", "1", None,
-        "damping force of Rayleigh's law, in its difference from the stated one",
+        "damping force of the Rayleigh law, as a fraction of its difference from the stated "
+            "law",
         _rayleigh_damping),
     Assumption("grip_layer_m", "m", 2e-4,
-        "what grip and skin give way, as thickness of the body's own material", _grip),
-    Assumption("machine_compliance_m_n", "m/N", 1e-6, "what a test bench gives way", _machine),
+        "compliance of grip and skin, as the thickness of a layer of the body's material", _grip),
+    Assumption("machine_compliance_m_n", "m/N", 1e-6, "compliance of the test bench", _machine),
     Assumption("platen_friction", "", 0.1,
-        "friction of what holds nodes across and lets them slide", _platen_friction),
+        "coefficient of friction of platens between which nodes slide", _platen_friction),
     Assumption("contact_stiffness", "1", 1.0,
-        "softness of contact with obstacles, in that of the pressure law", _contact_stiffness),
+        "compliance of the contact with obstacles, as a fraction of that of the pressure law",
+        _contact_stiffness),
     Assumption("buoyancy", "1", AIR_DENSITY_DEVIATION,
-        "buoyancy over that in the model, by the density of the air", _buoyancy),
+        "buoyancy relative to that of the model, because of the density of the air", _buoyancy),
     Assumption("added_mass", "1", AIR_COEFFICIENT_DEVIATION,
-        "air that moves with the body over that in the model", _added_mass),
+        "added mass of the air relative to that of the model", _added_mass),
     Assumption("air_drag", "1", AIR_COEFFICIENT_DEVIATION,
-        "drag of the air over that in the model", _air_drag),
+        "drag of the air relative to that of the model", _air_drag),
 )
 # fmt: on
 
@@ -721,8 +727,8 @@ KnownDeviation = Annotated[KnownEffect | Deviation, ByForm((dict, KnownEffect))]
 OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n")
 _DOCUMENTATION = """Standard deviations of systematic effects; "none" for what is exact.
 
-Of what is known to be there, such as the compliance of a machine, a table of mean and deviation.
-Nuisance parameters of recordings, by their names, count where they are not estimated.
+An effect that is known to exist, such as the compliance of a machine, has a table of mean and
+deviation. Nuisance parameters of recordings, by their names, count if they are not estimated.
 
 Attributes
 ----------

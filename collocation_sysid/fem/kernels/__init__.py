@@ -188,8 +188,7 @@ class EvaluatorChoice:
             raise VectorCodeError(message) from error
         self.name = "casadi"
         self.notes += (
-            f"The material is evaluated by CasADi's map, which is many times slower: "
-            f"{error.message}.",
+            f"The material is evaluated by CasADi's map, which is much slower: {error.message}.",
         )
 
 

@@ -269,7 +269,7 @@ def _read_private_file(path: Path) -> bytes:
     with os.fdopen(os.open(path, flags | getattr(os, "O_BINARY", 0)), "rb") as file:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode) or _ownership_fault(status):
-            raise OSError(f"{path} is not a file of this user alone")
+            raise OSError(f"{path} is not owned by this user alone")
         return file.read()
 
 
@@ -285,7 +285,7 @@ def _is_trusted(folder: Path) -> bool:
 def _warn_once(fault: str) -> None:
     """Warn once that compiled kernels are not stored."""
     warnings.warn(
-        f"compiled kernels are not kept: {fault}; set COLLOCATION_SYSID_CACHE to a folder of "
+        f"compiled kernels are not cached: {fault}; set COLLOCATION_SYSID_CACHE to a folder of "
         "your own (chmod 700)",
         RuntimeWarning,
         stacklevel=2,

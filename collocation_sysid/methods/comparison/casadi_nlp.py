@@ -180,21 +180,21 @@ class Sleqp(CasadiSolver):
 
 PLUGINS = {kind.name.removeprefix(PREFIX): kind for kind in (SqpMethod, Sleqp)}
 
-_LIBRARY = "it needs a library, and mostly a licence, that CasADi does not bring"
+_LIBRARY = "it needs a library, and usually a licence, that are not part of CasADi"
 REFUSED: dict[str, str] = {
     "ipopt": 'its own method is "interior-point"',
     "alpaqa": "it derives an augmented Lagrangian from expressions, and the NLP has only callbacks",
     "blocksqp": "it derives its Hessian's structure from expressions, and the NLP has only "
-    "callbacks; its QP solver wants MA27",
-    "fatrop": "it factorises densely what is not an optimal-control problem in stages, and goes "
-    "on where an evaluation fails or is to be stopped",
+    "callbacks; its QP solver needs MA27",
+    "fatrop": "it uses dense factorisations unless the problem consists of stages, and continues "
+    "although an evaluation failed or the user interrupted it",
     "feasiblesqpmethod": "its feasible start within bounds does not exist for this NLP",
     "qrsqp": "its QP solver cycles on this NLP",
     "scpgen": "it derives the NLP from expressions, and this one has only callbacks",
     "uno": "the plugin in CasADi's wheel corrupts memory on this NLP and aborts the process",
-    "bonmin": 'without integers it is IPOPT, whose method is "interior-point"; it can neither be '
-    "followed nor stopped",
-    "ampl": "it starts an AMPL solver outside, which has no callbacks",
+    "bonmin": 'without integers it is IPOPT, whose method is "interior-point"; its progress '
+    "cannot be shown, and it cannot be interrupted",
+    "ampl": "it starts an external AMPL solver, which does not support callbacks",
     **dict.fromkeys(("ccopt", "conopt", "knitro", "madnlp", "snopt", "worhp"), _LIBRARY),
 }
 

@@ -224,7 +224,10 @@ class Penalty(PenaltyOptions):
         )
         if is_increase_due and rho >= self.last_rho:
             if stage.is_minimum:
-                message = "The merit is at its minimum but the dynamics do not hold; raise rho_max."
+                message = (
+                    "The merit function is at its minimum, but the equations of motion "
+                    "are violated; raise rho_max."
+                )
                 raise SearchEnded(Status.STALLED, message)
             raise SearchEnded(
                 Status.ITERATION_LIMIT,
@@ -259,10 +262,14 @@ class AugmentedLagrangian(PenaltyOptions):
         is_last = rho >= self.rho_max or is_feasible
         if is_last and tolerance <= self.tolerance and slack.scaled > STUCK * before.scaled:
             if stage.is_minimum:
-                raise SearchEnded(Status.STALLED, "rho_max does not make the dynamics hold.")
+                raise SearchEnded(
+                    Status.STALLED,
+                    "The equations of motion are violated although "
+                    "ρ reached rho_max; raise rho_max.",
+                )
             raise SearchEnded(
                 Status.STALLED,
-                f"The last stage ended with a gradient of {stage.gradient:.2g}, short of its "
+                f"The last stage ended with a gradient of {stage.gradient:.2g}, above its "
                 f"tolerance {tolerance:.2g}; another inner solver may get farther.",
             )
         if not is_feasible and slack.scaled > FALL * before.scaled:
@@ -285,7 +292,7 @@ class _PenaltySolve:
         began = self.problem.from_original(recorder.initial_variables(start))
         self.variables = np.clip(began, self.problem.lower, self.problem.upper)
         if not self.problem.has_valid_elements(self.variables):
-            raise InputError("elements are inverted at the start; start from another point")
+            raise InputError("elements are inverted at the initial point; start from another guess")
         no_weights = np.zeros(nlp.constraint_count)
         merit = MeritFunction(self.problem, options.rho, no_weights)
         self.stage = Stage(merit, options.first_gradient)
@@ -324,7 +331,8 @@ class _PenaltySolve:
         estimate = merit.multiplier_estimate(self.problem.constraint_values(self.variables))
         return self.recorder.solution(
             status,
-            f"{reason} At ρ = {merit.rho:.3g} {self._violation()} is left.",
+            f"{reason} Remaining violation of the equations of motion at ρ = {merit.rho:.3g}: "
+            f"{self._violation()}.",
             self.problem.to_original(self.variables),
             self.problem.to_original_multipliers(estimate),
             self.iterations,

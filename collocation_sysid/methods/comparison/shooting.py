@@ -89,7 +89,7 @@ class Shooting(Options):
             multipliers = None
         if best is not None and search.failures:
             failed = f"{search.failures} of {shots} simulations failed"
-            recorder.notes.append(f"{failed}; the search went back each time")
+            recorder.notes.append(f"{failed}; each time the search continued with a shorter step")
         return recorder.solution(status, message, z, multipliers, shots, shots)
 
 

@@ -52,8 +52,8 @@ OF_FILES = ("mesh", "surface", "file", "poses", "displacement", "tension", "pres
 OF_TABLE = ("columns", "axis", "sign", "area_m2", "symmetry")
 OF_TIME = ("window_s", "resample_hz", "every", "validation")
 HEAD = """\
-# A designed motion, poses.csv, and what is predicted to be seen of it at the parameters' guesses.
-# Record it, and put the recorded files in the place of poses.csv and predicted_markers.csv.
+# A designed motion, poses.csv, and the marker tracks that are predicted at the parameters' guesses.
+# Record the motion, and replace poses.csv and predicted_markers.csv with the recorded files.
 
 """
 
@@ -92,7 +92,7 @@ def write_design(
             (place / PROBLEM_FILE).write_text(text, encoding="utf-8")
         save_pictures(place, design_figures(design))
         if with_film:
-            say("filming the motion")
+            say("rendering the film of the motion")
             shapes_m = design.predicted.positions_m
             replay = MotionRecord.from_experiment(experiment, (shapes_m, markers.positions_m))
             film(replay, place / FILM_FILE, FRAMES_PER_SECOND, names=("predicted", ""))

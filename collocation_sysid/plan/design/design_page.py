@@ -29,7 +29,7 @@ from .motion_design import Design
 def design_summary(design: Design, folder: Path) -> list[Shown]:
     """Return a design on one screen, as lines and tables."""
     tried = len(design.best.history)
-    interrupted = Line(f"interrupted: the best of {tried} motions", "check")
+    interrupted = Line(f"interrupted: the best of the {tried} motions so far", "check")
     return [
         *[interrupted] * design.best.is_interrupted,
         _error_table(design),
@@ -41,7 +41,7 @@ def design_summary(design: Design, folder: Path) -> list[Shown]:
 
 def _error_table(design: Design) -> Table:
     """Return the table of error bars before and after."""
-    heads = ("", "value", "error before", "error after", "over the draws", "times smaller")
+    heads = ("", "value", "error before", "error after", "range over the prior", "reduction factor")
     before = design.before
     after = design.after
     rows = []
@@ -64,7 +64,7 @@ def _percent(share: float) -> str:
     """Return a relative error as text; empty for NaN."""
     if np.isnan(share):
         return ""
-    return f"{100 * share:.3g} %" if share < 10 else "not told"
+    return f"{100 * share:.3g} %" if share < 10 else "not determined"
 
 
 def _column_note(design: Design) -> str:
@@ -72,11 +72,11 @@ def _column_note(design: Design) -> str:
     duration = f"{design.experiment.duration_s:.4g} s"
     after = f"after: the designed motion of {duration}"
     if design.added:
-        return f"before: the recordings so far; {after} added to them"
+        return f"before: the existing recordings; {after} in addition"
     if design.before is None:
         return after
     shipped = f"{design.recording.template.duration_s:.4g} s"
-    return f"before: the problem's own motion of {shipped}; {after} by itself"
+    return f"before: the motion of {shipped} in the problem; {after} alone"
 
 
 def design_figures(design: Design) -> dict[str, Figure]:
@@ -111,7 +111,7 @@ def motion_picture(design: Design) -> Figure:
         axes.plot(t_s, 100 * turned, color=VERMILION, lw=LINE_PT, label="angular")
         axes.axhline(100, color="black", lw=0.6, ls="--")
         axes.set_ylim(bottom=0)
-    style_axes(shift, "", "", "shift of the hand [mm]")
+    style_axes(shift, "", "", "displacement of the hand [mm]")
     style_axes(turn, "", "", "rotation vector [°]")
     style_axes(speed, "", "time [s]", "speed [% of limit]")
     style_axes(growth, "", "time [s]", "acceleration [% of limit]")
@@ -127,7 +127,7 @@ def error_bars_picture(design: Design) -> Figure:
     axes = figure.subplots()
     rows = np.arange(len(names))
     before = "recordings so far" if design.added else "the problem's motion"
-    after = "with the designed one" if design.added else "designed motion"
+    after = "with the designed motion" if design.added else "designed motion"
     for bars, label, colour, shift in (
         (design.before, before, VERMILION, -0.15),
         (design.after, after, BLUE, 0.15),

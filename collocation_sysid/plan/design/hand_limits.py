@@ -28,10 +28,14 @@ REACHED = 0.98
 class CameraSection(Section):
     """A camera, described by its cone of view."""
 
-    position_m: Vector = Field(description="Place [x, y, z] in the poses' world.")
-    looks_at_m: Vector = Field(description="A point [x, y, z] in the middle of its picture.")
+    position_m: Vector = Field(
+        description="Position [x, y, z] of the camera in the world frame of the poses."
+    )
+    looks_at_m: Vector = Field(
+        description="A point [x, y, z] that appears in the middle of its image."
+    )
     field_of_view_deg: Positive = Field(
-        lt=180, description="Full angle of the cone: that of the picture's shorter side."
+        lt=180, description="Full angle of the cone of view: that of the image's shorter side."
     )
 
     @model_validator(mode="after")
@@ -49,8 +53,8 @@ class Limits(Section):
     """
 
     workspace_m: tuple[Vector, Vector] = Field(
-        description="Lower and upper corner, [[x, y, z], [x, y, z]], of where the hand may be in "
-        "the poses' world."
+        description="Lower and upper corner, [[x, y, z], [x, y, z]], of the region in which the "
+        "hand may be, in the world frame of the poses."
     )
     speed_m_s: Positive = Field(description="Largest speed of the hand.")
     acceleration_m_s2: Positive = Field(description="Largest acceleration of the hand.")
@@ -60,17 +64,19 @@ class Limits(Section):
     angular_speed_deg_s: Positive = Field(description="Largest angular speed.")
     angular_acceleration_deg_s2: Positive = Field(description="Largest angular acceleration.")
     frequency_hz: Positive | None = Field(
-        None, description="No wave is faster; a tenth of the sampling rate by default."
+        None,
+        description="Largest frequency in the motion; a tenth of the sampling rate by default.",
     )
     markers_box_m: tuple[Vector, Vector] | None = Field(
-        None, description="Lower and upper corner of a box, [[x, y, z], [x, y, z]], that markers "
-        "stay in."
+        None, description="Lower and upper corner of a box, [[x, y, z], [x, y, z]], in which the "
+        "markers must stay."
     )  # fmt: skip
     camera: list[CameraSection] = Field(
-        default_factory=list, description="[[camera]] tables: markers stay in what they see."
+        default_factory=list,
+        description="[[camera]] tables: the markers must stay in their fields of view.",
     )
     cameras_per_marker: AtLeastOne = Field(
-        2, description="So many of the cameras must have each marker in view."
+        2, description="Number of cameras that must have each marker in view."
     )
 
     @model_validator(mode="after")
@@ -120,7 +126,7 @@ class Limits(Section):
             )
             raise InputError(
                 f"the hand starts at {at}, which is not between {' and '.join(corners)}; expected "
-                "a workspace around the start",
+                "a workspace that contains the start",
                 None,
                 "workspace_m",
             )

@@ -52,7 +52,7 @@ class DesignOptions(Options):
     Attributes
     ----------
     evaluations : int
-        Number of motions that are simulated; ten times as many are evaluated to first order before.
+        Number of motions that are simulated, after a first-order evaluation of ten times as many.
     pairs : int
         Number of pairs of draws from the prior.
     spread : float
@@ -238,7 +238,10 @@ class MotionObjective:
             """Report the progress now and then."""
             if number % NEWS == 0:
                 size = 100 * np.exp(size)
-                say(f"to first order: {number} of {count} motions, {size:.3g} %")
+                say(
+                    f"first-order evaluation: {number} of {count} motions, smallest error bar "
+                    f"{size:.3g} %"
+                )
 
         def value(coefficients: Array, _: float) -> float:
             """Return the logarithm of the error bar to first order."""
@@ -333,7 +336,7 @@ def design_motion(
     if not problem.parameters.free:
         raise InputError("every parameter is fixed; expected one to estimate", problem.path)
     if add:
-        say("identifying the parameters from the recordings there are")
+        say("identifying the parameters from the existing recordings")
         draws, known = _draws_from_recordings(problem, options)
     else:
         _require_guesses(problem)
@@ -342,7 +345,7 @@ def design_motion(
     judge = MotionObjective(recording, limits, criterion, draws, known)
     criterion.require_known(judge.errors(0.0, draws[0]))
     first = judge.first_guess(options, say)
-    say("seeking a motion")
+    say("searching for a motion")
     evaluations = 1 if first.is_interrupted else options.evaluations
     best = minimise(
         judge.value,
@@ -414,8 +417,9 @@ def _draws_from_recordings(problem: Problem, options: DesignOptions) -> tuple[li
     solution.unless_interrupted()
     if not solution.status.converged:
         raise InputError(
-            f"the recordings there are could not be fitted ({solution.status.value}), so that "
-            "there is nothing to add to; solve the problem first, or leave out --add",
+            f"the existing recordings could not be fitted ({solution.status.value}), so that a "
+            "motion cannot be designed in addition to them; solve the problem first, or leave "
+            "out --add",
             problem.path,
         )
     known = shared_information(linearise_fit(solution.collocation, solution.z))
@@ -446,8 +450,8 @@ def _require_guesses(problem: Problem) -> None:
     if names := problem.parameters.names_without_guess:
         key = f"parameters.{names[0]}"
         raise InputError(
-            "has no guess, and a motion is designed about a value; expected --set "
-            f"{key}.guess=VALUE, or --add to identify it first",
+            "has no guess, but a motion is designed for a value of each parameter; expected "
+            f"--set {key}.guess=VALUE, or --add to identify it first",
             problem.path,
             key,
         )

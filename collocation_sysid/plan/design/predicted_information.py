@@ -99,8 +99,8 @@ class DesignCriterion:
         slopes = errors.slopes_of(self.names)
         if self.kind == "D" and np.linalg.matrix_rank(slopes) < len(slopes):
             raise InputError(
-                f"of {', '.join(self.names)} one follows from the others, so that their ellipsoid "
-                "has no size; name fewer, or choose --criterion A or worst",
+                f"of {', '.join(self.names)} one follows from the others, so that their "
+                "confidence ellipsoid has no volume; name fewer, or choose --criterion A or worst",
                 None,
                 "--for",
             )
@@ -294,8 +294,8 @@ class FutureRecording:
         (grasp,) = template.grasps
         if grasp.axes != "xyz" or not (np.isinf(grasp.from_s) and np.isinf(grasp.until_s)):
             raise InputError(
-                "has a grasp that holds some axes, or for a while; expected one that holds "
-                "throughout"
+                "has a grasp that holds only some axes, or a part of the time; expected one that "
+                "holds throughout"
             )
         if not 3 <= self.samples <= MOST_SAMPLES:
             raise InputError(

@@ -68,7 +68,7 @@ def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
         ("frames", header_frames, points.shape[2]),
     ):
         if declared is not None and count != declared:
-            raise InputError(f"the header states {declared} {what}, but {count} are there")
+            raise InputError(f"the header states {declared} {what}, but the file contains {count}")
     labels = _labels(read)
     if len(labels) != points.shape[1]:
         raise InputError(
@@ -99,7 +99,7 @@ def _header_counts(content: bytes) -> tuple[int, int | None]:
     """
     start = _BLOCK * (content[0] - 1)
     if len(content) < max(start + 4, _BLOCK):
-        raise InputError("is cut short: the C3D header is not whole")
+        raise InputError("is truncated: the C3D header is incomplete")
     processor = content[start + 3]
     order = ">" if processor == _SGI else "<"
     points, analog, first, last = struct.unpack_from(f"{order}4H", content, 2)
@@ -113,11 +113,13 @@ def _header_counts(content: bytes) -> tuple[int, int | None]:
     size = _BLOCK * (data_block - 1) + frames * (4 * points + analog) * width
     if len(content) < size:
         raise InputError(
-            f"has {len(content)} bytes, but {frames} frames of {points} points need {size}; "
-            "is the file cut short?"
+            f"has {len(content)} bytes, but {frames} frames of {points} points need {size}; is "
+            "the file truncated?"
         )
     if frames < 1 or not points:
-        raise InputError(f"holds {points} points and {frames} frames; expected some")
+        raise InputError(
+            f"contains {points} points and {frames} frames; expected at least one of each"
+        )
     return points, frames
 
 

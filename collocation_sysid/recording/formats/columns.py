@@ -146,7 +146,7 @@ def read_columns(
     for key, (place, factor) in places.items():
         values[key] = factor * numeric_cells(grid, [place], blank_allowed)[:, 0]
         if np.isnan(values[key]).all():
-            raise InputError(f"column {grid.columns[place]} is blank throughout; leave it out")
+            raise InputError(f"column {grid.columns[place]} has no values; remove it")
     t_s = np.arange(float(len(grid.rows))) if t is None else times_in_column(grid, *t)
     return QuantityTable(grid, t_s, values)
 
@@ -178,7 +178,7 @@ def _column_named_by_user(grid: TextTable, quantity: Quantity, name: str) -> tup
     bare, unit_of_user = name_and_unit(name)
     column = name if name in grid.columns else bare
     if grid.columns.count(column) != 1:
-        fault = "is there twice" if column in grid.columns else "is not there"
+        fault = "exists twice" if column in grid.columns else "does not exist"
         raise grid.error_at(
             f"columns.{quantity.key} is {name!r}, which {fault}; the columns are "
             f"{', '.join(grid.columns)}{hint_at(name, grid.columns)}"
@@ -186,8 +186,8 @@ def _column_named_by_user(grid: TextTable, quantity: Quantity, name: str) -> tup
     unit = name_and_unit(column)[1] or unit_of_user
     if quantity in (STRAIN, STRESS) and _words(column) & _DEFORMED:
         raise grid.error_at(
-            f"column {column} is of the deformed specimen; expected engineering "
-            f"{quantity.key}, by the undeformed length or area"
+            f"column {column} refers to the deformed specimen; expected engineering "
+            f"{quantity.key}, relative to the undeformed length or area"
         )
     factor = None if unit is None else si_factor(unit, quantity.dimension)
     if factor is None:
@@ -213,8 +213,9 @@ def find_column(grid: TextTable, quantity: Quantity) -> tuple[int, float] | None
     fitting = [(k, factor) for k, factor in factors.items() if factor is not None]
     if len(fitting) > 1:
         raise grid.error_at(
-            f"the columns {', '.join(grid.columns[k] for k, _ in fitting)} may each be "
-            f'{quantity.key}; expected one, or columns = {{ {quantity.key} = "…" }} to say which'
+            f"the columns {', '.join(grid.columns[k] for k, _ in fitting)} could all be "
+            f'{quantity.key}; expected one of them, or columns = {{ {quantity.key} = "…" }} to '
+            "say which"
         )
     if units and not fitting:
         first = next(iter(units))
@@ -253,7 +254,7 @@ def _require_known_columns(grid: TextTable, quantities: Sequence[Quantity], all_
     for column in grid.columns:
         if name_and_unit(column)[0].lower() not in known:
             hint = hint_at(column, [quantity.column for quantity in quantities])
-            raise _columns_error(grid, quantities, all_of, f": {column} is none of them{hint}")
+            raise _columns_error(grid, quantities, all_of, f": {column} is not among them{hint}")
 
 
 def _columns_error(

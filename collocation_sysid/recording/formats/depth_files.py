@@ -187,7 +187,7 @@ def _read_folder(path: Path, count_m: float | None, length_m: float) -> DepthFil
     if not files:
         raise InputError(f"has no {', '.join((*IMAGES, *CLOUDS))}; expected images or clouds", path)
     if len(kinds := {each.suffix.lower() for each in files}) > 1:
-        raise InputError(f"has {', '.join(sorted(kinds))} together; expected one kind", path)
+        raise InputError(f"contains {', '.join(sorted(kinds))}; expected files of one kind", path)
     parts = [read_depth(each, count_m, length_m) for each in files]
     times = path / "times.csv"
     t_s = None
@@ -214,8 +214,8 @@ def _scaled_cloud(points: Array, path: Path, length_m: float) -> Array:
     points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise InputError(
-            f"has the shape {points.shape}; expected x, y, z of each point, and nx, ny, nz behind "
-            "them where normals are known",
+            f"has the shape {points.shape}; expected x, y, z of each point, and after them nx, "
+            "ny, nz if normals are known",
             path,
         )
     return np.hstack([length_m * points[:, :3], points[:, 3:]])
@@ -228,7 +228,7 @@ def _read_npz(path: Path) -> DepthFileContent:
     if len(names) != 1:
         raise InputError(
             f"has {', '.join(arrays) or 'nothing'}; expected one of depth_m, depth_counts with "
-            "count_m, and points_m; beside it t_s, camera_matrix, camera_pose"
+            "count_m, and points_m; and optionally t_s, camera_matrix, camera_pose"
         )
     values = arrays[names[0]]
     if names[0] == "depth_counts":
@@ -295,7 +295,7 @@ def _read_pcd(path: Path) -> Array:
     while "DATA" not in head:
         ends = raw.find(b"\n", begins)
         if ends < 0:
-            raise InputError("has no line DATA; expected a PCD file")
+            raise InputError("has no line that begins with DATA; expected a PCD file")
         words = raw[begins:ends].decode("ascii", "replace").split()
         head |= {words[0]: words[1:]} if words and words[0] != "#" else {}
         begins = ends + 1

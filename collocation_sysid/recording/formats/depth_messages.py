@@ -33,7 +33,7 @@ def depth_kind(message: Any) -> str:
         return f"depth images, {message.width} x {message.height}"
     packed = str(getattr(message, "format", ""))
     if hasattr(message, "data") and ("compressedDepth" in packed or "16UC1" in packed):
-        return "packed depth images"
+        return "compressed depth images"
     return ""
 
 
@@ -67,9 +67,9 @@ def camera_matrix(message: Any, rectified: bool, shape: tuple[int, int]) -> Arra
     if size != [*shape] or max(binned) > 1 or any(offset):
         rows, columns = size
         raise InputError(
-            f"is the camera of images of {columns} x {rows} pixels, binned by {binned}, from "
-            f"{offset} on, beside images of {shape[1]} x {shape[0]}; expected one of whole images "
-            "of that size: state camera.matrix"
+            f"describes images of {columns} x {rows} pixels, binned by {binned}, with the offset "
+            f"{offset}, but the images have {shape[1]} x {shape[0]} pixels; expected a camera of "
+            "complete images of that size: state camera.matrix"
         )
     projection = np.asarray(_field(message, "p"), dtype=float)
     if rectified and projection.size == 12 and projection.any():
@@ -92,7 +92,7 @@ def distortion_coefficients(message: Any, rectified: bool) -> Array:
     if kind != "plumb_bob" or len(coefficients) > 5:
         raise InputError(
             f"has the lens {kind} with {len(coefficients)} numbers; expected plumb_bob with five: "
-            "take the topic of rectified images, or state camera.distortion"
+            "use the topic of rectified images, or state camera.distortion"
         )
     return coefficients
 
@@ -134,8 +134,8 @@ def _decode_compressed(kind: str, data: bytes) -> Any:
         raise
     except Exception as error:  # the library has exceptions of its own
         raise InputError(
-            f"has an image of the format {kind!r} that is no PNG ({reason(error)}): take the topic "
-            "of images that are not packed, or have them packed as PNG"
+            f"has an image of the format {kind!r} that is not a PNG ({reason(error)}): use the "
+            "topic of uncompressed images, or compress them as PNG"
         ) from error
     if not packed or "32FC1" not in kind:
         return counts

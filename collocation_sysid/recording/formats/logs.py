@@ -82,7 +82,7 @@ class TopicAddress:
                 options["episode"] = int(part)
             else:
                 expected = "two frames PARENT>CHILD, a robot.urdf, rad or deg, or an episode"
-                raise InputError(f"found {part!r} behind the topic; expected {expected}")
+                raise InputError(f"found {part!r} after the topic; expected {expected}")
         return cls(Path(log), topic, **options)
 
 
@@ -142,8 +142,8 @@ def open_log(path: Path, episode: int | None = None) -> Iterator[Log]:
         log = partial(_Bag, path)
     else:
         raise InputError(
-            "is no log; expected a ROS bag (a folder with metadata.yaml, .db3 or .bag), an .mcap "
-            "file, or a LeRobot dataset (a folder with meta/info.json)"
+            "is not a log; expected a ROS bag (a folder with metadata.yaml, .db3 or .bag), an "
+            ".mcap file, or a LeRobot dataset (a folder with meta/info.json)"
         )
     try:
         with log() as each:
@@ -151,7 +151,7 @@ def open_log(path: Path, episode: int | None = None) -> Iterator[Log]:
     except (InputError, ImportError):
         raise
     except Exception as error:  # the libraries have exceptions of their own
-        raise InputError(f"is a damaged log, or not what it seems: {reason(error)}") from error
+        raise InputError(f"is damaged, or a file of another type: {reason(error)}") from error
 
 
 def require_topic(log: Log, topic: str) -> None:
@@ -218,7 +218,7 @@ class _Mcap:
         self._reader = make_reader(self._file, decoder_factories=decoders)
         summary = self._reader.get_summary()
         if summary is None or summary.statistics is None:
-            raise InputError("is cut short: it has no summary; `mcap recover` makes one")
+            raise InputError("is truncated: it has no summary; `mcap recover` creates one")
         counts = summary.statistics.channel_message_counts
         self.topics = {}
         for key, channel in summary.channels.items():

@@ -39,8 +39,8 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     top = next((k for k, row in enumerate(rows) if row.cells[0] == "Frame"), None)
     if top is None or top < 4 or not "".join(rows[top].cells[1:2]).startswith("Time"):
         raise InputError(
-            "is no Motive CSV with markers: expected rows of Type, Name, ID and Position, then "
-            "'Frame,Time (Seconds),X,Y,Z,…'"
+            "is not a Motive CSV with markers: expected rows of Type, Name, ID and Position, "
+            "then 'Frame,Time (Seconds),X,Y,Z,…'"
         )
     heads = _column_headings(rows[1:top], rows[top])
     columns = _marker_columns(heads, rows[top].line)
@@ -64,8 +64,8 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     )
     solved = {label: columns[label].kind for label in raw.labels}
     notes = (
-        f"{label}: has no measured columns; those of Type '{kind}' were taken, which Motive places "
-        "by the rigid body it fits"
+        f"{label}: has no measured columns; those of Type '{kind}' were used, which Motive "
+        "computes from a fitted rigid body"
         for label, kind in solved.items()
         if kind != _MEASURED
     )

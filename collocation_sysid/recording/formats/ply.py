@@ -96,4 +96,6 @@ def _plain_columns(content: bytes) -> Mapping[str, Array] | None:
 
 
 def _refuse_short(expected: int, count: int) -> None:
-    raise InputError(f"has {count} points; expected {expected}, as its header states: is it cut?")
+    raise InputError(
+        f"has {count} points; expected {expected}, as its header states: is the file truncated?"
+    )

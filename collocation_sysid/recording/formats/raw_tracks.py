@@ -145,7 +145,9 @@ class Header:
         """
         declared = self.number(key)
         if declared is not None and declared != count:
-            message = f"{key} is {declared:g}, but {count} {what} are there; is the file cut short?"
+            message = (
+                f"{key} is {declared:g}, but the file contains {count} {what}; is it truncated?"
+            )
             raise InputError(message, where=f"line {line or self.entries[key][1]}")
 
 

@@ -111,7 +111,9 @@ def topic_as_csv(address: TopicAddress) -> bytes:
         if not messages:
             raise InputError(f"the topic {address.topic} has no messages")
         if kind := depth_kind(messages[0][1]):
-            raise InputError(f"the topic {address.topic} holds {kind}; expected one of numbers")
+            raise InputError(
+                f"the topic {address.topic} contains {kind}; expected a topic with numbers"
+            )
         if _is_transforms(messages[0][1]):
             return _csv_content(
                 POSE, *_poses_through_frames(_all_transforms(log, messages, address.topic), address)
@@ -123,8 +125,8 @@ def topic_as_csv(address: TopicAddress) -> bytes:
     columns = list(dict.fromkeys(name for row in rows for name in row))
     if not columns:
         raise InputError(
-            f"the topic {address.topic} holds neither poses, points, wrenches, "
-            "positions of joints nor numbers"
+            f"the topic {address.topic} contains neither poses, points, wrenches, joint positions "
+            "nor numbers"
         )
     values = np.array([[row.get(name, np.nan) for name in columns] for row in rows])
     if address.robot is not None:
@@ -151,7 +153,7 @@ def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
     write = [f"{path.name}#{name}"]
     if first and _is_transforms(first[0][1]):
         chains = moving_chains(_all_transforms(log, log.messages(name), name))
-        serves = "poses of one frame in another" if chains else "frames that do not move"
+        serves = "poses of one frame relative to another" if chains else "static frames"
         write = [f"{write[0]}#{parent}>{child}" for parent, child in chains]
         if name.removesuffix(STATIC_TOPIC_SUFFIX) in log.topics and name.endswith(
             STATIC_TOPIC_SUFFIX
@@ -160,7 +162,7 @@ def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
     elif first and (depth_type := depth_kind(first[0][1])):
         serves = f"{depth_type}: [[experiment.depth]]"
     elif first and is_camera_model(first[0][1]):
-        serves = "the camera's matrix, for the depth images beside it"
+        serves = "matrix of the camera, for depth images in the same namespace"
         write = []
     elif first:
         messages = [message for _, message in first]
@@ -427,12 +429,12 @@ def _poses_through_frames(edges: Edges, address: TopicAddress) -> tuple[Array, A
     path = _frame_path(edges, parent, child)
     moving = [np.array(sorted(edges[edge])) for edge in path if len(edges[edge]) > 1]
     if not moving:
-        raise InputError(f"nothing moves between {parent} and {child}; leave poses out instead")
+        raise InputError(f"nothing moves between {parent} and {child}; omit the poses instead")
     first = max(t[0] for t in moving)
     last = min(t[-1] for t in moving)
     times = max((t[(t >= first) & (t <= last)] for t in moving), key=len)
     if not len(times):
-        raise InputError(f"the frames between {parent} and {child} have no common time")
+        raise InputError(f"the transforms between {parent} and {child} have no common time span")
     manager = Manager(check=False)
     for edge in path:
         at_s = np.array(sorted(edges[edge]))
@@ -518,12 +520,12 @@ def _poses_from_joints(
     assert address.robot is not None
     require_regular(address.robot)
     if address.frames is None:
-        raise InputError(f"expected two frames behind {address.robot.name}, as in #base>tool")
+        raise InputError(f"expected two frames after {address.robot.name}, as in #base>tool")
     robot = UrdfTransformManager(check=False)
     try:
         robot.load_urdf(address.robot.read_text(encoding="utf-8"))
     except Exception as error:  # lxml's and the library's own
-        raise InputError(f"is no URDF file: {error}", address.robot) from error
+        raise InputError(f"is not a URDF file: {error}", address.robot) from error
     parent, child = address.frames
     for frame in address.frames:
         if not robot.has_frame(frame):
@@ -533,7 +535,9 @@ def _poses_from_joints(
                 address.robot,
             )
     if unit is None:
-        raise InputError("does not tell the unit of its joints; expected #rad or #deg behind it")
+        raise InputError(
+            "does not state the unit of its joints; expected #rad or #deg after the topic"
+        )
     limits = {name: robot.get_joint_limits(name) for name in columns if _has_joint(robot, name)}
     if not limits:
         joints = ", ".join(columns)
@@ -563,7 +567,7 @@ def _require_joint_limits(
 ) -> None:
     """Raise an `InputError` if a joint is beyond its limits: the library would silently clip it."""
     if not limits[0] - JOINT_LIMIT_SLACK <= angle <= limits[1] + JOINT_LIMIT_SLACK:
-        hint = "" if address.unit else "; are these degrees? Then #deg belongs behind the topic"
+        hint = "" if address.unit else "; if these are degrees, append #deg to the topic"
         raise InputError(
             f"the joint {name} is at {angle:.4g}, beyond its limits {limits[0]:.4g} to "
             f"{limits[1]:.4g} in {address.robot and address.robot.name}{hint}"

@@ -91,7 +91,7 @@ def verify_export(
     target = target_named(target_name)
     if target.verify is None:
         able = ", ".join(name for name, each in TARGETS.items() if each.verify is not None)
-        raise InputError(f"{target.name} is not run from here; --verify works with {able}")
+        raise InputError(f"{target.name} cannot be run by this program; --verify works with {able}")
     # It may leave files of its own behind.
     with tempfile.TemporaryDirectory() as scratch:
         place = Path(shutil.copytree(folder, Path(scratch) / "export"))

@@ -58,7 +58,10 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         )
     limits.append("damping is not exported: an equilibrium has none")
     if body.is_quadratic:
-        limits.append("the weight of an element is spread by its shape functions, ours is lumped")
+        limits.append(
+            "CalculiX distributes the weight of an element with its shape functions, "
+            "this program lumps it at the nodes"
+        )
     nodes = (f"{k},{_format_values(*point)}\n" for k, point in enumerate(body.nodes_m, start=1))
     mesh = f"*NODE,NSET=ALL\n{''.join(nodes)}"
     kind = "C3D10" if body.is_quadratic else "C3D4"
@@ -178,7 +181,8 @@ def _material_card(region: IdentifiedRegion, is_linear: bool) -> tuple[str, str]
         limitation = ""
         if region.material == "linear" and not is_linear:
             limitation = (
-                "beside large strains the linear material becomes St. Venant and Kirchhoff's"
+                "in an analysis with large displacements the linear material becomes that of St. "
+                "Venant and Kirchhoff"
             )
         return f"*ELASTIC\n{_format_values(region.young_pa, region.poisson)}\n", limitation
     if region.material == "mooney-rivlin":
@@ -193,7 +197,8 @@ def _material_card(region: IdentifiedRegion, is_linear: bool) -> tuple[str, str]
             limit = c["gent_limit"]
             factors = mu / 2, mu / (4 * limit), mu / (6 * limit**2)
             limitation = (
-                f"Gent's energy is a series of three terms: right for Ī₁ − 3 well below {limit:.4g}"
+                "Gent's energy is exported as a series of three terms, accurate for Ī₁ − 3 well "
+                f"below {limit:.4g}"
             )
         constants = _format_values(
             factors[0], factors[1], factors[2], volume, ABSENT_TERM, ABSENT_TERM
@@ -207,13 +212,13 @@ def _material_card(region: IdentifiedRegion, is_linear: bool) -> tuple[str, str]
         )
         constants = _format_values(c["mu_pa"] / slope, stretch, volume)
         return f"*HYPERELASTIC,ARRUDA-BOYCE\n{constants}\n", (
-            "its energy of the volume is ½ κ ((J² − 1)/2 − ln J), ours ½ κ (J − 1)²: the same at "
-            "small changes of volume"
+            "its volumetric energy is ½ κ ((J² − 1)/2 − ln J) instead of ½ κ (J − 1)²: both "
+            "agree for small changes of volume"
         )
     constants = _format_values(region.mu_pa / 2, volume)
     return f"*HYPERELASTIC,NEO HOOKE\n{constants}\n", (
-        f"{region.material} becomes the neo-Hookean of Ī₁ with ½ κ (J − 1)²: the same λ and μ at "
-        "small strain, another stress from the second order of the strain on"
+        f"{region.material} becomes the neo-Hookean law of Ī₁ with ½ κ (J − 1)²: the same λ and μ "
+        "at small strain, but stresses differ in second order of the strain"
     )
 
 
@@ -234,7 +239,7 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     """
     program = shutil.which("ccx")
     if program is None:
-        raise InputError("no program ccx is on the path: install CalculiX to verify the export")
+        raise InputError("the program ccx was not found: install CalculiX to verify the export")
     try:
         job = [program, "-i", DECK.removesuffix(".inp")]
         ended = subprocess.run(
@@ -252,8 +257,8 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     (*_, ours), (*_, forces) = equilibria(body, len(times))
     sag_m = longest_displacement_m(ours)
     difference_m = longest_displacement_m(theirs - ours)
-    share = f" ({difference_m / sag_m:.2%} of it)" if sag_m else ""
-    remark = f"no node is further than {difference_m:.3g} m apart{share}"
+    share = f" ({difference_m / sag_m:.2%} of the displacement)" if sag_m else ""
+    remark = f"node positions differ by at most {difference_m:.3g} m{share}"
     what = "at rest" if len(times) == 1 else f"at {times[-1]:g} s"
     comparisons = [
         PredictionComparison(

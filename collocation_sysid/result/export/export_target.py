@@ -22,23 +22,23 @@ from .identified import IdentifiedBody
 from .obstacle_shapes import Primitive
 
 LINEAR_ONLY = (
-    "quadratic tetrahedra are split into eight linear ones on the same nodes: too stiff in bending "
-    "and near ν = ½"
+    "each quadratic tetrahedron is split into eight linear ones with the same nodes, which are "
+    "too stiff in bending and near ν = ½"
 )
 MEAN_DILATATION = (
-    "tet10-p0 becomes the plain quadratic tetrahedron: where ν is near ½ it is too stiff "
-    "(ν = {worst:.4g} here)"
+    "tet10-p0 becomes the standard quadratic tetrahedron, which is too stiff for ν near ½ (ν = "
+    "{worst:.4g} here)"
 )
 VISCOELASTICITY = (
-    "memory is not known; the stiffness is the long-term one, at once it is {at_once:.4g} "
-    "times that"
+    "viscoelastic memory is not supported; the exported stiffness is the long-term one, and the "
+    "instantaneous one is {at_once:.4g} times that"
 )
 MOTION = (
-    "grasped nodes are held where they are at the first sample; poses_1.csv and so on have the "
-    "motion, which something has to drive"
+    "grasped nodes are fixed at their positions of the first sample; the motion is in "
+    "poses_1.csv and so on, and your simulation has to apply it"
 )
 UNTESTED = (
-    "untested: written after the description of the format, never read by the simulator itself"
+    "untested: written according to the description of the format, but never read by the simulator"
 )
 
 
@@ -132,12 +132,12 @@ class TargetCapabilities:
         "{material} becomes the neo-Hookean material of the same λ and μ at small strain"
     )
     stiffness_damping: str = ""
-    mass_damping: str = "γ_m = {gamma_m_1_s:.4g} 1/s is not known"
+    mass_damping: str = "γ_m = {gamma_m_1_s:.4g} 1/s is not supported"
     damping_law: str = ""
     has_viscoelasticity: bool = False
     has_moving_grasps: bool = False
     has_moving_obstacles: bool = False
-    node_forces: str = "forces on nodes are left out"
+    node_forces: str = "forces on nodes are not exported"
     has_quadratic_elements: bool = False
     obstacle_shapes: tuple[str, ...] = ("plane", "sphere", "box", "cylinder", "capsule")
     has_rounded_edges: bool = True
@@ -179,16 +179,19 @@ class TargetCapabilities:
         """Yield sentences on what the simulator cannot express of the obstacles."""
         for each in body.obstacles:
             if (kind := Primitive.from_solid(each.shape).kind) not in self.obstacle_shapes:
-                yield f"{each.name}: what the body may touch is not exported if it is a {kind}"
+                yield f"{each.name}: an obstacle of the kind {kind} is not exported"
                 continue
             if getattr(each.shape, "rounding_m", 0.0) and not self.has_rounded_edges:
                 yield f"{each.name}: its edges are not rounded"
             if each.faces is not None and not self.has_contact_faces:
-                yield f"{each.name}: all of the body may touch it"
+                yield f"{each.name}: the whole surface of the body may touch it"
             if each.friction and not self.has_friction:
-                yield f"{each.name}: nothing rubs on it"
+                yield f"{each.name}: contact is without friction"
             if len(each.poses.t_s) > 1 and not self.has_moving_obstacles:
-                yield f"{each.name} is where it is at the first sample; its poses have the motion"
+                yield (
+                    f"{each.name} is fixed at its position of the first sample; its motion is "
+                    "in its poses file"
+                )
 
 
 def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
@@ -207,7 +210,7 @@ def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
     ):
         yield "forces and point masses stay as they are at the first sample"
     if any(not grasp.is_active(times).all() for grasp in e.grasps):
-        yield "grasps that begin or end to hold within the recording stay as they begin"
+        yield ("grasps that begin or end within the recording stay as they are at the first sample")
 
 
 def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
@@ -277,7 +280,7 @@ def comment_lines(
     Each line begins with `start` and ends with `end`, the marks of a comment in the format.
     """
     lines = [
-        f"{body.title}: as identified; SI units",
+        f"{body.title}: identified body; SI units",
         *(f"warning: {warning}" for warning in body.warnings),
         *(f"not expressed: {limit}" for limit in limitations),
     ]

@@ -24,10 +24,10 @@ CAPABILITIES = TargetCapabilities(
         "linear": "isotropic elastic",
     },
     stiffness_damping="γ_r = {gamma_r_s:.4g} s is not exported, since the step is static; in a "
-    'dynamic one a solid mixture with a "Newtonian viscous solid" of mu = γ_r μ and kappa = '
-    "γ_r (λ + 2/3 μ) is kelvin-voigt, but for the ratio of volumes J",
-    mass_damping="γ_m = {gamma_m_1_s:.4g} 1/s is not exported; in a dynamic step a body load "
-    '"mass damping" is it',
+    'dynamic step, a solid mixture with a "Newtonian viscous solid" of mu = γ_r μ and kappa = '
+    "γ_r (λ + 2/3 μ) equals kelvin-voigt up to a factor J",
+    mass_damping="γ_m = {gamma_m_1_s:.4g} 1/s is not exported; in a dynamic step, a body load "
+    '"mass damping" represents it',
     has_viscoelasticity=True,
     node_forces="",
     has_quadratic_elements=True,
@@ -42,7 +42,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         _material_xml(k, region, limits) for k, region in enumerate(body.regions, 1)
     )
     if body.node_loads_n.any():
-        limits.append("point masses and forces on nodes are left out")
+        limits.append("point masses and forces on nodes are not exported")
     xml = '<?xml version="1.0" encoding="UTF-8"?>\n' + comment_lines(body, limits, "<!-- ", " -->")
     xml += '<febio_spec version="4.0">\n<Module type="solid"/>\n'
     xml += (
@@ -89,8 +89,8 @@ def _material_xml(number: int, region: IdentifiedRegion, limits: list[str]) -> s
     )
     if uncoupled:
         limits.append(
-            f"{region.name}: an uncoupled viscoelastic material relaxes its shape only, ours its "
-            "volume too"
+            f"{region.name}: the uncoupled viscoelastic material of FEBio relaxes deviatoric "
+            "stress only, that of this program also the pressure"
         )
     return (
         f'<material id="{number}" {name} type="{"uncoupled " * uncoupled}viscoelastic">{density}'
@@ -109,7 +109,10 @@ def _elastic_law(region: IdentifiedRegion, limits: list[str]) -> tuple[str, dict
         return CAPABILITIES.materials[region.material], {"c1": c["c10_pa"], "c2": c["c01_pa"]}, True
     moduli = {"E": region.young_pa, "v": region.poisson}
     if region.material == "linear":
-        limits.append(f"{region.name}: a linear material turns with the body there, ours does not")
+        limits.append(
+            f"{region.name}: the linear material of FEBio rotates with the body, that "
+            "of this program does not"
+        )
     return CAPABILITIES.materials.get(region.material, "neo-Hookean"), moduli, False
 
 

@@ -179,7 +179,7 @@ class IdentifiedBody:
             problem = answer.apply_to_problem(problem)  # which may state no guess itself
         if any(body.scan_conditions is not None for body in problem.bodies):
             raise InputError(
-                "the mesh was made under gravity, and targets take meshes as free of stress; "
+                "the mesh was made under gravity, but simulators assume a stress-free mesh; "
                 "expected a stress-free mesh: write body.stress_free_mesh(theta) to a file, and "
                 'solve with that and rest_shape = "stress_free"',
                 folder,
@@ -399,12 +399,10 @@ def _warnings(result: Result) -> tuple[str, ...]:
     if (verdict := result.trust.verdict) != "good":
         warnings.append(f"the verdict on the run is {verdict!r}: {'; '.join(result.trust.reasons)}")
     if result.fields:
-        warnings.append(
-            f"{listed(result.fields)} differs from place to place: the mean is exported"
-        )
+        warnings.append(f"{listed(result.fields)} varies in space: the mean is exported")
     for name, each in result.parameters.items():
         if each.at_bound and not each.fixed:
             warnings.append(
-                f"{name} = {each.value:.4g} ended at a bound: the data would have it elsewhere"
+                f"{name} = {each.value:.4g} ended at a bound: the best value may lie beyond it"
             )
     return tuple(warnings)

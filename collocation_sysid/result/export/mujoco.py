@@ -46,12 +46,12 @@ RELATIVE_DIFFERENCE_STEP = 1e-5
 MAX_STEPS = 2_000_000
 CAPABILITIES = TargetCapabilities(
     {"st-venant-kirchhoff": "flex"},
-    "a flex is St. Venant and Kirchhoff's; {material} has the same E and ν at small strain, "
-    "another stress from its second order on",
-    'the damping of a flex is the law "material", γ_r (λ tr(Ė) I + 2 μ Ė); {damping} is the same '
-    "at small strain",
-    "damping by mass, γ_m = {gamma_m_1_s:.4g} 1/s, is not known, and MuJoCo refuses dampers on the "
-    "nodes of a flex",
+    "a flex has the law of St. Venant and Kirchhoff; {material} has the same E and ν at small "
+    "strain, but stresses differ in second order of the strain",
+    'the damping of a flex is the law "material", γ_r (λ tr(Ė) I + 2 μ Ė); {damping} agrees with '
+    "it at small strain",
+    "mass-proportional damping, γ_m = {gamma_m_1_s:.4g} 1/s, is not supported, and MuJoCo "
+    "refuses dampers on the nodes of a flex",
     damping_law="material",
     has_moving_grasps=True,
     has_rounded_edges=False,
@@ -77,8 +77,8 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     limits = CAPABILITIES.limitations(body)
     if body.experiment.grasps:
         limits.append(
-            "the weld of grasped nodes to the mocap bodies lags two steps behind: for a motion, "
-            "set position and velocity of the free joints at every step, as --verify does"
+            "the weld of grasped nodes to the mocap bodies lags by two time steps: to apply a "
+            "motion, set position and velocity of the free joints at every step, as --verify does"
         )
     step_s = _stable_step_s(body)
     x = comment_lines(body, limits, "<!-- ", " -->")
@@ -274,8 +274,8 @@ def _import_mujoco() -> ModuleType:
     version: str = getattr(mujoco, "__version__")  # noqa: B009 (not in its stubs)
     if int(version.partition(".")[0]) < OLDEST_VERSION:
         raise InputError(
-            f"found MuJoCo {version}, which takes a flex for stiffer than is written; "
-            f'expected {OLDEST_VERSION} or newer: pip install --upgrade "collocation-sysid[mujoco]"'
+            f"found MuJoCo {version}, which makes a flex stiffer than specified; expected "
+            f'{OLDEST_VERSION} or newer: pip install --upgrade "collocation-sysid[mujoco]"'
         )
     return mujoco
 
@@ -330,7 +330,10 @@ def _compare_motion(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> Pre
     mujoco.mj_resetDataKeyframe(model, data, 0)
     steps = round(e.timestep_s / model.opt.timestep)
     if steps * len(e.t_s) > MAX_STEPS:
-        raise InputError(f"{steps * len(e.t_s)} steps are too many to predict the motion with")
+        raise InputError(
+            f"the prediction of the motion would need {steps * len(e.t_s)} time "
+            "steps, which are too many"
+        )
     first = 7 * len(e.grasps)
     shapes = [data.qpos[first:].reshape(-1, 3).copy()]
     for k in range(steps * (len(e.t_s) - 1)):
@@ -347,7 +350,7 @@ def _compare_motion(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> Pre
     size_m = _rms_length(ours - rigid_m)
     difference_m = _rms_length(theirs - ours)
     share = f", {difference_m / size_m:.2%} of it" if size_m else ""
-    remark = f"they are {difference_m:.3g} m apart (RMS){share}"
+    remark = f"both simulations differ by {difference_m:.3g} m (RMS){share}"
     what = "RMS deformation over the recording"
     return PredictionComparison(what, _rms_length(theirs - rigid_m), size_m, "m", remark)
 

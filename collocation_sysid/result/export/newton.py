@@ -19,7 +19,8 @@ CAPABILITIES = TargetCapabilities(
     {"stable-neo-hookean": "soft mesh"},
     "{material} becomes the stable neo-Hookean energy of the same λ and μ at small strain",
     "damping γ_r becomes a viscosity k = γ_r μ / 2 [Pa s] with the stress 4 k Ė, the law "
-    '"material" without its part λ tr(Ė): changes of volume are damped less; here it is {damping}',
+    '"material" without its part λ tr(Ė): changes of volume are damped less; the identified law '
+    "is {damping}",
     has_rounded_edges=False,
     has_contact_faces=False,
 )
@@ -107,7 +108,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     limits = [
         *CAPABILITIES.limitations(body),
         *contact.limitations,
-        "SolverSemiImplicit takes other constants for the same material, k_mu = 4/3 μ and "
+        "SolverSemiImplicit needs other constants for the same material, k_mu = 4/3 μ and "
         "k_lambda = λ + 5/6 μ, and another damping",
         "positions are single precision",
     ]

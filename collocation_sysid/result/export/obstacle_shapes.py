@@ -357,9 +357,9 @@ class SharedContact:
             if not np.allclose(values, values[:1], atol=0)
         ]
         sentence = (
-            f"obstacles differ in {listed(unlike)}, of which a soft body in Newton has one: here "
-            f"the first's friction {friction[0]:.4g}, with which that of each other is averaged, "
-            f"and of all the largest stiffness {max(stiffness):.4g} N/m of a node and width "
-            f"{max(width):.4g} m"
+            f"obstacles differ in {listed(unlike)}, but a soft body in Newton has only one value: "
+            f"exported are the friction {friction[0]:.4g} of the first one, with which Newton "
+            f"averages that of each obstacle, and the largest stiffness {max(stiffness):.4g} N/m "
+            f"of a node and width {max(width):.4g} m"
         )
         return cls(friction[0], max(stiffness), max(width) / 2, (sentence,) * bool(unlike))

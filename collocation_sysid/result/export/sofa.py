@@ -22,8 +22,8 @@ PLUGINS = (
     "Topology.Container.Dynamic",
 )
 NEO_HOOKEAN_VERSIONS = (
-    "NeoHookean is that of λ and μ (½ λ ln² J − μ ln J + ½ μ (I₁ − 3)) in the versions of SOFA "
-    "that have StableNeoHookean too; older ones take other constants"
+    "NeoHookean has the constants λ and μ (½ λ ln² J − μ ln J + ½ μ (I₁ − 3)) in versions of "
+    "SOFA that also have StableNeoHookean; older versions use other constants"
 )
 CAPABILITIES = TargetCapabilities(
     {
@@ -32,8 +32,8 @@ CAPABILITIES = TargetCapabilities(
         "st-venant-kirchhoff": "StVenantKirchhoff",
         "linear": "linear",
     },
-    stiffness_damping="the damping is Rayleigh's, here {damping}: the same at small strain, but it "
-    "brakes that a stretched body turns",
+    stiffness_damping="SOFA uses Rayleigh damping instead of {damping}: both agree at small "
+    "strain, but Rayleigh damping also damps the rotation of a stretched body",
     mass_damping="",
     damping_law="rayleigh",
     obstacle_shapes=("plane", "sphere"),
@@ -54,15 +54,18 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     if body.is_quadratic or len(body.regions) != 1:
         raise InputError(
             f"the body has {len(body.regions)} region(s) of {body.body.element.name}; the scene "
-            "for SOFA takes one of linear tetrahedra: export to calculix, febio or json"
+            "for SOFA supports one region of linear tetrahedra: export to calculix, febio or json"
         )
     if (body.is_prescribed.any(axis=1) != body.is_node_prescribed).any():
-        raise InputError("a grasp holds single axes, which the scene for SOFA does not take")
+        raise InputError("a grasp holds single axes, which the scene for SOFA does not support")
     region = body.regions[0]
     limits = [*CAPABILITIES.limitations(body), NEO_HOOKEAN_VERSIONS]
     force = _elastic_law_xml(region)
     if (np.abs(body.prescribed_displacements_m) > 1e-9).any():
-        limits.append("grasps beside the first hold the body undeformed, not where they hold it")
+        limits.append(
+            "all grasps but the first hold the nodes at their undeformed positions, "
+            "not at those of the recording"
+        )
     mass = values_as_text(body.total_node_mass_kg)
     grasped = " ".join(map(str, np.flatnonzero(body.is_node_prescribed)))
     cells = " ".join(map(str, body.body.cells.ravel()))

@@ -43,10 +43,11 @@ REST_STEPS = 400
 REST_STEP_S = 2e-3
 CAPABILITIES = TargetCapabilities(
     {},
-    "{material} becomes whatever energy the simulator has for E and ν: Newton's is the stable "
-    "neo-Hookean one",
-    "damping γ_r is no part of the schemas: it stands as an attribute of our own",
-    "γ_m = {gamma_m_1_s:.4g} 1/s is no part of the schemas: it stands as an attribute of our own",
+    "the simulator chooses the energy for E and ν instead of {material}: in Newton it is the "
+    "stable neo-Hookean law",
+    "damping γ_r is not part of the USD schemas: it is exported as a custom attribute",
+    "γ_m = {gamma_m_1_s:.4g} 1/s is not part of the USD schemas: it is exported as a custom "
+    "attribute",
     has_moving_grasps=True,
     has_moving_obstacles=True,
     has_rounded_edges=False,
@@ -54,13 +55,13 @@ CAPABILITIES = TargetCapabilities(
 )
 SINGLE_PRECISION = "numbers are single precision"
 REGIONS = (
-    "regions are subsets of tetrahedra, each with its material; a simulator that takes one "
-    "material a body, as Newton 1.8, takes that of the largest"
+    "regions are subsets of tetrahedra, each with its material; a simulator with one material "
+    "per body, such as Newton 1.8, uses that of the largest"
 )
-POINT_MASSES = "point masses on nodes are left out"
+POINT_MASSES = "point masses on nodes are not exported"
 TILT = (
     "gravity points {degrees:.3g}° away from −z of the stage, as estimated from the recording; a "
-    "simulator that takes its magnitude alone, and lets it point along −z, leaves that out"
+    "simulator that uses its magnitude only, along −z, ignores this"
 )
 NO_SIMULATION = (
     "the points of the body are those of the first sample: the run has no forward simulation"

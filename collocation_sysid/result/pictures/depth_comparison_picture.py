@@ -48,7 +48,7 @@ def depth_picture(rows: Array) -> Figure:
     times = np.unique(rows[np.isnan(rows[:, 3]), 0])
     points = rows[np.isfinite(rows[:, 3])]
     if not len(points):
-        return _sentence_figure("no point is near enough to the body to count")
+        return _sentence_figure("no point is near enough to the body to be compared")
     fitted = bool(np.isfinite(points[:, 4]).any())
     axes, dot = _new_panels(points, times, 1 + fitted)
     nearest, farthest = np.percentile(points[:, 3], [1, 99])
@@ -71,7 +71,7 @@ def depth_picture(rows: Array) -> Figure:
             unused = here[~np.isfinite(here[:, 4])]
             column[1].plot(*unused[:, 1:3].T, ".", ms=1.5, color="0.7")
             distances = _draw_panel(column[1], used[:, 1:3], 1e3 * used[:, 4], lines, "0.6", behind)
-            scales.append((distances, "behind surface [mm]"))
+            scales.append((distances, "distance behind the surface [mm]"))
             rms = np.sqrt(np.mean((1e3 * used[:, 4]) ** 2))
             column[1].set_title(f"{rms:.2g} mm RMS, {len(used):,} points", fontsize=SMALL_PT)
     for row, (scale, label) in zip(axes, scales, strict=True):

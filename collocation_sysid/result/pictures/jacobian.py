@@ -77,8 +77,8 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     _tick_blocks(middle, "y", "c", range(first, steps), height)
     middle.tick_params(labelleft=False, left=False)
     name = rf"$\partial c_{{{steps - 1}}} / \partial x_{{{steps - 1}}}$"
-    free = "" if segment.has_constraints_of_grasps else ", free ones only"
-    style_axes(right, f"{name}: the mesh graph", "column, 3 node + axis", f"row{free}")
+    free = "" if segment.has_constraints_of_grasps else ", free dofs only"
+    style_axes(right, f"{name}: connectivity of the mesh", "column, 3 node + axis", f"row{free}")
     for axes in (full_axes, middle, right):
         axes.grid(False)
         axes.spines[:].set_visible(True)

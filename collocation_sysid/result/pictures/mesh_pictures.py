@@ -42,8 +42,8 @@ LETTER_MM = 1.4
 MAX_BODY_HEIGHT_MM = 70.0
 # Shortest distance on paper at which two marks are drawn apart: nearer ones cover each other.
 MIN_MARK_DISTANCE_MM = 0.4
-DECLARED_POSITION = "place given"
-UNSTATED_PLACE = "no place given"
+DECLARED_POSITION = "position given"
+UNSTATED_PLACE = "position not given"
 TENDON = "tendons"
 MARK_STYLES: dict[str, dict[str, Any]] = {
     DECLARED_POSITION: {"ls": "", "marker": "x", "ms": 3.2, "mec": BLUE, "mew": 0.8},

@@ -194,7 +194,7 @@ def marker_errors(
         if not np.isfinite(squares).any():
             continue
         totals.append(float(1e3 * np.sqrt(np.nanmean(squares))))
-        label = f"{label}: {totals[-1]:.3g} mm over all"
+        label = f"{label}: {totals[-1]:.3g} mm RMS in total"
         axes.plot(t_s, 1e3 * rms_over_markers(squares), label=label, **style)
     style_axes(axes, "", "time [s]", "RMS over markers [mm]")
     if totals and max(totals) > LOG_AXIS_RATIO * min(totals) > 0:

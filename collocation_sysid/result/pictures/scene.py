@@ -279,12 +279,12 @@ def legend_handles(*entries: str) -> list[Line2D]:
 
     Parameters
     ----------
-    *entries : {"grasped", "markers", "measured", "behind the body", "seen in depth"}
+    *entries : {"grasped", "markers", "measured", "behind the body", "depth image"}
     """
     styles = {
         "grasped": {**_GRASPED_STYLE, "ms": 3.0},
         "behind the body": {**_MARKER_STYLE, "mfc": "none"},
-        "seen in depth": {**_DEPTH_POINT_STYLE, "ms": 4.0},
+        "depth image": {**_DEPTH_POINT_STYLE, "ms": 4.0},
     }
     return [
         Line2D([], [], label=name, **styles.get(name, {**_MARKER_STYLE, "mfc": VERMILION}))

@@ -107,7 +107,7 @@ def _mark_continuation_stages(
             for axes in panels:
                 axes.axvline(between, color=_STAGE_COLOUR, lw=0.8, ls=(0, (2, 2)), zorder=0.5)
     shares = ", ".join(f"{100 * history[part.start].share:.3g}" for part in stages)
-    panels[0].set_title(f"fitted: {shares} % of the timesteps in turn", fontsize=SMALL_PT)
+    panels[0].set_title(f"continuation: {shares} % of the time steps in turn", fontsize=SMALL_PT)
 
 
 def _draw_parameters(
@@ -167,7 +167,7 @@ def scan_picture(young_pa: Array, misfit: Array, best: int) -> Figure:
         foot = np.full(int(failed.sum()), axes.get_ylim()[0])
         axes.plot(
             young_pa[failed], foot, "x", ms=5, color=VERMILION, clip_on=False, zorder=3,
-            label="not simulable",
+            label="simulation failed",
         )  # fmt: skip
     axes.plot(young_pa[best], misfit[best], "D", ms=5, color=ORANGE, zorder=3, label="start")
     add_legend_above(axes, columns=3)

@@ -197,7 +197,7 @@ def _camera_facing_weights(
 FIELD_TITLES = {
     "von_mises_pa": "von Mises stress [Pa]",
     "energy_density_j_m3": "elastic energy [J/m³]",
-    "det_f": "volume over undeformed, det F",
+    "det_f": "volume relative to the undeformed volume, det F",
 }
 # More would be too small to tell anything.
 MAX_SHAPES = 20

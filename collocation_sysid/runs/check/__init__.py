@@ -70,8 +70,8 @@ FIT_SIMULATIONS = 15.0
 DERIVATIVE_TOLERANCE = 1e-6
 AT_THE_GUESS = ", at the guess"
 SUBSTEPS_NOTE = (
-    "one step a sample is counted here. Where transcription.substeps is not given, solve "
-    f"takes as many as the error bars need, up to {MOST_SUBSTEPS}"
+    "check assumes one time step per sample. If transcription.substeps is not given, solve uses "
+    f"as many as the error bars require, up to {MOST_SUBSTEPS}"
 )
 
 
@@ -227,7 +227,7 @@ def check_problem(
     collocation = problem.collocation()
     notes = []
     if problem.parameters.names_without_guess:
-        report_progress("looking for a start, as there is no guess")
+        report_progress("searching for initial values, because no guess is given")
         collocation, scan = start_problem(collocation)
         problem = replace(problem, parameters=collocation.parameters)
         notes = [scan.sentence] if scan else []
@@ -238,7 +238,7 @@ def check_problem(
     total_s = (time.perf_counter() - started_s) * _grid_rows(collocation) / _grid_rows(first)
     report_progress("comparing derivatives with differences")
     jacobian_error, hessian_error = derivative_errors(first, first_z)
-    report_progress("estimating what methods take")
+    report_progress("estimating time and memory of the methods")
     program = _program_fields(problem, collocation, first, first_z)
     simulated = first
     z = first_z
@@ -246,17 +246,17 @@ def check_problem(
         report_progress(f"simulating the recordings at the guess, about {max(1, round(total_s))} s")
         simulated = collocation
         (z, start_notes) = initial_variables(collocation)
-    report_progress("looking at modes and at the description")
+    report_progress("computing natural modes and testing the description")
     causes = misspecification_hypotheses(problem)
     fit_s = FIT_SIMULATIONS * total_s * min(1.0, CHECKED_SAMPLES / _grid_rows(collocation))
     sensed = any(e.wrenches and e.markers.sample_count for e in problem.experiments)
     if sensed and not causes and (full or fit_s <= LONGEST_SIMULATION_S):
-        report_progress("comparing the wrenches with what the markers predict")
+        report_progress("comparing the wrenches with the prediction from the markers")
         causes = rank(wrench_mistakes(collocation))
     elif sensed and not causes:
         notes.append(
-            "the wrenches were not compared with what the markers predict: it would take about "
-            f"{fit_s:.2g} s; check --full does it"
+            "the wrenches were not compared with the prediction from the markers, which would "
+            f"take about {fit_s:.2g} s; check --full does it"
         )
     findings = CheckResult(
         **_simulated_fields(problem, simulated, z),
@@ -277,8 +277,8 @@ def check_problem(
     notes += cost_notes(findings.chosen_cost, findings.costs) if findings.chosen_cost else []
     if simulated is first:
         notes.append(
-            f"the recordings were not simulated at the guess but for their first samples: it would "
-            f"take about {total_s:.2g} s; check --full does it"
+            "only the first samples of the recordings were simulated at the guess; check --full "
+            f"simulates all of them, in about {total_s:.2g} s"
         )
     notes += [SUBSTEPS_NOTE] * (problem.substeps == "auto" and bool(findings.motions))
     findings = replace(findings, concerns=concerns)

@@ -53,8 +53,8 @@ def require_memory(problem: Problem, collocation: Collocation, method: object) -
     if needed_mb > there_mb:
         raise InputError(
             f"{method.name} would take about {needed_mb / 1e3:.2g} GB for "
-            f"{collocation.variable_count:,} variables, and {there_mb / 1e3:.2g} GB are there; "
-            f"take {remedy}",
+            f"{collocation.variable_count:,} variables, but the machine has {there_mb / 1e3:.2g} "
+            f"GB; use {remedy}",
             problem.path,
         )
 
@@ -174,7 +174,7 @@ def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
     if chosen.time_s < LONG_SOLVE_S or quickest.time_s > LARGEST_TIME_SHARE * chosen.time_s:
         return []
     return [
-        f'solver.method = "{quickest.method}" finds the same optimum much sooner than '
+        f'solver.method = "{quickest.method}" finds the same optimum much faster than '
         f"{chosen.method}"
     ]
 

@@ -241,20 +241,21 @@ def mode_notes(motion: ModesCheck) -> list[str]:
     name = motion.experiment
     if motion.not_oscillating:
         notes.append(
-            f"{motion.not_oscillating} modes of '{name}' do not oscillate (rigid motions that no "
-            "grasp holds) and are left out"
+            f"{motion.not_oscillating} modes of '{name}' are rigid motions that no grasp "
+            "prevents; they do not oscillate and are not listed"
         )
     if mode is None:
         return notes
     if mode.damping_ratio >= 1:
         notes.append(
-            f"the first mode of '{name}' creeps at the guess (damping ratio "
-            f"{mode.damping_ratio:.2g}): if the recording swings, guess less damping"
+            f"the first mode of '{name}' is overdamped at the guess (damping ratio "
+            f"{mode.damping_ratio:.2g}): if the recording oscillates, state a guess with less "
+            "damping"
         )
     if mode.period_error > PERIOD_ERROR and not _grid_concerns(motion, mode):
         notes.append(
             f"{motion.scheme} lengthens the first period of '{name}' by {mode.period_error:.1%}, "
-            f"and the stiffness found will be about {2 * mode.period_error:.1%} too high: "
+            f"so that the estimated stiffness will be about {2 * mode.period_error:.1%} too high: "
             f"{_step_remedy(motion)}"
         )
     return notes
