@@ -188,7 +188,9 @@ def test_what_is_stated_as_exact_is_tested_too():
 # Judgement of a probe -----------------------------------------------------------------------------
 
 
-def probe(relevance: float, is_significant: bool = True, name: str = DRIFT, fall: float = 20.0) -> Probe:
+def probe(
+    relevance: float, is_significant: bool = True, name: str = DRIFT, fall: float = 20.0
+) -> Probe:
     moves = {"young_pa": EstimateChange(8100.0, 40.0, 100.0, 2.0, 0.5)}
     own = (name,) if is_significant else ()
     return Probe("assumption", name, fall, moves, -0.05, 0.01, own, True, relevance)

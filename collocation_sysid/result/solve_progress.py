@@ -109,7 +109,7 @@ class SolveProgress(Watched):
         problem: Problem | None = None,
         verbose: bool = False,
         quiet: bool = False,
-        activity: str = "finding a start",
+        activity: str = "searching for an initial guess",
     ) -> None:
         super().__init__(console, quiet, live=not verbose)
         self.verbose = verbose
