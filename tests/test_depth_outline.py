@@ -211,7 +211,7 @@ def test_a_camera_more_than_two_deviations_off_asks_for_a_check():
     assert not camera_pose_concerns([], [])
     (found,) = camera_pose_concerns(["turn", "shift"], [1.0, -2.5])
     assert (found.code, found.grade) == ("nuisance/camera", "check")
-    assert "shift is 2.5 deviations" in found.message
+    assert "shift is 2.5 standard deviations" in found.message
 
 
 def test_the_lens_projects_points_to_the_pixels_of_their_rays():

@@ -217,7 +217,7 @@ def test_errors_that_persist_are_told_once():
     fit, wrong = sample(phi=0.9)
     found = uncertainty_from_fit(fit, PARAMETERS, wrong[:4])
     assert found.errors == "autocorrelated"
-    (note,) = [note for note in found.notes if "persist" in note]
+    (note,) = [note for note in found.notes if "between consecutive samples" in note]
     assert "0.8" in note or "0.9" in note
     forced = uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
     assert forced.errors == "independent"

@@ -109,7 +109,7 @@ def test_a_given_start_is_at_rest_unless_velocities_are_given():
         ({"markers": markers(present=False)}, "there is no marker sample"),
         ({"markers": markers(node_count=9)}, "body of 9 nodes"),
         ({"t_s": TIMES + 1, "markers": markers(TIMES + 1)}, "poses run from"),
-        ({"grasps": (lifted([0, 1, 7]),)}, "node 7, but the body has 5"),
+        ({"grasps": (lifted([0, 1, 7]),)}, "node 7, but the body has only 5"),
         ({"grasps": (lifted([0, 1, 2]), lifted([2, 3]))}, "node 2 is held by the grasps 1 and 2"),
         ({"gravity_m_s2": np.zeros(2)}, r"gravity_m_s2 has the shape \(2,\)"),
         ({"start": "at rest"}, "expected one of equilibrium, undeformed, given"),

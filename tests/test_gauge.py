@@ -156,7 +156,10 @@ def test_error_bars_and_verdict_know_them():
         ({"t_s": np.zeros(9)}, "of the reading 'accelerometer'"),
         ({"values": np.zeros((9, 2))}, "gives 3 numbers; expected 2"),
         ({"expression": lambda at: at.position_m}, "cannot be evaluated .*bias_m_s2"),
-        ({"expression": pull, "unknowns": {"gain": 1.0}}, "has t_s, position_m, velocity_m_s"),
+        (
+            {"expression": pull, "unknowns": {"gain": 1.0}},
+            "with the attributes t_s, position_m, velocity_m_s",
+        ),
         (
             {"expression": speed, "unknowns": {}, "values": np.zeros(9)},
             "not finite for .* at rest",

@@ -162,7 +162,7 @@ def test_placing_follows_the_configuration_given():
 
 def test_a_marker_without_position_is_refused_by_name():
     body = box_body()
-    with pytest.raises(InputError, match=r"marker '1' has no position.*reference_m"):
+    with pytest.raises(InputError, match=r"marker '1' has no sample .*reference_m"):
         place_markers([[0.1, 0.1, 0.1], [np.nan, 0.1, 0.1]], body.nodes_m, body)
 
 

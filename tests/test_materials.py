@@ -291,10 +291,13 @@ def not_casadi(F, mu_pa):
 @pytest.mark.parametrize(
     ("energy", "message"),
     [
-        (with_energy_at_rest, "'with-energy-at-rest' has the energy .* J/m³ undeformed, .*mu_pa ="),
-        (with_stress_at_rest, "'with-stress-at-rest' has the stress .* Pa undeformed"),
+        (
+            with_energy_at_rest,
+            "'with-energy-at-rest' has the energy .* J/m³ in the undeformed state, .*mu_pa =",
+        ),
+        (with_stress_at_rest, "'with-stress-at-rest' has the stress .* Pa in the undeformed state"),
         (without_constants, "'without-constants' has no constants; expected a function"),
-        (not_finite_at_rest, "'not-finite-at-rest' has the energy .* undeformed"),
+        (not_finite_at_rest, "'not-finite-at-rest' has the energy .* in the undeformed state"),
         (not_casadi, "'not-casadi' cannot be evaluated"),
     ],
 )

@@ -127,7 +127,7 @@ def test_matrices_give_the_same_poses_as_quaternions(tmp_path, poses, name):
     ("change", "words"),
     [
         (lambda m: 1.01 * m[:3, :3], ["is not a rotation", "0.0201"]),
-        (lambda m: m[:3, :3] * [[1, 1, -1]], ["mirrors", "determinant"]),
+        (lambda m: m[:3, :3] * [[1, 1, -1]], ["is a reflection", "determinant"]),
     ],
 )
 def test_a_matrix_that_is_no_rotation_is_refused(tmp_path, poses, name, change, words):
