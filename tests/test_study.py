@@ -261,7 +261,7 @@ def test_a_sweep_can_be_over_methods(tiny):
     [
         ("parameters.mu_pa.gues=1,2", "did you mean 'guess'"),
         ("transcription.substeps=1,x", "transcription.substeps: found 'x'"),
-        ("title.text=1", "--over: title.text leads into"),
+        ("title.text=1", "--over: title.text goes beyond the value"),
     ],
 )
 def test_swept_keys_the_problem_has_not_are_refused(tiny, over, message):

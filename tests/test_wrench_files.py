@@ -78,7 +78,7 @@ BAD = {
         ["line 5", "time must increase"],
     ),
     "short row": (lines(rows=[*ROWS[:3], "0.03,0"]), ["line 5", "2 cells"]),
-    "blank column": (lines(rows=[f"{k},,0,0,0,0,0" for k in range(4)]), ["fx_n is blank"]),
+    "blank column": (lines(rows=[f"{k},,0,0,0,0,0" for k in range(4)]), ["fx_n has no values"]),
     "empty": ("", ["is empty"]),
 }
 
@@ -98,7 +98,7 @@ SLIPS = {
     "another clock": (
         lines(rows=[f"{1e9 + k},0,0,0,0,0,0" for k in range(9)]),
         SENSOR,
-        ["force.csv runs from 1e+09 s", "one clock"],
+        ["force.csv runs from 1e+09 s", "the same clock"],
     ),
     "milliseconds": (
         lines(rows=[f"{10 * k + 5},0,0,0,0,0,0" for k in range(9)]),
