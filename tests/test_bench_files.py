@@ -368,7 +368,11 @@ def test_a_new_problem_of_each_kind_runs_as_it_is(tmp_path, monkeypatch, kind, d
     monkeypatch.chdir(tmp_path)
     begun = run_command("new", "mine", "--kind", kind)
     assert begun.code == 0
-    assert {Path(line).name for line in begun.out.splitlines()} == {"problem.toml", *data}
+    assert {Path(line).name for line in begun.out.splitlines()} == {
+        "problem.toml",
+        "schema.json",
+        *data,
+    }
     assert "collocation-sysid check mine/problem.toml" in begun.err
     assert "collocation-sysid solve mine/problem.toml" in begun.err
     guessed = ("--set", "parameters.young_pa.guess=3e4" if kind != "swing" else "solver.huber=9.0")

@@ -52,7 +52,7 @@ def test_a_report_may_be_markdown(run_folder: Path, page: str):
     assert run_command("report", run_folder, "--to", run_folder / "report.md").code == 0
     text = (run_folder / "report.md").read_text()
     assert text.count("![") == len(Elements(page).images)
-    for line in ("## Parameters", "## Residuals", "| marker | RMS | samples | suggests |"):
+    for line in ("## Parameters", "## Residuals", "| marker | RMS | samples | diagnosis |"):
         assert line in text.splitlines()
     assert all((run_folder / name).is_file() for name in re.findall(r"\]\((.*?\.png)\)", text))
 
