@@ -134,8 +134,10 @@ class Material:
         """Function from the constants to the small-strain (λ, μ): C₁₁₂₂ and C₁₂₁₂ at F = I."""
         F = ca.SX.sym("F", 9)
         values = ca.SX.sym("values", len(self.constants))
-        psi = self.psi(ca.reshape(F, 3, 3), values)
-        return ca.Function("lame", [values], [lame_constants(psi, F)])
+        gradient = ca.reshape(F, 3, 3)
+        rule = self.chain_rule(gradient, values)
+        psi = self.psi_in(rule, gradient, values)
+        return ca.Function("lame", [values], [lame_constants(psi, F, rule)])
 
     def _check_at_rest(self) -> None:
         """Raise an `InputError` unless energy and stress vanish at F = I."""
@@ -168,11 +170,23 @@ class Material:
         return ", ".join(f"{c.name} = {v:.3g}" for c, v in zip(self.constants, values, strict=True))
 
 
-def lame_constants(psi: ca.SX, F: ca.SX) -> ca.SX:
+def lame_constants(psi: ca.SX, F: ca.SX, rule: ChainRule | None = None) -> ca.SX:
     """Return the small-strain (λ, μ), C₁₁₂₂ and C₁₂₁₂ at F = I, of an energy density of F stacked
     (9,).
+
+    Parameters
+    ----------
+    psi : SX
+        Energy density; may contain the symbols of `rule`.
+    F : (9,) SX
+    rule : ChainRule, optional
+        Chain rule for `psi`, which then gives fewer operations; CasADi's derivatives by default.
     """
-    tangent, _ = ca.hessian(psi, F)
+    if rule is not None and rule.functions:
+        tangent = rule.jacobian(rule.gradient(psi, F), F)
+        (tangent,) = rule.eliminate([tangent])
+    else:
+        tangent, _ = ca.hessian(psi, F)
     entries = ca.vertcat(tangent[0, 4], tangent[1, 1])
     return ca.simplify(ca.substitute(entries, F, ca.SX(ca.DM(np.eye(3).ravel()))))
 
