@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from checks import assert_derivative, relative_error
-from materials_small import COMPILED, theta_for
+from materials_small import COMPILED, rounding, theta_for
 from problems_small import IDEAL, point_markers, uneven_box
 from scipy.spatial.transform import Rotation
 
@@ -107,7 +107,7 @@ def test_undeformed_it_is_rayleighs(material, element, rng):
     bodies = [small_body(material, element, "casadi", law) for law in ("kelvin-voigt", "rayleigh")]
     _, v = state(bodies[0], rng)
     found, expected = (damping_force(body, body.nodes_m.reshape(1, -1), v) for body in bodies)
-    assert relative_error(found, expected) < 1e-12
+    assert relative_error(found, expected) < rounding(material)
 
 
 @pytest.mark.parametrize(

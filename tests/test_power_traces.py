@@ -83,7 +83,9 @@ def test_partial_derivatives_agree_with_differences(traces, index, alpha):
     step = np.zeros(3)
     step[index[-1]] = 1e-4
     ends = [traces.evaluate(index[:-1], *(values + sign * step)) for sign in (1, -1)]
-    assert traces.evaluate(index, *values) == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=2e-6, abs=1e-9)
+    assert traces.evaluate(index, *values) == pytest.approx(
+        (ends[0] - ends[1]) / 2e-4, rel=2e-6, abs=1e-9
+    )
 
 
 @pytest.mark.parametrize("index", [(0, 0, 0), (0, 0, 1), (0, 1, 2), (1, 2, 2)])
@@ -92,7 +94,9 @@ def test_third_derivatives_agree_with_differences(traces, index):
     step = np.zeros(3)
     step[index[-1]] = 1e-4
     ends = [traces.evaluate(index[:-1], *(values + sign * step)) for sign in (1, -1)]
-    assert traces.evaluate(index, *values) == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-5, abs=1e-9)
+    assert traces.evaluate(index, *values) == pytest.approx(
+        (ends[0] - ends[1]) / 2e-4, rel=1e-5, abs=1e-9
+    )
 
 
 def test_value_and_slope_belong_together_also_where_all_stretches_are_one(traces):

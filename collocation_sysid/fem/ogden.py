@@ -113,6 +113,11 @@ def hyperfoam(terms: int) -> PowerLawEnergy:
     return PowerLawEnergy(_hyperfoam_density, tuple(names))
 
 
+def is_power_law(material: str) -> bool:
+    """Return whether the material of this name is Ogden's or a compressible foam."""
+    return material.startswith(("ogden-", "hyperfoam-"))
+
+
 def term_numbers(names: Iterable[str]) -> range:
     """Return the numbers of the terms of a law, from 1, from the names of its constants."""
     return range(1, 1 + sum(name.startswith("alpha_") for name in names))

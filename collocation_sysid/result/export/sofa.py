@@ -25,11 +25,16 @@ NEO_HOOKEAN_VERSIONS = (
     "NeoHookean is that of λ and μ (½ λ ln² J − μ ln J + ½ μ (I₁ − 3)) in the versions of SOFA "
     "that have StableNeoHookean too; older ones take other constants"
 )
+OGDEN_VOLUME = (
+    "the energy of the volume of Ogden is ½ κ ln² J, ours ½ κ (J − 1)²: the same at small changes "
+    "of volume"
+)
 CAPABILITIES = TargetCapabilities(
     {
         "neo-hookean": "NeoHookean",
         "stable-neo-hookean": "StableNeoHookean",
         "st-venant-kirchhoff": "StVenantKirchhoff",
+        "ogden-1": "Ogden",
         "linear": "linear",
     },
     stiffness_damping="the damping is Rayleigh's, here {damping}: the same at small strain, but it "
@@ -59,7 +64,8 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     if (body.is_prescribed.any(axis=1) != body.is_node_prescribed).any():
         raise InputError("a grasp holds single axes, which the scene for SOFA does not take")
     region = body.regions[0]
-    limits = [*CAPABILITIES.limitations(body), NEO_HOOKEAN_VERSIONS]
+    limits = [*CAPABILITIES.limitations(body)]
+    limits.append(OGDEN_VOLUME if region.material == "ogden-1" else NEO_HOOKEAN_VERSIONS)
     force = _elastic_law_xml(region)
     if (np.abs(body.prescribed_displacements_m) > 1e-9).any():
         limits.append("grasps beside the first hold the body undeformed, not where they hold it")
@@ -115,6 +121,10 @@ def _elastic_law_xml(region: IdentifiedRegion) -> str:
         )
     name = CAPABILITIES.materials.get(region.material, "NeoHookean")
     moduli = numbers_as_text((region.mu_pa, region.lambda_pa))
+    if region.material == "ogden-1":
+        (term,) = region.terms
+        # The energy is μ/α² (Σ λ̄^α − 3) + ½ κ ln² J.
+        moduli = numbers_as_text((term.mu_pa * term.alpha, term.alpha, region.kappa_pa))
     return (
         f'<TetrahedronHyperelasticityFEMForceField materialName="{name}" ParameterSet="{moduli}"/>'
     )
