@@ -42,7 +42,7 @@ def test_at_rest_the_margin_is_the_smaller_of_both_moduli(name):
 
 
 def test_st_venant_kirchhoff_softens_below_a_stretch_of_one_over_root_two():
-    """With λ = 0 the Kirchhoff stress of a stretch is μ s² (s² − 1), which has its minimum there."""
+    """With λ = 0 the Kirchhoff stress of a stretch s is μ s² (s² − 1), least at s² = ½."""
     stretch = np.sqrt(0.5)
     constants = {"lambda_pa": 0.0, "mu_pa": 300.0}
     assert margin("st-venant-kirchhoff", constants, stretch + 1e-6, 1.0, 1.0) > 0

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from problem_files import EXPERIMENT, PROBLEM, run_command, settings
+from problem_files import EXPERIMENT, PROBLEM, run_command
 from problems_small import smooth_poses, times
 
 from collocation_sysid.fem.structured import box_mesh
@@ -22,10 +22,11 @@ LAWS = {
 }
 
 
-def soft_bar(folder: Path, material: str, **changes: str) -> Path:
+def soft_bar(folder: Path, material: str, stiffness: float = 1.0, **changes: str) -> Path:
     """A recording of a bar so soft that it strains much, with 0.2 mm of noise.
 
-    The constants are without guess, except those in `changes`.
+    The constants are without guess, except those in `changes`. Moduli are those of `LAWS` times
+    `stiffness`.
     """
     folder.mkdir(exist_ok=True)
     box_mesh((0.06, 0.06, 0.12), (2, 2, 4)).write(folder / "body.vtu")
@@ -43,7 +44,10 @@ def soft_bar(folder: Path, material: str, **changes: str) -> Path:
     text += '\n[environment]\nair_density_kg_m3 = "none"\n'
     file = folder / "problem.toml"
     file.write_text(text)
-    truth = [f"parameters.{name}={value}" for name, value in LAWS[material].items()]
+    truth = [
+        f"parameters.{name}={value * (stiffness if name.endswith('_pa') else 1.0)}"
+        for name, value in LAWS[material].items()
+    ]
     write_data(
         Problem.read(file, truth, simulation=True), folder, Recipe("midpoint", noise_m=2e-4, seed=1)
     )
@@ -71,18 +75,16 @@ def test_a_file_without_guesses_recovers_the_constants_of_a_twin(material, tmp_p
     assert young == pytest.approx(2 * (1 + poisson) * shear_pa, rel=0.05)
 
 
+@pytest.mark.long
 def test_the_exponent_is_not_determined_by_small_strains(tmp_path):
     """At small strains only G = ½ μ α matters, and the output says so."""
-    file = soft_bar(tmp_path, "ogden-1", kappa_pa="19e4", mu_1_pa="{ guess = 4e4 }")
-    truth = settings("parameters.mu_1_pa=4e4", "parameters.alpha_1=5.0")
-    simulated = run_command("simulate", file, *truth, "--out", tmp_path / "twin")
-    assert simulated.code == 0, simulated.err
-    outcome = run_command("solve", file, "--out", tmp_path / "run", "--quiet", "--no-pictures")
+    file = soft_bar(tmp_path, "ogden-1", stiffness=1e3, kappa_pa="19e4")
+    outcome = run_command("solve", file, "--out", tmp_path / "run", "--no-pictures")
     assert outcome.code in (0, 1), outcome.err
-    result = json.loads((tmp_path / "run" / "result.json").read_text())
-    low, high = result["parameters"]["alpha_1"]["combined95"]
-    assert high - low > abs(result["parameters"]["alpha_1"]["value"])
-    assert result["verdict"] != "good"
+    assert "Verdict: good" not in outcome.out
+    found = json.loads((tmp_path / "run" / "result.json").read_text())["parameters"]["alpha_1"]
+    low, high = found["combined95"] or (-np.inf, np.inf)
+    assert found["at_bound"] or high - low > abs(found["value"])
 
 
 @pytest.mark.parametrize(
