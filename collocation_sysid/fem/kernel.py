@@ -309,7 +309,7 @@ class QuadraturePoint:
     point_data: ca.SX
     scaled_indices: tuple[int, ...] = ()
     rest: RestPointLayout | None = None
-    rule: ChainRule = ChainRule()
+    rule: ChainRule = field(default_factory=ChainRule)
 
     @classmethod
     def from_element(

@@ -1,15 +1,15 @@
-"""Energies in powers of the principal stretches: Ogden's rubber and Hill's compressible foam, with 1 to 4 terms.
+"""Energies in powers of the principal stretches with 1 to 4 terms: Ogden's law and Hill's foam.
 
 Ogden (1972), with isochoric stretches λ̄ᵢ = J^(−1/3) λᵢ:
 
-    ψ = Σ_p μ_p/α_p (λ̄₁^α_p + λ̄₂^α_p + λ̄₃^α_p − 3) + ½ κ (J − 1)²,   G = ½ Σ μ_p α_p.
+    ψ = Σ μ/α (λ̄₁^α + λ̄₂^α + λ̄₃^α − 3) + ½ κ (J − 1)²,   G = ½ Σ μ α.
 
-Hill (1978), Storåkers (1986), "hyperfoam" in finite-element programs:
+Hill (1978) and Storåkers (1986), "hyperfoam" in finite-element programs:
 
-    ψ = Σ_p 2μ_p/α_p² (λ₁^α_p + λ₂^α_p + λ₃^α_p − 3 + (J^(−α_p β_p) − 1)/β_p),   G = Σ μ_p,   κ = Σ 2μ_p (⅓ + β_p).
+    ψ = Σ 2μ/α² (λ₁^α + λ₂^α + λ₃^α − 3 + (J^(−αβ) − 1)/β),   G = Σ μ,   κ = Σ 2μ (⅓ + β).
 
 Both are functions of Ī₁ − 3, Ī₂ − 3 and J and smooth where stretches coincide, see `power_traces`.
-They are also smooth at α_p = 0 and β_p = 0, whose limits are finite.
+They are also smooth at α = 0 and β = 0, whose limits are finite.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class PowerLawEnergy:
             excesses.append(excess)
             return excess.symbol()
 
-        partials = {(): self.density(ratio, scaled_excess, constants)}
+        partials: dict[PartialIndex, ca.SX] = {(): self.density(ratio, scaled_excess, constants)}
         rule = ChainRule(tuple(excesses))
 
         def partial(index: PartialIndex) -> ca.SX:

@@ -10,9 +10,9 @@ which follows from the integral of λˢ⁻¹ / (1 + λ) by parts. z is linear in
     z = 1 + (t² (Ī₁ − 3) + t (Ī₂ − 3)) / (1 + t)³.
 
 The trapezoidal rule with spacing h has the error exp(−2π²/h), because ln z is analytic for
-|Im u| < π. It is applied to the whole line: beyond the nodes ln z is a power series in 1/t or t with
-the coefficients tr C̄ᵏ and tr C̄⁻ᵏ (Newton's identities), and the sum over the nodes that are left
-consists of geometric series. The nodes do not depend on s, which may be a variable.
+|Im u| < π. It is applied to the whole line: beyond the nodes ln z is a power series in 1/t or t
+with the coefficients tr C̄ᵏ and tr C̄⁻ᵏ (Newton's identities), and the sum over the nodes that are
+left consists of geometric series. The nodes do not depend on s, which may be a variable.
 
 Nodes are symmetric about u = 0. The sums for s and −s together are
 
@@ -163,7 +163,7 @@ class PowerTraces:
 
 def _nodes() -> Array:
     """Return the nodes u > 0 (NODES,), ascending."""
-    return SPACING * (np.arange(NODES) + 0.5)
+    return np.asarray(SPACING * (np.arange(NODES) + 0.5), dtype=np.float64)
 
 
 def _weights(parity: Parity, alpha: ca.SX) -> ca.SX:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, require_among
-from ..fem.constants import usual_value, without_region
+from ..fem.constants import MOST_TERMS, usual_value, without_region
 from ..fem.materials import DAMPINGS, MATERIALS
 from ..fem.moduli import ELASTIC, elastic_names
 from ..problem import Problem
@@ -344,7 +344,19 @@ def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
 
     linear = 0.0 if math.isnan(guess("c01_pa")) else guess("c01_pa")
     poisson = USUAL_POISSON if math.isnan(guess("poisson")) else guess("poisson")
-    ways = guess("mu_pa"), 2 * (guess("c10_pa") + linear), guess("young_pa") / (2 * (1 + poisson))
+    terms = range(1, MOST_TERMS + 1)
+    if any(not math.isnan(guess(f"beta_{p}")) for p in terms):
+        factors = {p: 1.0 for p in terms}  # of a foam
+    else:
+        factors = {p: guess(f"alpha_{p}") / 2 for p in terms}
+    products = [factor * guess(f"mu_{p}_pa") for p, factor in factors.items()]
+    powers = sum(each for each in products if not math.isnan(each))
+    ways = (
+        guess("mu_pa"),
+        powers,
+        2 * (guess("c10_pa") + linear),
+        guess("young_pa") / (2 * (1 + poisson)),
+    )
     return next((each for each in ways if each > 0), None)
 
 

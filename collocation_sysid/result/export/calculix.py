@@ -43,8 +43,8 @@ _ARRUDA_BOYCE_COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 MOST_TERMS = 3
 VALUES_PER_LINE = 8
 FOAM_LIMITATION = (
-    "CalculiX 2.20 stops with NaN for a HYPERFOAM of one term, and of two with a negative exponent; "
-    "Abaqus reads the same card"
+    "CalculiX 2.20 finds no equilibrium of a HYPERFOAM of one term, or of two with a negative "
+    "exponent; the card is that of Abaqus, too"
 )
 
 
