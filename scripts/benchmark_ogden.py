@@ -56,7 +56,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--mesh", default=PAPER_SIZE[0], help="rings x layers of the cylinder")
     parser.add_argument("--steps", type=int, default=PAPER_SIZE[1])
-    parser.add_argument("--element", default="tet4")
     parser.add_argument("--damping", default="kelvin-voigt")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=10)
@@ -96,7 +95,6 @@ def make_sweep(material: str, arguments: argparse.Namespace) -> Callable[[], tup
         cylinder_mesh(0.04, 0.16, rings, layers),
         material,
         density_kg_m3=20.0,
-        element=arguments.element,
         damping=arguments.damping,
         threads=arguments.threads,
     )

@@ -28,6 +28,8 @@ from .study_arguments import unique_items
 # Where a branch's share starts; time constants start evenly between a sample and the recording.
 SHARE = 0.1
 MOST_BRANCHES = 20
+# Constants of which a material needs one beside those of its shape.
+VOLUMETRIC = {"lambda_pa", "kappa_pa", "poisson"}
 # Budget entries that stand for other laws of damping, in place of which these are fitted.
 DAMPING_ASSUMPTIONS = ("damping_law", "rayleigh_damping")
 # Of a material of which nothing is said; and of the shear modulus, what a constant about zero has.
@@ -328,6 +330,9 @@ def _with_part_material(
     shear_pa = _shear_pa(parameters, prefix)
     if "mu_pa" in own and not elastic & {"mu_pa", "young_pa"}:
         kept[f"{prefix}mu_pa"] = _starting_guess("mu_pa", shear_pa)
+    if elastic_names(MATERIALS[material]) and not elastic & VOLUMETRIC:
+        # A foam has no modulus that another material could take over.
+        kept[f"{prefix}poisson"] = _starting_guess("poisson", shear_pa)
     needed = [name for name in own if name not in ELASTIC and prefix + name not in kept]
     return kept | {prefix + name: _starting_guess(name, shear_pa) for name in needed}
 
