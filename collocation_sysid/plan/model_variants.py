@@ -330,7 +330,8 @@ def _with_part_material(
     shear_pa = _shear_pa(parameters, prefix)
     if "mu_pa" in own and not elastic & {"mu_pa", "young_pa"}:
         kept[f"{prefix}mu_pa"] = _starting_guess("mu_pa", shear_pa)
-    if elastic_names(MATERIALS[material]) and not elastic & VOLUMETRIC:
+    own_or_shared = {without_region(name) for name in kept if name in mine | of_any}
+    if elastic_names(MATERIALS[material]) and not own_or_shared & VOLUMETRIC:
         # A foam has no modulus that another material could take over.
         kept[f"{prefix}poisson"] = _starting_guess("poisson", shear_pa)
     needed = [name for name in own if name not in ELASTIC and prefix + name not in kept]
