@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 from checks import relative_error
 from materials_small import CONSTANTS, HYPERFOAM, KAPPA_PA, OGDEN
+from rest_shapes_small import as_scanned
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.materials import MATERIALS, Material
 from collocation_sysid.fem.moduli import engineering_constants
+from collocation_sysid.fem.spatial_field import Field
+from collocation_sysid.fem.structured import box_mesh
 
 POWER_LAWS = [name for name in MATERIALS if name.startswith(("ogden", "hyperfoam"))]
 
@@ -258,21 +261,98 @@ def test_moduli_at_small_strain(name, shear, bulk):
 # Kernels ---------------------------------------------------------------------------------------
 
 
-def test_kernels_with_the_chain_rule_agree_with_those_without(small_mesh, rng):
-    """The same energy as a user's function is differentiated by F."""
-    ogden = MATERIALS["ogden-2"]
-    plain = Material("plain", lambda F, **constants: ogden.energy(F, **constants), ogden.constants)
-    x = small_mesh.points_m + rng.uniform(-0.003, 0.003, small_mesh.points_m.shape)
-    v, w = rng.standard_normal((2, *small_mesh.points_m.shape))
-    theta = np.array([*CONSTANTS["ogden-2"].values(), 0.009, 1.0])
-    for damping in ("kelvin-voigt", "rayleigh"):
-        ours, theirs = (
-            Body(small_mesh, law, density_kg_m3=30.0, damping=damping, evaluator="casadi")
-            for law in (ogden, plain)
+def laws_with_and_without_the_chain_rule(name: str) -> tuple[Material, Material]:
+    """A material, and the same energy as a user's function, which is differentiated by F."""
+    material = MATERIALS[name]
+    plain = Material("plain", lambda F, **c: material.energy(F, **c), material.constants)
+    return material, plain
+
+
+def assert_alike(found: object, expected: object) -> None:
+    """Compare all arrays of two dataclasses."""
+    for name, value in vars(expected).items():
+        assert relative_error(np.asarray(getattr(found, name)), np.asarray(value)) < 1e-8, name
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        pytest.param({}, id="plain"),
+        pytest.param({"damping": "rayleigh"}, id="rayleigh"),
+        pytest.param({"damping": "material"}, id="material"),
+        pytest.param({"element": "tet10-p0"}, id="averaged dilatation"),
+        pytest.param({"element": "tet10-p0", "damping": "rayleigh"}, id="averaged, rayleigh"),
+        pytest.param({"field": Field(0.05, modes=2)}, id="field"),
+        pytest.param({"prony": ["prony_1"]}, id="memory"),
+    ],
+)
+@pytest.mark.parametrize("name", ["ogden-2", "hyperfoam-1"])
+def test_kernels_with_the_chain_rule_agree_with_those_without(name, changes, rng):
+    mesh = box_mesh((0.06, 0.06, 0.06), (1, 1, 2))
+    ours, theirs = (
+        Body(mesh, law, density_kg_m3=30.0, evaluator="casadi", **changes)
+        for law in laws_with_and_without_the_chain_rule(name)
+    )
+    others = {"gamma_r_s": 0.009, "gamma_m_1_s": 1.0, "prony_1.share": 0.3, "prony_1.tau_s": 0.2}
+    others |= {"field_1": 0.4, "field_2": -0.3}
+    values = {**CONSTANTS[name], **{k: v for k, v in others.items() if k in ours.constants}}
+    theta = ours.theta_from_values(values)
+    x = ours.nodes_m + rng.uniform(-0.003, 0.003, ours.nodes_m.shape)
+    v, w = rng.standard_normal((2, *x.shape))
+    assert_alike(ours.linearise(x, v, theta), theirs.linearise(x, v, theta))
+    assert_alike(ours.second_derivatives(x, v, w, theta), theirs.second_derivatives(x, v, w, theta))
+
+
+@pytest.mark.parametrize("name", ["ogden-2", "hyperfoam-1"])
+def test_stresses_of_a_memory_agree_with_those_without_the_chain_rule(name, rng):
+    mesh = box_mesh((0.06, 0.06, 0.06), (1, 1, 2))
+    ours, theirs = (
+        Body(mesh, law, density_kg_m3=30.0, prony=["prony_1"], evaluator="casadi")
+        for law in laws_with_and_without_the_chain_rule(name)
+    )
+    others = {"gamma_r_s": 0.009, "gamma_m_1_s": 1.0, "prony_1.share": 0.3, "prony_1.tau_s": 0.2}
+    theta = ours.theta_from_values({**CONSTANTS[name], **others})
+    x = (ours.nodes_m + rng.uniform(-0.003, 0.003, ours.nodes_m.shape)).reshape(1, -1)
+    v = rng.standard_normal(x.shape)
+    weights = rng.standard_normal((1, ours.stresses.width))
+    directions = np.eye(len(theta))
+    results = [
+        (
+            body.stresses.stress(x, theta),
+            body.stresses.stress_jvp(x, v, theta),
+            body.stresses.stress_vjp(x, weights, theta),
+            body.stresses.stress_jacobian(x, theta),
+            body.stresses.stress_theta_derivatives(x, theta, directions),
         )
-        for found, expected in (
-            (ours.linearise(x, v, theta), theirs.linearise(x, v, theta)),
-            (ours.second_derivatives(x, v, w, theta), theirs.second_derivatives(x, v, w, theta)),
-        ):
-            for name, value in vars(expected).items():
-                assert relative_error(np.asarray(getattr(found, name)), np.asarray(value)) < 1e-8
+        for body in (ours, theirs)
+    ]
+    for found, expected in zip(*results, strict=True):
+        assert relative_error(found, expected) < 1e-8
+
+
+@pytest.mark.parametrize("element", ["tet4", "tet10-p0"])
+def test_a_stress_free_shape_agrees_with_that_without_the_chain_rule(element, rng):
+    """The constants also act through the shape, which is solved for."""
+    mesh = box_mesh((0.06, 0.03, 0.03), (3, 1, 1))
+    constants = scaled(CONSTANTS["ogden-2"], 100.0)
+    ours, theirs = (
+        Body(
+            mesh,
+            law,
+            density_kg_m3=300.0,
+            element=element,
+            evaluator="casadi",
+            rest_shape=as_scanned(mesh),
+        )
+        for law in laws_with_and_without_the_chain_rule("ogden-2")
+    )
+    theta = ours.theta_from_values({**constants, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0})
+    x = ours.nodes_m + rng.uniform(-0.001, 0.001, ours.nodes_m.shape)
+    v, w = rng.standard_normal((2, *x.shape))
+    assert_alike(ours.linearise(x, v, theta), theirs.linearise(x, v, theta))
+    assert_alike(ours.second_derivatives(x, v, w, theta), theirs.second_derivatives(x, v, w, theta))
+
+
+def scaled(constants: dict[str, float], factor: float) -> dict[str, float]:
+    """Constants with all moduli multiplied by a factor."""
+    return {n: v * factor if n.endswith("_pa") else v for n, v in constants.items()}
