@@ -281,7 +281,11 @@ def assert_alike(found: object, expected: object) -> None:
         pytest.param({"damping": "rayleigh"}, id="rayleigh"),
         pytest.param({"damping": "material"}, id="material"),
         pytest.param({"element": "tet10-p0"}, id="averaged dilatation"),
-        pytest.param({"element": "tet10-p0", "damping": "rayleigh"}, id="averaged, rayleigh"),
+        pytest.param(
+            {"element": "tet10-p0", "damping": "rayleigh"},
+            id="averaged, rayleigh",
+            marks=pytest.mark.long,
+        ),
         pytest.param({"field": Field(0.05, modes=2)}, id="field"),
         pytest.param({"prony": ["prony_1"]}, id="memory"),
     ],
@@ -330,7 +334,7 @@ def test_stresses_of_a_memory_agree_with_those_without_the_chain_rule(name, rng)
         assert relative_error(found, expected) < 1e-8
 
 
-@pytest.mark.parametrize("element", ["tet4", "tet10-p0"])
+@pytest.mark.parametrize("element", ["tet4", pytest.param("tet10-p0", marks=pytest.mark.long)])
 def test_a_stress_free_shape_agrees_with_that_without_the_chain_rule(element, rng):
     """The constants also act through the shape, which is solved for."""
     mesh = box_mesh((0.06, 0.03, 0.03), (3, 1, 1))
