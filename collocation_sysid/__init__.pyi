@@ -1,6 +1,6 @@
 """What the package exports; each module is imported when one of its names is asked for."""
 
-from . import live
+from . import live, testing
 from .errors import InputError, SimulationError
 from .fem.body import Body
 from .fem.constants import Constant
@@ -126,6 +126,7 @@ __all__ = [
     "run",
     "simulate",
     "solve",
+    "testing",
     "with_markers",
     "with_readings",
     "with_wrenches",

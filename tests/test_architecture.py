@@ -31,7 +31,7 @@ LAYERS = (
     {"pipeline"},
     {"live"},
     {"plan"},
-    {"cli"},
+    {"cli", "testing"},
 )
 
 

@@ -211,7 +211,8 @@ def test_the_reference_lists_what_is_public_and_nothing_else():
     page = (ROOT / "docs" / "api.md").read_text()
     listed = re.findall(r"^   ([\w.]+)$", page, re.MULTILINE)
     live = [f"live.{name}" for name in cs.live.__all__]
-    assert sorted(listed) == sorted([*(set(cs.__all__) - {"live"}), *live])
+    checks = [f"testing.{name}" for name in cs.testing.__all__]
+    assert sorted(listed) == sorted([*(set(cs.__all__) - {"live", "testing"}), *live, *checks])
 
 
 def test_the_reference_of_the_command_line_has_every_command_and_option(reference):
