@@ -253,8 +253,9 @@ def _check_round_trips(
         """Return prior, limits and effect of a row."""
         has_effect = each.reading is not None or each.clock is not None
         effect = _read(each, y, values, t_s, data) if has_effect else np.zeros(0)
-        limits = np.nan_to_num([each.sigma or 0.0, each.low, each.high, each.reach])
-        return np.concatenate([limits, effect])
+        limits = np.array([each.low, each.high, each.reach])
+        limits = np.where(np.isfinite(limits), limits, 0.0)
+        return np.concatenate([[each.sigma or 0.0], limits, effect])
 
     def load(loader: CodeLoader, table: Mapping[str, Any]) -> NuisanceRow:
         """Return the row of a table of a problem file."""
