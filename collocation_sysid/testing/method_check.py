@@ -101,7 +101,8 @@ def _fingerprint(collocation: Collocation) -> Array:
     rigid = [s.experiment.rigid_positions(s.dynamics.t_s) for s in collocation.transcriptions]
     z = collocation.pack(p, [x.reshape(len(x), -1) for x in rigid])
     values = [collocation.constraint_values(z), collocation.gradient(z), *collocation.bounds()]
-    return np.nan_to_num(np.concatenate([p, [collocation.objective(z)], *values]))
+    numbers = np.concatenate([p, [collocation.objective(z)], *values])
+    return np.where(np.isfinite(numbers), numbers, 0.0)
 
 
 def _check_answer(
