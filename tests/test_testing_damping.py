@@ -16,6 +16,8 @@ from collocation_sysid.testing.property_check import PropertyCheck
 # `check_material` combines the default law with every material.
 CASES = [(law, "neo-hookean", element) for law in DAMPINGS for element in ELEMENTS]
 CASES += [(law, "linear", "tet4") for law in DAMPINGS]
+# Rayleigh's law is the only one that contains more of the energy than its small-strain stiffness.
+CASES += [("rayleigh", material, "tet4") for material in MATERIALS]
 
 
 @pytest.mark.parametrize(("law", "material", "element"), dict.fromkeys(CASES))
@@ -27,7 +29,13 @@ def test_every_law_passes(law: str, material: str, element: str):
         is_objective=is_objective,
         is_dissipative=law != "rayleigh",
         elements=[element],
+        largest_strain=0.2 if law == "rayleigh" else 0.5,
     )
+
+
+@pytest.mark.parametrize("law", ["kelvin-voigt", "material"])
+def test_objective_laws_take_energy_out_at_large_strain(law: str):
+    check_damping(law, elements=[], largest_strain=1.5)
 
 
 def test_rayleighs_law_is_neither_objective_nor_dissipative():

@@ -11,6 +11,7 @@ from collocation_sysid.testing import check_material
 
 # The other materials are checked with linear elements; the laws of a point are the same for all.
 CASES = [(name, "tet4") for name in MATERIALS] + [("neo-hookean", name) for name in ELEMENTS]
+CASES += [("gent", "tet10-p0"), ("yeoh", "tet10")]
 
 
 @pytest.mark.parametrize(("name", "element"), dict.fromkeys(CASES))

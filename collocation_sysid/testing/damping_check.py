@@ -81,7 +81,15 @@ def check_damping(
         if is_objective:
             _check_objectivity(check, stress, F, rate, where)
     for element in elements:
-        check_internal_forces(check, known, made, values, element)
+        check_internal_forces(
+            check,
+            known,
+            made,
+            values,
+            element,
+            is_objective=is_objective,
+            is_dissipative=is_dissipative,
+        )
     own = {constant.name: values[constant.name] for constant in made.constants}
     check_missing_constant(check, own, material=known, damping=made)
     F = next(iter(deformation_gradients(check.rng, 1, largest_strain)))

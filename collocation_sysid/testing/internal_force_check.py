@@ -13,17 +13,21 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..array_types import Array, Index
 from ..fem.body import Body
 from ..fem.materials import DampingLaw, Material
 from ..program.block_band import full_matrix
-from .property_check import PropertyCheck
+from .property_check import EXACT, PropertyCheck
 from .small_problems import DENSITY_KG_M3, uneven_box, usual_constants
 
 # Size of random displacements of nodes [m] and their velocities [m/s]; edges are about 0.1 m long.
 DISPLACEMENT_M = 4e-3
 VELOCITY_M_S = 1.0
+# Size of the angular velocity of a superposed rotation: the velocities of its ends are then larger
+# than those of the deformation [rad/s].
+SPIN_RAD_S = 20.0
 # Size of a large change of a position [m], for differences.
 LARGE_CHANGE_M = 0.03
 
@@ -157,6 +161,9 @@ def check_internal_forces(
     damping: DampingLaw,
     values: dict[str, float],
     element: str,
+    *,
+    is_objective: bool = False,
+    is_dissipative: bool = False,
 ) -> None:
     """Compare the compiled forces of a small body and all their derivatives with the plain formula.
 
@@ -172,6 +179,10 @@ def check_internal_forces(
         Values of constants by name; others are those of a soft foam.
     element : str
         Name of the elements of the body.
+    is_objective : bool
+        Whether a superposed rotation that spins only rotates the force.
+    is_dissipative : bool
+        Whether the derivative of the force by the velocities has no positive eigenvalue.
 
     Raises
     ------
@@ -187,6 +198,11 @@ def check_internal_forces(
     force = body.force(x.reshape(shape), v.reshape(shape), theta)[0]
     first = _first_derivatives(body, x, v, theta)
     second = _second_derivatives(body, [x, v, w], theta)
+    check.require_equal(
+        body.second_derivatives(x, v, w, theta).theta[0],
+        w @ first[:, 2 * x.size :],
+        statement=f"∂(wᵀf)/∂θ of {element} elements differs from the first derivatives",
+    )
     if not body.element.mean_dilatation:
         plain = PlainInternalForce(body).evaluate(x, v, w, theta)
         names = ("force", "first derivative of the force", "second derivative of the force")
@@ -198,6 +214,58 @@ def check_internal_forces(
                 "formula with automatic derivatives",
             )
     _check_differences(check, body, state=[x, v, w], theta=theta, derivatives=(first, second))
+    _check_energy(check, body, x, theta)
+    if is_objective:
+        _check_objectivity(check, body, x, v, theta)
+    if is_dissipative:
+        _check_dissipation(check, body, first[:, x.size : 2 * x.size])
+
+
+def _check_energy(check: PropertyCheck, body: Body, x: Array, theta: Array) -> None:
+    """Require that the compiled force without velocities is minus the gradient of the energy."""
+    named = dict(zip(body.constants, theta, strict=True))
+    constants = {c.name: named[c.name] for c in body.parts[0].material.constants}
+    direction = LARGE_CHANGE_M * check.rng.standard_normal(x.size)
+    force = body.force(x, np.zeros_like(x), theta)[0]
+    check.require_product(
+        lambda at: np.atleast_1d(body.energy(at, **constants)),
+        np.atleast_1d(-force @ direction),
+        x,
+        direction,
+        statement=f"the compiled force of {body.element.name} elements is not minus the gradient "
+        "of the compiled energy",
+    )
+
+
+def _check_objectivity(check: PropertyCheck, body: Body, x: Array, v: Array, theta: Array) -> None:
+    """Require f(Qx, Q(v + ω × x)) = Q f(x, v) without mass-proportional damping."""
+    constants = theta.copy()
+    constants[-1] = 0.0
+    Q = Rotation.from_quat(check.rng.standard_normal(4)).as_matrix()
+    spin = SPIN_RAD_S * check.rng.standard_normal(3)
+    places, velocities = (field.reshape(-1, 3) for field in (x, v))
+    spinning = velocities + np.cross(spin, places)
+    found = body.force(places @ Q.T, spinning @ Q.T, constants)[0]
+    expected = body.force(places, velocities, constants)[0].reshape(-1, 3) @ Q.T
+    check.require_equal(
+        found,
+        expected.ravel(),
+        statement=f"a spinning rotation changes the force of {body.element.name} elements in the "
+        "body's axes",
+        tolerance=1e-8,
+    )
+
+
+def _check_dissipation(check: PropertyCheck, body: Body, by_velocity: Array) -> None:
+    """Require that no velocity increases the energy: no eigenvalue of ∂f/∂v is positive."""
+    powers = np.linalg.eigvalsh((by_velocity + by_velocity.T) / 2)
+    if not powers[-1] <= EXACT * np.abs(powers).max():
+        check.fail(
+            f"the damping of {body.element.name} elements adds energy: the largest eigenvalue of "
+            "∂f/∂v is positive",
+            powers[-1],
+            "at most 0 N s/m",
+        )
 
 
 def _check_differences(

@@ -89,7 +89,15 @@ def check_material(
         if is_objective:
             _check_objectivity(check, law, F, where)
     for element in elements:
-        check_internal_forces(check, made, DAMPINGS["kelvin-voigt"], values, element)
+        check_internal_forces(
+            check,
+            made,
+            DAMPINGS["kelvin-voigt"],
+            values,
+            element,
+            is_objective=is_objective,
+            is_dissipative=True,
+        )
     _check_messages(check, made, values)
     _check_round_trips(check, made, values, file, function)
 

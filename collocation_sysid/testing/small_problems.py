@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ..array_types import Array, Index
 from ..fem.body import Body
-from ..fem.constants import Constant, usual_value
+from ..fem.constants import Constant, is_modulus, usual_value
 from ..fem.mesh import TetMesh
 from ..fem.structured import box_mesh
 from ..model.parameters import Parameters, Unknown
@@ -21,6 +21,8 @@ from ..recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
 YOUNG_PA = 800.0
 POISSON = 0.25
 DENSITY_KG_M3 = 30.0
+# Value of moduli that a soft foam lacks, such as the factor of (Ī₁ − 3)²: their terms count, too.
+SMALL_MODULUS_PA = 30.0
 # Time between samples [s], and their number: as many as the stencils of all schemes and sensors
 # need.
 TIMESTEP_S = 0.01
@@ -73,11 +75,15 @@ def usual_constants(
         Stated values.
     """
     stated = dict(values or {})
-    usual = {c.name: usual_value(c.name, YOUNG_PA, POISSON) for c in constants}
-    return {
-        name: float(stated.get(name, 1.0 if value is None else value))
-        for name, value in usual.items()
-    }
+    return {c.name: float(stated.get(c.name, _usual_constant(c.name))) for c in constants}
+
+
+def _usual_constant(name: str) -> float:
+    """Return a value of a constant at which all terms of its law count."""
+    value = usual_value(name, YOUNG_PA, POISSON)
+    if value is None:
+        return 1.0
+    return SMALL_MODULUS_PA if is_modulus(name) and not value else value
 
 
 def highest_nodes(points_m: Array) -> Index:
