@@ -120,10 +120,10 @@ def check_force(
             found, np.zeros(law.dofs), statement="the force at rest is not zero", scale=1.0
         )
     unplaced = replace(made, nodes=None)
-    small = body or Body(uneven_box(1), density_kg_m3=DENSITY_KG_M3, forces=[unplaced])
-    check_program(check, program_of(swung_experiment(small), values))
     _check_messages(check, unplaced, values)
     _check_round_trips(check, law, states[0], file)
+    small = body or Body(uneven_box(1), density_kg_m3=DENSITY_KG_M3, forces=[unplaced])
+    check_program(check, program_of(swung_experiment(small), values))
 
 
 def _places(rng: np.random.Generator, positions_m: ArrayLike | None) -> Array:

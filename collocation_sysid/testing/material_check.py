@@ -88,6 +88,8 @@ def check_material(
         _check_derivatives(check, law, F, where)
         if is_objective:
             _check_objectivity(check, law, F, where)
+    _check_messages(check, made, values)
+    _check_round_trips(check, made, values, file, function)
     for element in elements:
         check_internal_forces(
             check,
@@ -98,8 +100,6 @@ def check_material(
             is_objective=is_objective,
             is_dissipative=True,
         )
-    _check_messages(check, made, values)
-    _check_round_trips(check, made, values, file, function)
 
 
 @dataclass(frozen=True, eq=False)

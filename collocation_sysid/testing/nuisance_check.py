@@ -77,15 +77,15 @@ def check_nuisance(
             f"the recording {base.name!r} does not have it", "no value", "at least one value"
         )
     collocation = program_of(changed, {})
+    data = collocation.transcriptions[0].nuisance
+    _check_round_trips(check, row, data, file, name_in_file)
+    if row not in KINDS:
+        _check_messages(check, row, base)
     if row.reading is not None:
         _check_reading(check, row, collocation)
     if row.clock is not None:
         _check_clock(check, row, collocation)
     check_program(check, collocation)
-    if row not in KINDS:
-        _check_messages(check, row, base)
-    data = collocation.transcriptions[0].nuisance
-    _check_round_trips(check, row, data, file, name_in_file)
 
 
 def _with_row(experiment: Experiment, row: NuisanceRow) -> Experiment:

@@ -138,12 +138,13 @@ class PropertyCheck:
             ]
             return np.stack([np.ravel(column) for column in columns], axis=1)
 
+        size = _size(found, function(point))
         self.require_equal(
             found,
-            _closest(found, differences),
+            _closest(found, differences, tolerance=tolerance * size),
             statement=f"{statement}, by central differences",
             tolerance=tolerance,
-            scale=_size(found, function(point)),
+            scale=size,
         )
 
     def require_product(
@@ -176,15 +177,18 @@ class PropertyCheck:
             If they differ.
         """
         found = np.asarray(product, dtype=float)
+        size = _size(found, function(point))
         expected = _closest(
-            found, lambda step: directional_derivative(function, point, direction, step)
+            found,
+            lambda step: directional_derivative(function, point, direction, step),
+            tolerance=tolerance * size,
         )
         self.require_equal(
             found,
             expected,
             statement=f"{statement}, by central differences",
             tolerance=tolerance,
-            scale=_size(expected, function(point)),
+            scale=size,
         )
 
     def require_refusal(self, call: Callable[[], Any], *, naming: str, statement: str) -> None:
@@ -216,14 +220,28 @@ class PropertyCheck:
             self.fail(f"{statement} is not refused", "no error", expected)
 
 
-def _closest(found: Array, differences: Callable[[float], Array]) -> Array:
-    """Return the differences, of all steps, that are closest to a derivative."""
-    candidates = [differences(step) for step in STEPS]
-    distances = [
-        np.linalg.norm(np.ravel(each - found)) if each.shape == found.shape else np.inf
-        for each in candidates
-    ]
-    return candidates[int(np.argmin(np.nan_to_num(distances, nan=np.inf)))]
+def _closest(found: Array, differences: Callable[[float], Array], *, tolerance: float) -> Array:
+    """Return the differences that are closest to a derivative.
+
+    Parameters
+    ----------
+    found : array
+        Derivative.
+    differences : callable
+        Differences with a step of this relative size.
+    tolerance : float
+        Largest error of an entry with which no other step is tried.
+    """
+    candidates = []
+    distances = []
+    for step in STEPS:
+        candidates.append(differences(step))
+        has_shape = candidates[-1].shape == found.shape
+        errors = np.abs(candidates[-1] - found) if has_shape else np.array(np.inf)
+        distances.append(float(np.nan_to_num(errors, nan=np.inf).max(initial=0.0)))
+        if distances[-1] <= tolerance:
+            break
+    return candidates[int(np.argmin(distances))]
 
 
 def _size(derivative: Array, value: ArrayLike) -> float:
