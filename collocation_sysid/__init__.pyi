@@ -4,7 +4,7 @@ from . import live, testing
 from .errors import InputError, SimulationError
 from .fem.body import Body
 from .fem.constants import Constant
-from .fem.materials import Material, Prony
+from .fem.materials import DampingLaw, Material, Prony
 from .fem.mesh import TetMesh
 from .fem.node_force import NodeForce
 from .fem.regions import Region
@@ -66,6 +66,7 @@ __all__ = [
     "Continuation",
     "Cuboid",
     "Cylinder",
+    "DampingLaw",
     "Depth",
     "DepthCamera",
     "Experiment",

@@ -163,6 +163,19 @@ def test_the_glossary_is_in_order_and_its_words_stand_on_the_pages_they_lead_to(
         assert "glossary.md" in page.read_text()
 
 
+def test_the_core_page_names_classes_that_there_are():
+    page = (ROOT / "docs" / "core.md").read_text()
+    paths = re.findall(r"^\| `collocation_sysid\.([\w.]+)\.(\w+)` \|", page, re.MULTILINE)
+    assert len(paths) > 11
+    for module, name in paths:
+        assert isinstance(
+            getattr(importlib.import_module(f"collocation_sysid.{module}"), name), type
+        )
+    figure = page.partition("```text\n")[2].partition("```")[0]
+    boxes = set(re.findall(r"^ ([A-Z]\w+)", figure, re.MULTILINE))
+    assert boxes - {name for _, name in paths} == {"PointPositions"}
+
+
 def test_the_front_page_shows_the_answer_that_the_readme_shows():
     (shown,) = blocks(ROOT / "docs" / "index.md", "console")
     lines = (ROOT / "README.md").read_text().splitlines()

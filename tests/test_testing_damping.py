@@ -11,7 +11,8 @@ from collocation_sysid.testing import check_damping
 from collocation_sysid.testing.internal_force_check import check_internal_forces
 from collocation_sysid.testing.property_check import PropertyCheck
 
-# Every law with linear and averaging elements, and with a linear material, which does not distinguish the shapes;
+# Every law with linear and averaging elements, and with a linear material,
+# which does not distinguish the shapes;
 # `check_material` combines the default law with every material.
 CASES = [(law, "neo-hookean", element) for law in DAMPINGS for element in ("tet4", "tet10-p0")]
 CASES += [("kelvin-voigt", "neo-hookean", "tet10")]
