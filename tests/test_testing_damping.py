@@ -11,14 +11,13 @@ from collocation_sysid.testing import check_damping
 from collocation_sysid.testing.internal_force_check import check_internal_forces
 from collocation_sysid.testing.property_check import PropertyCheck
 
-# Every law with linear and averaging elements, and with a linear material,
-# which does not distinguish the shapes;
+# Every law with linear and averaging elements, and with a linear material, which does not
+# distinguish the shapes. Rayleigh's law contains more of the energy than its stiffness at rest;
 # `check_material` combines the default law with every material.
 CASES = [(law, "neo-hookean", element) for law in DAMPINGS for element in ("tet4", "tet10-p0")]
 CASES += [("kelvin-voigt", "neo-hookean", "tet10")]
 CASES += [(law, "linear", "tet4") for law in DAMPINGS]
-# Rayleigh's law is the only one that contains more of the energy than its small-strain stiffness.
-CASES += [("rayleigh", material, "tet4") for material in MATERIALS]
+CASES += [("rayleigh", name, "tet4") for name in ("gent", "yeoh", "st-venant-kirchhoff")]
 
 
 @pytest.mark.parametrize(("law", "material", "element"), dict.fromkeys(CASES))

@@ -18,11 +18,11 @@ from collocation_sysid.testing import check_nuisance
 
 def cube_with_camera() -> cs.Experiment:
     """A cube that a depth camera sees between its samples."""
-    cube = hung_cube(6, (1, 1, 2))
+    cube = hung_cube(5, (1, 1, 2))
     pose = np.array([[1, 0, 0, 0.05], [0, 0, 1, -0.4], [0, -1, 0, 0.05], [0, 0, 0, 1.0]])
     camera = cs.DepthCamera([[100, 0, 0], [0, 100, 0], [0, 0, 1]], pose=pose)
     places = np.random.default_rng(0).uniform([-0.04, -0.04, 0.395], [0.04, 0.04, 0.405], (9, 3))
-    depth = cs.Depth("front", cube.t_s[1:5] + 0.003, [places] * 4, 0.05, camera, gate_m=0.1)
+    depth = cs.Depth("front", cube.t_s[1:4] + 0.003, [places] * 3, 0.05, camera, gate_m=0.1)
     return replace(cube, depths=[depth])
 
 
@@ -37,13 +37,13 @@ def cube_with_sensor() -> cs.Experiment:
 
 
 def bar_with_loads() -> cs.Experiment:
-    return replace(bar_loaded(6), nuisance=cs.Nuisance.none())
+    return replace(bar_loaded(5), nuisance=cs.Nuisance.none())
 
 
 # Recordings that have the parameters of a component; the others are those of every recording.
 RECORDINGS: dict[str, Callable[[], cs.Experiment]] = {
     "grasp": cube_with_a_displacement,
-    "obstacle": lambda: pressed_cube(4),
+    "obstacle": lambda: pressed_cube(3),
     "tendon": lambda: replace(driven_bar(4), nuisance=cs.Nuisance.none()),
     "pressure": lambda: replace(driven_bar(4), nuisance=cs.Nuisance.none()),
     "load": bar_with_loads,
