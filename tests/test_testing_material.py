@@ -19,6 +19,10 @@ def test_every_material_passes(name: str, element: str):
     check_material(name, is_objective=name != "linear", elements=[element])
 
 
+def test_a_material_with_memory_passes():
+    check_material("neo-hookean", elements=[], has_memory=True)
+
+
 def resists_rotation(F, mu_pa):
     return mu_pa * (ca.sumsqr((F + F.T) / 2 - ca.SX.eye(3)))
 

@@ -13,15 +13,23 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..array_types import Array
+from ..fem.body import Body
 from ..fem.constants import Constant
 from ..fem.materials import DAMPINGS, Energy, Material, as_material
 from ..problem.code_loader import CodeLoader
 from ..problem.schema import CodeSection
 from .internal_force_check import check_internal_forces
 from .missing_constant_check import check_missing_constant
+from .program_derivatives import check_program
 from .property_check import PropertyCheck
 from .round_trip import check_pickling, check_problem_file
-from .small_problems import usual_constants
+from .small_problems import (
+    DENSITY_KG_M3,
+    program_of,
+    swung_experiment,
+    uneven_box,
+    usual_constants,
+)
 
 # Number of random deformations.
 DEFORMATIONS = 4
@@ -38,6 +46,7 @@ def check_material(
     constants: Mapping[str, float] | None = None,
     is_objective: bool = True,
     elements: Sequence[str] = ("tet4",),
+    has_memory: bool = False,
     largest_strain: float = LARGEST_STRAIN,
     file: str | Path | None = None,
     function: str | None = None,
@@ -63,6 +72,8 @@ def check_material(
         Whether the energy does not depend on rotations; false for linear elasticity.
     elements : sequence of str
         Elements of the small body: "tet4", "tet10" and "tet10-p0".
+    has_memory : bool
+        Whether to check a small program in which the material has a branch of memory, too.
     largest_strain : float
         Largest entry of F − I of the random deformations; smaller for materials with a limit.
     file : str or Path, optional
@@ -100,6 +111,9 @@ def check_material(
             is_objective=is_objective,
             is_dissipative=True,
         )
+    if has_memory:
+        body = Body(uneven_box(1), made, DENSITY_KG_M3, prony=["prony_1"])
+        check_program(check, program_of(swung_experiment(body), values))
 
 
 @dataclass(frozen=True, eq=False)
