@@ -389,6 +389,17 @@ GRASP_SHIFT = NuisanceRow(
     said="a constant shift of it there; both where the start is an equilibrium and markers see it",
     same=_hand_eye_sharing_key,
 )
+STRAIN_ZERO = NuisanceRow(
+    "strain_zero",
+    "1",
+    None,
+    key="strain_zero",
+    changes=("grasps",),
+    applies=lambda experiment: experiment.specimen is not None,
+    label="zero of the strain",
+    told="zero of the strain off by {size}",
+    said="a constant offset of the strains of a specimen",
+)
 ZERO = NuisanceRow(
     "displacement_zero_m",
     "m",

@@ -351,6 +351,8 @@ class Assumption:
         component; None if there is no effect in this experiment.
     component_names : str
         Names of components with independent errors, separated by spaces; empty if there is one.
+    of_specimens : bool
+        Whether it concerns homogeneous specimens too, which have neither a mesh nor grips.
     """
 
     name: str
@@ -359,6 +361,7 @@ class Assumption:
     description: str
     effect: Callable[[ExperimentAtAnswer, int], Effect | None]
     component_names: str = ""
+    of_specimens: bool = False
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -428,7 +431,8 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
     """Effect of a stiffness that is higher along one axis by a share of E: the energy ½ E e² of the
     strain e along it.
 
-    Rayleigh damping K(x) v follows by its time derivative.
+    Rayleigh damping K(x) v follows by its time derivative. For specimens e is such that its stress
+    at large stretches λ, (λ − 1/λ²) / 3, is a constant share of that of Neo-Hooke's law.
     """
     body = at.body
     xi, nu = at.states
@@ -442,7 +446,10 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
         stretch, rate = (
             np.einsum("eqa,eaj->eqj", slopes, each.reshape(-1, 3)[body.cells]) for each in (x, v)
         )
-        strain = 0.5 * (np.sum(stretch**2, axis=2, keepdims=True) - 1)
+        squared = np.sum(stretch**2, axis=2, keepdims=True)
+        strain = 0.5 * (squared - 1)
+        if at.iterate.segment.experiment.specimen is not None:
+            strain = (1 - squared**-1.5) / 3
         pull = (strain + gamma * np.sum(stretch * rate, axis=2, keepdims=True)) * stretch
         pull = weight[..., None] * (pull + gamma * strain * rate)
         np.subtract.at(own.reshape(-1, 3), body.cells, np.einsum("eqa,eqj->eaj", slopes, pull))
@@ -670,11 +677,12 @@ ASSUMPTIONS = (
     Assumption("density_gradient", "1", 0.05,
         "density at one end of the body over that in its middle", _density_gradient, "x y z"),
     Assumption("anisotropy", "1", 0.05,
-        "stiffness along one axis over that across", _anisotropy, "x y z"),
+        "stiffness along one axis over that across", _anisotropy, "x y z", of_specimens=True),
     Assumption("stiffness_drift", "1", 0.02,
-        "stiffness at the end over that at the beginning", _drift),
+        "stiffness at the end over that at the beginning", _drift, of_specimens=True),
     Assumption("time_scale", "1", 1e-4, "pace of all clocks", _time_scale),
-    Assumption("poisson", "", 0.02, "Poisson's ratio, where it is stated", _poisson),
+    Assumption("poisson", "", 0.02, "Poisson's ratio, where it is stated", _poisson,
+        of_specimens=True),
     Assumption("damping_law", "1", 1.0,
         "damping force of another objective law, in its difference from the stated one",
         _objective_damping, " ".join(OBJECTIVE_DAMPINGS)),

@@ -1,0 +1,205 @@
+"""Homogeneous specimens without a mesh: exact stresses, fits, files and mistakes in them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import collocation_sysid as cs
+from collocation_sysid.program.simulation import with_readings
+from collocation_sysid.recording.homogeneous_deformation import TESTS
+
+LAMBDA_PA = 4e5
+MU_PA = 1e5
+YOUNG_PA = MU_PA * (3 * LAMBDA_PA + 2 * MU_PA) / (LAMBDA_PA + MU_PA)
+POISSON = LAMBDA_PA / 2 / (LAMBDA_PA + MU_PA)
+NEO_HOOKEAN = {"young_pa": YOUNG_PA, "poisson": POISSON, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+EXACT = {"strain_zero": 0.0, "area_error": 0.0}
+
+
+def nominal_pa(stretches):
+    """Principal nominal stresses of ψ = ½ λ (ln J)² − μ ln J + ½ μ (tr C − 3)."""
+    stretches = np.asarray(stretches, dtype=float)
+    return (LAMBDA_PA * np.log(stretches.prod()) + MU_PA * (stretches**2 - 1)) / stretches
+
+
+def lateral_stretch(stretches_at):
+    """Free stretch at which its own stress, the first one, vanishes."""
+    return brentq(lambda free: nominal_pa(stretches_at(free))[0], 0.2, 3.0, xtol=1e-15)
+
+
+def expected(test, strain):
+    """Stress, second stress and lateral stretch by principal stretches; NaN without one."""
+    stretch = 1 + strain
+    if test == "uniaxial":
+        free = lateral_stretch(lambda free: (free, free, stretch))
+        return nominal_pa((stretch, free, free))[0], np.nan, free
+    if test in ("equibiaxial", "biaxial", "planar"):
+        second = {"equibiaxial": stretch, "planar": 1.0, "biaxial": 1 + strain / 2}[test]
+        free = lateral_stretch(lambda free: (free, second, stretch))
+        first_pa, second_pa, _ = nominal_pa((stretch, second, free))
+        return first_pa, second_pa, free
+    if test == "simple-shear":
+        return MU_PA * strain, np.nan, np.nan
+    second = stretch if test == "volumetric" else 1.0
+    return nominal_pa((stretch, second, second))[0], np.nan, np.nan
+
+
+def specimen(test, strain, **keys):
+    """Specimen of a test with zeros in place of the measurements that the test has."""
+    strain = np.asarray(strain, dtype=float)
+    zeros = np.zeros_like(strain)
+    if test == "biaxial":
+        keys = {"second_strain": strain / 2, **keys}
+    if test in ("biaxial", "planar"):
+        keys = {"second_stress_pa": zeros, **keys}
+    if test in ("uniaxial", "equibiaxial", "biaxial", "planar"):
+        keys = {"lateral_stretch": 1 + zeros, **keys}
+    return cs.Specimen(test, strain, zeros, **{"sigma_pa": 100.0, **EXACT, **keys})
+
+
+def simulated(test, strain, values=NEO_HOOKEAN, material="neo-hookean", **keys):
+    """Values (T,) of the sensors of a specimen by name."""
+    experiment = specimen(test, strain, **keys).experiment(material, test)
+    trajectory = cs.simulate(experiment, values)
+    names = [gauge.name for gauge in experiment.readings]
+    read = [values[:, 0] for values in trajectory.custom_sensor_values]
+    return dict(zip(names, read, strict=True))
+
+
+@pytest.mark.parametrize("test", TESTS)
+def test_stresses_are_those_of_the_closed_form(test):
+    strain = np.array([-0.3, -0.1, 0.0, 0.2, 0.8, 1.5])
+    read = simulated(test, strain)
+    rows = np.array([expected(test, each) for each in strain]).T
+    assert "stress" in read
+    assert ("second stress" in read) == (test in ("biaxial", "planar"))
+    assert ("lateral stretch" in read) == np.isfinite(rows[2]).all()
+    for name, row in zip(("stress", "second stress", "lateral stretch"), rows, strict=True):
+        if name in read:
+            np.testing.assert_allclose(read[name], row, rtol=1e-9, atol=1e-9 * np.abs(row).max())
+
+
+def test_an_incompressible_solid_has_rivlins_stresses():
+    strain = np.linspace(0.1, 2.0, 5)
+    values = {"c10_pa": 8e4, "c01_pa": 2e4, "kappa_pa": 1e12, "gamma_r_s": 0, "gamma_m_1_s": 0}
+    stretch = 1 + strain
+    of_test = {
+        "uniaxial": 2 * (stretch - stretch**-2) * (8e4 + 2e4 / stretch),
+        "equibiaxial": 2 * (stretch - stretch**-5) * (8e4 + 2e4 * stretch**2),
+        "planar": 2 * (stretch - stretch**-3) * (8e4 + 2e4),
+    }
+    for test, stress_pa in of_test.items():
+        read = simulated(test, strain, values, "mooney-rivlin")
+        np.testing.assert_allclose(read["stress"], stress_pa, rtol=1e-5)
+
+
+def with_errors(twin, *, strain_zero=0.0, area_error=0.0, noise=0.0, material="neo-hookean"):
+    """Experiment of a specimen whose measurements have a wrong zero, a wrong area and noise."""
+    wrong = cs.Specimen(
+        twin.test, twin.strain + strain_zero, twin.stress_pa, sigma_pa=twin.sigma_pa, **EXACT
+    )
+    trajectory = cs.simulate(wrong.experiment(material), NEO_HOOKEAN)
+    rng = np.random.default_rng(1)
+    values = [
+        (1 + area_error) * read + noise * rng.normal(size=read.shape)
+        for read in trajectory.custom_sensor_values
+    ]
+    return with_readings(twin.experiment(material, twin.test), values)
+
+
+def test_zero_of_the_strain_and_error_of_the_area_are_estimated():
+    strain = np.linspace(0.01, 1.0, 30)
+    twins = [
+        cs.Specimen("uniaxial", strain, 0 * strain, sigma_pa=50.0, area_error=0.01),
+        cs.Specimen("equibiaxial", strain, 0 * strain, sigma_pa=50.0, area_error=1e-5),
+    ]
+    recorded = [
+        with_errors(twins[0], strain_zero=3e-3, area_error=0.02, noise=50.0),
+        with_errors(twins[1], strain_zero=-2e-3, noise=50.0),
+    ]
+    problem = cs.Problem(recorded, {**NEO_HOOKEAN, "young_pa": cs.Unknown()})
+    run = cs.run(problem)
+    low, high = run.estimates["young_pa"].statistical95
+    assert low < YOUNG_PA < high
+    assert high - low < 0.02 * YOUNG_PA
+    assert run.nuisance("uniaxial: zero of the strain [1]") == pytest.approx(3e-3, abs=1e-3)
+    assert run.nuisance("uniaxial: area_error of stress [1]") == pytest.approx(0.02, abs=2e-3)
+
+
+# Problem files ------------------------------------------------------------------------------------
+
+PROBLEM = """
+[object]
+material = "neo-hookean"
+
+[parameters]
+young_pa = {}
+poisson = 0.4
+
+[[experiment]]
+name = "pull"
+kind = "specimen"
+test = "uniaxial"
+file = "pull.csv"
+sigma_pa = 100.0
+"""
+
+
+def written(folder, text=PROBLEM, header="stretch,stress (kPa)", rows=None):
+    """Problem file in a folder, with a table of an exact uniaxial test."""
+    strain = np.linspace(0.05, 0.8, 12)
+    stress_pa = simulated("uniaxial", strain)["stress"]
+    rows = np.column_stack([1 + strain, stress_pa / 1e3]) if rows is None else rows
+    lines = [header, *(",".join(f"{cell:.10g}" for cell in row) for row in rows)]
+    (folder / "pull.csv").write_text("\n".join(lines) + "\n")
+    (folder / "problem.toml").write_text(text)
+    return folder / "problem.toml"
+
+
+def test_a_problem_of_specimens_needs_no_mesh_and_no_damping(tmp_path):
+    run = cs.run(cs.Problem.read(written(tmp_path)))
+    # With a fixed Poisson's ratio of 0.4, which is the true one.
+    assert pytest.approx(0.4) == POISSON
+    assert run.parameters["young_pa"] == pytest.approx(YOUNG_PA, rel=1e-6)
+    run.save(tmp_path / "run")
+    assert (tmp_path / "run" / "result.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("header", "factors", "keys"),
+    [
+        ("strain (%),stress [MPa]", (100.0, 1e-6), ""),
+        ("Dehnung in %,Spannung in MPa", (100.0, 1e-6), ""),
+        ("extension (mm),force (N)", (20.0, 4e-6), "length_m = 0.02\narea_m2 = 4e-6\n"),
+        ("strain (-),stress_pa", (-1.0, -1.0), "strain_sign = -1\nstress_sign = -1\n"),
+        (
+            "Kanal 1,Kanal 2",
+            (1.0, 1.0),
+            'columns = { strain = "Kanal 1 (-)", stress = "Kanal 2 (Pa)" }',
+        ),
+    ],
+)
+def test_tables_of_machines_are_read(tmp_path, header, factors, keys):
+    strain = np.linspace(0.05, 0.8, 12)
+    rows = np.column_stack([strain, simulated("uniaxial", strain)["stress"]]) * factors
+    path = written(tmp_path, PROBLEM + keys, header, rows)
+    (experiment,) = cs.Problem.read(path).experiments
+    assert experiment.readings[0].measured_values[:, 0] == pytest.approx(
+        simulated("uniaxial", strain)["stress"], rel=1e-8
+    )
+
+
+def test_true_stress_is_converted_if_it_is_declared(tmp_path):
+    strain = np.linspace(0.05, 0.8, 12)
+    read = simulated("uniaxial", strain)
+    across = read["lateral stretch"]
+    rows = np.column_stack([strain, read["stress"] / across**2, across])
+    header = "strain (-),true stress (Pa),lateral stretch"
+    path = written(tmp_path, PROBLEM + 'stress = "true"\n', header, rows)
+    (experiment,) = cs.Problem.read(path).experiments
+    assert experiment.readings[0].measured_values[:, 0] == pytest.approx(read["stress"], rel=1e-8)
+    path = written(tmp_path, PROBLEM, header, rows)
+    with pytest.raises(cs.InputError, match="true stress"):
+        cs.Problem.read(path)
