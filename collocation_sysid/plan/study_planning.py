@@ -274,7 +274,8 @@ def plan_models(
         wrenches.
     """
     for each in problem.experiments:
-        if not (each.validation or each.markers.sample_count or each.wrenches):
+        is_compared = each.markers.sample_count or each.wrenches or each.specimen is not None
+        if not (each.validation or is_compared):
             raise InputError(
                 f"'{each.name}' has neither markers nor a measured wrench; expected one of these, "
                 "by which models are told apart: predictions are not compared with depth images or "

@@ -188,7 +188,7 @@ class SpecimenCells:
         """
         constants = next(iter(self._bodies.values())).constants.values()
         damping = {c.name: 0.0 for c in constants if c in (GAMMA_R, GAMMA_M)}
-        return damping | dict(parameters)
+        return {**parameters, **{n: v for n, v in damping.items() if n not in parameters}}
 
 
 def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:

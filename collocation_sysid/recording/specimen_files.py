@@ -119,8 +119,14 @@ class SpecimenTable:
 
     def rows(self, chosen: Index) -> dict[str, Array | None]:
         """Return the arrays at chosen rows, by their indices, as arguments of `Specimen`."""
-        names = ("t_s", "strain", "stress_pa", "second_strain", "second_stress_pa")
-        arrays = {name: getattr(self, name) for name in (*names, "lateral_stretch")}
+        arrays = {
+            "t_s": self.t_s,
+            "strain": self.strain,
+            "stress_pa": self.stress_pa,
+            "second_strain": self.second_strain,
+            "second_stress_pa": self.second_stress_pa,
+            "lateral_stretch": self.lateral_stretch,
+        }
         return {name: None if each is None else each[chosen] for name, each in arrays.items()}
 
 
