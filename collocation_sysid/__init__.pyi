@@ -1,6 +1,6 @@
 """What the package exports; each module is imported when one of its names is asked for."""
 
-from . import live
+from . import datasets, live
 from .errors import InputError, SimulationError
 from .fem.body import Body
 from .fem.constants import Constant
@@ -121,6 +121,7 @@ __all__ = [
     "Wrench",
     "box_mesh",
     "cylinder_mesh",
+    "datasets",
     "depth_image",
     "live",
     "place_markers",

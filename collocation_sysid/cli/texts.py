@@ -14,7 +14,7 @@ import typer
 
 from ..console import PlainConsole
 from ..display import Shown, Table
-from ..errors import located, require_among
+from ..errors import InputError, located, require_among
 from ..pages import page_files, page_text, page_title
 from ..serialisation import as_json
 from .command_options import AsJson, command
@@ -163,28 +163,44 @@ class NewCommand:
         Name of the new folder.
     kind : str
         With a simulated recording of this kind, so that it runs as it is.
+    dataset : str
+        With the files of this data set instead, such as kawabata_1981.
     """
 
     name: Annotated[str, typer.Argument()]
     kind: NewProblemKind | None = None
+    dataset: str | None = None
 
 
 @command(
-    commands, "new my_object", "new silicone --kind compression", "check silicone/problem.toml"
+    commands,
+    "new my_object",
+    "new silicone --kind compression",
+    "new rubber --dataset kawabata_1981",
+    "check silicone/problem.toml",
 )
 def new(options: NewCommand) -> None:
     """Write a commented problem file to start from."""
+    from ..datasets.dataset_files import copy_dataset
     from ..problem.new_problem import create_problem
 
     folder = Path(options.name)
     kind = options.kind
-    file, *data = create_problem(folder, kind and kind.value)
+    if kind is not None and options.dataset is not None:
+        raise InputError("found --kind and --dataset; expected one of them", None, "--dataset")
+    if options.dataset is not None:
+        file, *data = copy_dataset(options.dataset, folder)
+    else:
+        file, *data = create_problem(folder, kind and kind.value)
     typer.echo(file)
     for each in data:
         typer.echo(each)
     yours = "put your mesh, poses and marker tracks beside it and name them in it"
     example = "it runs as it is, on simulated data; then put your own in their place"
-    error_console.print(f"Next: {yours if kind is None else example}.", soft_wrap=True)
+    is_empty = kind is None and options.dataset is None
+    if options.dataset is not None:
+        example = "it runs as it is; its first lines state the source of the data"
+    error_console.print(f"Next: {yours if is_empty else example}.", soft_wrap=True)
     for next_ in ("check", "solve"):
         error_console.print(f"  collocation-sysid {next_} {shlex.quote(str(file))}", soft_wrap=True)
 
