@@ -203,3 +203,108 @@ def test_true_stress_is_converted_if_it_is_declared(tmp_path):
     path = written(tmp_path, PROBLEM, header, rows)
     with pytest.raises(cs.InputError, match="true stress"):
         cs.Problem.read(path)
+
+
+# Mistakes -----------------------------------------------------------------------------------------
+
+STRAIN = np.linspace(0.05, 0.8, 12)
+
+
+@pytest.mark.parametrize(
+    ("header", "factors", "keys", "message"),
+    [
+        ("strain (-),stress (kPa)", (100.0, 1e-3), "", "strain.*(%)"),
+        ("stretch,stress (kPa)", (100.0, 1e-3), "", "stretch"),
+        ("strain (-),stress (kPa)", (1.0, -1e-3), "", "opposite signs.*stress_sign = -1"),
+        ("strain (-),stress (GPa)", (1.0, 1.0), "", "Check the unit"),
+        ("strain,stress (kPa)", (1.0, 1e-3), "", "names no unit"),
+        ("strain (-),force (N)", (1.0, 1.0), "", "area_m2"),
+        ("extension (mm),stress (kPa)", (1.0, 1e-3), "", "length_m"),
+        ("extension (mm),stress (kPa)", (-1e3, -1e-3), "length_m = 0.02", "strain_sign"),
+        ("strain (-),stress (kPa)", (1.0, 1e-3), "skip_cycles = 1", "1 loading cycles"),
+        ("strain (-),stress (kPa)", (1.0, 1e-3), "skip_cycle = 1", "did you mean 'skip_cycles'"),
+        ("strain (-),stress (kPa)", (1.0, 1e-3), "window_s = [0.0, 5.0]", "t_s"),
+    ],
+)
+def test_mistakes_in_a_table_are_named(tmp_path, header, factors, keys, message):
+    rows = np.column_stack([STRAIN, simulated("uniaxial", STRAIN)["stress"]]) * factors
+    path = written(tmp_path, f"{PROBLEM}{keys}\n", header, rows)
+    with pytest.raises(cs.InputError, match=message) as raised:
+        cs.Problem.read(path)
+    assert "problem.toml" in str(raised.value) or "pull.csv" in str(raised.value)
+
+
+def test_strains_that_begin_at_one_are_stretches(tmp_path):
+    strain = np.linspace(0.0, 0.8, 12)
+    rows = np.column_stack([1 + strain, simulated("uniaxial", strain)["stress"]])
+    with pytest.raises(cs.InputError, match="call the column stretch"):
+        cs.Problem.read(written(tmp_path, header="strain (-),stress (Pa)", rows=rows))
+
+
+def test_a_confined_test_with_positive_compression_is_refused(tmp_path):
+    strain = np.linspace(0.0, -0.3, 12)
+    rows = -np.column_stack([strain, simulated("confined", strain)["stress"]])
+    text = PROBLEM.replace("uniaxial", "confined")
+    path = written(tmp_path, text, "strain (-),stress (Pa)", rows)
+    with pytest.raises(cs.InputError, match="strain_sign = -1"):
+        cs.Problem.read(path)
+    path = written(
+        tmp_path, text + "strain_sign = -1\nstress_sign = -1\n", "strain (-),stress (Pa)", rows
+    )
+    assert cs.run(cs.Problem.read(path)).parameters["young_pa"] == pytest.approx(YOUNG_PA)
+
+
+def test_a_thousandfold_stress_beside_another_test_is_refused(tmp_path):
+    stress_pa = simulated("planar", STRAIN)["stress"]
+    rows = np.column_stack([STRAIN, stress_pa / 1e3])
+    path = written(tmp_path)
+    lines = ["strain (-),stress (MPa)", *(f"{a:.10g},{b:.10g}" for a, b in rows)]
+    (tmp_path / "wide.csv").write_text("\n".join(lines))
+    path.write_text(PROBLEM + PROBLEM[PROBLEM.index("[[") :].replace("pull", "wide"))
+    with pytest.raises(cs.InputError, match="kPa or MPa"):
+        cs.Problem.read(path)
+
+
+def test_rows_out_of_order_are_noted(tmp_path):
+    strain = np.concatenate([np.linspace(0.05, 0.8, 12), np.linspace(0.05, 0.8, 12)])
+    rows = np.column_stack([strain, simulated("uniaxial", strain)["stress"]])
+    path = written(tmp_path, header="strain (-),stress (Pa)", rows=rows)
+    (note,) = [each for each in cs.Problem.read(path).notes if "order of time" in each]
+    assert "after row 12" in note
+    softened = rows.copy()
+    softened[12:, 1] *= 0.7
+    mixed = softened[np.argsort(softened[:, 0], kind="stable")]
+    path = written(tmp_path, header="strain (-),stress (Pa)", rows=mixed)
+    assert any("loading and unloading" in each for each in cs.Problem.read(path).notes)
+
+
+def test_first_loading_cycles_are_left_out(tmp_path):
+    cycle = np.concatenate([np.linspace(0.02, 0.8, 10), np.linspace(0.75, 0.0, 10)])
+    strain = np.tile(cycle, 3)
+    rows = np.column_stack([strain, simulated("uniaxial", strain)["stress"]])
+    rows[:20, 1] *= 1.5  # the virgin material is stiffer
+    text = PROBLEM + "skip_cycles = 1\n"
+    problem = cs.Problem.read(written(tmp_path, text, "strain (-),stress (Pa)", rows))
+    assert len(problem.experiments[0].t_s) in (40, 41)
+    assert cs.run(problem).parameters["young_pa"] == pytest.approx(YOUNG_PA, rel=1e-4)
+
+
+def mistaken(mistake):
+    """Experiment of a specimen with noise and a mistake in its values."""
+    rng = np.random.default_rng(3)
+    strain = (
+        np.linspace(-0.02, -0.5, 20) if mistake == "compression" else np.linspace(0.02, 0.8, 20)
+    )
+    stress_pa = simulated("uniaxial", strain)["stress"] + 500.0 * rng.normal(size=20)
+    if mistake == "true-stress":
+        stress_pa = stress_pa * (1 + strain)
+    if mistake == "compression":
+        strain, stress_pa = -strain, -stress_pa
+    return cs.Specimen("uniaxial", strain, stress_pa, 500.0).experiment(name="pull")
+
+
+@pytest.mark.parametrize("mistake", ["true-stress", "compression", None])
+def test_a_refit_finds_mistakes_that_leave_a_plausible_curve(mistake):
+    run = cs.run(cs.Problem([mistaken(mistake)], {**NEO_HOOKEAN, "young_pa": cs.Unknown()}))
+    causes = [each.cause for each in run.causes]
+    assert causes[:1] == ([f"specimen-{mistake}"] if mistake else [])

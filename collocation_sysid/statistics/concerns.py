@@ -127,6 +127,14 @@ TOPICS: Mapping[str, Topic] = {
             "sign": "along {axis} grasp {grasp} and the force that it gives go opposite ways "
             "(correlation {correlation:.2f}), as if the body gave work: one of both signs is "
             "wrong; set sign = -1 of its displacement or of its wrench",
+            "specimen-true-stress": "its stresses fit as true stresses, force over the deformed "
+            'area: set stress = "true", or divide forces by the undeformed area',
+            "specimen-compression": "strains and stresses fit as those of compression: set "
+            "strain_sign = -1 and stress_sign = -1",
+            "specimen-percent": "its strains fit as percent: name the unit in the column, "
+            '"strain (%)"',
+            "specimen-unit": "its stresses fit if multiplied by {factor:g}: the column seems to be "
+            "in {unit}",
             "wrench-sign": "all of it fits with the other sign: it is what the body gives the "
             "grasp; change its sign",
             "wrench-sign/part": "its {what} fit with the other sign, the rest does not: change "
