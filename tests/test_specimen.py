@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from problem_files import TRUTH, run_command, write_problem
 from scipy.optimize import brentq
 
 import collocation_sysid as cs
 from collocation_sysid.program.simulation import with_readings
 from collocation_sysid.recording.homogeneous_deformation import TESTS
+from collocation_sysid.result.replay import read_run
 
 LAMBDA_PA = 4e5
 MU_PA = 1e5
@@ -308,3 +310,66 @@ def test_a_refit_finds_mistakes_that_leave_a_plausible_curve(mistake):
     run = cs.run(cs.Problem([mistaken(mistake)], {**NEO_HOOKEAN, "young_pa": cs.Unknown()}))
     causes = [each.cause for each in run.causes]
     assert causes[:1] == ([f"specimen-{mistake}"] if mistake else [])
+
+
+# Beside other recordings --------------------------------------------------------------------------
+
+
+def test_simulate_writes_the_table_that_the_problem_reads(tmp_path):
+    path = written(tmp_path)
+    twin = tmp_path / "twin"
+    value = f"parameters.young_pa.guess={2 * YOUNG_PA}"
+    outcome = run_command("simulate", path, "--out", twin, "--set", value)
+    assert outcome.code == 0, outcome.err
+    (twin / "problem.toml").write_text(PROBLEM)
+    run = cs.run(cs.Problem.read(twin / "problem.toml"))
+    assert run.parameters["young_pa"] == pytest.approx(2 * YOUNG_PA, rel=1e-6)
+
+
+def test_specimens_and_a_motion_share_the_parameters(tmp_path):
+    path = write_problem(tmp_path, {"swing": 8})
+    stress_pa = simulated("uniaxial", STRAIN, TRUTH)["stress"]
+    rows = np.column_stack([STRAIN, stress_pa])
+    motion = path.read_text()
+    written(tmp_path, header="strain (-),stress (Pa)", rows=rows)
+    pull = PROBLEM[PROBLEM.index("[[") :].replace("100.0", "0.5")
+    path.write_text(f'{motion}\n{pull}\n[experiment_defaults]\nstart_rule = "standard"\n')
+    problem = cs.Problem.read(path, ["solver.method=reduced-space"])
+    run = cs.run(problem)
+    assert {name: run.optimum[name].value for name in TRUTH} == pytest.approx(TRUTH, rel=1e-3)
+    run.save(tmp_path / "run")
+    _, records = read_run(tmp_path / "run")
+    assert [len(each.undeformed_m) for each in records] == [
+        len(each.body.nodes.points_m) for each in problem.experiments
+    ]
+    assert records[1].strain == pytest.approx(STRAIN)
+
+
+def test_memory_relaxes_at_the_rate_of_its_branch():
+    strain = np.full(12, 0.2)
+    strain[0] = 0.0
+    t_s = np.concatenate([[0.0], np.linspace(1.0, 40.0, 11)])
+    twin = cs.Specimen("simple-shear", strain, 0 * strain, 100.0, t_s=t_s, **EXACT)
+    experiment = twin.experiment(prony=("slow",))
+    values = {**NEO_HOOKEAN, "slow.share": 0.4, "slow.tau_s": 10.0}
+    (read,) = cs.simulate(experiment, values).custom_sensor_values
+    relaxed = 0.2 * MU_PA
+    excess = read[1:, 0] / relaxed - 1
+    rates = -np.diff(np.log(excess)) / np.diff(t_s[1:])
+    assert rates == pytest.approx(np.full(10, 0.1), rel=0.05)
+
+
+def test_compare_ranks_laws_by_held_out_specimens(tmp_path):
+    stress_pa = {test: simulated(test, STRAIN)["stress"] for test in ("uniaxial", "planar")}
+    path = written(tmp_path)
+    lines = ["strain (-),stress (Pa)"]
+    lines += [f"{a:.10g},{b:.10g}" for a, b in zip(STRAIN, stress_pa["planar"], strict=True)]
+    (tmp_path / "wide.csv").write_text("\n".join(lines))
+    more = PROBLEM[PROBLEM.index("[[") :].replace("pull", "wide").replace("uniaxial", "planar")
+    path.write_text(PROBLEM + more)
+    outcome = run_command(
+        "compare", path, "--materials", "neo-hookean,stable-neo-hookean", "--out", tmp_path / "out"
+    )
+    assert outcome.code == 0, outcome.err
+    assert "→  neo-hookean" in outcome.out
+    assert "held out kPa" in outcome.out
