@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from problem_files import TRUTH, run_command, write_problem
@@ -11,6 +13,7 @@ import collocation_sysid as cs
 from collocation_sysid.program.simulation import with_readings
 from collocation_sysid.recording.homogeneous_deformation import TESTS
 from collocation_sysid.result.replay import read_run
+from collocation_sysid.runs.numerical_error import finer_mesh
 
 LAMBDA_PA = 4e5
 MU_PA = 1e5
@@ -373,3 +376,14 @@ def test_compare_ranks_laws_by_held_out_specimens(tmp_path):
     assert outcome.code == 0, outcome.err
     assert "→  neo-hookean" in outcome.out
     assert "held out kPa" in outcome.out
+
+
+def test_refinement_leaves_specimens_as_they_are(tmp_path):
+    run = cs.run(cs.Problem.read(written(tmp_path)))
+    with pytest.raises(cs.InputError, match="homogeneous and exact"):
+        cs.refine(run)
+    problem = cs.Problem.read(write_problem(tmp_path, {"swing": 8}))
+    experiment = specimen("uniaxial", STRAIN).experiment(name="pull")
+    finer = finer_mesh(replace(problem, experiments=[*problem.experiments, experiment]))
+    assert finer.experiments[1].body is experiment.body
+    assert len(finer.experiments[0].body.cells) == 8 * len(problem.bodies[0].cells)
