@@ -387,3 +387,12 @@ def test_refinement_leaves_specimens_as_they_are(tmp_path):
     finer = finer_mesh(replace(problem, experiments=[*problem.experiments, experiment]))
     assert finer.experiments[1].body is experiment.body
     assert len(finer.experiments[0].body.cells) == 8 * len(problem.bodies[0].cells)
+
+
+@pytest.mark.parametrize("poisson", [0.49, 0.4999, 0.49995])
+def test_a_poissons_ratio_near_one_half_has_a_finite_budget(poisson):
+    twin = cs.Specimen("uniaxial", STRAIN, simulated("uniaxial", STRAIN)["stress"], 1e3)
+    values = {**NEO_HOOKEAN, "young_pa": cs.Unknown(), "poisson": poisson}
+    run = cs.run(cs.Problem([twin.experiment()], values))
+    low, high = run.estimates["young_pa"].combined95
+    assert 0 < low < high < 2 * low

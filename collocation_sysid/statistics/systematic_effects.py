@@ -55,6 +55,8 @@ AIR_DENSITY_DEVIATION = 0.03
 # depend on its shape, on edges, on amplitude and on frequency.
 AIR_COEFFICIENT_DEVIATION = 0.4
 _AXES = "xyz"
+# Poisson's ratio of an incompressible material.
+INCOMPRESSIBLE_POISSON = 0.5
 # Laws of damping that a real material may obey: Rayleigh's resists rotation, as no material does.
 OBJECTIVE_DAMPINGS = ("kelvin-voigt", "material")
 # Differences by a displacement: its largest entry over the length of an edge.
@@ -489,13 +491,16 @@ def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
     if not stated:
         return None
     values = at.parameters.values(at.iterate.q)
+    # Both differences stay below ½, where the bulk modulus would be infinite.
+    largest = max(values[name] for name in stated)
+    step = min(SMALL, (INCOMPRESSIBLE_POISSON - largest) / 2)
     larger, smaller = (
         at.internal_n(
             theta=at.body.theta_from_values({n: v + way * (n in stated) for n, v in values.items()})
         )
-        for way in (SMALL, -SMALL)
+        for way in (step, -step)
     )
-    return Effect((larger - smaller) / (2 * SMALL))
+    return Effect((larger - smaller) / (2 * step))
 
 
 def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
