@@ -169,7 +169,7 @@ def test_missing_depths_at_the_free_end_that_count_as_evidence_ask_for_a_check(r
     problem = cs.Problem([seen_by(image, background="empty")], cs.Parameters.from_mapping(unknown))
     answer = cs.run(problem, seek_causes=False)
     assert answer.trust.verdict != "good"
-    assert any("outline of the body" in reason for reason in answer.trust.reasons)
+    assert any("model's outline" in reason for reason in answer.trust.reasons)
     known = cs.Problem([seen_by(image, background="unknown")], cs.Parameters.from_mapping(unknown))
     found = cs.solve(known).parameters["young_pa"]
     assert found == pytest.approx(TRUTH["young_pa"], rel=0.2)
@@ -200,7 +200,7 @@ def test_a_soft_bar_is_found_without_a_guess_from_a_camera_that_is_off():
     known = cs.solve(soft_problem(0, SOFT_TRUTH["young_pa"]))
     assert robust_loss(solution) < robust_loss(known) + SAME_LOSS
     assert solution.parameters["young_pa"] == pytest.approx(SOFT_TRUTH["young_pa"], rel=0.2)
-    (said,) = (note for note in solution.notes if "starts of the scan" in note)
+    (said,) = (note for note in solution.notes if "initial values of the scan" in note)
     assert "local minima" in said
     assert solution.scan is not None
     assert solution.scan.young_pa[solution.scan.best] == pytest.approx(3.16e4, rel=0.01)
