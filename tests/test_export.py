@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 import casadi as ca
 import numpy as np
 import pytest
+from materials_small import HYPERFOAM, OGDEN, term_constants
 from problem_files import run_command, write_problem
 from problems_small import IDEAL, nodes_where, smooth_poses, times, vertex_markers
 
@@ -315,6 +316,94 @@ def test_febio_gets_energy_and_memory(tmp_path):
     np.testing.assert_array_equal(nodes, body.nodes_m)
 
 
+def scaled_terms(terms, kappa_pa: float | None = None) -> dict[str, float]:
+    """Constants of terms for a shear modulus of 300 Pa, scaled to 20 kPa."""
+    scale = 20e3 / 300
+    values = {n: v * scale if n.endswith("_pa") else v for n, v in term_constants(terms).items()}
+    return values if kappa_pa is None else {**values, "kappa_pa": kappa_pa}
+
+
+OGDEN_TERMS = {count: scaled_terms(terms, 5e4) for count, terms in OGDEN.items()}
+FOAM_TERMS = {count: scaled_terms(terms) for count, terms in HYPERFOAM.items()}
+
+
+def card_values(folder: Path, keyword: str) -> list[float]:
+    """Numbers of the card of a material in the deck of CalculiX."""
+    lines = (folder / "body.inp").read_text().splitlines()
+    start = next(k for k, line in enumerate(lines) if line.startswith(keyword)) + 1
+    stop = next(k for k, line in enumerate(lines) if k > start and line.startswith("*"))
+    return [float(value) for line in lines[start:stop] for value in line.split(",")]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_calculix_gets_the_terms_of_ogdens_law(count, tmp_path):
+    folder = exported(held_bar(f"ogden-{count}", OGDEN_TERMS[count]), "calculix", tmp_path)
+    values = card_values(folder, f"*HYPERELASTIC,OGDEN,N={count}")
+    c = OGDEN_TERMS[count]
+    # 2μ/α² there is μ/α here.
+    pairs = [(c[f"mu_{p}_pa"] * c[f"alpha_{p}"] / 2, c[f"alpha_{p}"]) for p in range(1, count + 1)]
+    np.testing.assert_allclose(values[: 2 * count], np.ravel(pairs), rtol=1e-10)
+    assert values[2 * count] == pytest.approx(2 / 5e4)
+    assert values[2 * count + 1 :] == [1e20] * (count - 1)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_calculix_gets_the_terms_of_the_foam(count, tmp_path):
+    folder = exported(held_bar(f"hyperfoam-{count}", FOAM_TERMS[count]), "calculix", tmp_path)
+    values = card_values(folder, f"*HYPERFOAM,N={count}")
+    c = FOAM_TERMS[count]
+    pairs = [(c[f"mu_{p}_pa"], c[f"alpha_{p}"]) for p in range(1, count + 1)]
+    poisson = [c[f"beta_{p}"] / (1 + 2 * c[f"beta_{p}"]) for p in range(1, count + 1)]
+    np.testing.assert_allclose(values, [*np.ravel(pairs), *poisson], rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("material", "values", "target"),
+    [
+        ("ogden-4", OGDEN_TERMS[4], "calculix"),
+        ("hyperfoam-4", FOAM_TERMS[4], "calculix"),
+        ("hyperfoam-1", FOAM_TERMS[1], "febio"),
+        ("ogden-2", OGDEN_TERMS[2], "sofa"),
+        ("hyperfoam-1", FOAM_TERMS[1], "sofa"),
+        ("ogden-1", OGDEN_TERMS[1], "mujoco"),
+    ],
+)
+def test_what_has_no_such_material_says_what_becomes_of_it(material, values, target, tmp_path):
+    exported_files = write_export(held_bar(material, values), target, tmp_path / target)
+    assert any(
+        material in limit and ("neo-Hookean" in limit or "same E and ν" in limit)
+        for limit in exported_files.limitations
+    )
+
+
+def test_febio_gets_the_terms_of_ogdens_law(tmp_path):
+    model = ElementTree.parse(
+        exported(held_bar("ogden-2", OGDEN_TERMS[2]), "febio", tmp_path) / "body.feb"
+    )
+    material = model.find(".//Material/material")
+    assert material is not None
+    assert material.get("type") == "Ogden"
+    found = {each.tag: float(each.text or "") for each in material}
+    c = OGDEN_TERMS[2]
+    for p in (1, 2):  # c/m² there is μ/α here
+        assert found[f"c{p}"] == pytest.approx(c[f"mu_{p}_pa"] * c[f"alpha_{p}"])
+        assert found[f"m{p}"] == c[f"alpha_{p}"]
+    assert found["k"] == pytest.approx(5e4)
+    assert found["pressure_model"] == 2
+
+
+def test_sofa_gets_ogdens_law_of_one_term(tmp_path):
+    folder = exported(held_bar("ogden-1", OGDEN_TERMS[1]), "sofa", tmp_path)
+    scene = ElementTree.parse(folder / "body.scn")
+    force = scene.find(".//TetrahedronHyperelasticityFEMForceField")
+    assert force is not None
+    assert force.get("materialName") == "Ogden"
+    c = OGDEN_TERMS[1]
+    expected = [c["mu_1_pa"] * c["alpha_1"], c["alpha_1"], 5e4]
+    np.testing.assert_allclose(numbers_in(force.get("ParameterSet") or ""), expected)
+    assert "½ κ ln² J" in (folder / "body.scn").read_text()
+
+
 def in_febio(body: IdentifiedBody, folder: Path) -> ElementTree.Element:
     return ElementTree.parse(exported(body, "febio", folder) / "body.feb").getroot()
 
@@ -542,6 +631,8 @@ SAME_ENERGY = {
     "linear": {"young_pa": 5e4, "poisson": 0.3},
     "mooney-rivlin": {"c10_pa": 7e3, "c01_pa": 3e3, "kappa_pa": 5e4},
     "yeoh": {"c10_pa": 1e4, "c20_pa": 1e3, "c30_pa": 1e2, "kappa_pa": 5e4},
+    **{f"ogden-{n}": OGDEN_TERMS[n] for n in (1, 2, 3)},
+    "hyperfoam-3": FOAM_TERMS[3],
 }
 
 

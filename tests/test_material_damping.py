@@ -7,18 +7,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from checks import assert_derivative, directional_derivative, relative_error
-from materials_small import theta_for
+from materials_small import COMPILED, theta_for
 from problems_small import EDGE_M, IDEAL, box, nodes_where, uneven_box
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import ELEMENTS
-from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.program.block_band import full_matrix
 
-OBJECTIVE = [name for name in MATERIALS if name != "linear"]
+OBJECTIVE = [name for name in COMPILED if name != "linear"]
 # Small-strain constants (λ, μ) of `materials_small` [Pa], and γ_r [s].
 LAME_PA = 200.0
 SHEAR_PA = 300.0

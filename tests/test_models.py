@@ -20,6 +20,7 @@ from wrenches_small import fitted
 from collocation_sysid import Unknown
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.constants import usual_value
 from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.parameters import Parameters
@@ -250,6 +251,8 @@ def changed(
         ("yeoh", "lambda_pa gamma_r_s gamma_m_1_s c10_pa c20_pa c30_pa"),
         ("mooney-rivlin", "lambda_pa gamma_r_s gamma_m_1_s c10_pa c01_pa"),
         ("gent", "lambda_pa mu_pa gamma_r_s gamma_m_1_s gent_limit"),
+        ("ogden-1", "lambda_pa gamma_r_s gamma_m_1_s mu_1_pa alpha_1"),
+        ("ogden-2", "lambda_pa gamma_r_s gamma_m_1_s mu_1_pa alpha_1 mu_2_pa alpha_2"),
     ],
 )
 def test_a_material_brings_its_constants_and_the_rest_stays_as_stated(bar, material, expected):
@@ -272,6 +275,36 @@ def test_the_fixed_poisson_ratio_stays_whatever_the_material(bar):
     assert next(i.guess for i in problem.parameters.items if i.is_fixed) == 0.45
     back = changed(bar, "neo-hookean", BOTH, overrides=(*_as_yeoh(), "object.density_kg_m3=40"))
     assert set(back.parameters.names) == {"kappa_pa", "mu_pa", "gamma_r_s", "gamma_m_1_s"}
+
+
+def test_a_foam_replaces_all_moduli(bar):
+    problem = changed(bar, "hyperfoam-1", {"hyperfoam-1": 0, "linear": 0})
+    constants = {"mu_1_pa", "alpha_1", "beta_1"}
+    assert set(problem.parameters.names) == {"gamma_r_s", "gamma_m_1_s", *constants}
+    # As stiff as the file's guess of μ = 200 Pa.
+    guesses = problem.parameters.guesses
+    assert guesses["mu_1_pa"] == pytest.approx(200.0)
+
+
+@pytest.mark.parametrize(
+    ("material", "constants", "shear_pa"),
+    [
+        (
+            "ogden-2",
+            "mu_1_pa = 100, alpha_1 = 3, mu_2_pa = -50, alpha_2 = -2, kappa_pa = {}",
+            200.0,
+        ),
+        ("hyperfoam-1", "mu_1_pa = 100, alpha_1 = 3, beta_1 = 0.2", 100.0),
+    ],
+)
+def test_another_law_starts_as_stiff_as_the_powers_of_the_stretches(
+    bar, material, constants, shear_pa
+):
+    stated = f"parameters={{{constants}, gamma_r_s = {{}}, gamma_m_1_s = {{}}}}"
+    overrides = (f"object.material={material}", stated)
+    problem = changed(bar, "gent", {"gent": 0, material: 0}, overrides=overrides)
+    guesses = {item.name: item.guess for item in problem.parameters.items}
+    assert guesses["mu_pa"] == pytest.approx(shear_pa)
 
 
 def _as_yeoh() -> tuple[str, ...]:
@@ -543,7 +576,10 @@ def test_the_law_is_a_source_of_the_chosen_ones_budget():
 
 @pytest.mark.parametrize("law", MATERIALS)
 def test_every_law_has_a_stiffness_at_small_strain(law):
-    own = {c.name: Unknown(c.usual or 1e3) for c in MATERIALS[law].constants}
+    own = {
+        c.name: Unknown(c.usual or usual_value(c.name, 2.6e3) or 1e3)
+        for c in MATERIALS[law].constants
+    }
     values = own | {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
     body = Body(box().mesh, density_kg_m3=30.0, material=law)
     hung = replace(hung_cube(2), body=body)

@@ -63,6 +63,16 @@ MODELS = {
         {"c10_pa": 150.0, "c20_pa": 60.0, "c30_pa": 0.0, "kappa_pa": 400.0, **DAMPING},
         {"c10_pa": 220.0, "c20_pa": 20.0, "kappa_pa": 600.0, "gamma_r_s": 0.006},
     ),
+    "an exponent": (
+        {"material": "ogden-1"},
+        {"mu_1_pa": 150.0, "alpha_1": 4.0, "kappa_pa": 400.0, **DAMPING},
+        {"mu_1_pa": 250.0, "alpha_1": 3.0, "gamma_r_s": 0.006},
+    ),
+    "a foam": (
+        {"material": "hyperfoam-1"},
+        {"mu_1_pa": 300.0, "alpha_1": 6.0, "beta_1": 0.3, **DAMPING},
+        {"mu_1_pa": 400.0, "alpha_1": 3.0, "beta_1": 0.6, "gamma_r_s": 0.006},
+    ),
     "a user's own": (
         {"material": stiffening},
         {"shear_pa": 300.0, "bulk_pa": 400.0, "stiffening": 0.3, **DAMPING},

@@ -84,6 +84,54 @@ GENT_LIMIT = Constant("gent_limit", "J_m", "largest Ī₁ − 3", (1e-2, 1e4), u
 CHAIN_STRETCH = Constant(
     "chain_stretch", "λ_m", "stretch at which the chains lock", (1.01, 100.0), usual=5.0
 )
+# Most terms of a law in powers of the stretches, see `ogden`.
+MOST_TERMS = 4
+# Largest |α|, for which `power_traces` is accurate.
+LARGEST_EXPONENT = 30.0
+_SUBSCRIPTS = "₁₂₃₄"
+# The first term gives the scale of the stiffness and is positive. Those after it may be negative,
+# as in Ogden's own constants of rubber.
+MU_TERMS = (
+    Constant("mu_1_pa", "μ₁", "factor of the first power of the stretches", STIFFNESS),
+    *(
+        Constant(f"mu_{p}_pa", f"μ{_SUBSCRIPTS[p - 1]}", "factor of a power", (-1e9, 1e9), "linear")
+        for p in range(2, MOST_TERMS + 1)
+    ),
+)
+# Usual exponents: different ones, because the derivatives by those of equal terms are equal.
+USUAL_EXPONENTS = (2.0, 4.0, -2.0, -4.0)
+ALPHA_TERMS = tuple(
+    Constant(
+        f"alpha_{p}",
+        f"α{_SUBSCRIPTS[p - 1]}",
+        "exponent of the stretches",
+        # The first exponent has the sign of μ₁, which is positive.
+        (0.1 if p == 1 else -25.0, 25.0),
+        "linear",
+        typical=1.0,
+        usual=usual,
+        below=LARGEST_EXPONENT,
+        at_least=-LARGEST_EXPONENT,
+    )
+    for p, usual in enumerate(USUAL_EXPONENTS, start=1)
+)
+# At β = −⅓ the bulk modulus of a term is zero; ν/(1 − 2ν) of a term alone, usually with ν = 0.3.
+BETA_TERMS = tuple(
+    Constant(
+        f"beta_{p}",
+        f"β{_SUBSCRIPTS[p - 1]}",
+        "compressibility of a power, ν/(1 − 2ν)",
+        (0.0, 50.0),
+        "linear",
+        typical=0.2,
+        usual=0.75,
+        at_least=-0.33,
+    )
+    for p in range(1, MOST_TERMS + 1)
+)
+# Shares of the shear modulus in the factors μ_p of a material without guesses. They have the signs
+# of the usual exponents, and are not zero, where nothing depends on the exponent.
+USUAL_SHARES = (1.0, 0.1, -0.1, -0.05)
 # Constants of a branch of the memory, preceded by the name of the branch: ``prony_1.share``.
 SHARE = Constant(
     "share", "g", "stiffness that relaxes, relative to the long-term one",
@@ -124,6 +172,9 @@ KNOWN: Mapping[str, Constant] = {
         C30,
         GENT_LIMIT,
         CHAIN_STRETCH,
+        *MU_TERMS,
+        *ALPHA_TERMS,
+        *BETA_TERMS,
         SHARE,
         TAU,
         DENSITY,
@@ -219,6 +270,7 @@ def usual_value(name: str, young_pa: float, poisson: float = 0.3) -> float | Non
         "c01_pa": 0.1,
         "c20_pa": 0.0,
         "c30_pa": 0.0,
+        **{term.name: share for term, share in zip(MU_TERMS, USUAL_SHARES, strict=True)},
     }
     return shear * shares.get(without_region(name), 1.0)
 

@@ -144,7 +144,7 @@ def quadrature_point(
     count = (
         law.internal_variable_count if internal_variable_count is None else internal_variable_count
     )
-    return QuadraturePoint.from_element(
+    point = QuadraturePoint.from_element(
         element,
         law.constant_count,
         *fields,
@@ -152,6 +152,8 @@ def quadrature_point(
         scaled=law.scaled_indices,
         rest=law.rest,
     )
+    rule = law.material.chain_rule(point.material_gradient, _material_constants(point, law))
+    return replace(point, rule=rule)
 
 
 def kernel_from_outputs(name: str, point: QuadraturePoint, outputs: Outputs) -> ElementKernel:
@@ -177,19 +179,44 @@ def kernel_from_outputs(name: str, point: QuadraturePoint, outputs: Outputs) -> 
 
 def _energy(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return the elastic energy V ψ of a point."""
-    return point.volume * law.psi(point.material_gradient, point.local_constants)
+    return point.volume * _energy_density(point, law)
+
+
+def _energy_density(point: QuadraturePoint, law: PointLaw) -> ca.SX:
+    """Return ψ of a point, which may be a symbol of its `rule`."""
+    constants = _material_constants(point, law)
+    return law.material.psi_in(point.rule, point.material_gradient, constants)
+
+
+def _material_constants(point: QuadraturePoint, law: PointLaw) -> ca.SX:
+    """Return the constants of the material at a point, multiplied by the field."""
+    return point.local_constants[: len(law.material.constants)]
 
 
 def _potential(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return Θ of a point, whose negative derivative by x is an internal force."""
     energy = _energy(point, law)
-    damping = law.damping_potential(
-        energy, point.strain_symbols, point.strain_rate_symbols, point.local_constants
-    )
-    damped = energy + damping
+    damped = energy + _damping_potential(point, law, energy)
     if not law.has_memory:
         return damped
     return damped + point.theta[-1] * energy + memory_energy(point)
+
+
+def _damping_potential(point: QuadraturePoint, law: PointLaw, energy: ca.SX) -> ca.SX:
+    """Return the damping potential V ψ_d of a point from its elastic energy V ψ; 0 if it has none.
+
+    A law that treats all symbols alike also gets the symbols of energies and their rates. Any
+    other gets the energy as an expression without them.
+    """
+    strain = point.strain_symbols
+    rate = point.strain_rate_symbols
+    if law.damping.accepts_symbols:
+        symbols, rates = point.rule.rates(strain, rate)
+        strain = ca.vertcat(strain, symbols)
+        rate = ca.vertcat(rate, rates)
+    elif law.damping.potential:
+        (energy,) = point.rule.eliminate([energy])
+    return law.damping_potential(energy, strain, rate, point.local_constants)
 
 
 def memory_energy(point: QuadraturePoint) -> ca.SX:
@@ -214,9 +241,7 @@ def six_entries(matrix: ca.SX) -> ca.SX:
 
 def first_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return the first Piola–Kirchhoff stress P = ∂ψ/∂F, stacked (9,)."""
-    return ca.gradient(
-        law.psi(point.material_gradient, point.local_constants), point.gradients["x"]
-    )
+    return point.gradient(_energy_density(point, law), point.gradients["x"])
 
 
 def second_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:

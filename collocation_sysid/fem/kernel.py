@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 import casadi as ca
 
+from .chain_rule import ChainRule
 from .elements import Element
 from .rest_point_layout import RestPointLayout
 
@@ -294,6 +295,9 @@ class QuadraturePoint:
     rest : RestPointLayout, optional
         Layout of a stress-free shape that is not the mesh, see `rest_shape`: its data are the last
         ones of `point_data`, and the changes of its inputs the last entries of θ.
+    rule : ChainRule
+        Energies that stand as symbols in expressions until `make_phase` replaces them; none by
+        default. Derivatives are taken with `gradient`, `jacobian` and `directional_derivative`.
     """
 
     nodes: int
@@ -305,6 +309,7 @@ class QuadraturePoint:
     point_data: ca.SX
     scaled_indices: tuple[int, ...] = ()
     rest: RestPointLayout | None = None
+    rule: ChainRule = field(default_factory=ChainRule)
 
     @classmethod
     def from_element(
@@ -405,6 +410,22 @@ class QuadraturePoint:
         """Symbols of an energy that depend on x: F and m."""
         return ca.vertcat(self.gradients["x"], *self.stretches[:1])
 
+    def gradient(self, scalar: ca.SX, by: ca.SX) -> ca.SX:
+        """Return the gradient of a scalar by symbols (k,), including that through `rule`."""
+        return self.rule.gradient(scalar, by)
+
+    def jacobian(self, expression: ca.SX, by: ca.SX) -> ca.SX:
+        """Return the derivative (m, k) of an expression (m,) by symbols (k,), including that
+        through `rule`.
+        """
+        return self.rule.jacobian(expression, by)
+
+    def directional_derivative(self, expression: ca.SX, by: ca.SX, direction: ca.SX) -> ca.SX:
+        """Return the derivative of an expression by symbols (k,) along a direction (k,), including
+        that through `rule`.
+        """
+        return self.rule.directional_derivative(expression, by, direction)
+
     @property
     def strain_rate_symbols(self) -> ca.SX:
         """Symbols of the derivative of `strain_symbols` along v."""
@@ -426,7 +447,8 @@ class QuadraturePoint:
     def weighted_derivative(self, scalar: ca.SX) -> ca.SX:
         """Return the derivative of a scalar of x and v by x along w."""
         inputs = ca.vertcat(self.gradients["x"], *self.stretches[:2])
-        return ca.jtimes(scalar, inputs, ca.vertcat(self.gradients["w"], *self.stretches[2:]))
+        direction = ca.vertcat(self.gradients["w"], *self.stretches[2:])
+        return self.directional_derivative(scalar, inputs, direction)
 
     def derivative(self, scalar: ca.SX, by: By) -> ca.SX:
         """Return a derivative of a scalar, where fields stand for their gradients."""
@@ -437,8 +459,8 @@ class QuadraturePoint:
         if not inputs:
             return scalar
         if len(inputs) < 2:
-            return ca.jacobian(scalar, inputs[0]).T
-        return ca.jacobian(ca.gradient(scalar, inputs[0]), inputs[1])
+            return self.jacobian(scalar, inputs[0]).T
+        return self.jacobian(self.gradient(scalar, inputs[0]), inputs[1])
 
     def make_phase(self, name: str, pieces: Pieces, sums: ca.SX | None = None) -> Phase:
         """Return a phase with these pieces.
@@ -462,8 +484,9 @@ class QuadraturePoint:
             ca.vec(ca.reshape(field, 3, self.nodes) @ shape_gradients)
             for field in self.fields.values()
         ]
+        explicit = self.rule.eliminate([piece for _, piece in pieces.values()])
         outputs = ca.substitute(
-            [ca.densify(piece) for _, piece in pieces.values()],
+            [ca.densify(piece) for piece in explicit],
             [ca.vertcat(*self.gradients.values())],
             [ca.vertcat(*gradients)],
         )

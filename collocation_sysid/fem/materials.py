@@ -6,8 +6,8 @@ custom energy, call `Material.from_energy(function)` or pass the function to `Bo
 
 Energies in (λ, μ) have the small-strain stiffness of linear elasticity with these constants.
 Energies in the isochoric invariants Ī₁ = J^(−2/3) I₁, Ī₂ = J^(−4/3) I₂ have the volumetric term ½ κ
-(J − 1)². Ogden's is omitted: its derivatives by principal stretches are not exact where stretches
-coincide.
+(J − 1)². Laws in powers of the principal stretches are in `ogden`; kernels differentiate their
+energies by the chain rule through the invariants, see `Material.chain_rule`.
 
 A `DampingLaw` law is a potential or a stress that depends on the rate of deformation.
 "kelvin-voigt"
@@ -33,8 +33,11 @@ import numpy as np
 
 from ..errors import InputError, hint_at
 from ..files import reason
-from .constants import GAMMA_R, SHARE, TAU, Constant, constant_named
+from .chain_rule import ChainRule
+from .constants import GAMMA_R, MOST_TERMS, SHARE, TAU, Constant, constant_named
+from .invariants import isochoric_invariants
 from .kernel import from_lower_triangle
+from .ogden import PowerLawEnergy, hyperfoam, ogden
 
 T = TypeVar("T")
 Energy = Callable[..., ca.SX]
@@ -100,16 +103,41 @@ class Material:
         """Return the energy density as an expression, from the constants as a vector in their
         order.
         """
-        named = {c.name: values[k] for k, c in enumerate(self.constants)}
-        return ca.SX(self.energy(F, **named))
+        return ca.SX(self.energy(F, **self._named(values)))
+
+    def chain_rule(self, F: ca.SX, values: ca.SX) -> ChainRule:
+        """Return the chain rule for derivatives of `psi_in`.
+
+        Parameters
+        ----------
+        F : (3, 3) SX
+            Deformation gradient.
+        values : (c,) SX
+            Constants in their order.
+        """
+        if not isinstance(self.energy, PowerLawEnergy):
+            return ChainRule()
+        return ChainRule((self.energy.symbolic(F, values),))
+
+    def psi_in(self, rule: ChainRule, F: ca.SX, values: ca.SX) -> ca.SX:
+        """Return the energy density as the symbol of a rule from `chain_rule`, if it has one, else
+        as an expression in F (3, 3) and the constants (c,).
+        """
+        return rule.functions[0].symbol() if rule.functions else self.psi(F, values)
+
+    def _named(self, values: ca.SX) -> dict[str, ca.SX]:
+        """Return the constants by name, from a vector in their order."""
+        return {c.name: values[k] for k, c in enumerate(self.constants)}
 
     @cached_property
     def lame(self) -> ca.Function:
         """Function from the constants to the small-strain (λ, μ): C₁₁₂₂ and C₁₂₁₂ at F = I."""
         F = ca.SX.sym("F", 9)
         values = ca.SX.sym("values", len(self.constants))
-        psi = self.psi(ca.reshape(F, 3, 3), values)
-        return ca.Function("lame", [values], [lame_constants(psi, F)])
+        gradient = ca.reshape(F, 3, 3)
+        rule = self.chain_rule(gradient, values)
+        psi = self.psi_in(rule, gradient, values)
+        return ca.Function("lame", [values], [lame_constants(psi, F, rule)])
 
     def _check_at_rest(self) -> None:
         """Raise an `InputError` unless energy and stress vanish at F = I."""
@@ -143,11 +171,23 @@ class Material:
         return ", ".join(f"{c.name} = {v:.3g}" for c, v in zip(self.constants, values, strict=True))
 
 
-def lame_constants(psi: ca.SX, F: ca.SX) -> ca.SX:
+def lame_constants(psi: ca.SX, F: ca.SX, rule: ChainRule | None = None) -> ca.SX:
     """Return the small-strain (λ, μ), C₁₁₂₂ and C₁₂₁₂ at F = I, of an energy density of F stacked
     (9,).
+
+    Parameters
+    ----------
+    psi : SX
+        Energy density; may contain the symbols of `rule`.
+    F : (9,) SX
+    rule : ChainRule, optional
+        Chain rule for `psi`, which then gives fewer operations; CasADi's derivatives by default.
     """
-    tangent, _ = ca.hessian(psi, F)
+    if rule is not None and rule.functions:
+        tangent = rule.jacobian(rule.gradient(psi, F), F)
+        (tangent,) = rule.eliminate([tangent])
+    else:
+        tangent, _ = ca.hessian(psi, F)
     entries = ca.vertcat(tangent[0, 4], tangent[1, 1])
     return ca.simplify(ca.substitute(entries, F, ca.SX(ca.DM(np.eye(3).ravel()))))
 
@@ -197,13 +237,13 @@ def mooney_rivlin(F: ca.SX, c10_pa: ca.SX, c01_pa: ca.SX, kappa_pa: ca.SX) -> ca
 
     See Bonet & Wood 2008, sec. 6.5.
     """
-    first, second = _isochoric_invariants(F)
+    first, second = isochoric_invariants(F)
     return c10_pa * (first - 3) + c01_pa * (second - 3) + _volumetric(F, kappa_pa)
 
 
 def yeoh(F: ca.SX, c10_pa: ca.SX, c20_pa: ca.SX, c30_pa: ca.SX, kappa_pa: ca.SX) -> ca.SX:
     """Yeoh's energy ψ = Σ_i C_i0 (Ī₁ − 3)^i + U, i = 1 … 3, with μ = 2 C₁₀ (Yeoh 1993)."""
-    excess = _isochoric_invariants(F)[0] - 3
+    excess = isochoric_invariants(F)[0] - 3
     return excess * (c10_pa + excess * (c20_pa + excess * c30_pa)) + _volumetric(F, kappa_pa)
 
 
@@ -212,7 +252,7 @@ def gent(F: ca.SX, mu_pa: ca.SX, gent_limit: ca.SX, kappa_pa: ca.SX) -> ca.SX:
 
     Ī₁ < 3 + J_m for every stretch (Gent 1996).
     """
-    remaining = 1 - (_isochoric_invariants(F)[0] - 3) / gent_limit
+    remaining = 1 - (isochoric_invariants(F)[0] - 3) / gent_limit
     # The square root makes the derivatives NaN beyond the limit, too; otherwise a solver that
     # evaluates forces alone could converge there.
     return -mu_pa * gent_limit * ca.log(ca.sqrt(remaining)) + _volumetric(F, kappa_pa)
@@ -224,7 +264,7 @@ def arruda_boyce(F: ca.SX, mu_pa: ca.SX, chain_stretch: ca.SX, kappa_pa: ca.SX) 
     Five terms of the inverse Langevin function; C is such that μ is the shear modulus at small
     strain (Arruda & Boyce 1993, eq. 22).
     """
-    first = _isochoric_invariants(F)[0]
+    first = isochoric_invariants(F)[0]
     series = ca.SX(0)
     slope = ca.SX(0)
     for i, coefficient in enumerate((1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750), start=1):
@@ -232,15 +272,6 @@ def arruda_boyce(F: ca.SX, mu_pa: ca.SX, chain_stretch: ca.SX, kappa_pa: ca.SX) 
         series += weight * (first**i - 3**i)
         slope += 2 * weight * i * 3 ** (i - 1)
     return mu_pa * series / slope + _volumetric(F, kappa_pa)
-
-
-def _isochoric_invariants(F: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return the isochoric invariants Ī₁ and Ī₂."""
-    C = F.T @ F
-    first = ca.trace(C)
-    second = 0.5 * (first**2 - ca.sumsqr(C))
-    shrink = ca.exp(ca.log(ca.det(F)) * (-2.0 / 3.0))
-    return shrink * first, shrink**2 * second
 
 
 def _volumetric(F: ca.SX, kappa_pa: ca.SX) -> ca.SX:
@@ -267,6 +298,13 @@ MATERIALS: dict[str, Material] = {
         "arruda-boyce": arruda_boyce,
         "linear": linear_elastic,
     }.items()
+}
+MATERIALS |= {
+    f"{name}-{terms}": Material(
+        f"{name}-{terms}", energy(terms), tuple(map(constant_named, energy(terms).names))
+    )
+    for name, energy in (("ogden", ogden), ("hyperfoam", hyperfoam))
+    for terms in range(1, MOST_TERMS + 1)
 }
 
 
@@ -325,12 +363,16 @@ class DampingLaw:
     stress : callable, optional
         Instead of a potential: ``stress(psi, F, rate, **constants)`` → the stress P_v (9,) and
         ∂P_v/∂F (9, 9), which need not be symmetric. P_v must be linear in Ḟ, and ∂P_v/∂Ḟ symmetric.
+    accepts_symbols : bool
+        Whether the potential only differentiates psi along (F, Ḟ) as a whole, so that further
+        symbols of psi and their rates may follow those of F; false by default.
     """
 
     name: str
     constants: tuple[Constant, ...]
     potential: Potential | None = field(default=None, repr=False)
     stress: Stress | None = field(default=None, repr=False)
+    accepts_symbols: bool = False
 
 
 def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -386,7 +428,7 @@ def rayleigh(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:
 DAMPINGS: dict[str, DampingLaw] = {
     "kelvin-voigt": DampingLaw("kelvin-voigt", (GAMMA_R,), stress=kelvin_voigt),
     "material": DampingLaw("material", (GAMMA_R,), stress=material_form),
-    "rayleigh": DampingLaw("rayleigh", (GAMMA_R,), rayleigh),
+    "rayleigh": DampingLaw("rayleigh", (GAMMA_R,), rayleigh, accepts_symbols=True),
 }
 
 

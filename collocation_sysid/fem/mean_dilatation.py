@@ -129,12 +129,16 @@ class _VolumeSums:
         return self.volumes.numel()
 
     def with_stretches(self, pieces: Pieces) -> Pieces:
-        """Return pieces with m replaced by its expression in the sums."""
+        """Return pieces with m replaced by its expression in the sums.
+
+        Symbols of energies are replaced first, because energies depend on m.
+        """
         m = _volume_logarithms(self.volumes, self.volume)
         m -= _volume_logarithms(self.own_volumes, self.point.mesh_volume)
+        explicit = self.point.rule.eliminate([piece for _, piece in pieces.values()])
         return {
             key: (how, ca.substitute(piece, self.stretches, m))
-            for key, (how, piece) in pieces.items()
+            for (key, (how, _)), piece in zip(pieces.items(), explicit, strict=True)
         }
 
     def volume_pieces(self, order: int) -> Pieces:
@@ -196,18 +200,19 @@ class _ScalarDerivatives:
     @cached_property
     def by_stretch(self) -> ca.SX:
         """Derivatives ∂g/∂m by the stretches."""
-        return ca.gradient(self.scalar, self.shape.stretches)
+        return self.shape.point.gradient(self.scalar, self.shape.stretches)
 
     def second_derivative_pieces(self) -> Pieces:
         """Return the pieces whose sums couple in second derivatives: ∂²g by (m, m), (m, θ), (field,
         m).
         """
-        by_m = ca.jacobian(self.by_stretch, self.shape.stretches)
+        point = self.shape.point
+        by_m = point.jacobian(self.by_stretch, self.shape.stretches)
         pieces: Pieces = {
             self.sum_name("second"): ("none", ca.vec(from_lower_triangle(by_m))),
             self.sum_name("slopes_by_theta"): (
                 "none",
-                ca.vec(ca.jacobian(self.by_stretch, self.shape.point.differentiated_constants)),
+                ca.vec(point.jacobian(self.by_stretch, point.differentiated_constants)),
             ),
         }
         for field in self.fields:
@@ -223,10 +228,12 @@ class _ScalarDerivatives:
         if not nodal:
             return point.derivative(self.scalar, by)
         if len(nodal) == 1:
-            gradient = ca.gradient(self.scalar, point.gradients[nodal[0]])
+            gradient = point.gradient(self.scalar, point.gradients[nodal[0]])
             gradient += (self._with_stretch(nodal[0])[9:, :]).T @ self.by_stretch
             return (
-                gradient if len(by) == 1 else ca.jacobian(gradient, point.differentiated_constants)
+                gradient
+                if len(by) == 1
+                else point.jacobian(gradient, point.differentiated_constants)
             )
         alpha, beta = nodal
         weights = ca.SX.sym("weights", shape.count)
@@ -254,9 +261,11 @@ class _ScalarDerivatives:
 
     def _hessian(self, alpha: str, beta: str) -> ca.SX:
         """Return the second derivatives of g by (gradient, m) of two fields."""
-        gradients = self.shape.point.gradients
-        first, second = (ca.vertcat(gradients[f], self.shape.stretches) for f in (alpha, beta))
-        hessian = ca.jacobian(ca.gradient(self.scalar, first), second)
+        point = self.shape.point
+        first, second = (
+            ca.vertcat(point.gradients[field], self.shape.stretches) for field in (alpha, beta)
+        )
+        hessian = point.jacobian(point.gradient(self.scalar, first), second)
         return from_lower_triangle(hessian) if alpha == beta else hessian
 
 

@@ -37,7 +37,7 @@ Expression = Callable[[QuadraturePoint, PointLaw], ca.SX]
 
 def _stress_by_theta(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return ∂S by the material's constants and the logarithm of a field, column after column."""
-    slope = ca.jacobian(second_piola(point, law), point.differentiated_constants)
+    slope = point.jacobian(second_piola(point, law), point.differentiated_constants)
     of_field = slope[:, law.constant_count :]
     return ca.vec(ca.horzcat(slope[:, : len(law.material.constants)], of_field))
 
@@ -49,13 +49,14 @@ def _stress_derivative(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     rate = point.gradients["v"]
     inverse = ca.inv_minor(point.material_gradient)
     stress = inverse @ ca.reshape(piola, 3, 3)
-    change = ca.reshape(ca.jtimes(piola, F, rate), 3, 3) - ca.reshape(rate, 3, 3) @ stress
+    piola_rate = point.directional_derivative(piola, F, rate)
+    change = ca.reshape(piola_rate, 3, 3) - ca.reshape(rate, 3, 3) @ stress
     return six_entries(inverse @ change)
 
 
 def _stress_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return (∂S/∂x)ᵀ σ, with the weights σ as data of the points."""
-    return ca.gradient(
+    return point.gradient(
         ca.dot(point.internal_variables, second_piola(point, law)), point.gradients["x"]
     )
 
@@ -73,7 +74,7 @@ def _memory_force_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 def _stress_jacobian(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return (∂S/∂x)ᵀ, column after column."""
-    return ca.jacobian(second_piola(point, law), point.gradients["x"]).T
+    return point.jacobian(second_piola(point, law), point.gradients["x"]).T
 
 
 def _memory_force_jacobian(point: QuadraturePoint, law: PointLaw) -> ca.SX:

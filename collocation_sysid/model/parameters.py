@@ -135,7 +135,7 @@ class Parameter:
         if not least <= self.lower < self.upper or (self.scale == "log" and self.lower == 0):
             raise InputError(
                 f"lower = {self.lower:g}, upper = {self.upper:g}, expected "
-                f"{'0 < ' if self.scale == 'log' else '0 <= ' if least == 0 else ''}lower < upper",
+                f"{'0 < ' if self.scale == 'log' else _lower_limit_text(least)}lower < upper",
                 None,
                 self.name,
             )
@@ -159,7 +159,7 @@ class Parameter:
         least = constant.at_least if self.scale == "linear" else constant.lower_limit
         value = np.nan if self.guess is None else self.guess
         if not (np.isfinite(value) and value >= least):
-            expected = "a number" if least < 0 else "a number >= 0"
+            expected = "a number" if least == -np.inf else f"a number >= {least:g}"
             raise InputError(f"fixed = {value:g}, expected {expected}", None, self.name)
         self._require_below_limit(value, "fixed")
 
@@ -194,6 +194,11 @@ class Parameter:
     def value_derivative(self, value: float) -> float:
         """Return the derivative of the value by q, at a value."""
         return value if self.scale == "log" else self.unit
+
+
+def _lower_limit_text(least: float) -> str:
+    """Return the start of an inequality with the smallest admissible value; "" if there is none."""
+    return "" if least == -np.inf else f"{least:g} <= "
 
 
 # Initial guess of the contrast of two phases if no value is known. It differs from 1, at which the

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, require_among
-from ..fem.constants import usual_value, without_region
+from ..fem.constants import MOST_TERMS, usual_value, without_region
 from ..fem.materials import DAMPINGS, MATERIALS
 from ..fem.moduli import ELASTIC, elastic_names
 from ..problem import Problem
@@ -28,6 +28,8 @@ from .study_arguments import unique_items
 # Where a branch's share starts; time constants start evenly between a sample and the recording.
 SHARE = 0.1
 MOST_BRANCHES = 20
+# Constants of which a material needs one beside those of its shape.
+VOLUMETRIC = {"lambda_pa", "kappa_pa", "poisson"}
 # Budget entries that stand for other laws of damping, in place of which these are fitted.
 DAMPING_ASSUMPTIONS = ("damping_law", "rayleigh_damping")
 # Of a material of which nothing is said; and of the shear modulus, what a constant about zero has.
@@ -332,6 +334,10 @@ def _with_part_material(
     shear_pa = _shear_pa(parameters, prefix)
     if "mu_pa" in own and not elastic & {"mu_pa", "young_pa"}:
         unchanged[f"{prefix}mu_pa"] = _starting_guess("mu_pa", shear_pa)
+    own_or_shared = {without_region(name) for name in unchanged if name in mine | of_any}
+    if elastic_names(MATERIALS[material]) and not own_or_shared & VOLUMETRIC:
+        # A foam has no modulus that another material could take over.
+        unchanged[f"{prefix}poisson"] = _starting_guess("poisson", shear_pa)
     needed = [name for name in own if name not in ELASTIC and prefix + name not in unchanged]
     return unchanged | {prefix + name: _starting_guess(name, shear_pa) for name in needed}
 
@@ -348,7 +354,19 @@ def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
 
     linear = 0.0 if math.isnan(guess("c01_pa")) else guess("c01_pa")
     poisson = USUAL_POISSON if math.isnan(guess("poisson")) else guess("poisson")
-    ways = guess("mu_pa"), 2 * (guess("c10_pa") + linear), guess("young_pa") / (2 * (1 + poisson))
+    terms = range(1, MOST_TERMS + 1)
+    if any(not math.isnan(guess(f"beta_{p}")) for p in terms):
+        factors = {p: 1.0 for p in terms}  # of a foam
+    else:
+        factors = {p: guess(f"alpha_{p}") / 2 for p in terms}
+    products = [factor * guess(f"mu_{p}_pa") for p, factor in factors.items()]
+    powers = sum(each for each in products if not math.isnan(each))
+    ways = (
+        guess("mu_pa"),
+        powers,
+        2 * (guess("c10_pa") + linear),
+        guess("young_pa") / (2 * (1 + poisson)),
+    )
     return next((each for each in ways if each > 0), None)
 
 

@@ -34,6 +34,7 @@ from ..statistics.assessment import (
     stability_concerns,
 )
 from ..statistics.concerns import Concern
+from ..statistics.material_stability import strain_stability_concerns
 from ..statistics.plausibility import material_hypothesis, size_and_density_hypotheses
 from ..statistics.remedies import remedy_for
 from ..statistics.residual_diagnostics import MarkerDiagnosis
@@ -104,6 +105,7 @@ def solution_concerns(
             name = part.segment.experiment.name
             yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
     yield from stability_concerns(find_instabilities(solution.collocation, solution.z))
+    yield from strain_stability_concerns(solution.parts)
     yield from contact_concerns(contact_summaries_of_parts(solution.parts))
     if not solution.collocation.nq:
         yield from _prediction_concerns(rollouts)

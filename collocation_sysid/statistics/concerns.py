@@ -297,6 +297,12 @@ TOPICS: Mapping[str, Topic] = {
         {
             "grows": "the motion of '{experiment}' is unstable at t = {time_s:.3g} s: disturbances "
             "grow at a rate of {growth_1_s:.2g} 1/s",
+            "material": "the material {material}{where} is unstable at strains of '{experiment}' "
+            "(Drucker): at {time_s:.3g} s and the principal stretches {stretches} a further strain "
+            "lowers its stress; take a law with fewer terms, or bound its constants",
+            "rest": "the material {material} of {where} is unstable without any strain: its shear "
+            "modulus is {mu_pa:.3g} Pa and its bulk modulus {kappa_pa:.3g} Pa; both must be "
+            "positive. In Ogden's law the shear modulus is half the sum of mu_p alpha_p",
         },
     ),
     "contact": Topic(

@@ -39,6 +39,13 @@ CAPABILITIES = TargetCapabilities(
 )
 # Coefficients C_i of the series of Arruda and Boyce.
 _ARRUDA_BOYCE_COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
+# Largest number of terms of Ogden's law and of the foam, and of values on a line.
+MOST_TERMS = 3
+VALUES_PER_LINE = 8
+FOAM_LIMITATION = (
+    "CalculiX 2.20 finds no equilibrium of a HYPERFOAM of one term, or of two with a negative "
+    "exponent; the card is that of Abaqus, too"
+)
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
@@ -215,11 +222,41 @@ def _material_card(region: IdentifiedRegion, is_linear: bool) -> tuple[str, str]
             "its volumetric energy is ½ κ ((J² − 1)/2 − ln J) instead of ½ κ (J − 1)²: both "
             "agree for small changes of volume"
         )
+    if region.terms and len(region.terms) <= MOST_TERMS:
+        is_foam = region.material.startswith("hyperfoam")
+        return _power_law_card(region, volume), FOAM_LIMITATION if is_foam else ""
     constants = _format_values(region.mu_pa / 2, volume)
     return f"*HYPERELASTIC,NEO HOOKE\n{constants}\n", (
         f"{region.material} becomes the neo-Hookean law of Ī₁ with ½ κ (J − 1)²: the same λ and μ "
         "at small strain, but stresses differ in second order of the strain"
     )
+
+
+def _power_law_card(region: IdentifiedRegion, volume: float) -> str:
+    """Return the card of Ogden's law or of the foam.
+
+    The energy of a term in the card is 2μ/α² (Σ λ^α − 3): μ is ½ μ_p α_p of Ogden's law.
+
+    Parameters
+    ----------
+    region : IdentifiedRegion
+    volume : float
+        Constant D₁ = 2/κ of the volumetric energy of Ogden's law [1/Pa].
+    """
+    terms = region.terms
+    if region.material.startswith("ogden"):
+        keyword = "HYPERELASTIC,OGDEN"
+        values = [value for t in terms for value in (t.mu_pa * t.alpha / 2, t.alpha)]
+        values += [volume] + [ABSENT_TERM] * (len(terms) - 1)
+    else:
+        keyword = "HYPERFOAM"
+        values = [value for t in terms for value in (t.mu_pa, t.alpha)]
+        values += [t.beta / (1 + 2 * t.beta) for t in terms]
+    lines = [
+        _format_values(*values[k : k + VALUES_PER_LINE])
+        for k in range(0, len(values), VALUES_PER_LINE)
+    ]
+    return f"*{keyword},N={len(terms)}\n" + "".join(f"{line}\n" for line in lines)
 
 
 def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:

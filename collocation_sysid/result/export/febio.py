@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...array_types import Index
+from ...fem.constants import MOST_TERMS
 from .export_target import ExportedFiles, TargetCapabilities, comment_lines, values_as_text
 from .identified import IdentifiedBody, IdentifiedRegion
 from .obstacle_shapes import FacetedObstacle, faceted_obstacles
@@ -19,6 +20,7 @@ QUADRATIC_PRESSURE_MODEL = 2
 CAPABILITIES = TargetCapabilities(
     {
         "mooney-rivlin": "Mooney-Rivlin",
+        **{f"ogden-{terms}": "Ogden" for terms in range(1, MOST_TERMS + 1)},
         "neo-hookean": "neo-Hookean",
         "st-venant-kirchhoff": "St.Venant-Kirchhoff",
         "linear": "isotropic elastic",
@@ -107,6 +109,12 @@ def _elastic_law(region: IdentifiedRegion, limits: list[str]) -> tuple[str, dict
     c = region.constants
     if region.material == "mooney-rivlin":
         return CAPABILITIES.materials[region.material], {"c1": c["c10_pa"], "c2": c["c01_pa"]}, True
+    if region.material in CAPABILITIES.materials and region.terms:
+        # The energy of a term is c/m² (Σ λ̄^m − 3).
+        values = {}
+        for number, term in enumerate(region.terms, start=1):
+            values |= {f"c{number}": term.mu_pa * term.alpha, f"m{number}": term.alpha}
+        return CAPABILITIES.materials[region.material], values, True
     moduli = {"E": region.young_pa, "v": region.poisson}
     if region.material == "linear":
         limits.append(

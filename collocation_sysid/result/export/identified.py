@@ -20,6 +20,7 @@ from ...array_types import Array, Index
 from ...errors import InputError, listed, located
 from ...fem.body import Body
 from ...fem.moduli import engineering_constants
+from ...fem.ogden import is_power_law, term_numbers
 from ...problem import Problem
 from ...recording import Experiment, Markers, Obstacle
 from ...recording.obstacle_solids import solid_key
@@ -35,6 +36,15 @@ class IdentifiedBranch:
     name: str
     share: float
     tau_s: float
+
+
+@dataclass(frozen=True)
+class PowerTerm:
+    """Term of Ogden's law or of a compressible foam: μ_p [Pa], α_p, and β_p of a foam."""
+
+    mu_pa: float
+    alpha: float
+    beta: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +89,17 @@ class IdentifiedRegion:
     def kappa_pa(self) -> float:
         """Bulk modulus κ = λ + ⅔ μ."""
         return self.lambda_pa + 2 / 3 * self.mu_pa
+
+    @property
+    def terms(self) -> tuple[PowerTerm, ...]:
+        """Terms of Ogden's law or of a compressible foam; empty for other materials."""
+        if not is_power_law(self.material):
+            return ()
+        c = self.constants
+        return tuple(
+            PowerTerm(c[f"mu_{p}_pa"], c[f"alpha_{p}"], c.get(f"beta_{p}", 0.0))
+            for p in term_numbers(c)
+        )
 
 
 def without_obstacles(experiment: Experiment) -> Experiment:

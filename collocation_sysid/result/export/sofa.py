@@ -25,11 +25,16 @@ NEO_HOOKEAN_VERSIONS = (
     "NeoHookean has the constants λ and μ (½ λ ln² J − μ ln J + ½ μ (I₁ − 3)) in versions of "
     "SOFA that also have StableNeoHookean; older versions use other constants"
 )
+OGDEN_VOLUME = (
+    "the energy of the volume of Ogden is ½ κ ln² J, ours ½ κ (J − 1)²: the same at small changes "
+    "of volume"
+)
 CAPABILITIES = TargetCapabilities(
     {
         "neo-hookean": "NeoHookean",
         "stable-neo-hookean": "StableNeoHookean",
         "st-venant-kirchhoff": "StVenantKirchhoff",
+        "ogden-1": "Ogden",
         "linear": "linear",
     },
     stiffness_damping="SOFA uses Rayleigh damping instead of {damping}: both agree at small "
@@ -59,7 +64,8 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     if (body.is_prescribed.any(axis=1) != body.is_node_prescribed).any():
         raise InputError("a grasp holds single axes, which the scene for SOFA does not support")
     region = body.regions[0]
-    limits = [*CAPABILITIES.limitations(body), NEO_HOOKEAN_VERSIONS]
+    limits = [*CAPABILITIES.limitations(body)]
+    limits.append(OGDEN_VOLUME if region.material == "ogden-1" else NEO_HOOKEAN_VERSIONS)
     force = _elastic_law_xml(region)
     if (np.abs(body.prescribed_displacements_m) > 1e-9).any():
         limits.append(
@@ -116,6 +122,10 @@ def _elastic_law_xml(region: IdentifiedRegion) -> str:
         )
     name = CAPABILITIES.materials.get(region.material, "NeoHookean")
     moduli = values_as_text((region.mu_pa, region.lambda_pa))
+    if region.material == "ogden-1":
+        (term,) = region.terms
+        # The energy is μ/α² (Σ λ̄^α − 3) + ½ κ ln² J.
+        moduli = values_as_text((term.mu_pa * term.alpha, term.alpha, region.kappa_pa))
     return (
         f'<TetrahedronHyperelasticityFEMForceField materialName="{name}" ParameterSet="{moduli}"/>'
     )

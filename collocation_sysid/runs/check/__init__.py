@@ -27,6 +27,7 @@ from ...statistics.assessment import contact_concerns, rotation_step_concerns, s
 from ...statistics.camera_misspecifications import camera_hypotheses
 from ...statistics.concerns import Concern
 from ...statistics.discretisation_error import MOST_SUBSTEPS
+from ...statistics.material_stability import strain_stability_concerns
 from ...statistics.misspecification_hypothesis import Hypothesis, rank
 from ...statistics.modal_misspecifications import find_misspecifications_by_modes
 from ...statistics.placement_causes import placement_mistakes
@@ -272,7 +273,11 @@ def check_problem(
     touching = (
         () if start_notes else _contact_concerns(simulated, z, is_complete=simulated is not first)
     )
-    concerns = (*_concerns(problem, findings, find_instabilities(simulated, z)), *touching)
+    concerns = (
+        *_concerns(problem, findings, find_instabilities(simulated, z)),
+        *strain_stability_concerns(simulated.iterates(z)),
+        *touching,
+    )
     notes += [*start_notes, *(each for m in findings.motions for each in mode_notes(m))]
     notes += cost_notes(findings.chosen_cost, findings.costs) if findings.chosen_cost else []
     if simulated is first:

@@ -18,6 +18,7 @@ from ...fem.spatial_field import FieldResolution
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...statistics.concerns import Concern, concern_if
+from ...statistics.material_stability import rest_stability_concerns
 
 # Mean-ratio quality below which an element's shape functions are poor.
 POOR_QUALITY = 0.1
@@ -265,7 +266,11 @@ def check_body(body: Body, theta: Array, experiments: tuple[str, ...]) -> BodyCh
         worst_elements=worst,
         cells_across=shape.cells_across,
         guess=_constants_at_guess(body, theta),
-        concerns=(*element_concerns(body, theta, shape, worst[0]), *_field_concerns(fields)),
+        concerns=(
+            *element_concerns(body, theta, shape, worst[0]),
+            *rest_stability_concerns(body, theta),
+            *_field_concerns(fields),
+        ),
         fields=fields,
         rest_shape=_rest_shape(body),
         rest_shape_change_m=_rest_shape_change_m(body, theta),

@@ -1,0 +1,133 @@
+"""Derivatives of expressions that contain expensive functions of a few variables.
+
+Differentiated by the nine components of the deformation gradient, an energy that is an expensive
+function of a few invariants is evaluated many times over. A `SymbolicFunction` stands in
+expressions as a symbol. Its partial derivatives are symbols too, each evaluated once, and
+`ChainRule` differentiates expressions that contain these symbols.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import casadi as ca
+
+# Arguments by which a function is differentiated, counting from 0, ascending: (0, 0, 2) stands for
+# ∂³/∂y₀²∂y₂, and () for the function itself.
+PartialIndex = tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SymbolicFunction:
+    """Scalar function of a few arguments whose partial derivatives are symbols.
+
+    Attributes
+    ----------
+    arguments : (n,) SX
+        Expressions at which the function is evaluated.
+    evaluate : callable
+        Returns the partial derivatives with some indices as expressions in the symbols on which
+        the arguments depend.
+    symbols : dict of PartialIndex to SX
+        Symbols created so far; `symbol` adds to it.
+    """
+
+    arguments: ca.SX
+    evaluate: Callable[[Sequence[PartialIndex]], list[ca.SX]]
+    symbols: dict[PartialIndex, ca.SX] = field(default_factory=dict)
+
+    def symbol(self, index: PartialIndex = ()) -> ca.SX:
+        """Return the symbol of a partial derivative; of the function itself by default."""
+        key = tuple(sorted(index))
+        if key not in self.symbols:
+            self.symbols[key] = ca.SX.sym("_".join(map(str, ("partial", *key))))
+        return self.symbols[key]
+
+    def indices_in(self, expressions: Sequence[ca.SX]) -> list[PartialIndex]:
+        """Return the indices of the partial derivatives that occur in expressions."""
+        if not self.symbols:
+            return []
+        occurring = {each.__hash__() for each in ca.symvar(ca.veccat(*expressions))}
+        return [key for key, each in self.symbols.items() if each.__hash__() in occurring]
+
+    def shifted(self, indices: Sequence[PartialIndex], arguments: Sequence[int]) -> ca.SX:
+        """Return the derivatives (k, a) of partial derivatives by some of the arguments."""
+        return ca.vertcat(
+            *(ca.horzcat(*(self.symbol((*index, a)) for a in arguments)) for index in indices)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ChainRule:
+    """Derivatives of expressions in which functions stand as symbols.
+
+    Attributes
+    ----------
+    functions : tuple of SymbolicFunction
+        Functions whose arguments do not contain symbols of one another; empty by default, where
+        all derivatives are CasADi's.
+    """
+
+    functions: tuple[SymbolicFunction, ...] = ()
+
+    def jacobian(self, expression: ca.SX, by: ca.SX) -> ca.SX:
+        """Return the total derivative (m, k) of an expression (m,) by symbols (k,)."""
+        total = ca.jacobian(expression, by)
+        for function in self.functions:
+            indices = function.indices_in([expression])
+            slopes = ca.jacobian(function.arguments, by)
+            arguments = sorted(set(slopes.sparsity().row()))
+            if indices and arguments:
+                symbols = ca.vertcat(*map(function.symbol, indices))
+                by_argument = ca.jacobian(expression, symbols) @ function.shifted(
+                    indices, arguments
+                )
+                total += by_argument @ slopes[arguments, :]
+        return total
+
+    def gradient(self, scalar: ca.SX, by: ca.SX) -> ca.SX:
+        """Return the total gradient (k,) of a scalar by symbols (k,)."""
+        if not self.functions:
+            return ca.gradient(scalar, by)
+        return ca.densify(self.jacobian(scalar, by)).T
+
+    def directional_derivative(self, expression: ca.SX, by: ca.SX, direction: ca.SX) -> ca.SX:
+        """Return the total derivative of an expression by symbols (k,) along a direction (k,)."""
+        symbols = [by]
+        rates = [direction]
+        for function in self.functions:
+            if indices := function.indices_in([expression]):
+                symbols += map(function.symbol, indices)
+                rates.append(self._rates(function, indices, by, direction))
+        return ca.jtimes(expression, ca.vertcat(*symbols), ca.vertcat(*rates))
+
+    def rates(self, by: ca.SX, direction: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Return the symbols of all functions, without their partial derivatives, and their total
+        derivatives by symbols (k,) along a direction (k,).
+        """
+        symbols = [function.symbol() for function in self.functions]
+        rates = [self._rates(function, [()], by, direction) for function in self.functions]
+        return ca.vertcat(ca.SX(0, 1), *symbols), ca.vertcat(ca.SX(0, 1), *rates)
+
+    def _rates(
+        self,
+        function: SymbolicFunction,
+        indices: Sequence[PartialIndex],
+        by: ca.SX,
+        direction: ca.SX,
+    ) -> ca.SX:
+        """Return the derivatives of partial derivatives of a function along a direction."""
+        argument_rates = ca.jtimes(function.arguments, by, direction)
+        arguments = sorted(set(ca.sparsify(argument_rates).sparsity().row()))
+        return function.shifted(indices, arguments) @ argument_rates[arguments]
+
+    def eliminate(self, expressions: Sequence[ca.SX]) -> list[ca.SX]:
+        """Return expressions with all symbols replaced by what they stand for."""
+        explicit = list(expressions)
+        for function in self.functions:
+            if indices := function.indices_in(explicit):
+                symbols = ca.vertcat(*map(function.symbol, indices))
+                values = ca.densify(ca.vertcat(*function.evaluate(indices)))
+                explicit = ca.substitute(explicit, [symbols], [values])
+        return explicit

@@ -1,0 +1,110 @@
+"""Concerns about materials that are unstable at the strains of a motion, or at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from ..array_types import Array
+from ..fem.body import Body
+from ..fem.material_stability import is_examined, principal_stretches, stability_margins
+from ..program.experiment_iterate import ExperimentIterate
+from .concerns import Concern
+
+# Number of states of a motion that are examined.
+STATES = 8
+# Largest number of quadrature points examined in a part, those with the largest strains.
+POINTS = 2000
+# Margin over the shear modulus that is rounding.
+ROUNDING = 1e-9
+
+
+def rest_stability_concerns(body: Body, theta: Array) -> Iterator[Concern]:
+    """Yield a concern for each part whose material is unstable without any strain.
+
+    Parameters
+    ----------
+    body : Body
+    theta : (k,)
+    """
+    for part, constants in zip(body.parts, body.split_theta(theta), strict=True):
+        if is_examined(part.material):
+            own = np.asarray(constants[: len(part.material.constants)])
+            if not stability_margins(part.material, own, np.ones((1, 3)))[0] > 0:
+                lam, mu = body.lame(theta)[part.name]
+                data = {
+                    "material": part.material.name,
+                    "where": part.name or "the body",
+                    "mu_pa": mu,
+                    "kappa_pa": lam + 2 / 3 * mu,
+                }
+                yield Concern("stability/rest", "doubtful", data)
+
+
+def strain_stability_concerns(iterates: Iterable[ExperimentIterate]) -> Iterator[Concern]:
+    """Yield a concern for each experiment and part whose material is unstable at its strains.
+
+    Up to `STATES` samples and, in each part, the `POINTS` quadrature points with the largest
+    strains are examined. A constant that varies in space is taken at its mean.
+
+    Parameters
+    ----------
+    iterates : iterable of ExperimentIterate
+        Motions at the estimates.
+    """
+    for iterate in iterates:
+        experiment = iterate.segment.experiment
+        samples = np.linspace(0, len(experiment.t_s) - 1, STATES).round().astype(int)
+        samples = np.unique(samples)
+        states = iterate.x[iterate.segment.markers.sample_rows[samples]]
+        body = experiment.body
+        theta = np.asarray(iterate.equations.theta)
+        if any(is_examined(part.material) for part in body.parts):
+            stretches = principal_stretches(body, states, theta)
+            yield from _part_concerns(
+                body, theta, stretches, experiment.name, experiment.t_s[samples]
+            )
+
+
+def _part_concerns(
+    body: Body, theta: Array, stretches: Array, experiment: str, t_s: Array
+) -> Iterator[Concern]:
+    """Yield a concern for each part with an unstable point, about the point of least margin.
+
+    Parameters
+    ----------
+    body : Body
+    theta : (k,)
+    stretches : (T, E, q, 3)
+    experiment : str
+        Name of the experiment.
+    t_s : (T,)
+    """
+    for part, constants in zip(body.parts, body.split_theta(theta), strict=True):
+        if not is_examined(part.material):
+            continue
+        own = np.asarray(constants[: len(part.material.constants)])
+        of_part = stretches[:, part.cells]
+        times = np.repeat(t_s, of_part[0, ..., 0].size)
+        points = of_part.reshape(-1, 3)
+        valid = points.min(axis=1) > 0
+        points = points[valid]
+        times = times[valid]
+        largest = np.argsort(-np.abs(np.log(points)).max(axis=1), kind="stable")[:POINTS]
+        margins = stability_margins(part.material, own, points[largest])
+        shear_pa = abs(body.lame(theta)[part.name][1])
+        if not np.isfinite(margins).any() or np.nanmin(margins) >= -ROUNDING * shear_pa:
+            continue
+        worst = largest[np.nanargmin(margins)]
+        yield Concern(
+            "stability/material",
+            "check",
+            {
+                "material": part.material.name,
+                "where": f" of region '{part.name}'" if part.name else "",
+                "experiment": experiment,
+                "time_s": float(times[worst]),
+                "stretches": ", ".join(f"{each:.3g}" for each in points[worst][::-1]),
+            },
+        )
