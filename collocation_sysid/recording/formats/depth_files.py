@@ -36,6 +36,9 @@ from .topics import sort_by_time
 
 # Depth of one count of an integer image if none is stated [m], as is usual for depth cameras.
 USUAL_COUNT_M = 1e-3
+# Largest length in a depth file [m]. Depths in micrometres that are read as metres are below it, so
+# that a wrong unit is named by `check`; damaged floating-point numbers are mostly far above it.
+LARGEST_LENGTH_M = 1e6
 # Endings of files with images, and with clouds of points.
 IMAGES = (".png", ".exr")
 CLOUDS = (".ply", ".pcd", ".npy", ".xyz")
@@ -117,9 +120,9 @@ def read_depth(
     require_regular(path)
     kind = path.suffix.lower()
     if kind not in _READERS:
-        known_camera_fields = ", ".join(_READERS)
+        expected = ", ".join(_READERS)
         raise InputError(
-            f"is a {kind or 'file without an ending'}; expected one of {known_camera_fields}", path
+            f"is a {kind or 'file without an ending'}; expected one of {expected}", path
         )
     try:
         content = _READERS[kind](path)
@@ -206,7 +209,25 @@ def _in_metres(image: Array, count_m: float | None) -> Array:
         raise InputError(f"has the shape {image.shape}; expected one channel of depths")
     if image.dtype.kind in "iu":
         return image * (USUAL_COUNT_M if count_m is None else count_m)
-    return image.astype(float)
+    metres = image.astype(float)
+    _require_possible_lengths(metres)
+    return metres
+
+
+def _require_possible_lengths(values_m: Array) -> None:
+    """Refuse lengths [m] beyond `LARGEST_LENGTH_M`; values that are not finite are not compared.
+
+    Raises
+    ------
+    InputError
+        With the largest length, which no camera can have measured.
+    """
+    largest_m = np.max(np.abs(values_m), initial=0.0, where=np.isfinite(values_m))
+    if largest_m > LARGEST_LENGTH_M:
+        raise InputError(
+            f"contains the length {largest_m:.3g} m; expected at most {LARGEST_LENGTH_M:,.0f} m: "
+            "the file is damaged, or its unit is another one (length_unit, count_m)"
+        )
 
 
 def _scaled_cloud(points: Array, path: Path, length_m: float) -> Array:
@@ -218,7 +239,10 @@ def _scaled_cloud(points: Array, path: Path, length_m: float) -> Array:
             "ny, nz if normals are known",
             path,
         )
-    return np.hstack([length_m * points[:, :3], points[:, 3:]])
+    places_m = length_m * points[:, :3]
+    with located(path):
+        _require_possible_lengths(places_m)
+    return np.hstack([places_m, points[:, 3:]])
 
 
 def _read_npz(path: Path) -> DepthFileContent:
@@ -235,6 +259,8 @@ def _read_npz(path: Path) -> DepthFileContent:
         values = values * float(arrays.get("count_m", USUAL_COUNT_M))
     samples = [np.asarray(each, dtype=float) for each in (values if values.ndim == 3 else [values])]
     clouded = names[0] == "points_m"
+    for sample in samples:
+        _require_possible_lengths(sample)
     camera = (arrays.get(name) for name in ("t_s", "camera_matrix", "camera_pose"))
     return DepthFileContent([] if clouded else samples, samples if clouded else [], *camera)
 
