@@ -232,7 +232,8 @@ def _require_possible_lengths(values_m: Array) -> None:
 
 def _scaled_cloud(points: Array, path: Path, length_m: float) -> Array:
     """Return points (P, 3) or (P, 6) in metres; an `InputError` for another shape."""
-    points = np.asarray(points, dtype=float)
+    with np.errstate(invalid="ignore"):  # a damaged file may have signalling NaN
+        points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise InputError(
             f"has the shape {points.shape}; expected x, y, z of each point, and after them nx, "
