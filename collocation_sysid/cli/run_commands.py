@@ -178,7 +178,7 @@ class ReportCommand:
     Attributes
     ----------
     folder : FOLDER
-        A run folder, or an output folder of compare or sweep.
+        A run folder, or the output folder of compare-methods, compare-models or sweep.
     to : FILE
         Output file, .html or .md; report.html in the folder by default.
     """
@@ -187,7 +187,7 @@ class ReportCommand:
     to: Path | None = None
 
 
-@command(commands, "report runs/swing", "report runs/compare --to comparison.html")
+@command(commands, "report runs/swing", "report runs/swing-sweep --to sweep.html")
 def report(options: ReportCommand) -> None:
     """Write a report of a run or a study as one HTML page or a Markdown file.
 
