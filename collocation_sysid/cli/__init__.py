@@ -40,10 +40,18 @@ FAMILIES = (
     "texts",
     "installation_commands",
 )
+# Groups of commands in the help, in the order in which a user needs them.
+COMMAND_GROUPS = {
+    "Identify parameters": ("new", "check", "solve", "refine", "live", "replay"),
+    "Inspect a run": ("report", "plot", "animate", "view"),
+    "Extend a study": ("simulate", "compare-models", "compare-methods", "sweep", "design"),
+    "Exchange data": ("log", "export"),
+    "Reference and installation": ("explain", "methods", "schema", "doctor", "completion"),
+}
 # Commands that were replaced, with the message to who types their old name.
 REPLACED_COMMANDS = {
-    "compare": "it was divided in two. compare-methods compares the methods that --methods names, and "
-    "compare-models compares materials, laws of damping and branches by held-out data",
+    "compare": "it was divided in two. compare-methods compares the methods that --methods names, "
+    "and compare-models compares materials, laws of damping and branches by held-out data",
     "topics": "it was renamed. log LOG lists the topics in a robot's log",
 }
 
@@ -101,11 +109,11 @@ class LazyCommands(TyperGroup):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a line on each command into the help."""
-        with formatter.section("Commands"):
-            formatter.write_dl(
-                [(name, summary) for name, (_, summary) in _command_sources().items()]
-            )
+        """Write a line on each command into the help, by groups."""
+        sources = _command_sources()
+        for title, names in COMMAND_GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name, sources[name][1]) for name in names])
 
 
 app = typer.Typer(

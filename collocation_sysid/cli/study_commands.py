@@ -202,10 +202,10 @@ def _single_method(text: str | None) -> str | None:
     """
     if text is None:
         return None
-    names = parse_methods(text, "--method")
-    if len(names) > 1:
-        raise InputError(f"found {', '.join(names)}; expected one method", None, "--method")
-    return names[0]
+    method, *others = parse_methods(text, "--method")
+    if others:
+        raise InputError(f"found {text}; expected one method", None, "--method")
+    return method
 
 
 def _run_study(
