@@ -774,6 +774,7 @@ WRITING = (
     ("plot", "run"),
     ("view", "run", "--html", "out/view.html"),
     ("export", "run", "--to", "json"),
+    ("export", "run", "--to", "out/body.inp"),
     ("new", "out/mine"),
 )
 
