@@ -476,5 +476,5 @@ def _identify_small_body() -> tuple[str, bool]:
     if not solution.status.converged:
         return f"the search did not converge ({solution.status.value}: {solution.message})", False
     deviation = abs(solution.parameters["mu_pa"] / truth_pa - 1)
-    message = f"the shear modulus of a block is identified to {deviation:.1e}"
+    message = f"relative error of an identified shear modulus {deviation:.1e}"
     return message, deviation < SELF_TEST_TOLERANCE

@@ -142,7 +142,7 @@ def test_a_wrong_answer_fails_the_self_test(monkeypatch):
     monkeypatch.setattr(installation_check, "SELF_TEST_TOLERANCE", -1.0)
     message, is_passed = installation_check._identify_small_body()
     assert not is_passed
-    assert "identified to" in message
+    assert "relative error" in message
     assert not SelfTest(is_passed, message, 0.1).is_passed
 
 

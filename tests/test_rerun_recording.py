@@ -163,7 +163,7 @@ def test_missing_markers_are_left_out(run_folder, tmp_path):
 def test_it_cannot_be_verified(run_folder):
     outcome = run_command("export", run_folder, "--to", "rerun", "--verify")
     assert outcome.code == 2
-    assert "a recording predicts nothing" in outcome.err
+    assert "has no predictions to verify" in outcome.err
 
 
 def test_without_the_extra_the_error_names_it(run_folder, tmp_path, monkeypatch):

@@ -162,7 +162,11 @@ def _export_recording(options: ExportCommand, destination: ExportDestination) ->
     from ..result.export.rerun_recording import RECORDING_FILE, write_rerun
 
     if options.verify:
-        raise InputError("a recording predicts nothing; leave it out", None, "--verify")
+        raise InputError(
+            "a recording for a viewer has no predictions to verify; leave out --verify",
+            None,
+            "--verify",
+        )
     destination.require_possible()
     with destination.export_folder() as folder:
         missing = write_rerun(options.run_folder, folder, options.experiment)
