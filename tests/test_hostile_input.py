@@ -182,7 +182,7 @@ def test_a_log_that_is_a_pipe_is_refused(tiny: Path, name: str):
     (tiny / "bag").mkdir(exist_ok=True)
     (tiny / "bag" / "metadata.yaml").write_text("")
     os.mkfifo(tiny / name)
-    words = ["topics", name.partition("/")[0]]
+    words = ["log", name.partition("/")[0]]
     done = subprocess.run(
         [sys.executable, "-c", COMMAND_LINE, *words], capture_output=True, text=True, timeout=300
     )
@@ -246,8 +246,11 @@ def test_so_is_such_an_override(tiny: Path, value: str):
 @pytest.mark.parametrize(
     ("words", "found"),
     [
-        (("compare", "--methods", "shooting", "--starts", "1000000"), "asks for 1,000,000 starts"),
-        (("compare", "--prony", "0,1000000"), "whole numbers up to 20"),
+        (
+            ("compare-methods", "--methods", "shooting", "--starts", "1000000"),
+            "asks for 1,000,000 starts",
+        ),
+        (("compare-models", "--prony", "0,1000000"), "whole numbers up to 20"),
         (("sweep", "--over", "solver.huber=1:2:1000000"), "asks for 1,000,000 values"),
         (("sweep", "--over", f"solver.huber=1:2:1{'0' * 30}"), "asks for more than 10"),
         (

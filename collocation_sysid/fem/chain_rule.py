@@ -124,10 +124,10 @@ class ChainRule:
 
     def eliminate(self, expressions: Sequence[ca.SX]) -> list[ca.SX]:
         """Return expressions with all symbols replaced by what they stand for."""
-        explicit = list(expressions)
+        expanded = list(expressions)
         for function in self.functions:
-            if indices := function.indices_in(explicit):
+            if indices := function.indices_in(expanded):
                 symbols = ca.vertcat(*map(function.symbol, indices))
                 values = ca.densify(ca.vertcat(*function.evaluate(indices)))
-                explicit = ca.substitute(explicit, [symbols], [values])
-        return explicit
+                expanded = ca.substitute(expanded, [symbols], [values])
+        return expanded

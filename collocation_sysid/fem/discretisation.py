@@ -121,10 +121,10 @@ class Discretisation(ConstantsModel):
     @cached_property
     def part_of_cells(self) -> Index:
         """Index of the part to which each cell belongs (E,)."""
-        part_numbers = np.zeros(len(self.cells), dtype=np.int64)
+        part_indices = np.zeros(len(self.cells), dtype=np.int64)
         for k, part in enumerate(self.parts):
-            part_numbers[part.cells] = k
-        return part_numbers
+            part_indices[part.cells] = k
+        return part_indices
 
     def law(self, number: int, memory: bool = False) -> PointLaw:
         """Return the law of the quadrature points of a part.

@@ -484,9 +484,9 @@ class QuadraturePoint:
             ca.vec(ca.reshape(field, 3, self.nodes) @ shape_gradients)
             for field in self.fields.values()
         ]
-        explicit = self.rule.eliminate([piece for _, piece in pieces.values()])
+        expanded = self.rule.eliminate([piece for _, piece in pieces.values()])
         outputs = ca.substitute(
-            [ca.densify(piece) for piece in explicit],
+            [ca.densify(piece) for piece in expanded],
             [ca.vertcat(*self.gradients.values())],
             [ca.vertcat(*gradients)],
         )

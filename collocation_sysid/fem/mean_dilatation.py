@@ -135,10 +135,10 @@ class _VolumeSums:
         """
         m = _volume_logarithms(self.volumes, self.volume)
         m -= _volume_logarithms(self.own_volumes, self.point.mesh_volume)
-        explicit = self.point.rule.eliminate([piece for _, piece in pieces.values()])
+        expanded = self.point.rule.eliminate([piece for _, piece in pieces.values()])
         return {
             key: (how, ca.substitute(piece, self.stretches, m))
-            for (key, (how, _)), piece in zip(pieces.items(), explicit, strict=True)
+            for (key, (how, _)), piece in zip(pieces.items(), expanded, strict=True)
         }
 
     def volume_pieces(self, order: int) -> Pieces:

@@ -107,10 +107,9 @@ class PowerTraces:
         opposite = _product(factor, lambda index: even(index) - odd(index))
         for doubling in range(DOUBLINGS):
             square = _exponent_partials(4**doubling * s**2, alpha)
-            excess, opposite = (
-                _doubled(excess, opposite, square),
-                _doubled(opposite, excess, square),
-            )
+            doubled_excess = _doubled(excess, opposite, square)
+            opposite = _doubled(opposite, excess, square)
+            excess = doubled_excess
         return cache(lambda index: excess(index) / 4)
 
     def _sum(self, parity: Parity, alpha: ca.SX) -> Partials:

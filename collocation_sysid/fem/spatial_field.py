@@ -54,8 +54,8 @@ class Field:
     Parameters
     ----------
     parameter : str
-        Constant of the material or its damping law; young_pa stands for all moduli of a material;
-        density_kg_m3.
+        Constant that varies: one of the material or of its damping law, young_pa for all moduli of
+        a material together, or density_kg_m3.
     length_m : float or list
         Correlation length: places at this distance have the correlation 1/e. Of several lengths the
         most likely one is used.

@@ -302,8 +302,8 @@ class StressEvaluator:
             # 3n for each of what the points carry, part after part.
             per_number = dofs_of(cells).shape[1]
             length = len(self.jacobian_entries.points)
-            point_numbers = np.arange(per_number * places.size).reshape(len(cells), -1)
-            destinations = per_number * places[0, 0, 0] + point_numbers
+            point_offsets = np.arange(per_number * places.size).reshape(len(cells), -1)
+            destinations = per_number * places[0, 0, 0] + point_offsets
         elif "nodes" in kernel.contractions.values():
             destinations = dofs_of(cells)
             length = body.pattern.size

@@ -269,12 +269,12 @@ class CondensedCollocation(Collocation):
 
     @property
     def variable_count(self) -> int:
-        """Length of z."""
+        """Number of variables z that remain."""
         return len(self._remaining[0])
 
     @property
     def constraint_count(self) -> int:
-        """Length of g."""
+        """Number of constraints g that remain."""
         return len(self._remaining[1])
 
     @property
@@ -369,7 +369,7 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def _jacobian(self) -> CondensedPattern:
-        """Pattern of ∂g/∂z."""
+        """Sparsity pattern of the constraint Jacobian ∂g/∂z."""
         of_variable, of_row = self._condensed_indices
         rows, columns = _entries(self.complete.jacobian_structure)
         remaining = np.flatnonzero(of_row[rows] >= 0)

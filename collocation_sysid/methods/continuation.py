@@ -45,7 +45,7 @@ STAGES: dict[str, type] = {kind.name: kind for kind in _ONE_HORIZON}
 
 @dataclass(frozen=True)
 class Continuation(Options):
-    """Another method on growing parts of every recording.
+    """Continuation over the horizon: another method on growing parts of every recording.
 
     Attributes
     ----------

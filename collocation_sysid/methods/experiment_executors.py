@@ -82,19 +82,19 @@ class LocalExecutor:
         self.threads = threads
 
     def store_segments(self, collocation: Collocation) -> list[Any]:
-        """See `ExperimentExecutor`."""
+        """Return the transcriptions themselves, which stay in this process."""
         return list(collocation.transcriptions)
 
     def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
-        """See `ExperimentExecutor`."""
+        """Apply a function to every experiment in parallel, and return the results themselves."""
         return map_experiments(lambda row: run(*row), [*zip(*columns, strict=True)], self.threads)
 
     def fetch(self, stored: Sequence[Any]) -> list[Any]:
-        """See `ExperimentExecutor`."""
+        """Return the stored values unchanged."""
         return list(stored)
 
     def notes(self) -> list[str]:
-        """See `ExperimentExecutor`."""
+        """Return no remarks: threads cannot be lost."""
         return []
 
 
@@ -131,7 +131,7 @@ class DaskExecutor:
             ]
 
     def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
-        """See `ExperimentExecutor`."""
+        """Apply a function to every experiment on its worker, and return futures of the results."""
         rows = zip(self._homes, *columns, strict=True)
         with self._end_search_if_disconnected():
             return [self._submit(home, run, *row) for home, *row in rows]
@@ -149,7 +149,7 @@ class DaskExecutor:
             return [self._result(future) for future in stored]
 
     def notes(self) -> list[str]:
-        """See `ExperimentExecutor`."""
+        """Return a remark if workers were lost."""
         with self._end_search_if_disconnected():
             failed_workers = self._first - self.client.nthreads().keys()
         note = f"{len(failed_workers)} of {len(self._first)} workers were lost during the solve: "

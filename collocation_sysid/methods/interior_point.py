@@ -90,7 +90,7 @@ NO_DAMPING = 1e-2
 
 @dataclass(frozen=True)
 class InteriorPoint(Options):
-    """Interior point, by IPOPT.
+    """Interior-point method (IPOPT) for parameters and trajectories together.
 
     Attributes
     ----------

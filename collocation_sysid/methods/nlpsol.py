@@ -17,7 +17,7 @@ import numpy as np
 from ..array_types import Array
 from ..errors import InputError
 from ..program.collocation import Collocation, convert_variables
-from ..signal_handling import LEFT_BEHIND, raises_interrupt
+from ..signal_handling import ABANDONED_THREAD, raises_interrupt
 from .callbacks import HessianValues, IterationMonitor, NlpFunctions
 from .condensed_program import complete_multipliers
 from .initial_point import InitialMultipliers
@@ -208,7 +208,7 @@ def _run_on_thread(search: Callable[[], None], monitor: IterationMonitor) -> Non
                 remaining_s -= LOOK_EVERY_S if monitor.stop else 0.0
         finally:
             if thread.is_alive():
-                thread.name = LEFT_BEHIND
+                thread.name = ABANDONED_THREAD
                 monitor.errors.append(_SolverAbandoned())
 
 

@@ -49,7 +49,7 @@ MISFIT = 3.0
 
 @dataclass(frozen=True)
 class ReducedSpace(SearchOptions):
-    """Gauss–Newton steps of the parameters, with the trajectories that the dynamics give them."""
+    """Gauss–Newton method for the parameters; the equations of motion give the trajectories."""
 
     name: ClassVar[str] = "reduced-space"
 

@@ -78,7 +78,7 @@ class Recorder:
 
     @property
     def elapsed_s(self) -> float:
-        """Time since construction [s]."""
+        """Wall-clock time since the recorder was made [s]."""
         return time.perf_counter() - self.start_s
 
     @property

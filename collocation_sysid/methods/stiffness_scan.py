@@ -46,7 +46,7 @@ SOFT_PA = 1e4
 # Tolerance of simulations that are only compared.
 LOOSE = NewtonOptions(tolerance=1e-4)
 # Number of failures in a row that end the scan.
-LOST_MARKERS = 2
+CONSECUTIVE_FAILURES = 2
 # Misfit over the best one that counts as a failure.
 WORSE = 3.0
 # The scan continues beyond an end as long as the misfit decreases by this share.
@@ -512,7 +512,7 @@ class _ScanState:
             finite_misfits = [m for m in self.misfits.values() if np.isfinite(m)]
             is_failure = bool(finite_misfits) and not misfit <= WORSE * min(finite_misfits)
             failures = failures + 1 if is_failure else 0
-            if failures == LOST_MARKERS:
+            if failures == CONSECUTIVE_FAILURES:
                 self.is_ended_early = True
                 return
 

@@ -45,7 +45,7 @@ class Unknown:
     guess : float, optional
         Value at which the search starts; found by a scan of the stiffness by default.
     lower, upper : float, optional
-        Bounds.
+        Bounds of the estimate; those of the constant by default.
     prior : (mean, deviation), optional
         Normal prior: on the logarithm, with a relative deviation; of a linear parameter, on the
         value, with an absolute deviation.
@@ -53,7 +53,7 @@ class Unknown:
         Whether the logarithm of a positive parameter is estimated, or the value of any sign.
     typical : float, optional
         Typical change of a linear parameter in one step of the solver; by default that of its
-        constant, else its guess.
+        constant, or else the guess.
     """
 
     guess: Finite | None = None

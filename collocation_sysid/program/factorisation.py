@@ -184,7 +184,7 @@ class _RefinedFactor:
 
 @dataclass(frozen=True, eq=False)
 class _SparseFactor:
-    """Factor by SuperLU."""
+    """Complete LU factorisation of a sparse matrix by SuperLU."""
 
     lu: SuperLU
     positive_definite: bool

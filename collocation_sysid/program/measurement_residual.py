@@ -109,7 +109,7 @@ class ResidualExpression:
 
     @property
     def _input_count(self) -> int:
-        """Number of inputs u."""
+        """Number of inputs u: positions of the vectors and nuisance parameters."""
         return GROUP * self.vector_count + self.nuisance_count
 
     @property
@@ -118,7 +118,7 @@ class ResidualExpression:
         return self.data_count + 2 * self.measured_count
 
     def _residual_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
-        """Expression of the residual."""
+        """Return the expression of the residual (prediction − measurement) / σ."""
         ends = [0, self.data_count, self.data_count + self.measured_count, self._data_count]
         own, measured, weight = ca.vertsplit(data, ends)
         vectors, phi = ca.vertsplit(u, [0, GROUP * self.vector_count, self._input_count])
@@ -126,7 +126,7 @@ class ResidualExpression:
         return weight * (predicted - measured)
 
     def _loss_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
-        """Expression of the loss."""
+        """Return the expression of the robust loss of the residual."""
         return self._robust_loss(self._residual_expression(u, data), data)
 
     def _robust_loss(self, residual: ca.SX, _: ca.SX) -> ca.SX:

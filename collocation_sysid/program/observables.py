@@ -160,12 +160,12 @@ class PointPositions:
 
     @property
     def count(self) -> int:
-        """Number of times."""
+        """Number of grid times at which the points are observed."""
         return len(self.rows)
 
     @property
     def vector_count(self) -> int:
-        """Number of points."""
+        """Number of observed points."""
         return len(self.association.prior_places_m)
 
     @property

@@ -264,7 +264,7 @@ class RowEquations:
         return row.w[0] * force + self.known - row.s[0] * row.mass_kg * x
 
     def residual(self, x: Array) -> Array:
-        """Return c_t (3n,) [N]."""
+        """Return the constraints c_t (3n,) [N] at positions x_t (3n,) [m]."""
         return self.residual_from(self.force(x), x)
 
     def linearise(self, x: Array) -> tuple[Array, Array, Array]:

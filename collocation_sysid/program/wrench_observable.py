@@ -161,7 +161,7 @@ class GraspWrench:
 
     @cached_property
     def t_s(self) -> Array:
-        """Times (n,) [s]."""
+        """Grid times (n,) with a known wrench [s]."""
         return self.reaction_grid.t_s[self.known_rows]
 
     @property

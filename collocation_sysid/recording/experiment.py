@@ -90,7 +90,7 @@ class Experiment:
     tendons : sequence of Tendon
         Tendons in the body.
     pressures : sequence of Pressure
-        Pressures in cavities, or on patches with a held rim.
+        Pressures in cavities, or on patches whose rim is held.
     readings : sequence of Gauge
         Custom sensors.
     depths : sequence of Depth

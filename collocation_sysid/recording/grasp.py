@@ -45,20 +45,21 @@ class Grasp:
     poses : PoseSequence or (T, 4, 4) array
         Rigid motion that carries the nodes.
     from_s : float
-        First time at which it holds; from the start by default.
+        First time [s] of the grasp or contact; the start of the recording by default.
     until_s : float
-        Last time at which it holds; if this is the first sample time, the body is released from its
-        equilibrium in this grasp. To the end by default.
+        Last time [s] of the grasp or contact; the end of the recording by default. If a grasp ends
+        at the first sample, the body is released from its equilibrium in this grasp.
     sigma_m : float, optional
-        Standard deviation of the noise in each position of the poses; estimated from their
-        roughness where it is not given.
+        Standard deviation of the noise in each position of the poses [m]; estimated from their
+        roughness by default.
     sigma_rad : float, optional
-        Standard deviation of the noise in each rotation, about each axis [rad]; likewise.
+        Standard deviation of the noise in each rotation, about each axis [rad]; estimated from the
+        roughness of the poses by default.
     selection : Selection, optional
         The selection that the nodes come from; None for node numbers. On a finer mesh it is
         evaluated again.
     axes : str
-        Axes of the world along which it holds; the nodes slide along the others.
+        Axes of the world along which the nodes are prescribed; they slide along the others.
     zero : str
         Axes along which the zero of the poses is uncertain, as that of a test bench's crosshead,
         with the standard deviation in the experiment's `nuisance`; none by default.

@@ -137,12 +137,14 @@ class PointMass(Load):
     Parameters
     ----------
     nodes : (k,) int array or Selection
-        Nodes that carry it in equal parts, selected as in a grasp.
+        Nodes that carry the mass in equal parts, selected as in a grasp.
     mass_kg : float
     from_s : float
-        When it joins the body, with the uncertainty nuisance.joining; always there by default.
+        Time at which the mass joins the body [s], with the uncertainty nuisance.joining; before the
+        recording by default.
     until_s : float
-        When it leaves the body, likewise.
+        Time at which the mass leaves the body [s], with the same uncertainty; after the recording
+        by default.
     selection : Selection, optional
         The selection that the nodes come from; None for node numbers. On a finer mesh it is
         evaluated again.
@@ -179,7 +181,7 @@ class Force(Load):
     Parameters
     ----------
     nodes : (k,) int array or Selection
-        Nodes that it acts on in equal parts, selected as in a grasp.
+        Nodes on which the force acts in equal parts, selected as in a grasp.
     force_n : (3,) or (m, 3) array
         Constant force [x, y, z].
     t_s : (m,) array, optional
@@ -188,9 +190,10 @@ class Force(Load):
         The selection that the nodes come from; None for node numbers. On a finer mesh it is
         evaluated again.
     from_s : float
-        When it begins to act, with the uncertainty nuisance.joining; always by default.
+        Time at which the force begins [s], with the uncertainty nuisance.joining; before the
+        recording by default.
     until_s : float
-        When it ends, likewise.
+        Time at which the force ends [s], with the same uncertainty; after the recording by default.
     """
 
     nodes: Index = key(Nodes, converter=node_converter("the force"), read=selection_from_section)

@@ -33,7 +33,7 @@ _PLACES = Key(
     "places",
     Literal["free", "surface"],
     lambda word: word == "surface",
-    description="Whether estimated positions may be anywhere, or stay on the surface.",
+    description="Estimated positions on the undeformed body: anywhere in it, or on its surface.",
     default="free",
 )
 
@@ -66,7 +66,9 @@ class Markers:
     located : (M,) bool array, optional
         Whether a place is given; derived from `marker_places_m` by default.
     attach : {"auto", "vertex", "embedded"}
-        See `place_markers`.
+        Nodes that carry a marker. "vertex": the nearest node. "embedded": the nodes of the
+        tetrahedron that contains the marker or is nearest to it. "auto": the nearest node if it
+        lies within 5 % of the mean edge length, otherwise "embedded".
     max_distance_m : float, optional
         Largest distance of a marker from the body; the mean edge length by default.
 

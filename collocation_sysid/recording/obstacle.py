@@ -58,17 +58,19 @@ class Obstacle(Grasp):
     poses : PoseSequence or (T, 4, 4) array
         Motion of its frame; at rest in the body's frame by default.
     name : str
-        For messages and pictures.
+        Name in messages and pictures.
     friction : float or str
         Coefficient of friction; or the name of a parameter, whose bounds are 0 and 2.
     faces : Selection, optional
-        Faces that may touch it: those whose corners are all selected. All by default.
+        Faces of the body that may touch the obstacle: those whose corners are all selected. All by
+        default.
     stiffness_pa_m : float, optional
-        κ of the pressure κ (⟨δ − g⟩² − ⟨−g⟩²)/δ at the gap g; by default 100 times Young's modulus
-        at the current parameters over the mean edge of the face at each point.
+        Contact stiffness κ [Pa/m] in the pressure κ (⟨δ − g⟩² − ⟨−g⟩²)/δ at the gap g; by default
+        100 times Young's modulus at the current parameters over the mean edge of the face at each
+        point.
     width_m : float, optional
-        δ, the gap at which the pressure begins; by default that edge over 5000, with friction over
-        500.
+        Gap δ at which the pressure begins [m]; by default the mean edge of the face over 5000, or
+        over 500 with friction.
     slip : float, optional
         Sliding speed [m/s], or slip from sample to sample [m] of a static experiment, at which
         friction is 0.7 of its limit.

@@ -191,7 +191,7 @@ class Cylinder(_AxialSolid):
     ends_m : (2, 3) array
         Centres of both ends.
     rounding_m : float
-        Radius of its edges.
+        Radius of the rounded edges [m]; zero for sharp edges.
     """
 
     rounding_m: float = key(NotNegative, default=0.0)
@@ -228,9 +228,9 @@ class Cuboid(Solid):
     Parameters
     ----------
     corners_m : (2, 3) array
-        Its lowest and its highest corner.
+        Lowest and highest corner.
     rounding_m : float
-        Radius of its edges.
+        Radius of the rounded edges [m]; zero for sharp edges.
     """
 
     corners_m: Array = key(tuple[Vector, Vector], converter=float_converter((2, 3), "corners_m"))
@@ -295,8 +295,9 @@ else:
 
 
 class SolidSection(Section):
-    """The solid, by exactly one of these keys, in the frame of its poses; without poses in the
-    body's.
+    """Rigid solid, described by exactly one of these keys in the frame of its poses.
+
+    Without poses the frame is that of the undeformed body.
 
     Attributes
     ----------

@@ -176,7 +176,7 @@ TOPICS: Mapping[str, Topic] = {
         "trust",
         "Look at the residuals over time: a constant part indicates a wrong position or "
         "offset, large residuals at the beginning a wrong time of release, an oscillation a "
-        "wrong stiffness or damping. The command compare --materials tests whether another "
+        "wrong stiffness or damping. The command compare-models --materials tests whether another "
         "material law predicts better.",
         {
             "outline": "{percent:.0f} % of the model's outline are more than {pixels:.0f} pixels "

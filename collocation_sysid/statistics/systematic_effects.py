@@ -712,9 +712,9 @@ class KnownEffect(Section):
     Attributes
     ----------
     mean : float
-        Its size.
+        Size of the effect, positive.
     deviation : float
-        Standard deviation of its size.
+        Standard deviation of the size.
     """
 
     mean: Positive
@@ -794,6 +794,6 @@ else:
         namespace={
             "__module__": __name__,
             "__doc__": _DOCUMENTATION
-            + "\n".join(f"{name}\n    {said}." for name, _, said in _FIELDS),
+            + "\n".join(f"{name}\n    {description}." for name, _, description in _FIELDS),
         },
     )

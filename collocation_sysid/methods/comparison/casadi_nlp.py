@@ -116,7 +116,7 @@ class CasadiSolver(Options):
 
 @dataclass(frozen=True)
 class SqpMethod(CasadiSolver):
-    """SQP, with convex QPs."""
+    """Sequential quadratic programming (SQP) with convex quadratic programs."""
 
     name: ClassVar[str] = "casadi:sqpmethod"
     functions: ClassVar[Mapping[str, str]] = {
@@ -149,7 +149,7 @@ class SqpMethod(CasadiSolver):
 
 @dataclass(frozen=True)
 class Sleqp(CasadiSolver):
-    """Trust-region SLP-EQP."""
+    """SLP-EQP in a trust region: steps of QPs with the active constraints of linear programs."""
 
     name: ClassVar[str] = "casadi:sleqp"
     functions: ClassVar[Mapping[str, str]] = {

@@ -189,7 +189,7 @@ class _ScaledMerit:
         return self._last[1:]
 
     def value(self, s: Array) -> float:
-        """Return m at s."""
+        """Return the merit function m at the variables s."""
         return self.merit.value(self.to_variables(s))
 
     def value_and_gradient(self, s: Array) -> tuple[float, Array]:

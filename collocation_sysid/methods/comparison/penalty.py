@@ -192,7 +192,7 @@ class PenaltyOptions(Options):
 
 @dataclass(frozen=True)
 class Penalty(PenaltyOptions):
-    """The equations of motion are not constraints, but violations are penalised, as in the paper.
+    """Penalty method: violations of the equations of motion are penalised, as in the paper.
 
     Attributes
     ----------
@@ -241,7 +241,7 @@ class Penalty(PenaltyOptions):
 
 @dataclass(frozen=True)
 class AugmentedLagrangian(PenaltyOptions):
-    """A penalty with multipliers, so that ρ need not become large."""
+    """Augmented Lagrangian: a penalty with multipliers, so that ρ need not become large."""
 
     name: ClassVar[str] = "augmented-lagrangian"
 

@@ -43,7 +43,7 @@ MEMORY = 20
 
 @dataclass(frozen=True)
 class Shooting(Options):
-    """Single shooting.
+    """Single shooting: simulate with trial parameters, and improve them.
 
     Attributes
     ----------
@@ -196,7 +196,7 @@ class _ShootingSearch:
     # Optimisers -------------------------------------------------------------------------------
 
     def _gauss_newton(self) -> tuple[Status, str]:
-        """Minimise by SciPy's `least_squares_of_fit`."""
+        """Minimise the squared residuals by SciPy's `least_squares`; return status and message."""
         result = least_squares(
             self._residual,
             np.zeros(len(self.first)),  # then the trust region starts at one
@@ -226,7 +226,7 @@ class _ShootingSearch:
         return shot.slope
 
     def _quasi_newton(self) -> tuple[Status, str]:
-        """Minimise by SciPy's L-BFGS-B."""
+        """Minimise the loss by SciPy's L-BFGS-B; return status and message."""
         result = minimize(
             self._objective,
             self.first,
