@@ -1,10 +1,10 @@
 """What the package exports; each module is imported when one of its names is asked for."""
 
-from . import live
+from . import live, testing
 from .errors import InputError, SimulationError
 from .fem.body import Body
 from .fem.constants import Constant
-from .fem.materials import Material, Prony
+from .fem.materials import DampingLaw, Material, Prony
 from .fem.mesh import TetMesh
 from .fem.node_force import NodeForce
 from .fem.regions import Region
@@ -66,6 +66,7 @@ __all__ = [
     "Continuation",
     "Cuboid",
     "Cylinder",
+    "DampingLaw",
     "Depth",
     "DepthCamera",
     "Experiment",
@@ -126,6 +127,7 @@ __all__ = [
     "run",
     "simulate",
     "solve",
+    "testing",
     "with_markers",
     "with_readings",
     "with_wrenches",
