@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 import pytest
+from test_forces import breath, foundation
 
 import collocation_sysid as cs
 from collocation_sysid.fem.air import unit_drag
@@ -36,7 +37,20 @@ def creeping(x, v, before, at, creep_n_m):
     return -creep_n_m * at.volume_m3 * 1e4 * (x - at.rest_m - after), after
 
 
+def quadratic_body() -> cs.Body:
+    """A body with quadratic faces, on some of which a force acts."""
+    force = cs.NodeForce.from_law(breath, nodes=cs.Box((-1, -1, -1), (1, 1, 0.051)), on="faces")
+    mesh = cs.box_mesh((0.1, 0.1, 0.1), (1, 1, 2))
+    return cs.Body(mesh, density_kg_m3=30.0, element="tet10", forces=[force])
+
+
 FORCES = {
+    "foundation": (foundation, {"constants": {"whirl_n_m3": 4e4}}),
+    "breath": (cs.NodeForce.from_law(breath, on="faces"), {"is_dissipative": True}),
+    "breath, quadratic": (
+        cs.NodeForce.from_law(breath, on="faces"),
+        {"is_dissipative": True, "body": quadratic_body()},
+    ),
     "drag": (drag, {"is_dissipative": True, "is_zero_at_rest": True}),
     "bed": (bed, {"energy": bed_energy, "is_zero_at_rest": True, "is_dissipative": True}),
     "lift": (lift, {"is_dissipative": True, "is_zero_at_rest": True}),

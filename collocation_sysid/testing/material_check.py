@@ -36,6 +36,12 @@ DEFORMATIONS = 4
 # Largest entries of F − I in them: stretches from about 0.6 to 1.4, in which every usual material
 # has an energy.
 LARGEST_STRAIN = 0.2
+# Largest entry of F − I at which energies are compared after pickling: small, for materials with a
+# limit.
+ROUND_TRIP = 0.02
+# Largest relative difference of derivatives by a chain rule from those by F: both contain powers of
+# the invariants, whose rounding errors are larger.
+CHAIN_RULE = 1e-8
 # Orthonormal strains: a stiffness that resists them all is that of a solid.
 DIAGONAL = [np.diag(each) for each in np.eye(3)]
 
@@ -54,12 +60,13 @@ def check_material(
     """Check a material: energy, stress, stiffness, objectivity, compiled forces and round trips.
 
     The undeformed material has no energy and no stress, and resists every small strain. Stress
-    and stiffness at random deformations are the derivatives of the energy, by central
-    differences; a rotation changes neither the energy nor the stress in the body's axes. The
-    compiled forces of a small body, and their derivatives of first and second order by positions,
-    velocities and constants, agree with a plain sum over its elements and CasADi's automatic
-    derivatives of it, and with central differences. A missing or misspelt constant is refused by
-    its name. The material can be pickled.
+    and stiffness at random deformations, and at deformations with equal principal stretches, are
+    the derivatives of the energy, by central differences, and so are the derivatives of the
+    stress by the constants; a rotation changes neither the energy nor the stress in the body's
+    axes. The compiled forces of a small body, and their derivatives of first and second order by
+    positions, velocities and constants, agree with a plain sum over its elements and CasADi's
+    automatic derivatives of it, and with central differences. A missing or misspelt constant is
+    refused by its name. The material can be pickled.
 
     Parameters
     ----------
@@ -94,8 +101,7 @@ def check_material(
     values = usual_constants(made.constants, constants)
     law = EnergyDerivatives(made, np.array([*values.values()]))
     _check_undeformed(check, law)
-    for number, F in enumerate(deformation_gradients(check.rng, DEFORMATIONS, largest_strain)):
-        where = f"at random deformation {number} (strains up to {largest_strain:g})"
+    for where, F in _deformations(check.rng, largest_strain):
         _check_derivatives(check, law, F, where)
         if is_objective:
             _check_objectivity(check, law, F, where)
@@ -138,10 +144,38 @@ class EnergyDerivatives:
         tangent, stress = ca.hessian(psi, F)
         return ca.Function("law", [F], [psi, stress, tangent])
 
+    @cached_property
+    def _kernel_function(self) -> ca.Function:
+        """Function of F (9,) and the constants, differentiated as in kernels: by a chain rule."""
+        F = ca.SX.sym("F", 9)
+        values = ca.SX.sym("values", len(self.values))
+        gradient = ca.reshape(F, 3, 3)
+        rule = self.material.chain_rule(gradient, values)
+        psi = self.material.psi_in(rule, gradient, values)
+        stress = rule.gradient(psi, F)
+        outputs = [psi, stress, rule.jacobian(stress, F), rule.jacobian(stress, values)]
+        return ca.Function("kernel", [F, values], rule.eliminate(outputs))
+
     def evaluate(self, F: Array) -> tuple[Array, Array, Array]:
         """Return ψ (1,), P (9,) and ∂P/∂F (9, 9) at F (9,), stacked column after column."""
         psi, stress, tangent = (output.full() for output in self._function.call([F]))
         return psi.ravel(), stress.ravel(), tangent
+
+    def evaluate_kernel(
+        self, F: Array, values: Array | None = None
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return ψ, P and ∂P/∂F like `evaluate`, and ∂P/∂θ (9, k), as kernels differentiate.
+
+        Parameters
+        ----------
+        F : (9,) array
+        values : (k,) array, optional
+            Values of the constants in place of those of this object.
+        """
+        constants = self.values if values is None else values
+        outputs = (each.full() for each in self._kernel_function.call([F, constants]))
+        psi, stress, tangent, by_constants = outputs
+        return psi.ravel(), stress.ravel(), tangent, by_constants
 
     def evaluate_plain(self, F: Array) -> Array:
         """Return ψ (1,) by calling the energy function with numbers."""
@@ -169,6 +203,15 @@ def deformation_gradients(
         while np.linalg.det(F) < 0.1:
             F = np.eye(3) + rng.uniform(-largest_strain, largest_strain, (3, 3))
         yield F.ravel(order="F")
+
+
+def _deformations(rng: np.random.Generator, largest_strain: float) -> Iterator[tuple[str, Array]]:
+    """Return descriptions and deformation gradients (9,): random ones, then equal stretches."""
+    for number, F in enumerate(deformation_gradients(rng, DEFORMATIONS, largest_strain)):
+        yield f"at random deformation {number} (strains up to {largest_strain:g})", F
+    for stretch in (1 + largest_strain, 1 - largest_strain):
+        yield f"at a uniaxial stretch of {stretch:g}", np.diag([1.0, 1.0, stretch]).ravel()
+        yield f"at a volumetric stretch of {stretch:g}", stretch * np.eye(3).ravel()
 
 
 def random_rotation(rng: np.random.Generator) -> Array:
@@ -215,6 +258,33 @@ def _check_derivatives(check: PropertyCheck, law: EnergyDerivatives, F: Array, w
     check.require_derivative(
         lambda at: law.evaluate(at)[1], tangent, F, statement=f"∂P/∂F is wrong {where}", scale=0.1
     )
+    _check_kernel_derivatives(check, law, F, where)
+
+
+def _check_kernel_derivatives(
+    check: PropertyCheck, law: EnergyDerivatives, F: Array, where: str
+) -> None:
+    """Require that the derivatives of kernels are those of the energy by F and the constants."""
+    plain = law.evaluate(F)
+    *kernel, by_constants = law.evaluate_kernel(F)
+    # Stress and energy may vanish, in a volumetric stretch for instance.
+    stiffness = float(np.abs(plain[2]).max())
+    for name, found, expected in zip(("ψ", "P", "∂P/∂F"), kernel, plain, strict=True):
+        check.require_equal(
+            found,
+            expected,
+            statement=f"{name} of kernels differs from the energy's {where}",
+            tolerance=CHAIN_RULE,
+            scale=stiffness,
+        )
+    sizes = np.maximum(np.abs(law.values), np.finfo(float).tiny)
+    check.require_derivative(
+        lambda values: law.evaluate_kernel(F, values)[1],
+        by_constants,
+        law.values,
+        statement=f"∂P/∂θ is wrong {where}",
+        scale=sizes,
+    )
 
 
 def _check_objectivity(check: PropertyCheck, law: EnergyDerivatives, F: Array, where: str) -> None:
@@ -254,12 +324,12 @@ def _check_round_trips(
 ) -> None:
     """Require the same energies after pickling and from a problem file."""
     constants = np.array([*values.values()])
-    F = np.array([1.1, 0.05, 0.0, -0.02, 0.95, 0.03, 0.01, 0.0, 1.02])
+    deformations = [*deformation_gradients(np.random.default_rng(0), DEFORMATIONS, ROUND_TRIP)]
 
     def evaluate(made: Material) -> Array:
-        """Return the names of the constants as numbers, and ψ and P at a deformation."""
-        psi, stress, _ = EnergyDerivatives(made, constants).evaluate(F)
-        return np.concatenate([psi, stress])
+        """Return ψ at a few deformations."""
+        law = EnergyDerivatives(made, constants)
+        return np.concatenate([law.evaluate_plain(F) for F in deformations])
 
     def load(loader: CodeLoader, table: Mapping[str, Any]) -> Material:
         """Return the material of a table of a problem file."""
