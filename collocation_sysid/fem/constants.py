@@ -17,6 +17,7 @@ Scale = Literal["log", "linear"]
 _UNITS = {
     "_kg_m3": "kg/m³",
     "_m_s2": "m/s²",
+    "_pa_s": "Pa s",
     "_1_s": "1/s",
     "_pa": "Pa",
     "_kg": "kg",

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple, get_args
@@ -158,6 +158,10 @@ class NodeForce:
         force = cls(name, law, known, chosen, on, carries)
         force._check()
         return force
+
+    def __getstate__(self) -> dict[str, Any]:
+        # CasADi's symbols cannot be pickled; cached properties are computed again.
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
         """Return forces (3k,) on k nodes, followed by the internal variables, as an expression.

@@ -144,7 +144,9 @@ class WrenchResidual(MeasurementResidual):
         predicted = ca.reshape(values, 6, times) @ ca.vertcat(
             *lagrange_weights(at, ca.vertsplit(data))
         )
-        predicted[tared[: own.numel() - has_clock]] += own[has_clock:]
+        tare = own[has_clock:]
+        if tare.numel():
+            predicted[tared[: tare.numel()]] += tare
         return predicted
 
     # Of reactions -----------------------------------------------------------------------------
