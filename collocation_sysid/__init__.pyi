@@ -1,6 +1,6 @@
 """What the package exports; each module is imported when one of its names is asked for."""
 
-from . import live
+from . import datasets, live
 from .errors import InputError, SimulationError
 from .fem.body import Body
 from .fem.constants import Constant
@@ -45,6 +45,7 @@ from .recording import (
     PointMass,
     PoseSequence,
     Pressure,
+    Specimen,
     Sphere,
     Tendon,
     Wrench,
@@ -105,6 +106,7 @@ __all__ = [
     "SimulationError",
     "Sleqp",
     "Solution",
+    "Specimen",
     "Sphere",
     "SqpMethod",
     "Status",
@@ -119,6 +121,7 @@ __all__ = [
     "Wrench",
     "box_mesh",
     "cylinder_mesh",
+    "datasets",
     "depth_image",
     "live",
     "place_markers",

@@ -55,6 +55,8 @@ AIR_DENSITY_DEVIATION = 0.03
 # depend on its shape, on edges, on amplitude and on frequency.
 AIR_COEFFICIENT_DEVIATION = 0.4
 _AXES = "xyz"
+# Poisson's ratio of an incompressible material.
+INCOMPRESSIBLE_POISSON = 0.5
 # Laws of damping that a real material may obey: Rayleigh's resists rotation, as no material does.
 OBJECTIVE_DAMPINGS = ("kelvin-voigt", "material")
 # Differences by a displacement: its largest entry over the length of an edge.
@@ -351,6 +353,8 @@ class Assumption:
         component; None if there is no effect in this experiment.
     component_names : str
         Names of components with independent errors, separated by spaces; empty if there is one.
+    of_specimens : bool
+        Whether it concerns homogeneous specimens too, which have neither a mesh nor grips.
     """
 
     name: str
@@ -359,6 +363,7 @@ class Assumption:
     description: str
     effect: Callable[[ExperimentAtAnswer, int], Effect | None]
     component_names: str = ""
+    of_specimens: bool = False
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -428,7 +433,8 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
     """Effect of a stiffness that is higher along one axis by a share of E: the energy ½ E e² of the
     strain e along it.
 
-    Rayleigh damping K(x) v follows by its time derivative.
+    Rayleigh damping K(x) v follows by its time derivative. For specimens e is such that its stress
+    at large stretches λ, (λ − 1/λ²) / 3, is a constant share of that of Neo-Hooke's law.
     """
     body = at.body
     xi, nu = at.states
@@ -442,7 +448,10 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
         stretch, rate = (
             np.einsum("eqa,eaj->eqj", slopes, each.reshape(-1, 3)[body.cells]) for each in (x, v)
         )
-        strain = 0.5 * (np.sum(stretch**2, axis=2, keepdims=True) - 1)
+        squared = np.sum(stretch**2, axis=2, keepdims=True)
+        strain = 0.5 * (squared - 1)
+        if at.iterate.segment.experiment.specimen is not None:
+            strain = (1 - squared**-1.5) / 3
         pull = (strain + gamma * np.sum(stretch * rate, axis=2, keepdims=True)) * stretch
         pull = weight[..., None] * (pull + gamma * strain * rate)
         np.subtract.at(own.reshape(-1, 3), body.cells, np.einsum("eqa,eqj->eaj", slopes, pull))
@@ -482,15 +491,18 @@ def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
     if not constants:
         return None
     values = at.parameters.values(at.iterate.q)
+    # Both differences stay below ½, where the bulk modulus would be infinite.
+    largest = max(values[name] for name in constants)
+    step = min(SMALL, (INCOMPRESSIBLE_POISSON - largest) / 2)
     larger, smaller = (
         at.internal_n(
             theta=at.body.theta_from_values(
                 {n: v + way * (n in constants) for n, v in values.items()}
             )
         )
-        for way in (SMALL, -SMALL)
+        for way in (step, -step)
     )
-    return Effect((larger - smaller) / (2 * SMALL))
+    return Effect((larger - smaller) / (2 * step))
 
 
 def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
@@ -675,11 +687,14 @@ ASSUMPTIONS = (
         "density at one end of the body relative to that in its middle", _density_gradient, "x y "
         "z"),
     Assumption("anisotropy", "1", 0.05,
-        "stiffness along one axis relative to that across it", _anisotropy, "x y z"),
+        "stiffness along one axis relative to that across it", _anisotropy, "x y z",
+        of_specimens=True),
     Assumption("stiffness_drift", "1", 0.02,
-        "stiffness at the end of a recording relative to that at its beginning", _drift),
+        "stiffness at the end of a recording relative to that at its beginning", _drift,
+        of_specimens=True),
     Assumption("time_scale", "1", 1e-4, "rate of all clocks", _time_scale),
-    Assumption("poisson", "", 0.02, "Poisson's ratio, if it is stated", _poisson),
+    Assumption("poisson", "", 0.02, "Poisson's ratio, if it is stated", _poisson,
+        of_specimens=True),
     Assumption("damping_law", "1", 1.0,
         "damping force of another objective law, as a fraction of its difference from the "
             "stated law",
