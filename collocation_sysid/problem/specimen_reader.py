@@ -76,6 +76,11 @@ class SpecimenReader:
             require_plausible_specimen(specimen)
         for warning in order_warnings(specimen):
             self._add_note(warning)
+        if table.is_displacement and section.area_m2 is None:
+            self._add_note(
+                "the compliance of the test bench is not part of the budget: state area_m2, the "
+                "undeformed area of the specimen, unless an extensometer measured the displacement"
+            )
         self._note_unknown_past(specimen)
         experiment = specimen.experiment(
             name=section.name, validation=section.validation, body=self.body
@@ -93,6 +98,8 @@ class SpecimenReader:
         if len(rows) < len(table.t_s):
             self._add_note(f"{section.file}: {len(rows)} of {len(table.t_s)} rows are used")
         arguments: dict[str, Any] = table.rows(rows)
+        if table.is_displacement and section.area_m2 is not None:
+            arguments |= {"length_m": section.length_m, "area_m2": section.area_m2}
         return Specimen(
             section.test,
             **arguments,

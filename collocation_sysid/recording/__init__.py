@@ -12,7 +12,7 @@ measured reaction forces.
 - `custom_sensor`: custom sensors.
 - `nuisance`: unknowns of a single recording, with their priors.
 - `environment`: the density of the air.
-- `specimen`, `homogeneous_deformation`: material tests without a mesh.
+- `specimen`, `specimen_stretches`, `homogeneous_deformation`: material tests without a mesh.
 
 Files are read by `marker_files` (markers), `pose_files` (poses), `time_tables` (forces,
 displacements, pressures, custom sensors) and the subpackage `formats`; `recording_writers` writes

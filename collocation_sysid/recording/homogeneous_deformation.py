@@ -51,6 +51,10 @@ class HomogeneousDeformation:
     young_ratio : float
         Initial slope of stress over strain, of an incompressible material, over Young's modulus;
         NaN if it is not determined by Young's modulus.
+    area_over_length_m : float
+        Undeformed area over undeformed length [m] of a specimen whose strain e₁ is the displacement
+        of a test bench over that length, so that the compliance of the bench adds to it; 0 if the
+        strain was measured on the specimen.
     """
 
     test: str
@@ -61,6 +65,7 @@ class HomogeneousDeformation:
     second_stress: str = ""
     lateral: str = ""
     young_ratio: float = 1.0
+    area_over_length_m: float = 0.0
 
     @property
     def is_shear(self) -> bool:

@@ -7,6 +7,8 @@ linear tetrahedra, which represents the homogeneous deformation exactly, see
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 
@@ -31,6 +33,7 @@ from .homogeneous_deformation import (
 )
 from .nuisance import Nuisance
 from .poses import PoseSequence
+from .specimen_stretches import require_evaluable_law
 
 # Density of a cell [kg/m³], on which no equilibrium without gravity depends.
 CELL_DENSITY_KG_M3 = 1000.0
@@ -84,12 +87,16 @@ class Specimen:
         Standard deviation of the relative error of the area, which is estimated; 0 if exact.
     stress_zero_pa : float
         Standard deviation of a constant offset of the stresses, which is estimated; 0 if exact.
+    length_m, area_m2 : float, optional
+        Undeformed length and area of the specimen, if `strain` is the displacement of a test bench
+        over the length: the budget then contains the compliance of the bench. None (both) if the
+        strain was measured on the specimen.
 
     Raises
     ------
     InputError
-        For an unknown test, arrays of different lengths, a stretch that is not positive, or a
-        measurement that the test does not have.
+        For an unknown test, arrays of different lengths, a stretch that is not positive, a
+        measurement that the test does not have, or a length without an area.
     """
 
     test: str
@@ -110,6 +117,8 @@ class Specimen:
     strain_zero: float = key(NotNegative, default=STRAIN_ZERO)
     area_error: float = key(NotNegative, default=AREA_ERROR)
     stress_zero_pa: float = key(NotNegative, default=0.0)
+    length_m: float | None = key(Positive, default=None)
+    area_m2: float | None = key(Positive, default=None)
 
     def __post_init__(self) -> None:
         if self.test not in DEFORMATIONS:
@@ -119,6 +128,13 @@ class Specimen:
         times = np.arange(float(len(self.strain))) if self.t_s is None else self.t_s
         vars(self)["t_s"] = times
         self._require_measurements_of_test()
+        if (self.length_m is None) != (self.area_m2 is None):
+            raise InputError(
+                "found one of length_m and area_m2; expected both, or neither for a strain that "
+                "was measured on the specimen",
+                None,
+                "length_m",
+            )
         for name in ("stress_pa", "t_s", "second_strain", "second_stress_pa", "lateral_stretch"):
             values = getattr(self, name)
             if values is not None and len(values) != len(self.strain):
@@ -156,7 +172,10 @@ class Specimen:
     @property
     def deformation(self) -> HomogeneousDeformation:
         """Components of the deformation gradient that the test prescribes."""
-        return DEFORMATIONS[self.test]
+        deformation = DEFORMATIONS[self.test]
+        if self.length_m is None or self.area_m2 is None:
+            return deformation
+        return replace(deformation, area_over_length_m=self.area_m2 / self.length_m)
 
     def __repr__(self) -> str:
         return f"Specimen({self.test!r}: {len(self.strain)} samples)"
@@ -188,6 +207,7 @@ class Specimen:
         """
         cell = cell_body(self.test, material, prony) if body is None else body
         assert self.t_s is not None
+        require_evaluable_law(cell, self.test, self.strain, self.second_strain)
         nuisance = Nuisance.none(strain_zero=self.strain_zero or None)
         return Experiment(
             cell,

@@ -107,6 +107,8 @@ class SpecimenTable:
         None if the table has no such column.
     is_incompressible : bool
         Whether true stresses were converted as those of an incompressible specimen.
+    is_displacement : bool
+        Whether the strain is a displacement over the length of the specimen.
     """
 
     t_s: Array
@@ -116,6 +118,7 @@ class SpecimenTable:
     second_stress_pa: Array | None
     lateral_stretch: Array | None
     is_incompressible: bool
+    is_displacement: bool
 
     def rows(self, chosen: Index) -> dict[str, Array | None]:
         """Return the arrays at chosen rows, by their indices, as arguments of `Specimen`."""
@@ -172,6 +175,7 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         is_incompressible=layout.stress == "true"
         and lateral is None
         and layout.test in ("uniaxial", "equibiaxial", "planar", "biaxial"),
+        is_displacement=DISPLACEMENT.key in table.values,
     )
 
 

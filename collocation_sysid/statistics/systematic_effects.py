@@ -33,6 +33,7 @@ from ..program.collocation import ExperimentIterate
 from ..program.contact_summary import surface_gaps_and_pressures
 from ..program.reaction_forces import forces_on_dofs, reaction_forces
 from ..recording.grasp import free_rigid_motions
+from ..recording.homogeneous_deformation import STRESS_PER_FORCE, HomogeneousDeformation
 from ..recording.nuisance import KINDS
 from ..schema_tables import ByForm, Section
 from ..validated_types import Options, Positive
@@ -536,6 +537,8 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """
     experiment = at.iterate.segment.experiment
     prescribed = at.iterate.equations.prescribed
+    if experiment.specimen is not None:
+        return _machine_of_specimen(at, experiment.specimen)
     if not experiment.is_static or not (driven := _is_driven(at)).any():
         return None
     displacement_m = np.zeros_like(at.grasp_force_n)
@@ -546,6 +549,27 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
             )
             if driven[here].any():
                 displacement_m[:, here] = -at.grasp_force_n[:, here].sum(axis=1, keepdims=True)
+    return Effect(displacement_m=displacement_m)
+
+
+def _machine_of_specimen(
+    at: ExperimentAtAnswer, deformation: HomogeneousDeformation
+) -> Effect | None:
+    """Effect of the compliance C of a test bench on a homogeneous specimen of area A and length L,
+    whose strain is smaller than the displacement over the length by C A P / L, with its nominal
+    stress P. None if the strain was measured on the specimen.
+    """
+    if not deformation.area_over_length_m:
+        return None
+    dofs = at.iterate.equations.prescribed.dofs
+    direction, normal = (_AXES.index(axis) for axis in deformation.first_stress)
+    loaded = np.searchsorted(dofs, 3 * (1 + normal) + direction)
+    stress_pa = STRESS_PER_FORCE * at.grasp_force_n[:, loaded]
+    strain_m_n = -deformation.area_over_length_m * stress_pa
+    displacement_m = np.zeros_like(at.grasp_force_n)
+    for node, (by_strain_m, _) in deformation.displaced_nodes().items():
+        columns = np.searchsorted(dofs, 3 * node + np.arange(3))
+        displacement_m[:, columns] = strain_m_n[:, None] * by_strain_m
     return Effect(displacement_m=displacement_m)
 
 
@@ -705,7 +729,8 @@ ASSUMPTIONS = (
         _rayleigh_damping),
     Assumption("grip_layer_m", "m", 2e-4,
         "compliance of grip and skin, as the thickness of a layer of the body's material", _grip),
-    Assumption("machine_compliance_m_n", "m/N", 1e-6, "compliance of the test bench", _machine),
+    Assumption("machine_compliance_m_n", "m/N", 1e-6, "compliance of the test bench", _machine,
+        of_specimens=True),
     Assumption("platen_friction", "", 0.1,
         "coefficient of friction of platens between which nodes slide", _platen_friction),
     Assumption("contact_stiffness", "1", 1.0,
