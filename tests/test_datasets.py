@@ -1,17 +1,27 @@
-"""Data sets by name: their experiments, their problem files, and copies of them."""
+"""Datasets by name: their experiments, their problem files, and copies of them."""
 
 from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 from problem_files import run_command
 
 import collocation_sysid as cs
+from collocation_sysid.datasets.dataset_files import copy_dataset
 from collocation_sysid.recording.homogeneous_deformation import DEFORMATIONS
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize("name", cs.datasets.DATASETS)
-def test_a_data_set_states_source_licence_and_units_and_has_experiments(name):
+def test_a_dataset_states_source_licence_and_units_and_has_experiments(name):
     read = getattr(cs.datasets, name)
     for word in ("Source", "MIT", "nits" if "Units" in read.__doc__ else "MPa"):
         assert word in read.__doc__
@@ -61,7 +71,7 @@ def test_a_law_fits_kawabatas_small_stretches_well():
     assert found == pytest.approx(exact, rel=3e-3)
 
 
-def test_new_copies_a_data_set_that_can_be_checked(tmp_path, monkeypatch):
+def test_new_copies_a_dataset_that_can_be_checked(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     outcome = run_command("new", "rubber", "--dataset", "treloar_1944")
     assert (outcome.code, "rubber/problem.toml" in outcome.out) == (0, True)
@@ -69,6 +79,55 @@ def test_new_copies_a_data_set_that_can_be_checked(tmp_path, monkeypatch):
     assert [each.name for each in problem.experiments] == ["uniaxial"]
 
 
-def test_an_unknown_data_set_is_refused_with_the_nearest_name():
+def test_a_copy_of_measured_data_has_source_licence_and_schema(tmp_path):
+    for name in ("kawabata_1981", "treloar_1944", "diani"):
+        file, *others = copy_dataset(name, tmp_path / name)
+        names = {each.name for each in others}
+        assert {"LICENSE_Hyperelastics.md", "schema.json"} <= names
+        text = file.read_text()
+        assert text.startswith("#:schema schema.json\n")
+        assert "Hyperelastics.jl, Copyright (c) 2022 TRACER Lab at Liberty University, MIT" in text
+    assert not (tmp_path / "kawabata_1981" / "calendering.csv").exists()
+    with pytest.raises(cs.InputError, match="it is there already"):
+        copy_dataset("diani", tmp_path / "diani")
+
+
+def test_a_copy_of_a_simulated_recording_names_a_schema_beside_it(tmp_path):
+    file, *_ = copy_dataset("foam_cylinder", tmp_path)
+    assert file.name == "recording.toml"
+    for each in (file, tmp_path / "problem.toml"):
+        assert each.read_text().startswith("#:schema schema.json\n")
+    assert not (tmp_path / "LICENSE_Hyperelastics.md").exists()
+
+
+def test_a_wheel_contains_the_datasets_with_their_licence(tmp_path, monkeypatch):
+    hatchling = pytest.importorskip("hatchling.build")
+    monkeypatch.chdir(ROOT)  # the project that is built
+    wheel = tmp_path / hatchling.build_wheel(str(tmp_path))
+    installed = tmp_path / "installed"
+    zipfile.ZipFile(wheel).extractall(installed)
+    program = "from collocation_sysid.cli import main; main()"
+
+    def run(*arguments: str) -> str:
+        return subprocess.run(
+            [sys.executable, "-c", program, *arguments],
+            env=os.environ | {"PYTHONPATH": str(installed)},
+            cwd=tmp_path,
+            capture_output=True,
+            check=False,
+            text=True,
+            encoding="utf-8",
+        ).stdout
+
+    assert "LICENSE_Hyperelastics.md" in run("new", "rubber", "--dataset", "kawabata_1981")
+    run("solve", "rubber/problem.toml", "--out", "run", "--no-pictures", "--quiet")
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["derived"]["young_pa"]["value"] == pytest.approx(1.2e6, rel=0.3)
+    for name in cs.datasets.DATASETS:
+        run("new", name, "--dataset", name)
+        assert (tmp_path / name / cs.datasets.DATASETS[name]).is_file()
+
+
+def test_an_unknown_dataset_is_refused_with_the_nearest_name():
     with pytest.raises(cs.InputError, match="did you mean 'kawabata_1981'"):
         cs.datasets.read_problem("kawabata")

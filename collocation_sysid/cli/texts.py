@@ -203,7 +203,7 @@ def new(options: NewCommand) -> None:
     example = "the problem runs as it is, with simulated data; then replace them by your own"
     is_empty = kind is None and options.dataset is None
     if options.dataset is not None:
-        example = "the problem runs as it is; its first lines state the source of the data"
+        example = "the problem runs as it is; its comments state the source of the data"
     error_console.print(f"Next: {yours if is_empty else example}.", soft_wrap=True)
     for next_ in ("check", "solve"):
         error_console.print(f"  collocation-sysid {next_} {shlex.quote(str(file))}", soft_wrap=True)

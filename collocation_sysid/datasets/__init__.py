@@ -1,6 +1,6 @@
-"""Data sets by name: measured rubber from the literature, and the project's simulated recordings.
+"""Datasets by name: measured rubber from the literature, and the project's simulated recordings.
 
-Each function returns experiments that can be solved with `Problem`. A data set is a folder with a
+Each function returns experiments that can be solved with `Problem`. A dataset is a folder with a
 problem file and tables, which ``collocation-sysid new NAME --dataset DATASET`` copies;
 `read_problem` reads it with its parameters.
 

@@ -1,4 +1,4 @@
-"""Folders of the data sets: problem files with their tables.
+"""Folders of the datasets: problem files with their tables.
 
 Measured rubber is part of the package. Simulated recordings are in the repository's `problems/`,
 which a wheel contains beside them (`force-include` in pyproject.toml).
@@ -10,10 +10,11 @@ import shutil
 from pathlib import Path
 
 from ..errors import InputError, hint_at
-from ..files import replaced_file, require_possible
+from ..files import replaced_file, require_possible, write_text_file
 from ..problem import Problem
+from ..problem.editor_schema import SCHEMA_FILE, schema_text, schema_url, with_schema_reference
 
-# Problem file of each data set.
+# Problem file of each dataset.
 DATASETS = {
     "kawabata_1981": "problem.toml",
     "treloar_1944": "problem.toml",
@@ -25,17 +26,23 @@ DATASETS = {
     "table1": "problem.toml",
     "wrist_sensor": "problem.toml",
 }
+# Licence of the datasets of others; the other datasets have the licence of this project.
+THIRD_PARTY_LICENCES = dict.fromkeys(
+    ("kawabata_1981", "treloar_1944", "diani"), "LICENSE_Hyperelastics.md"
+)
+# First line of problem files that name a JSON schema for editors.
+_SCHEMA_COMMENT = "#:schema "
 _IN_PACKAGE = Path(__file__).parent
 _IN_CHECKOUT = Path(__file__).parents[2] / "problems"
 
 
 def dataset_folder(name: str) -> Path:
-    """Return the folder of a data set.
+    """Return the folder of a dataset.
 
     Raises
     ------
     InputError
-        If there is no data set of this name, or it is not installed.
+        If there is no dataset of this name, or it is not installed.
     """
     if name not in DATASETS:
         raise InputError(
@@ -46,52 +53,71 @@ def dataset_folder(name: str) -> Path:
         if (parent / name / DATASETS[name]).is_file():
             return parent / name
     raise InputError(
-        f"the data set {name!r} is not part of this installation; expected its folder in "
+        f"the dataset {name!r} is not part of this installation; expected its folder in "
         f"{_IN_PACKAGE} or {_IN_CHECKOUT}",
         where="dataset",
     )
 
 
 def dataset_file(name: str, file: str) -> Path:
-    """Return a file of a data set; raise `InputError` if there is no such data set."""
+    """Return a file of a dataset; raise `InputError` if there is no such dataset."""
     return dataset_folder(name) / file
 
 
 def read_problem(name: str) -> Problem:
-    """Return the problem of a data set, one of `DATASETS`, with experiments and parameters.
+    """Return the problem of a dataset, one of `DATASETS`, with experiments and parameters.
 
     Raises
     ------
     InputError
-        If there is no data set of this name, or it is not installed.
+        If there is no dataset of this name, or it is not installed.
     """
     folder = dataset_folder(name)
     return Problem.read(folder / DATASETS[name])
 
 
 def copy_dataset(name: str, folder: Path) -> list[Path]:
-    """Copy the files of a data set into a folder, which is created if necessary.
+    """Copy the files of a dataset into a folder, which is created if necessary.
+
+    Problem files name the JSON schema for editors like those of `create_problem`. Measured data of
+    others come with their licence.
 
     Returns
     -------
     list of Path
-        The problem file, followed by the other files.
+        The problem file, followed by the other files, the licence and the schema.
 
     Raises
     ------
     InputError
-        If there is no data set of this name, one of the files exists, or the folder cannot be
+        If there is no dataset of this name, one of the files exists, or the folder cannot be
         created.
     """
     source = dataset_folder(name)
     problem_file = source / DATASETS[name]
     others = sorted(file for file in source.iterdir() if file.is_file() and file != problem_file)
+    if name in THIRD_PARTY_LICENCES:
+        others.append(_IN_PACKAGE / THIRD_PARTY_LICENCES[name])
     require_possible(folder)
+    url = schema_url()
     copies = {file: folder / file.name for file in (problem_file, *others)}
-    for copy in copies.values():
+    schema = [] if url else [folder / SCHEMA_FILE]
+    for copy in (*copies.values(), *schema):
         if copy.exists():
             raise InputError("it is there already; choose another name", copy)
     for file, copy in copies.items():
-        with replaced_file(copy) as draft:
-            shutil.copyfile(file, draft)
-    return list(copies.values())
+        _copy_file(file, copy, url or SCHEMA_FILE)
+    for file in schema:
+        write_text_file(file, schema_text())
+    return [*copies.values(), *schema]
+
+
+def _copy_file(file: Path, copy: Path, schema: str) -> None:
+    """Copy a file of a dataset; a problem file names the schema by an address or file name."""
+    if file.suffix == ".toml":
+        text = file.read_text(encoding="utf-8")
+        if text.startswith(_SCHEMA_COMMENT):
+            write_text_file(copy, with_schema_reference(text, schema))
+            return
+    with replaced_file(copy) as draft:
+        shutil.copyfile(file, draft)
