@@ -26,6 +26,7 @@ LAYERS = (
     {"methods"},
     {"statistics"},
     {"problem"},
+    {"datasets"},
     {"runs"},
     {"result"},
     {"pipeline", "installation_check"},

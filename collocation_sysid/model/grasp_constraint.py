@@ -143,6 +143,14 @@ class GraspConstraint:
                 columns = np.searchsorted(self.dofs, 3 * grasp.nodes + "xyz".index(axis))
                 column = np.flatnonzero(self.nuisance.motion_indices == place)
                 derivatives[np.ix_(rows, columns, column)] = self.nuisance.scales[place]
+            for place in self.nuisance.strain_zero_indices:
+                columns = np.searchsorted(self.dofs, grasp.prescribed_dofs)
+                column = np.flatnonzero(self.nuisance.motion_indices == place)
+                shifts_m = np.tile(self.nuisance.strain_shifts_m[number], len(grasp.nodes))
+                own_m = shifts_m.reshape(-1, 3)[:, grasp.axis_indices].ravel()
+                derivatives[np.ix_(rows, columns, column)] = (
+                    self.nuisance.scales[place] * own_m[None, :, None]
+                )
         half_interval_s = 0.5e-3 * self.experiment.timestep_s
         for columns, obstacle, row, _, place in self._obstacle_parameters:
             if row == OBSTACLE_TIME:

@@ -16,7 +16,7 @@ A tension T acts on the body as max(0, f T − b), a pressure p as f p − b.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
 from typing import Any, NamedTuple, TypeVar, get_args
@@ -46,6 +46,7 @@ from ..recording.nuisance import (
     PLACE,
     POSE_TURN,
     PRESSURE_OFFSET,
+    STRAIN_ZERO,
     TARE,
     TENSION_OFFSET,
     TILT,
@@ -151,6 +152,9 @@ class NuisanceMap:
         Loads with an estimated time, in the order of their parameters.
     recorded_s : (float, float)
         First and last time of the recording.
+    strain_shifts_m : (G, 3)
+        Displacement of the node of each grasp per unit of strain [m]; empty unless the experiment
+        is a specimen without a mesh.
     """
 
     entries: tuple[NuisanceEntry, ...]
@@ -165,6 +169,7 @@ class NuisanceMap:
     declared_calibration: Array
     timed_loads: tuple[TimedLoad, ...]
     recorded_s: tuple[float, float]
+    strain_shifts_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod
     def from_experiment(cls, experiment: Experiment, pivot_m: Array | None = None) -> NuisanceMap:
@@ -207,6 +212,7 @@ class NuisanceMap:
             np.array([a.factor_and_offset for a in experiment.actuators]).reshape(-1, 2),
             tuple(timed for _, timed in _timed_loads(experiment)),
             (float(experiment.t_s[0]), float(experiment.t_s[-1])),
+            _strain_shifts_m(experiment),
         )
         for row in experiment.nuisance.own:
             nuisance_map._require_valid_expression(row)
@@ -363,6 +369,11 @@ class NuisanceMap:
         """Return the indices in φ of the zeros of a grasp's displacement, axis by axis."""
         return self.indices_of_rows(ZERO, component=number)
 
+    @cached_property
+    def strain_zero_indices(self) -> Index:
+        """Indices in φ of the zero of the strain of a specimen; empty if it is not estimated."""
+        return self.indices_of_rows(STRAIN_ZERO)
+
     def obstacle_parameters(self, number: int) -> list[tuple[NuisanceRow, int, int]]:
         """Return row, axis and index in φ of every nuisance parameter of an obstacle.
 
@@ -404,6 +415,8 @@ class NuisanceMap:
         zero_m = np.zeros(3)
         for place in self.displacement_zero_indices(number):
             zero_m[self.entries[place].axis] = phi[place] * self.scales[place]
+        for place in self.strain_zero_indices:
+            zero_m += phi[place] * self.scales[place] * self.strain_shifts_m[number]
         return replace(grasp, poses=grasp.poses.after(motion).with_shift(zero_m))
 
     def bounds(self, samples: int) -> tuple[Array, Array]:
@@ -530,6 +543,17 @@ class NuisanceMap:
         across = np.linalg.svd(down[None])[2][1:]
         tilted = down + ca.mtimes(ca.DM(across.T), angles)
         return ca.SX(size * tilted / ca.norm_2(tilted))
+
+
+def _strain_shifts_m(experiment: Experiment) -> Array:
+    """Return the displacement (G, 3) of the node of each grasp of a specimen per unit of strain
+    [m]; empty, (0, 3), if the experiment has a mesh.
+    """
+    if experiment.specimen is None:
+        return np.zeros((0, 3))
+    moving = experiment.specimen.displaced_nodes()
+    still = np.zeros(3), np.zeros(3)
+    return np.array([sum(moving.get(int(g.nodes[0]), still)) for g in experiment.body_grasps])
 
 
 def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:

@@ -25,6 +25,7 @@ from ..array_types import Array, Index
 from ..errors import SimulationError
 from ..model.forces import Forces
 from ..recording.experiment import Experiment
+from ..recording.specimen_files import specimen_strains
 
 # λ_1/λ_3 at which the surface of a half-space is unstable: the root of ξ³ + ξ² + 3 ξ − 1.
 BIOT_RATIO = 0.29559774
@@ -107,9 +108,13 @@ def explain_failure(
 ) -> SimulationError:
     """Return the error with the mode, if a static path ended by a loss of stability;
     otherwise the same error.
+
+    A homogeneous specimen has no mode: its message names the test and the strain.
     """
     if error.state_m is None:
         return error
+    if experiment.specimen is not None:
+        return SimulationError(specimen_message(experiment, error.time_s), error.time_s)
     try:
         instability = find_stability_loss(experiment, theta, error.state_m, error.time_s)
     except (ArpackError, RuntimeError, np.linalg.LinAlgError):
@@ -119,6 +124,19 @@ def explain_failure(
     explained_error = SimulationError(instability.message, error.time_s, error.element)
     explained_error.stability_loss = instability
     return explained_error
+
+
+def specimen_message(experiment: Experiment, time_s: float) -> str:
+    """Return the message for a specimen that has no stable equilibrium at a time [s]."""
+    assert experiment.specimen is not None
+    strain, _ = specimen_strains(experiment)
+    value = float(np.interp(time_s, experiment.t_s, strain))
+    return (
+        f"specimen '{experiment.name}': the material has no stable equilibrium in the "
+        f"{experiment.specimen.test} test at a strain of {value:.4g} with these constants. They "
+        "are probably not determined by the fitted tests: fit this kind of test too, bound the "
+        "constants, or use a law with fewer constants"
+    )
 
 
 def find_stability_loss(

@@ -21,6 +21,7 @@ from .custom_sensor import Gauge
 from .depth_camera import Depth
 from .environment import air_density, usual_air_density
 from .grasp import Grasp, free_rigid_motions, prescribed_dofs
+from .homogeneous_deformation import HomogeneousDeformation
 from .loads import Force, LoadTime, PointMass, smooth_ramp
 from .markers import Markers
 from .measured_wrench import Wrench
@@ -101,6 +102,9 @@ class Experiment:
     nuisance : Nuisance
         Standard deviations of the unknowns of this recording alone, which are estimated too: by
         default those of a careful laboratory; `Nuisance.none` for ideal data.
+    specimen : HomogeneousDeformation, optional
+        Homogeneous deformation of a material test without a mesh, see `Specimen`; None for a body
+        with a mesh.
 
     Raises
     ------
@@ -132,6 +136,7 @@ class Experiment:
     depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=())
     nuisance: Nuisance = DEFAULT_NUISANCE
     air_density_kg_m3: float = key(converter=air_density, default_factory=usual_air_density)
+    specimen: HomogeneousDeformation | None = None
 
     def __post_init__(self) -> None:
         loads = ("masses", "forces", "tendons", "pressures")

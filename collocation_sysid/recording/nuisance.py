@@ -391,6 +391,17 @@ GRASP_SHIFT = NuisanceRow(
     "equilibrium and markers measure it",
     same=_hand_eye_sharing_key,
 )
+STRAIN_ZERO = NuisanceRow(
+    "strain_zero",
+    "1",
+    None,
+    key="strain_zero",
+    changes=("grasps",),
+    applies=lambda experiment: experiment.specimen is not None,
+    label="zero of the strain",
+    sentence="offset of the strain: {size}",
+    description="a constant offset of the strains of a specimen",
+)
 ZERO = NuisanceRow(
     "displacement_zero_m",
     "m",

@@ -162,8 +162,9 @@ def changed_residuals(
     changes: list[Array] = []
     for part in collocation.iterates(z):
         at = ExperimentAtAnswer(part, collocation.parameters, surface_correlation)
+        is_specimen = part.segment.experiment.specimen is not None
         effects = [
-            (row.effect(at, axis), sigma)
+            (None if is_specimen and not row.of_specimens else row.effect(at, axis), sigma)
             for row, sigma in assumptions
             for axis in range(len(row.components))
         ]

@@ -31,6 +31,7 @@ from .modal_misspecifications import (
     gravity_hypotheses,
 )
 from .plausibility import load_sign_hypotheses
+from .specimen_misspecifications import find_specimen_misspecifications
 from .wrench_causes import wrench_causes
 
 # RMS residual in standard deviations up to which there is nothing to explain.
@@ -83,6 +84,7 @@ def find_misspecifications(solution: Solution, budget: int | None = None) -> tup
     hypotheses = [
         *wrench_causes(solution),
         *(cause for e in fitted for cause in load_sign_hypotheses(e)),
+        *find_specimen_misspecifications(solution),
     ]
     if max(misfits) > NOISE:
         worst = fitted[int(np.argmax(misfits))]

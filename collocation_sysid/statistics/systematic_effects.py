@@ -33,6 +33,7 @@ from ..program.collocation import ExperimentIterate
 from ..program.contact_summary import surface_gaps_and_pressures
 from ..program.reaction_forces import forces_on_dofs, reaction_forces
 from ..recording.grasp import free_rigid_motions
+from ..recording.homogeneous_deformation import STRESS_PER_FORCE, HomogeneousDeformation
 from ..recording.nuisance import KINDS
 from ..schema_tables import ByForm, Section
 from ..validated_types import Options, Positive
@@ -55,6 +56,8 @@ AIR_DENSITY_DEVIATION = 0.03
 # depend on its shape, on edges, on amplitude and on frequency.
 AIR_COEFFICIENT_DEVIATION = 0.4
 _AXES = "xyz"
+# Poisson's ratio of an incompressible material.
+INCOMPRESSIBLE_POISSON = 0.5
 # Laws of damping that a real material may obey: Rayleigh's resists rotation, as no material does.
 OBJECTIVE_DAMPINGS = ("kelvin-voigt", "material")
 # Differences by a displacement: its largest entry over the length of an edge.
@@ -351,6 +354,8 @@ class Assumption:
         component; None if there is no effect in this experiment.
     component_names : str
         Names of components with independent errors, separated by spaces; empty if there is one.
+    of_specimens : bool
+        Whether it concerns homogeneous specimens too, which have neither a mesh nor grips.
     """
 
     name: str
@@ -359,6 +364,7 @@ class Assumption:
     description: str
     effect: Callable[[ExperimentAtAnswer, int], Effect | None]
     component_names: str = ""
+    of_specimens: bool = False
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -428,7 +434,8 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
     """Effect of a stiffness that is higher along one axis by a share of E: the energy ½ E e² of the
     strain e along it.
 
-    Rayleigh damping K(x) v follows by its time derivative.
+    Rayleigh damping K(x) v follows by its time derivative. For specimens e is such that its stress
+    at large stretches λ, (λ − 1/λ²) / 3, is a constant share of that of Neo-Hooke's law.
     """
     body = at.body
     xi, nu = at.states
@@ -442,7 +449,10 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
         stretch, rate = (
             np.einsum("eqa,eaj->eqj", slopes, each.reshape(-1, 3)[body.cells]) for each in (x, v)
         )
-        strain = 0.5 * (np.sum(stretch**2, axis=2, keepdims=True) - 1)
+        squared = np.sum(stretch**2, axis=2, keepdims=True)
+        strain = 0.5 * (squared - 1)
+        if at.iterate.segment.experiment.specimen is not None:
+            strain = (1 - squared**-1.5) / 3
         pull = (strain + gamma * np.sum(stretch * rate, axis=2, keepdims=True)) * stretch
         pull = weight[..., None] * (pull + gamma * strain * rate)
         np.subtract.at(own.reshape(-1, 3), body.cells, np.einsum("eqa,eqj->eaj", slopes, pull))
@@ -482,15 +492,18 @@ def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
     if not constants:
         return None
     values = at.parameters.values(at.iterate.q)
+    # Both differences stay below ½, where the bulk modulus would be infinite.
+    largest = max(values[name] for name in constants)
+    step = min(SMALL, (INCOMPRESSIBLE_POISSON - largest) / 2)
     larger, smaller = (
         at.internal_n(
             theta=at.body.theta_from_values(
                 {n: v + way * (n in constants) for n, v in values.items()}
             )
         )
-        for way in (SMALL, -SMALL)
+        for way in (step, -step)
     )
-    return Effect((larger - smaller) / (2 * SMALL))
+    return Effect((larger - smaller) / (2 * step))
 
 
 def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
@@ -524,6 +537,8 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """
     experiment = at.iterate.segment.experiment
     prescribed = at.iterate.equations.prescribed
+    if experiment.specimen is not None:
+        return _machine_of_specimen(at, experiment.specimen)
     if not experiment.is_static or not (driven := _is_driven(at)).any():
         return None
     displacement_m = np.zeros_like(at.grasp_force_n)
@@ -534,6 +549,27 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
             )
             if driven[here].any():
                 displacement_m[:, here] = -at.grasp_force_n[:, here].sum(axis=1, keepdims=True)
+    return Effect(displacement_m=displacement_m)
+
+
+def _machine_of_specimen(
+    at: ExperimentAtAnswer, deformation: HomogeneousDeformation
+) -> Effect | None:
+    """Effect of the compliance C of a test bench on a homogeneous specimen of area A and length L,
+    whose strain is smaller than the displacement over the length by C A P / L, with its nominal
+    stress P. None if the strain was measured on the specimen.
+    """
+    if not deformation.area_over_length_m:
+        return None
+    dofs = at.iterate.equations.prescribed.dofs
+    direction, normal = (_AXES.index(axis) for axis in deformation.first_stress)
+    loaded = np.searchsorted(dofs, 3 * (1 + normal) + direction)
+    stress_pa = STRESS_PER_FORCE * at.grasp_force_n[:, loaded]
+    strain_m_n = -deformation.area_over_length_m * stress_pa
+    displacement_m = np.zeros_like(at.grasp_force_n)
+    for node, (by_strain_m, _) in deformation.displaced_nodes().items():
+        columns = np.searchsorted(dofs, 3 * node + np.arange(3))
+        displacement_m[:, columns] = strain_m_n[:, None] * by_strain_m
     return Effect(displacement_m=displacement_m)
 
 
@@ -675,11 +711,14 @@ ASSUMPTIONS = (
         "density at one end of the body relative to that in its middle", _density_gradient, "x y "
         "z"),
     Assumption("anisotropy", "1", 0.05,
-        "stiffness along one axis relative to that across it", _anisotropy, "x y z"),
+        "stiffness along one axis relative to that across it", _anisotropy, "x y z",
+        of_specimens=True),
     Assumption("stiffness_drift", "1", 0.02,
-        "stiffness at the end of a recording relative to that at its beginning", _drift),
+        "stiffness at the end of a recording relative to that at its beginning", _drift,
+        of_specimens=True),
     Assumption("time_scale", "1", 1e-4, "rate of all clocks", _time_scale),
-    Assumption("poisson", "", 0.02, "Poisson's ratio, if it is stated", _poisson),
+    Assumption("poisson", "", 0.02, "Poisson's ratio, if it is stated", _poisson,
+        of_specimens=True),
     Assumption("damping_law", "1", 1.0,
         "damping force of another objective law, as a fraction of its difference from the "
             "stated law",
@@ -690,7 +729,8 @@ ASSUMPTIONS = (
         _rayleigh_damping),
     Assumption("grip_layer_m", "m", 2e-4,
         "compliance of grip and skin, as the thickness of a layer of the body's material", _grip),
-    Assumption("machine_compliance_m_n", "m/N", 1e-6, "compliance of the test bench", _machine),
+    Assumption("machine_compliance_m_n", "m/N", 1e-6, "compliance of the test bench", _machine,
+        of_specimens=True),
     Assumption("platen_friction", "", 0.1,
         "coefficient of friction of platens between which nodes slide", _platen_friction),
     Assumption("contact_stiffness", "1", 1.0,

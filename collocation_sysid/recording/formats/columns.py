@@ -42,12 +42,18 @@ class Quantity:
         SI unit, as it is written in the names of columns.
     words : str
         Words, separated by blanks, of which machines use one in the column's name.
+    qualifier : str
+        Key of `QUALIFIERS` whose words the column's name has too; "" for a name without any.
+    unitless : bool
+        Whether the column's name may state no unit, which then is 1.
     """
 
     key: str
     dimension: str
     unit: str
     words: str = ""
+    qualifier: str = ""
+    unitless: bool = False
 
     @property
     def column(self) -> str:
@@ -71,9 +77,20 @@ STRAIN = Quantity("strain", "ratio", "1", "strain dehnung stauchung déformation
 STRESS = Quantity("stress", "pressure", "pa", "stress spannung contrainte")
 TENSION = Quantity("tension", "force", "n", "tension")
 PRESSURE = Quantity("pressure", "pressure", "pa", "pressure druck pression")
+_STRETCHES = "stretch lambda λ streckung"
+STRETCH = Quantity("stretch", "ratio", "1", _STRETCHES, unitless=True)
+SECOND_STRETCH = Quantity("second_stretch", "ratio", "1", _STRETCHES, "second", unitless=True)
+LATERAL_STRETCH = Quantity("lateral_stretch", "ratio", "1", _STRETCHES, "lateral", unitless=True)
+SECOND_STRAIN = Quantity("second_strain", "ratio", "1", STRAIN.words, "second")
+LATERAL_STRAIN = Quantity("lateral_strain", "ratio", "1", STRAIN.words, "lateral")
+VOLUME_RATIO = Quantity("volume_ratio", "ratio", "1", "volumenverhältnis", unitless=True)
+SECOND_STRESS = Quantity("second_stress", "pressure", "pa", STRESS.words, "second")
+TRUE_STRESS = Quantity("true_stress", "pressure", "pa", STRESS.words, "deformed")
 KNOWN_QUANTITIES = (
     *(TIME, *DISPLACEMENTS, *FORCES, *TORQUES),
     *(DISPLACEMENT, FORCE, STRAIN, STRESS, TENSION, PRESSURE),
+    *(STRETCH, SECOND_STRETCH, LATERAL_STRETCH, SECOND_STRAIN, LATERAL_STRAIN),
+    *(VOLUME_RATIO, SECOND_STRESS, TRUE_STRESS),
 )
 
 # A column's name and its unit: Load (kN), Load [kN], Load / kN, Load in kN, load_kn.
@@ -83,6 +100,12 @@ _NAMED = re.compile(
 )
 # Strains and stresses of the deformed specimen, which neither its length nor its area multiplies.
 _DEFORMED = {"true", "wahre", "cauchy", "logarithmic"}
+# Words of a name by what they make of a quantity: it is another one with them.
+QUALIFIERS = {
+    "deformed": _DEFORMED,
+    "second": {"second", "zweite"},
+    "lateral": {"lateral", "transverse", "quer", "querdehnung"},
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +207,8 @@ def _column_named_by_user(grid: TextTable, quantity: Quantity, name: str) -> tup
             f"{', '.join(grid.columns)}{hint_at(name, grid.columns)}"
         )
     unit = name_and_unit(column)[1] or unit_of_user
+    if unit is None and quantity.unitless:
+        unit = quantity.unit
     if quantity in (STRAIN, STRESS) and _words(column) & _DEFORMED:
         raise grid.error_at(
             f"column {column} refers to the deformed specimen; expected engineering "
@@ -209,6 +234,8 @@ def find_column(grid: TextTable, quantity: Quantity) -> tuple[int, float] | None
         for k, column in enumerate(grid.columns)
         if _name_fits(column, quantity)
     }
+    if quantity.unitless:
+        units = {k: unit or quantity.unit for k, unit in units.items()}
     factors = {k: si_factor(unit, quantity.dimension) for k, unit in units.items() if unit}
     fitting = [(k, factor) for k, factor in factors.items() if factor is not None]
     if len(fitting) > 1:
@@ -226,8 +253,11 @@ def find_column(grid: TextTable, quantity: Quantity) -> tuple[int, float] | None
 def _name_fits(column: str, quantity: Quantity) -> bool:
     """Return whether the name of a column, without its unit, fits a quantity."""
     name, _ = name_and_unit(column)
-    called = _words(name) & set(quantity.words.split())
-    return name.lower() == quantity.key or bool(called and not _words(name) & _DEFORMED)
+    words = _words(name)
+    called = words & set(quantity.words.split())
+    qualifiers = {key for key, of_key in QUALIFIERS.items() if words & of_key}
+    own = {quantity.qualifier} if quantity.qualifier else set()
+    return name.lower() == quantity.key or bool(called and qualifiers == own)
 
 
 def name_and_unit(column: str) -> tuple[str, str | None]:
