@@ -470,12 +470,13 @@ class Prony:
 
 
 def as_branches(branches_or_names: Sequence[str | Prony]) -> tuple[Prony, ...]:
-    """Return Prony branches from their names, or the given branches.
+    """Return Prony branches from a sequence of names or branches; branches are returned as they
+    are.
 
     Raises
     ------
     InputError
-        For an invalid name, or a name that occurs twice.
+        For a string in place of a sequence, an invalid name, or a name that occurs twice.
     """
     if isinstance(branches_or_names, str):
         raise InputError(f"prony is {branches_or_names!r}; expected a sequence of names")

@@ -138,7 +138,14 @@ def write_tetrahedra(
     point_arrays: Mapping[str, np.ndarray] | None = None,
     cell_arrays: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Write a mesh, in metres, to any format that meshio knows by the file's extension."""
+    """Write a mesh, in metres, to any format that meshio knows by the file's extension; booleans
+    become integers.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
     import meshio  # slow to import
 
     point_data: dict[str, Any] = {n: _without_booleans(v) for n, v in (point_arrays or {}).items()}
@@ -281,9 +288,9 @@ def _nodes_of(data: MeshContent, masks: list[np.ndarray]) -> np.ndarray:
 
 
 def _of_tetrahedra(data: MeshContent, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the values on tetrahedra of arrays given block by block.
+    """Return the values (E, …) on tetrahedra of arrays given block by block, by name.
 
-    All-false masks are omitted.
+    Masks without a true value are omitted.
     """
     tetrahedra = [block.type in _TETRAHEDRA and len(block.data) > 0 for block in data.cells]
     selected = {}
@@ -300,7 +307,9 @@ def _of_tetrahedra(data: MeshContent, arrays: Mapping[str, Any]) -> dict[str, np
 
 
 def _triangle_sets(data: MeshContent, arrays: Mapping[str, Any]) -> Arrays:
-    """Return the corners of the triangles on which arrays given block by block are 1."""
+    """Return for each name the corners (k, 3) of the triangles on which an array given block by
+    block is 1. Arrays with other values than 0 and 1, or without a 1, are omitted.
+    """
     blocks = [k for k, block in enumerate(data.cells) if block.type in _TRIANGLES]
     sets = {}
     for name, per_block in arrays.items():
@@ -321,7 +330,9 @@ def _cell_counts(data: MeshContent) -> Counter[str]:
 
 
 def _listed(counts: Mapping[str, int]) -> str:
-    """Return the numbers of cells as text."""
+    """Return numbers of cells by type as text, such as "12 tetra, 3 line"; "no cells at all" if
+    empty.
+    """
     return ", ".join(f"{count} {name}" for name, count in counts.items()) or "no cells at all"
 
 

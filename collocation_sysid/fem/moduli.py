@@ -164,7 +164,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def engineering_constants(lambda_pa: Any, mu_pa: Any) -> tuple[Any, Any]:
-    """Return (E, ν) from (λ, μ), as numbers or expressions."""
+    """Return Young's modulus and Poisson's ratio (E, ν) from (λ, μ), as numbers or expressions."""
     return (
         mu_pa * (3 * lambda_pa + 2 * mu_pa) / (lambda_pa + mu_pa),
         lambda_pa / (2 * (lambda_pa + mu_pa)),
