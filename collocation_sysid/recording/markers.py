@@ -109,7 +109,14 @@ class Markers:
         self._check_places(m)
 
     def _check_places(self, m: int) -> None:
-        """Check the places of the m markers and store them with `located`."""
+        """Check the places of the m markers, and store them in place: without a placement
+        `places_m` (m, 3), NaN where unknown, and `located` (m,); `places_sigma_m` as an array (m,).
+
+        Raises
+        ------
+        InputError
+            If both places and a placement are given, or their number is not m.
+        """
         places_m = self.places_m
         placement = self.placement
         known = self.located
@@ -195,8 +202,8 @@ class Markers:
 
     @cached_property
     def first_samples(self) -> tuple[Array, Array]:
-        """First present sample of every marker (M, 3) [m], NaN if there is none, and its time (M,)
-        [s].
+        """Return the first present sample (M, 3) of every marker [m], NaN if there is none, and its
+        time (M,) [s].
         """
         rows = self.is_present.argmax(axis=0)
         return self.positions_m[rows, np.arange(len(self.names))], self.t_s[rows]

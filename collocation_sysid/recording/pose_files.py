@@ -90,8 +90,13 @@ def read_poses(
 def _checked_sequence(
     t_s: Array, positions_m: Array, quaternions: Array, row_names: list[str]
 ) -> PoseSequence:
-    """Return a pose sequence; a faulty pose raises an `InputError` that names its entry of
-    `row_names`.
+    """Return a pose sequence from times (T,) [s], positions (T, 3) [m] and quaternions (T, 4),
+    ordered x, y, z, w.
+
+    Raises
+    ------
+    InputError
+        If a pose is faulty; the message names its entry of `row_names` (T,).
     """
     if fault := first_pose_fault(t_s, positions_m, quaternions):
         raise InputError(fault[1], where=row_names[fault[0]])
@@ -192,7 +197,14 @@ def _quaternion_columns(grid: TextTable, order: str | None, columns: list[int]) 
 
 
 def _read_archive(path: str | Path) -> tuple[Array, Array]:
-    """Return `t_s` (T,) and `matrices` (T, 4, 4) of a NumPy archive, in the file's unit."""
+    """Return `t_s` (T,) [s] and `matrices` (T, 4, 4) of a NumPy archive, in the file's unit of
+    length.
+
+    Raises
+    ------
+    InputError
+        If the file is no such archive, or its arrays have other shapes.
+    """
     try:
         arrays = load_arrays(path)
     except InputError:
@@ -215,7 +227,21 @@ def _read_archive(path: str | Path) -> tuple[Array, Array]:
 def _from_matrices(
     t_s: Array, matrices: Array, length_unit: str | None, row_names: list[str]
 ) -> PoseSequence:
-    """Return the poses of matrices (T, 4, 4); `row_names` name the rows in messages."""
+    """Return the poses of matrices (T, 4, 4) at times (T,) [s].
+
+    Parameters
+    ----------
+    t_s, matrices : arrays
+    length_unit : str or None
+        Unit of the translations, a key of `METRES_PER_UNIT`; None for metres.
+    row_names : list of str
+        Name of each matrix, for messages.
+
+    Raises
+    ------
+    InputError
+        If a matrix is no rigid motion, or times do not increase.
+    """
     if fault := first_matrix_fault(t_s, matrices):
         raise InputError(fault[1], where=row_names[fault[0]])
     metres = METRES_PER_UNIT[length_unit or "m"]

@@ -51,7 +51,9 @@ def write_wrench_csv(path: str | Path, t_s: ArrayLike, values: ArrayLike) -> Non
 
 
 def write_columns_csv(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
-    """Write columns (T,) under their names, blank for NaN."""
+    """Write columns (T,) under their names, blank for NaN; the file is replaced only when it is
+    complete.
+    """
     _write_csv(path, [*columns], np.column_stack([np.asarray(each) for each in columns.values()]))
 
 
