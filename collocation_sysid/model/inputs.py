@@ -92,7 +92,7 @@ class Inputs:
         return np.broadcast_to(u, full_shape[:2]), np.broadcast_to(by_p, full_shape)
 
     def weighted_hessian(self, p: Array, weights: Array) -> Array:
-        """Return Σ_t weights[t] · ∂²u_t/∂p² (m, m) for weights (N, U)."""
+        """Return Σ_t weights[t] · ∂²u_t/∂p² (m, m) at parameters p (m,), for weights (N, U)."""
         hessian = np.zeros((self.parameter_count,) * 2)
         offset = 0
         for each, generated in zip(self.groups, self._functions, strict=True):

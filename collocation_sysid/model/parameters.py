@@ -341,9 +341,11 @@ class Parameters:
         return Parameters((*own_items, *contrasts, *modes))
 
     def only_fixed(self, values: Mapping[str, float]) -> Parameters:
-        """Return only the parameters with these names, fixed at these values.
+        """Return only the parameters with these names, fixed at these values; tied ones become
+        fixed.
 
-        Other parameters are omitted; see `with_fixed` to keep them.
+        Other parameters and names that do not exist are omitted; see `with_fixed` to keep the other
+        parameters.
         """
         selected = (item for item in self.items if item.name in values)
         return Parameters(
@@ -369,7 +371,8 @@ class Parameters:
         return frozenset(item.name for item in self.items if item.scale == "linear")
 
     def scale_and_bounds(self, name: str) -> tuple[bool, tuple[float, float]]:
-        """Return whether a parameter has a linear scale, and its (lower, upper) bounds.
+        """Return whether a parameter has a linear scale (else a logarithmic one), and its (lower,
+        upper) bounds.
 
         The bounds of a derived modulus, or of a fixed or tied parameter, are infinite.
         """
@@ -403,7 +406,9 @@ class Parameters:
         )
 
     def expressions(self, q: ca.SX) -> dict[str, ca.SX]:
-        """Return every parameter as an expression in q, by name."""
+        """Return every parameter, in SI units, as an expression in q (nq,), by name; fixed ones are
+        constants.
+        """
         by_name = {item.name: ca.SX(item.guess or 0.0) for item in self.items}
         for k, item in enumerate(self.free):
             by_name[item.name] = ca.exp(q[k]) if item.scale == "log" else q[k] * item.unit
@@ -413,7 +418,9 @@ class Parameters:
         return by_name
 
     def values(self, q: Sequence[float] | Array) -> dict[str, float]:
-        """Return the value of every parameter at q, by name."""
+        """Return the value of every parameter in SI units at q (nq,), by name; fixed and tied ones
+        are included.
+        """
         by_name = {item.name: float(item.guess or 0.0) for item in self.items}
         for item, coordinate in zip(self.free, q, strict=True):
             by_name[item.name] = item.from_coordinate(float(coordinate))
@@ -434,9 +441,11 @@ class Parameters:
         return self.values(self.guess_q)
 
     def prior_residuals(self, q: Array) -> tuple[Array, Array]:
-        """Return the residuals of the priors and their derivatives by q, (nq,) each.
+        """Return the residuals of the priors in standard deviations, and their derivatives by q,
+        (nq,) each.
 
-        Both are zero for parameters without a prior.
+        Both are zero for parameters without a prior. The residual of a parameter with a logarithmic
+        scale is that of its logarithm.
         """
         residuals = np.zeros(len(q))
         slopes = np.zeros(len(q))
@@ -583,7 +592,9 @@ class ThetaMap:
 
     @cached_property
     def _derived(self) -> tuple[tuple[str, ...], GeneratedFunction]:
-        """Names of the derived moduli, and their expression with derivatives."""
+        """Names of the derived moduli, see `_derived_moduli`, and the function from q to their
+        values.
+        """
         names = self.parameters.names
         body = self.body
         derived_names, _ = _derived_moduli(
