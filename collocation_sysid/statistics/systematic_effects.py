@@ -770,7 +770,7 @@ if TYPE_CHECKING:
     @dataclass(frozen=True, init=False)
     class Assumptions(_AssumptionsBase):
         """Standard deviations of all assumptions and nuisance parameters, one field per row
-        of `ASSUMPTIONS` and of `recording.nuisance.ROWS`.
+        of `ASSUMPTIONS` and of `recording.nuisance.KINDS`.
         """
 
         def __init__(
