@@ -68,8 +68,8 @@ class ExperimentIterate:
 
     @cached_property
     def histories(self) -> tuple[AnyHistory, ...]:
-        """History variables of the body and of forces at all evaluations, followed by
-        lifted contact pressures.
+        """History variables of the body and of forces at all evaluations, then given contact
+        pressures: lifted ones where they are variables, else computed from the positions.
         """
         dynamics = self.equations.dynamics
         pressed = dynamics.contact_with_pressures(self.x, self.lifted_pressures)

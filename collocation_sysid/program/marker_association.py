@@ -102,7 +102,8 @@ class MarkerAssociation:
 
     @classmethod
     def from_experiment(cls, experiment: Experiment) -> MarkerAssociation:
-        """Build the chart of the stated places of an experiment's markers and depth cameras.
+        """Return the association for the stated places of an experiment's markers and depth
+        cameras.
 
         Markers without a stated place get the place where their first sample lies on the undeformed
         body in its grasp; `Transcription.place_unknown_markers` replaces it before a solve.
@@ -133,7 +134,7 @@ class MarkerAssociation:
     def from_exact_places(
         cls, body: Body, placement: Placement, points_m: Array
     ) -> MarkerAssociation:
-        """Build the chart of places (M, 3) [m] that are not estimated."""
+        """Return the association for places (M, 3) [m] that are not estimated."""
         count = len(points_m)
         none = np.zeros(count, dtype=np.int64)
         return cls(
@@ -151,7 +152,7 @@ class MarkerAssociation:
         )
 
     def matches(self, experiment: Experiment) -> bool:
-        """Whether the chart belongs to the experiment's body, and has the same priors and
+        """Whether the association belongs to the experiment's body, and has the same priors and
         cameras.
         """
         return (
@@ -172,18 +173,27 @@ class MarkerAssociation:
         return self._coordinates(self.centre_places_m)
 
     def _coordinates(self, points_m: Array) -> Array:
-        """Return φ (M, k) of places (M, 3) [m]; zero for exact places."""
+        """Return the coordinates (M, k) of places (M, 3) [m], in prior standard deviations along
+        `axes`; zero for exact places.
+        """
         sigma = np.where(self.sigma_m > 0, self.sigma_m, np.inf)[:, None]
         return np.einsum("mik,mi->mk", self.axes, points_m - self.prior_places_m) / sigma
 
     def places_m(self, phi: Array) -> Array:
-        """Return the places (M, 3) on the undeformed body at φ (M, k) [m]."""
+        """Return the places (M, 3) on the undeformed body [m] for coordinates `phi` (M, k) in prior
+        standard deviations along `axes`.
+        """
         moved = np.einsum("mik,mk->mi", self.axes, phi - self.centre_coordinates)
         return self.centre_places_m + self.sigma_m[:, None] * moved
 
     def shape_functions(self, phi: Array) -> tuple[Index, ShapeFunctions]:
-        """Return the nodes (M, npe) of each marker's element and their shape functions at φ
-        (M, k).
+        """Return the nodes (M, npe) of each marker's element, and their shape functions at its
+        place with derivatives by the k coordinates of the place.
+
+        Parameters
+        ----------
+        phi : (M, k) array
+            Coordinates of the places, in prior standard deviations along `axes`.
         """
         element = self.body.element
         k = self.axes.shape[2]
@@ -214,9 +224,9 @@ class MarkerAssociation:
     # Following the estimates ------------------------------------------------------------------
 
     def centred_at(self, points_m: Array) -> MarkerAssociation:
-        """Return the chart with its centre at places (M, 3) [m]; with `surface_gaps_and_pressures`
-        at the
-        nearest points of the surface.
+        """Return the association with its centre at places (M, 3) [m] of the estimated markers:
+        their elements, and the axes along which the places may move. With `on_surface` the centres
+        are the nearest points of the surface.
         """
         points = points_m.copy()
         cells = self.cells.copy()
@@ -259,8 +269,8 @@ class MarkerAssociation:
         return chart, chart.centre_coordinates
 
     def _without_alternation(self, points_m: Array) -> MarkerAssociation:
-        """Return the chart about places (M, 3) such that none alternates between two faces for
-        ever.
+        """Return the association about places (M, 3) [m] such that none alternates between two
+        faces for ever.
 
         Where a marker stands off an edge, the plane of each face may lead back to the other. Such a
         place stays in one of the planes, even outside the surface.
@@ -295,8 +305,8 @@ class MarkerAssociation:
         )
 
     def _is_outside(self, point: Array, cell: int) -> bool:
-        """Whether another element contains a place better than element `cell`, by more than
-        `BETTER`; false for NaN.
+        """Whether another element contains a point (3,) of the undeformed body better than the
+        element with index `cell`, by more than `BETTER`; false for NaN.
         """
         if not np.isfinite(point).all():
             return False

@@ -58,7 +58,7 @@ class MotionJacobian:
 
     @cached_property
     def _skew(self) -> BlockBand:
-        """Structure of `structure` for adding the skew parts of ∂F/∂x and ∂F/∂v."""
+        """Plan that adds the skew parts of ∂F/∂x and ∂F/∂v to the values of `structure`."""
         has_skew_damping = self.dynamics.forces.has_skew_damping
         return skew_block_band(
             self.pattern.size, self._row_starts, self._blocks(), by_velocity=has_skew_damping
@@ -115,8 +115,8 @@ class MotionJacobian:
 
     @cached_property
     def _constant_positions(self) -> tuple[Index, Index]:
-        """Positions of the inertia entries, and of the unit entries of grasp rows, in the
-        values.
+        """Positions in the values of `structure` of the inertia entries, and of the unit entries of
+        grasp rows.
         """
         place = np.searchsorted(self.constrained_dofs, self.free_dofs)
         positions = [np.zeros(0, dtype=np.int64)]

@@ -241,8 +241,8 @@ class SurfaceCorrespondences:
         return np.minimum(distances_m, initial_gate_m(self.body.nodes_m))
 
     def next_gate_m(self, shapes_m: Array, phi: Array) -> float:
-        """Return a narrower gate if the points are near enough to the surface [m], else the
-        present gate.
+        """Return the gate for the next search [m]: narrower if the points are near enough to the
+        surfaces (S, n, 3), else the present one.
         """
         gate_m = max(self._expected_distance_m(shapes_m, phi), self.camera.depth.gate_m)
         return gate_m if gate_m <= NARROWER * self.gate_m else self.gate_m

@@ -114,8 +114,8 @@ class WrenchResidual(MeasurementResidual):
         return min(2 if self.observable.reaction_grid.is_static else NEIGHBOURS, known)
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
-        """Return the stencil of all samples: the grid times around each, and their
-        distances from it.
+        """Return the stencil of all samples: the grid times around each, among the first `known`,
+        shifted by the clock of φ, and their distances from it.
         """
         clock = self.observable.parameter_indices(SENSOR_TIME)
         used = self._neighbour_count(known)
@@ -133,8 +133,16 @@ class WrenchResidual(MeasurementResidual):
         )
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the prediction (6,) from wrenches at neighbouring grid times, the shift of
-        the clock and the tare.
+        """Return the prediction (6,).
+
+        Parameters
+        ----------
+        values : (3, 2 · times) SX
+            Wrenches at neighbouring grid times [N, N m].
+        phi : SX
+            Shift of the clock, if estimated, and tare, in prior standard deviations.
+        data : (times,) SX
+            Distances of these times from the sample [s].
         """
         times = data.numel()
         tared = np.flatnonzero(self.wrench.measured_components)
@@ -175,8 +183,8 @@ class WrenchResidual(MeasurementResidual):
 
 
 def _is_covered(observable: GraspWrench, t_s: Array, known: int) -> NDArray[np.bool_]:
-    """Return the mask (S,) of the samples within the first `known` grid times for any shift
-    of the clock.
+    """Return the mask (S,) of the samples at times (S,) that lie within the first `known` grid
+    times for any admissible shift of the clock; all false if none are known.
     """
     if not known:
         return np.zeros(len(t_s), dtype=bool)
