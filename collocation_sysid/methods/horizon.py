@@ -256,13 +256,17 @@ class Horizon:
         return results, failures[0] if failures else None
 
     def extrapolate(self, iterate: Iterate, step: Array) -> list[Any]:
-        """Return the positions, stored by the workers, after a step (np,) of the parameters."""
+        """Return the positions of each experiment, stored by the workers, after the feasibility
+        step of the iterate and a step (np,) of the parameters, to first order.
+        """
         return self.workers.map_experiments(
             extrapolate, self.segments, iterate.trajectories, self._by_experiment(step)
         )
 
     def fit_summaries(self, p: Array, trajectories: Sequence[Any]) -> list[FitSummary]:
-        """Return the fit of trajectories x at parameters p, without a sweep."""
+        """Return the fit of trajectories, as the workers store them, at parameters p (np,), without
+        a sweep; one summary for each experiment.
+        """
         summaries = self.workers.map_experiments(
             fit_summary, self.segments, self._by_experiment(p), trajectories
         )

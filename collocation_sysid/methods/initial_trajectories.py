@@ -51,8 +51,8 @@ def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
     """Return variables z (variables,) at the guess, and notes for the user.
 
     Each experiment is simulated at the guess with the collocation scheme. If that fails, the
-    initial shape is moved rigidly with the grasp and a note is added: collocation needs no feasible
-    start.
+    initial shape is moved rigidly with the grasp instead and a note is added, because collocation
+    needs no feasible start.
     """
     p = collocation.guess_p
     positions = []

@@ -83,7 +83,7 @@ def with_curvature(fit: SquareRootInformation, curvature: Array) -> SquareRootIn
 
 
 def require_second_derivatives(collocation: Collocation) -> None:
-    """Raise `InputError` if the problem has no exact second derivatives.
+    """Check that the problem has exact second derivatives.
 
     Raises
     ------
@@ -137,8 +137,8 @@ def exact_curvature(
 
 
 def _tangent_direction(collocation: Collocation, iterate: Iterate, k: int) -> Array:
-    """Return the change of all variables per unit of parameter k (an index), along the
-    equations of motion.
+    """Return the change (variables,) of all variables per unit of the parameter with index k, along
+    the equations of motion; other parameters do not change.
     """
     unit = np.eye(len(iterate.p))[k]
     position_changes = [

@@ -197,6 +197,8 @@ def _run(
 def _run_on_thread(search: Callable[[], None], monitor: IterationMonitor) -> None:
     """Run a search on a thread, so that the main thread can handle signals during long
     factorisations.
+
+    After a request to stop, the search is abandoned if it does not end within `GRACE_S`.
     """
     thread = threading.Thread(target=copy_context().run, args=(search,), daemon=True)
     with _interruptible(monitor):

@@ -281,8 +281,8 @@ def reassociate(
 
 
 def extrapolate(transcription: Transcription, sweep_result: SweepResult, step: Array) -> Array:
-    """Return positions (rows, 3n) [m] after the feasibility step and a step (k,) of the
-    parameters.
+    """Return positions (rows, 3n) [m] after the feasibility step of a sweep and a step (k,) of the
+    experiment's parameters, to first order.
     """
     return (
         sweep_result.x
@@ -328,8 +328,8 @@ def simulate_rows(
 
 
 def fit_summary(transcription: Transcription, p: Array, x: Array) -> FitSummary:
-    """Return the fit of positions x (rows, 3n) [m] at parameters p, with residuals computed
-    from them.
+    """Return the fit of positions x (rows, 3n) [m] at the experiment's parameters p (k,), with
+    residuals of the equations of motion evaluated at x.
     """
     part = _iterate(transcription, p, x)
     return FitSummary.from_iterate(part, x, float(np.abs(part.residual_n).max()))

@@ -199,7 +199,9 @@ class _QuadraticModel:
             return self._step(damping)
 
     def _step(self, damping: float) -> Array | None:
-        """Return the damped step, see `step`."""
+        """Return the step (variables,) of the model with `damping` added to the diagonal of the
+        positions; None if the matrix is not positive definite.
+        """
         positions = self._positions
         border = self.problem.parameter_indices
         band = self._band.copy("F")
@@ -224,9 +226,15 @@ class _QuadraticModel:
         return step
 
     def _bounded_step(self, schur: Array, slope: Array) -> Array | None:
-        """Minimise ½ dᵀ S d + sᵀ d over the parameters' steps d within bounds and reach.
+        """Return the steps d of the parameters that minimise ½ dᵀ S d + sᵀ d within bounds and
+        reach; None if S is not positive definite.
 
-        Return None if S is not positive definite.
+        Parameters
+        ----------
+        schur : (parameters, parameters) array
+            S.
+        slope : (parameters,) array
+            s.
         """
         try:
             factor = cholesky(schur, lower=True)
