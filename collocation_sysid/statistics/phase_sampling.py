@@ -226,7 +226,9 @@ def initial_phases(
 
 
 def _class_threshold(values: Array, weights: Array) -> float:
-    """Return the threshold between two classes with the least weighted variance within (Otsu)."""
+    """Return the threshold between two classes of values (E,) with the least weighted variance
+    within (Otsu); the upper class includes it.
+    """
     order = np.argsort(values)
     sorted_values = values[order]
     weight = np.cumsum(weights[order])

@@ -138,14 +138,18 @@ class SolvedFit:
     changes: ResidualChanges
 
     def uncertainty_of_refit(self, fit: LinearisedFit, p: Array) -> Uncertainty:
-        """Return estimates and error bars of another fit at its parameters p (p,)."""
+        """Return estimates and error bars of another fit at its parameters p (p,), with the error
+        model of this one.
+        """
         q = p[: fit.shared_count]
         constants = (segment.constants for segment in self.collocation.transcriptions)
         fit = replace(fit, derived=DerivedModuli.from_bodies(constants, q))
         return uncertainty_from_fit(fit, self.collocation.parameters, q, self.error_model)
 
     def changes_of_estimates(self, uncertainty: Uncertainty) -> dict[str, EstimateChange]:
-        """Return the changes of the estimates that a refit determines, by name."""
+        """Return the changes of the estimates that a refit determines precisely, from those of the
+        joint fit, by name.
+        """
         changes = {}
         for name, each in {**uncertainty.estimates, **uncertainty.derived}.items():
             error = each.statistical_std_error
@@ -167,7 +171,9 @@ class SolvedFit:
 
 
 def _share_of_interval(change: float, interval: tuple[float, float] | None) -> float | None:
-    """Return a change over the half width of an interval; None without one."""
+    """Return a change over the half width of an interval, with its sign; None without an
+    interval.
+    """
     return None if interval is None else 2 * change / max(interval[1] - interval[0], 1e-300)
 
 
