@@ -184,7 +184,10 @@ def _read_with_meshio(path: str | Path) -> Iterator[MeshContent]:
 
 @contextlib.contextmanager
 def _as_input_error(path: str | Path, done: str) -> Iterator[None]:
-    """Context that turns any failure on an invalid file into one `InputError`, and prints nothing.
+    """Context that turns a failure on an invalid file into one `InputError` with the path, and
+    prints nothing.
+
+    An `OSError` while writing is raised unchanged.
 
     Parameters
     ----------

@@ -150,7 +150,13 @@ def _is_small_and_safe(path: Path) -> bool:
 
 
 def _read_in_process(path: str | Path) -> MeshContent:
-    """Return the content of a file read in this process."""
+    """Return the content of a file read in this process; nothing is printed.
+
+    Raises
+    ------
+    InputError
+        With the reason, if meshio cannot read the file.
+    """
     import meshio  # slow to import
 
     captured = io.StringIO()

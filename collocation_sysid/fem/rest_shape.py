@@ -532,8 +532,13 @@ class InverseEquilibrium:
     # Newton's method ------------------------------------------------------------------------
 
     def _solve(self, theta: Array) -> RestShape:
-        """Return the stress-free shape at θ with derivatives, from the latest solution or from the
-        mesh.
+        """Return the stress-free shape at θ (k,) with derivatives, from the latest solution or, if
+        that fails, from the mesh.
+
+        Raises
+        ------
+        RestShapeError
+            If there is none near the mesh.
         """
         weight = self._weight_n(theta)
         start = self._predict(theta)

@@ -87,7 +87,9 @@ class EliminatedDofs:
 
     @classmethod
     def from_segment(cls, transcription: Transcription, complete: Collocation) -> EliminatedDofs:
-        """Return the dofs that are prescribed by constraints."""
+        """Return the grasped dofs of an experiment whose positions follow from φ: those that
+        constraints of the `complete` program prescribe.
+        """
         rows = np.flatnonzero(transcription.is_grasp_constraint)
         time, place = np.divmod(rows, transcription.constraints_per_time)
         dofs = (

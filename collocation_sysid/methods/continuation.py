@@ -151,7 +151,8 @@ class _ContinuationState:
 
     def solve(self, share: float) -> bool:
         """Solve the first share of the samples, starting from the last solution, and store the
-        result; return whether to continue with a larger share.
+        result; return whether to continue with a larger share: unless the solve was interrupted or
+        refused.
         """
         recorder = self.recorder
         part = recorder.collocation if share == 1 else first_share(recorder.collocation, share)

@@ -221,7 +221,9 @@ class ReducedSearch:
             return None
 
     def _solve_horizons(self) -> Status:
-        """Solve one horizon after the other, and return the last status."""
+        """Solve one horizon after the other, up to the complete problem or a limit of iterations,
+        and return the last status.
+        """
         status = Status.CONVERGED
         for share in self.options.ladder:
             last = share == self.options.ladder[-1]

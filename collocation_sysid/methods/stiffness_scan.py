@@ -240,7 +240,11 @@ def scan_stiffness(
 
 
 def _other_starts(misfit: Array, best: int) -> tuple[int, ...]:
-    """Return indices of the next best starts, see `Scan.others`.
+    """Return the indices of moduli other than the best that may lead to a better solution, in
+    ascending order of the misfit.
+
+    They are the neighbours of the best and other minima of the misfit, unless their misfit is much
+    larger; at most `MORE_STARTS`.
 
     Parameters
     ----------
@@ -518,9 +522,10 @@ class _ScanState:
         self.is_ended_early = False
 
     def try_sequence(self, young_pa: Sequence[float]) -> None:
-        """Try Young's moduli in the given order [Pa] until several in a row fail or fit badly.
+        """Try Young's moduli in the given order [Pa] until several in a row fail or fit badly; then
+        `is_ended_early` is set.
 
-        Moduli that give the same parameters are tried once.
+        Of neighbours that give the same parameters only one is tried.
         """
         failures = 0
         first, *others = ([*same] for _, same in groupby(young_pa, self.trial.parameter_key))

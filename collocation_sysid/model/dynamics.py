@@ -122,6 +122,8 @@ class Dynamics:
     ) -> Dynamics:
         """Discretise an experiment in time.
 
+        The constants of the body are NaN until `with_theta` or `with_inputs` sets them.
+
         Parameters
         ----------
         experiment : Experiment

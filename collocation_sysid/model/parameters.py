@@ -316,8 +316,8 @@ class Parameters:
     def with_fields(self, bodies: Iterable[Body]) -> Parameters:
         """Return these parameters with those of the bodies' fields that are not stated yet.
 
-        The coefficients and contrasts of fields are added. A stated contrast without a prior gets
-        the prior of its field.
+        The coefficients and contrasts of fields are added. A stated contrast that is neither fixed
+        nor has a prior gets the prior of its field.
         """
         bodies = tuple(bodies)
         names = dict.fromkeys(name for body in bodies for name in body.field_coefficient_names)
@@ -457,7 +457,8 @@ class Parameters:
         return residuals, slopes
 
     def with_guess(self, values: Mapping[str, float]) -> Parameters:
-        """Return these parameters with other guesses; for a fixed parameter with another value.
+        """Return these parameters with other guesses; for a fixed parameter with another value. The
+        guess of a tied parameter has no effect.
 
         Raises
         ------
@@ -474,7 +475,8 @@ class Parameters:
         )
 
     def with_fixed(self, values: Mapping[str, float]) -> Parameters:
-        """Return these parameters with some of them fixed at given values.
+        """Return these parameters with some of them fixed at given values; a fixed one loses its
+        prior, its bounds and its tie to another.
 
         Names that do not exist are ignored.
         """

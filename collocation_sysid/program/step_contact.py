@@ -89,12 +89,13 @@ class ContactCandidates:
         )
 
     def inputs(self, contact: Contact, xi: Array, nu: Array, theta: Array) -> tuple[Array, Array]:
-        """Return the inputs and the data of the contact law's generated force.
+        """Return the inputs (k, i) and the data (d, i) of the law's `point_force_function` at the i
+        candidates.
 
         Parameters
         ----------
         contact : Contact
-            Contact force with this law.
+            Contact force with this law, which provides the data of the points.
         xi, nu : (3n,) arrays
             State [m] and velocity [m/s].
         theta : (k,) array

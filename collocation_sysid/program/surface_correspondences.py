@@ -281,12 +281,28 @@ def _match_image(
 ) -> dict[str, NDArray]:
     """Find the correspondences of one image.
 
+    Parameters
+    ----------
+    camera : DepthCameraModel
+    surface : VisibleSurface
+    body : Body
+    sample : int
+        Index of the image.
+    x : (n, 3) array
+        Positions of the surface's nodes at the image [m].
+    phi : (k,) array
+        Nuisance parameters.
+    gate_m : float
+        Largest distance of a point from the surface [m].
+    settled : bool
+        Whether the search has nearly converged, so that points hidden behind other parts of the
+        body are left out.
+
     Returns
     -------
     dict of arrays
         Arrays of the points within the gate, by attribute name of `SurfaceCorrespondences`; and
-        "reasons", the
-        numbers of points left out in the order of `EXCLUSION_REASONS`.
+        "reasons", the numbers of points left out in the order of `EXCLUSION_REASONS`.
     """
     depth = camera.depth
     cloud = camera.depth.clouds[sample]

@@ -574,7 +574,7 @@ class Experiment:
 
     def _append_obstacle_frames(self, node_count: int) -> None:
         """Append positions and velocities of the obstacles' frames to a given start state without
-        them.
+        them, in place; a state that has them is unchanged.
 
         Parameters
         ----------

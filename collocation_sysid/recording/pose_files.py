@@ -114,8 +114,8 @@ def _read_columns(grid: TextTable, places: Iterable[int]) -> Array:
 
 
 def _with_column_names(table: TextTable) -> TextTable:
-    """Name the columns of a table with eight columns whose first row is numbers; others are
-    unchanged.
+    """Return a table with eight columns whose names are numbers with the usual names of poses, and
+    the numbers as its first row; other tables unchanged.
     """
     if len(table.columns) != 8 or not all(map(is_number, table.columns)):
         return table
@@ -172,6 +172,12 @@ def _quaternion_columns(grid: TextTable, order: str | None, columns: list[int]) 
         Stated order of the columns; needed if the columns are numbered.
     columns : list of int
         Columns that hold neither time nor position.
+
+    Raises
+    ------
+    InputError
+        If the columns are neither named nor numbered as those of a quaternion, the order is needed
+        and missing, or the names contradict it.
     """
     place = {grid.columns[k]: k for k in columns}
     if sorted(place) == ["qw", "qx", "qy", "qz"]:

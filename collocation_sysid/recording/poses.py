@@ -307,7 +307,8 @@ def jump_intervals(t_s: Array, values: Array) -> Index:
     """Return the indices of the intervals in which values (m, k) jump; interval i begins at sample
     i.
 
-    A jump is a change that is more than 10 times as fast as those just before and just after.
+    A jump is a change that is more than 10 times as fast as those just before and just after, and
+    not small compared with the range of the values. The first and the last interval are not tested.
     """
     change = np.linalg.norm(np.diff(values, axis=0), axis=1)
     rate = change / np.diff(t_s)

@@ -64,6 +64,8 @@ def combine(
 ) -> CombinedEstimate:
     """Correct an estimate and combine the contributions to its uncertainty.
 
+    An estimate at a bound is not corrected and has no uncertainty.
+
     Parameters
     ----------
     name : str

@@ -361,12 +361,12 @@ def field_estimates_at(collocation: Collocation, z: Array) -> dict[str, FieldEst
 def mean_logarithm(
     body: Body, parameters: Parameters, q: Array, *, part_index: int, names: Sequence[str]
 ) -> tuple[float, Array]:
-    """Return the logarithm of the mean of a part's field, and its derivatives by some parameters.
+    """Return the logarithm of the mean of a part's field, and its derivatives by some parameters;
+    for a density the ratio to the stated density in place of the logarithm.
 
     Parameters
     ----------
     body : Body
-        The body.
     parameters : Parameters
         Shared parameters.
     q : (nq,) array

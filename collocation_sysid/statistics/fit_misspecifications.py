@@ -98,7 +98,16 @@ def _refit_hypotheses(
     solution: Solution, experiment: Experiment, budget: int | None
 ) -> list[Hypothesis]:
     """Return the hypotheses whose correction lets the first samples of an experiment fit far
-    better, by refits with at most `budget` sweeps (None for no limit).
+    better; empty if these cannot be fitted.
+
+    Parameters
+    ----------
+    solution : Solution
+        The fit; refits begin at the guess of its problem.
+    experiment : Experiment
+    budget : int or None
+        Largest number of sweeps for all refits together; None for the default, see
+        `find_misspecifications`.
     """
     first = first_samples(experiment, MOST_SAMPLES)
     alone = _Refitter(solution, first, budget)

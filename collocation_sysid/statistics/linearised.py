@@ -389,7 +389,7 @@ class Information:
 
 
 def factorise_information(fit: LinearisedFit) -> Information:
-    """Factorise the information of a fit."""
+    """Return the information of residuals and priors of a fit about all parameters, factorised."""
     all_rows = least_squares_of_fit(fit)
     slopes = tuple(block.channels[1] @ all_rows.root for block in fit.blocks)
     prior = all_rows.root * fit.prior_jacobian[:, None]

@@ -508,8 +508,8 @@ def marker_places(
 
 
 def _std_errors_m(iterate: ExperimentIterate, uncertainty: Uncertainty | None) -> Array | None:
-    """Return the standard errors (M, 3) of the markers' coordinates [m], or None without
-    `uncertainty`.
+    """Return the standard errors (M, 3) of the coordinates of an experiment's marker places [m],
+    zero for exact places; None without `uncertainty`.
     """
     if uncertainty is None:
         return None

@@ -376,8 +376,10 @@ class _LineSearch:
         return self.function.value(self.x + step * self.direction)
 
     def search(self, step: float) -> _LineTrial | None:
-        """Return a trial that satisfies the Wolfe conditions (L0 … L3), starting at a step size;
-        None if none is found within the allowed number of trials.
+        """Return a trial that satisfies the Wolfe conditions (L0 … L3), starting at a step size.
+
+        None if the allowed number of trials does not contain one, or no number lies between the
+        ends of the interval.
         """
         try:
             a, b = self._bracket(step)

@@ -323,7 +323,9 @@ class _QuadraticModel:
 
 
 def _narrow_order(square: sp.coo_array) -> Index:
-    """Return an order of the positions that makes the band narrow."""
+    """Return an order (n,) of the positions that makes the band of a symmetric matrix narrower; the
+    identity if none is found.
+    """
     order = reverse_cuthill_mckee(sp.csr_array(square), symmetric_mode=True).astype(np.int64)
     place = np.empty_like(order)
     place[order] = np.arange(len(order))

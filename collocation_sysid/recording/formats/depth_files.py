@@ -354,7 +354,13 @@ def _with_normals(points: Array, columns: Mapping[str, Array]) -> Array:
 
 
 def _read_pcd(path: Path) -> Array:
-    """Read the points (P, 3) or (P, 6) of a PCD file, ascii or binary."""
+    """Read the points (P, 3) or (P, 6) of a PCD file, ascii or binary.
+
+    Raises
+    ------
+    InputError
+        If the file has no header, is compressed, or lacks a coordinate.
+    """
     raw = path.read_bytes()
     head = dict[str, list[str]]()
     begins = 0

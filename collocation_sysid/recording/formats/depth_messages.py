@@ -205,6 +205,11 @@ def _unpadded_rows(message: Any, step: int, size: int) -> Any:
         Bytes from row to row.
     size : int
         Bytes of a pixel or point.
+
+    Raises
+    ------
+    InputError
+        If the message has another number of bytes, or its rows are too short.
     """
     data = np.frombuffer(_message_data(message), "u1")
     height = message.height
