@@ -115,7 +115,7 @@ class Body(Discretisation):
         Name in `materials.MATERIALS`, or energy function ``(F, **constants) -> ψ`` in CasADi SX,
         see `Material.from_energy`.
     density_kg_m3 : float, optional
-        Density of all regions without a density. Give either this or `total_node_mass_kg`.
+        Density of all regions without a density. Give either this or `mass_kg`.
     element : str, default "tet4"
         Name in `elements.ELEMENTS`. "tet10" adds a node on every edge of the mesh: about eight
         times as many unknowns, and much more accurate in bending. "tet10-p0" also averages the
@@ -161,7 +161,7 @@ class Body(Discretisation):
     pattern : SymmetricPattern
         Sparsity pattern of K.
     has_declared_mass : bool
-        Whether `total_node_mass_kg` was given.
+        Whether `mass_kg` was given.
 
     Raises
     ------

@@ -291,7 +291,7 @@ class QuadraturePoint:
     stretches : tuple of SX
         If the element averages the dilatation: the logarithm m of the stretch that does so and,
         with v, its derivative along v, and with w, those of both along w; see
-        `averages_dilatation`.
+        `mean_dilatation`.
     point_data : SX
         Internal variables of the point, see `memory`; with a field, its logarithm comes last.
     scaled_indices : tuple of int

@@ -13,8 +13,7 @@ function theorem, with the residual r, ∂X/∂θ = −(∂r/∂X)⁻¹ ∂r/∂
 The kernels keep Y as the reference configuration of the computation. With G = ∂X/∂Y at a quadrature
 point, the deformation gradient of the material is F = (∂x/∂Y) G⁻¹ and the volume of the point V det
 G, see `RestPointLayout`. G and its derivatives by θ are data of the points, so that forces and all
-their
-derivatives are those of the complete model in every method.
+their derivatives are those of the complete model in every method.
 """
 
 from __future__ import annotations
@@ -336,7 +335,7 @@ class InverseEquilibrium:
     Parameters
     ----------
     body : Body
-        Body with a `scan_stiffness`. (`body` imports this module, hence no annotation.)
+        Body with `scan_conditions`. (`body` imports this module, hence no annotation.)
 
     Attributes
     ----------

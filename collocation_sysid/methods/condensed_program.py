@@ -323,7 +323,8 @@ class CondensedCollocation(Collocation):
         return variables
 
     def complete_multipliers(self, z: Array, loss_weight: float, multipliers: Array) -> Array:
-        """Return the multipliers of all constraints of the complete program.
+        """Return the multipliers of all constraints of the complete program; those of eliminated
+        constraints make the Lagrangian stationary in the eliminated positions.
 
         Parameters
         ----------
@@ -401,7 +402,8 @@ class CondensedCollocation(Collocation):
         return self._jacobian.structure
 
     def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
-        """Return g and the values of ∂g/∂z from one evaluation of the elements.
+        """Return the constraints g (constraints,) and the values of ∂g/∂z, including the dependence
+        through the eliminated positions, from one evaluation of the elements.
 
         Parameters
         ----------

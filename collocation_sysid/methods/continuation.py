@@ -108,7 +108,8 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
     experiment : Experiment
         Experiment.
     count : int
-        Number of samples; it is increased to the first sample with a marker, or with a depth image.
+        Number of samples; it is increased to three, and to the first sample with a marker or with a
+        depth image.
     """
     markers = experiment.markers
     stop = min(len(experiment.t_s), max(count, markers.first_visible_sample + 1, 3))

@@ -141,7 +141,7 @@ class DaskExecutor:
 
         Raises
         ------
-        Ended
+        SearchEnded
             If the scheduler or all workers are lost, or an experiment terminates every worker that
             processes it.
         """

@@ -91,7 +91,7 @@ class Horizon:
     """The problem on the first rows of every experiment.
 
     Arguments named `x` are lists with one entry per experiment, stored by the workers, of any kind
-    that `trajectory.trajectory_positions` accepts.
+    that `trajectory_sweeps.trajectory_positions` accepts.
 
     Parameters
     ----------
@@ -186,14 +186,15 @@ class Horizon:
 
     @one_blas_thread()
     def _run(self, p: Array, run: Callable[..., SweepResult], *columns: Sequence[Any]) -> Iterate:
-        """Run a function of `trajectory` for every experiment and join the results to an iterate.
+        """Run a function of `trajectory_sweeps` for every experiment, and return the iterate of the
+        joined results.
 
         Parameters
         ----------
         p : (np,) array
             All parameters (q, φ).
         run : callable
-            Function of (solver, segment, huber, p of the experiment, entries of the columns).
+            Function of (solver, transcription, huber, p of the experiment, entries of the columns).
         columns : sequence
             Further arguments, one entry per experiment each.
         """
@@ -239,7 +240,7 @@ class Horizon:
 
         Returns
         -------
-        tuple of list of Reached and SimulationError or None
+        tuple of list of SimulationResult and SimulationError or None
             Trajectories, stored by the workers, and the first failure; None if all are complete.
         """
         known = trajectories or self._repeat(None)

@@ -25,7 +25,10 @@ LARGEST_SHARE = 0.9
 
 
 def secant_update(curvature: Array, previous: Iterate, after: Iterate) -> Array:
-    """Return B (np, np) after an accepted step, by the update of Dennis, Gay and Welsch.
+    """Return B (np, np) after an accepted step, by the update of Dennis, Gay and Welsch; B itself
+    if the score does not increase along the step.
+
+    B is what Gauss–Newton neglects of the Hessian.
 
     Parameters
     ----------

@@ -53,7 +53,7 @@ FEWEST = 8
 
 
 def samples_in_share(count: int, share: float) -> int:
-    """Return the number of samples in a share of `count` samples, at least `FEWEST_SAMPLES` if
+    """Return the number of samples in a share of `count` samples, at least `FEWEST` if
     there are as many.
     """
     return min(count, max(FEWEST, round(share * count)))

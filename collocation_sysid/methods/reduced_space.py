@@ -19,7 +19,7 @@ quarter, half and all of the recording) extend the convergence to cases where on
 simulated at the guess. If even one horizon cannot be simulated completely, its first rows are
 solved before the others.
 
-Use it by default: it needs the least memory and time. Its search is in `minimise`.
+Use it by default: it needs the least memory and time. Its search is in `reduced_search`.
 """
 
 from __future__ import annotations

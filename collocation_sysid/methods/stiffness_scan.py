@@ -539,7 +539,8 @@ class _ScanState:
                 return
 
     def extend_range(self, young_pa: float, factor: float) -> None:
-        """Try moduli beyond an end of the range, as long as the misfit decreases.
+        """Try moduli beyond an end of the range, as long as the misfit decreases, within
+        `LIMITS_PA`; their misfits are stored.
 
         Parameters
         ----------

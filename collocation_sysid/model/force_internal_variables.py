@@ -1,6 +1,6 @@
 """Internal variables of one force along a motion, with derivatives forward and backward in time.
 
-See `custom_force_terms` for the law of a force with internal variables h. At evaluation k, with the
+See `point_forces` for the law of a force with internal variables h. At evaluation k, with the
 previous variables b = h_{k−1}, columns of derivatives follow by the chain rule,
 
     dF_k ∋ ∂F/∂b db,   dh_k = ∂h/∂b db + ∂h/∂y dy_k + ∂h/∂ẏ dẏ_k + ∂h/∂c dc_k,

@@ -5,7 +5,7 @@ Derive a force from `ForceTerm`, or from `point_forces.Pointwise` if it acts poi
 pressure. A term is F(ξ, ν; u) at T times. Its inputs (see `inputs`) follow the constants θ of the
 body in u. Terms add their values and derivatives to shared arrays, on the sparsity pattern of all
 couplings and with one column for every input. The chain rule from inputs to parameters is applied
-in `setting`.
+in `equations_at_parameters`.
 """
 
 from __future__ import annotations

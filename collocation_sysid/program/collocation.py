@@ -124,13 +124,13 @@ class Collocation:
     has_grasp_constraints : bool, default False
         If true, prescribed displacements are constraints instead of bounds.
     huber : float, optional
-        Threshold of Huber's loss in standard deviations, see `ResidualExpression`; None means a
+        Threshold of Huber's loss in standard deviations, see `measurement_residual`; None means a
         quadratic
         loss.
     associations : mapping of experiment name to MarkerAssociation
         Elements, clock samples and correspondences of the measurements. Experiments that are
-        missing, or whose chart belongs to another body or other priors, get the chart of the stated
-        places.
+        missing, or whose association belongs to another body or other priors, get that of the
+        stated places.
     has_lifted_variables : bool, default False
         If true, keep history variables, measured wrenches and contact pressures as variables with
         constraints (lifted variables, see `lifted`), so that the exact matrices are sparse. If
@@ -385,7 +385,7 @@ class Collocation:
     def follow_estimates(
         self, p: Array, positions: Sequence[Array] = ()
     ) -> tuple[Collocation, Array]:
-        """Update the charts where the estimates p have left them.
+        """Update the associations where the estimates p have left them.
 
         Parameters
         ----------
@@ -398,7 +398,7 @@ class Collocation:
         Returns
         -------
         (Collocation, array)
-            The program with the new charts, which is self if no chart has changed, and p in it.
+            The program with the new associations, which is self if none has changed, and p in it.
         """
         rows = positions or [np.zeros((0, segment.dof_count)) for segment in self.transcriptions]
         pairs = zip(self.transcriptions, rows, strict=True)
@@ -428,7 +428,7 @@ class Collocation:
         Returns
         -------
         (Collocation, array)
-            The program with the new charts, which is self if everything is stated, and p in it.
+            The program with the new associations, which is self if all is stated, and p in it.
         """
         if not any(segment.rows_to_place for segment in self.transcriptions):
             return self, p
@@ -467,7 +467,7 @@ class Collocation:
 
     @property
     def guess_p(self) -> Array:
-        """Guess of p: that of q, and φ at the centres of the charts."""
+        """Guess of p: that of q, and φ at the centres of the associations."""
         return self._combine_parameters(
             self.parameters.guess_q, [s.guess_phi for s in self.transcriptions]
         )

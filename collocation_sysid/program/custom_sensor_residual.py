@@ -228,7 +228,7 @@ def custom_sensor_residuals(
         The experiment.
     t_s : (N,) array
         Times of the rows of x [s].
-    grid : Table
+    grid : ReactionGrid
         Times at which reaction forces are known.
     nuisance : NuisanceMap
         Nuisance parameters of the experiment.

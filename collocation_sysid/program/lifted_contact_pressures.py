@@ -5,8 +5,8 @@ For evaluations k with an equation of motion, in widths δ of the contact law,
     (b_k + g(ξ_k) − √((b_k − g(ξ_k))² + 4 r δ²)) / δ = 0,   variables b_k / δ,
 
 with the pressure variable b, the gap g and the relaxation r, see `model.contact`. The structure is
-that of a force history (`force_rows`), but b belongs to the evaluation itself instead of the one
-before. The variables are not negative.
+that of a force history (`lifted_force_histories`), but b belongs to the evaluation itself instead
+of the one before. The variables are not negative.
 """
 
 from __future__ import annotations

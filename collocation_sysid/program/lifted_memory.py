@@ -140,7 +140,7 @@ class LiftedMemory(LiftedVariables):
 
         Returns
         -------
-        (History, (N, width) array)
+        (MemoryHistory, (N, width) array)
             The history, and μ such that multipliers · r = −Σ μ_k (m_k − d_k m_{k−1} − a_k S_k).
         """
         return _body_history(iterate), self._history_weights(multipliers)

@@ -5,8 +5,8 @@
 
 see `wrench_observable`; without a low-pass Y is W. The loss is a function of Y, whose Hessian
 couples only the few grid times around a sample. R are the lifted reaction forces of
-`reaction_rows`. W and Y are scaled by their measurement uncertainty, so that the loss has similar
-curvature by them as by positions; their equations are scaled like other equations.
+`lifted_reactions`. W and Y are scaled by their measurement uncertainty, so that the loss has
+similar curvature by them as by positions; their equations are scaled like other equations.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class LiftedWrench(LiftedVariables):
 
     @cached_property
     def _row_unit(self) -> Array:
-        """Unit (6,) of the equations [N, N m], between `_unit_text` and that of R for good
+        """Unit (6,) of the equations [N, N m], between `_unit` and that of R for good
         conditioning.
         """
         return self._reaction_unit**0.75 * self._unit**0.25

@@ -3,11 +3,10 @@ clock.
 
 The place X of a marker on the undeformed body and the shift τ of its clock are estimated.
 Predictions are smooth functions of them within one element and around one sample; a
-`MarkerAssociation` states
-which. When estimates leave it, `MarkerAssociation.follow_estimates` returns another chart, and the
-problem stays the
-same up to the tolerances below. A chart also contains the surface correspondences of depth cameras,
-see `surface_correspondences`.
+`MarkerAssociation` states which. When estimates leave it, `MarkerAssociation.follow_estimates`
+returns another association, and the problem stays the same up to the tolerances below. An
+association also contains the surface correspondences of depth cameras, see
+`surface_correspondences`.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ class MarkerAssociation:
     cells : (M,) array
         Elements of estimated places.
     centre_places_m : (M, 3) array
-        Places at the centre of the chart [m].
+        Places at the centre of the association [m].
     axes : (M, 3, k) array
         Orthonormal directions in which places may move.
     crossed_edges : (M, 2, 3) array
@@ -169,7 +168,7 @@ class MarkerAssociation:
 
     @cached_property
     def centre_coordinates(self) -> Array:
-        """Coordinates φ (M, k) of the places at the centre of the chart."""
+        """Coordinates φ (M, k) of the places at the centre of the association."""
         return self._coordinates(self.centre_places_m)
 
     def _coordinates(self, points_m: Array) -> Array:
@@ -240,7 +239,7 @@ class MarkerAssociation:
         return replace(self, centre_places_m=points, cells=cells, axes=axes)
 
     def follow_estimates(self, phi: Array, shift_samples: float) -> tuple[MarkerAssociation, Array]:
-        """Return a chart for estimates that have left this one, and φ in it.
+        """Return an association for estimates that have left this one, and φ in it.
 
         Parameters
         ----------
@@ -251,8 +250,8 @@ class MarkerAssociation:
 
         Returns
         -------
-        (Chart, (M, k) array)
-            The new chart, which is self if nothing has left it, and φ in it.
+        (MarkerAssociation, (M, k) array)
+            The new association, which is self if nothing has left it, and φ in it.
         """
         points = self.places_m(phi)
         changed_cell = False

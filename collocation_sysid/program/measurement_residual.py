@@ -466,7 +466,7 @@ class MeasurementResidual(ABC):
         ----------
         values : (n, e, 3) array
             Values of the observable.
-        observable_derivatives : MemoryForwardColumns
+        observable_derivatives : ObservableDerivatives
             Their derivatives.
         phi : (k,) array
             Nuisance parameters; they are the last of all parameters.

@@ -100,7 +100,7 @@ def simulate_newmark(
         Positions at the samples [m].
     (T, 3n) array
         Velocities at the samples [m/s].
-    Forced
+    ReactionForces
         Reaction forces on the sensed dofs at all steps.
 
     Raises

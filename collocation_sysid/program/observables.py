@@ -2,11 +2,10 @@
 derivatives.
 
 An observable has values c (n, e, 3) at n of the grid times: positions of e points of the body
-(`PointPositions`, here), or force and torque of a grasp (`wrench_channel.GraspWrench`). `reading`
-turns
-them into residuals. An observable is `local` if it depends on few positions at each time; then it
-provides derivatives by these positions. Other observables can be lifted to variables of the
-program, see `lifted_variables`.
+(`PointPositions`, here), or force and torque of a grasp (`wrench_observable.GraspWrench`).
+`measurement_residual` turns them into residuals. An observable is `local` if it depends on few
+positions at each time; then it provides derivatives by these positions. Other observables can be
+lifted to variables of the program, see `lifted_variables`.
 """
 
 from __future__ import annotations
@@ -224,7 +223,7 @@ class PointPositions:
 
         Parameters
         ----------
-        motion : ModesCheck
+        motion : ObservedMotion
             The motion, with its changes `by` (R, 3e, c).
         phi : (k,) array
             Nuisance parameters.
@@ -276,7 +275,7 @@ class PointPositions:
 
         Parameters
         ----------
-        motion : ModesCheck
+        motion : ObservedMotion
             The motion, over all grid times.
         phi : (k,) array
             Nuisance parameters.

@@ -148,7 +148,7 @@ class Observation:
 
         Returns
         -------
-        list of Motion
+        list of ObservedMotion
             One entry per measurement.
         """
 

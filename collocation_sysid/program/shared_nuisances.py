@@ -1,4 +1,4 @@
-"""Nuisance parameters shared by several experiments: one entry of p, one prior, one chart.
+"""Nuisance parameters shared by several experiments: one entry of p, one prior, one association.
 
 Experiments share those nuisance parameters whose `scope` is the same word in both, and whose label
 is the same: the place of a marker by its name, the pose of the cameras or of the clamp by its axis.

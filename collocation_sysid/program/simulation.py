@@ -65,7 +65,7 @@ class Trajectory:
         Node velocities [m/s]; zero in a static experiment.
     markers_m : (T, M, 3) array
         Markers [m].
-    reactions : (Table, ReactionForces)
+    reactions : (ReactionGrid, ReactionForces)
         Reaction forces on the dofs of instrumented grasps, and their times.
     wrenches : tuple of (S, 6) arrays
         Predictions of the force–torque sensors at their times [N] and [N m], NaN outside the known

@@ -2,9 +2,8 @@
 
 Points are not labelled: each belongs to the nearest point of the surface, for the current shape and
 camera pose (iterative closest points). A `SurfaceCorrespondences` states these correspondences for
-every image;
-it is renewed as estimates change, as charts of marker places are. In between, residuals along the
-surface normals are smooth.
+every image; it is renewed as estimates change, as associations of marker places are. In between,
+residuals along the surface normals are smooth.
 """
 
 from __future__ import annotations
@@ -209,7 +208,7 @@ class SurfaceCorrespondences:
 
         Returns
         -------
-        Sighting
+        SurfaceCorrespondences
             The new correspondences; self if neither shapes, camera nor gate have changed.
         """
         known = len(shapes_m)

@@ -635,7 +635,7 @@ class ForwardSubstitution:
     ----------
     solver : Sweep
         Factorised time steps.
-    columns : QuantityTable
+    columns : SweepColumns
         Right-hand sides.
     state : ForwardState, optional
         State after earlier rows; by default there are none.

@@ -1,13 +1,10 @@
 """Transcription of one experiment: its variables, constraints and their derivatives.
 
 The constraints are the discrete equations of motion of a collocation scheme. Values are scaled:
-variables x / `strain_length_m`, equations of motion c / `force_n`, and constraints of grasped dofs
-(x − u
-x̄) / `strain_length_m`, which prescribe the pose u of the grasp applied to the undeformed position
-x̄.
+variables x / `length_m`, equations of motion c / `force_n`, and constraints of grasped dofs (x − u
+x̄) / `length_m`, which prescribe the pose u of the grasp applied to the undeformed position x̄.
 `Collocation` concatenates the segments of all experiments; use a `Transcription` where one
-experiment is
-treated alone.
+experiment is treated alone.
 
 Symbols: N grid times, n nodes, q shared parameters, φ nuisance parameters of the experiment, z all
 variables and g all constraints of the nonlinear program.
@@ -259,7 +256,7 @@ class Transcription:
         return other
 
     def follow_estimates(self, phi: Array, x: Array) -> tuple[MarkerAssociation, Array]:
-        """Update the chart where estimates have left it.
+        """Update the association where estimates have left it.
 
         Markers get the elements that contain their estimated places, clocks the nearest samples,
         and depth cameras the correspondences in the current shapes.
@@ -273,8 +270,8 @@ class Transcription:
 
         Returns
         -------
-        (Chart, (k,) array)
-            The chart, which is the present one if nothing has left it, and φ in the new chart.
+        (MarkerAssociation, (k,) array)
+            The association, which is the present one if nothing has left it, and φ in it.
         """
         nuisance = self.nuisance
         places = self.markers.coordinate_parameters
@@ -305,8 +302,8 @@ class Transcription:
 
         Returns
         -------
-        (Chart, (k,) array)
-            The chart, and φ in it.
+        (MarkerAssociation, (k,) array)
+            The association, and φ in it.
         """
         phi = phi.copy()
         sightings = tuple(depth.aligned_correspondences(x, phi) for depth in self.depths)

@@ -114,7 +114,7 @@ class GraspWrench:
         Frame of the sensor, see `Wrench`.
     point_m : (3,) array
         Origin of the sensor, see `Wrench` [m].
-    reaction_grid : Table
+    reaction_grid : ReactionGrid
         Times at which reaction forces are known.
     nuisance : NuisanceMap
         Nuisance parameters of the experiment.
@@ -208,7 +208,7 @@ class GraspWrench:
             Frame of the sensor, see `Wrench`.
         point_m : (3,) array
             Origin of the sensor [m].
-        grid : Table
+        grid : ReactionGrid
             Times at which reaction forces are known.
         nuisance : NuisanceMap
             Nuisance parameters of the experiment.
@@ -395,7 +395,7 @@ class GraspWrench:
 
         Parameters
         ----------
-        motion : ModesCheck
+        motion : ObservedMotion
             Motion whose reaction forces have changes `reaction_by` and `position_by` with c
             columns.
         phi : (k,) array
@@ -464,7 +464,7 @@ class GraspWrench:
         grasp : Grasp
             Grasp whose poses have errors; the result is 0 for another grasp, or a frame fixed in
             the world.
-        motion : ModesCheck
+        motion : ObservedMotion
             Motion with its reaction forces.
         phi : (k,) array
             Nuisance parameters.

@@ -2,9 +2,9 @@
 
     ŷ(s) = Σ_k ℓ_k(s + τ) Y_k + tare,
 
-where Y is the wrench on the grid (`wrench_channel`), τ the shift of the sensor's clock, and ℓ are
-the cubic weights of the four grid times around the sample. Each sample is compared at its own time,
-however many there are in a step, so that no averaging hides a motion.
+where Y is the wrench on the grid (`wrench_observable`), τ the shift of the sensor's clock, and ℓ
+are the cubic weights of the four grid times around the sample. Each sample is compared at its own
+time, however many there are in a step, so that no averaging hides a motion.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ def wrench_residuals(
     ----------
     experiment : Experiment
         The experiment.
-    grid : Table
+    grid : ReactionGrid
         Times at which reaction forces are known.
     nuisance : NuisanceMap
         Nuisance parameters of the experiment.

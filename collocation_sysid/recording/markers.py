@@ -57,14 +57,14 @@ class Markers:
         NaN where a place is not known: the estimate then starts from the first sample, with a prior
         as wide as the body. The same holds for all markers without places and placement.
     placement : Placement, optional
-        Weights of the nodes, one row per marker, in place of `marker_places_m`.
+        Weights of the nodes, one row per marker, in place of `places_m`.
     places_sigma_m : (M,) array or float, optional
         Standard deviation of the given places, zero for exact ones; that of the experiment's
         nuisance by default.
     on_surface : bool
         Whether estimated places stay on the surface: two coordinates in place of three.
     located : (M,) bool array, optional
-        Whether a place is given; derived from `marker_places_m` by default.
+        Whether a place is given; derived from `places_m` by default.
     attach : {"auto", "vertex", "embedded"}
         See `place_markers`.
     max_distance_m : float, optional

@@ -130,7 +130,7 @@ class Assessment:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Messages of the concerns, in the order of `solution_concerns`."""
+        """Messages of the concerns, in the order of `concerns`."""
         return tuple(concern.message for concern in self.concerns)
 
     def combined_with(self, other: Assessment) -> Assessment:
@@ -242,14 +242,15 @@ def numerical_concerns(
     combined_std_errors: Mapping[str, float | None],
     refinement: Refinement | None,
 ) -> list[Concern]:
-    """Return a concern if step or mesh dominate the uncertainty of a parameter.
+    """Return a concern if the correction for step and mesh is large compared with the standard
+    uncertainty of a parameter; it names the parameter with the largest ratio.
 
     Parameters
     ----------
     optimum : mapping of name to Estimate
         Estimates before the correction of the discretisation error.
     combined_std_errors : mapping of name to float or None
-        Combined standard uncertainties; None if unknown.
+        Combined standard uncertainties; None if unknown, then the parameter is left out.
     refinement : Refinement or None
         Discretisation errors; None if they are unknown, which is no concern.
     """

@@ -55,7 +55,7 @@ class _EffectColumns(SweepColumns):
         residual: Array | None,
         free: Index,
     ) -> tuple[Array, Array]:
-        """Return R (k, free, c) and F_R (k, 3n, c), see `QuantityTable.right_hand_sides`."""
+        """Return R (k, free, c) and F_R (k, 3n, c), see `SweepColumns.right_hand_sides`."""
         return self.rows_n[rows][:, free].copy(), self.forces_n[rows].copy()
 
 
@@ -88,7 +88,8 @@ class ResidualChanges(NamedTuple):
 def changes_of_assumptions(
     collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
 ) -> ResidualChanges:
-    """Return the changes of the residuals by all assumptions of a fit.
+    """Return the changes of the residuals by all assumptions of a fit and by nuisance parameters
+    that are not estimated, each off by its standard deviation.
 
     Parameters
     ----------
@@ -156,7 +157,7 @@ def changed_residuals(
     *,
     surface_correlation: float = CORRELATION,
 ) -> ResidualChanges:
-    """Return the changes of the residuals by some assumptions.
+    """Return the changes of the residuals by some assumptions, each off by its standard deviation.
 
     Parameters
     ----------
@@ -245,7 +246,7 @@ def propagate_columns(
         The experiment at the answer.
     solver : Sweep
         Factorised time steps.
-    columns : QuantityTable
+    columns : SweepColumns
         Right-hand sides, not by parameters.
     inertia_n : (N, g, c) array or 0
         Changes of the equations of motion of the sensed dofs, which reaction forces do not contain

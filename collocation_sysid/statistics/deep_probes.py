@@ -1,12 +1,11 @@
 """Deeper checks of a fit: refits of parts of the data, and with assumptions relaxed.
 
 Windows of time and recordings are fitted alone by one Gauss–Newton step from the answer, as for
-`scatter`. An assumption that is relaxed joins the linearised fit as one more nuisance parameter,
-with the deviation of the budget as its prior and the changes of the residuals as its derivative,
-see `changes_of_nuisances`. Where its amplitude is significant, the effect is computed again at the
-parameters
-that the step leads to, and a step is taken from there, until parameters settle; the remaining error
-is of second order in the amplitude. Error bars are those of any fit.
+`recording_scatter`. An assumption that is relaxed joins the linearised fit as one more nuisance
+parameter, with the deviation of the budget as its prior and the changes of the residuals as its
+derivative, see `consider_analysis`. Where its amplitude is significant, the effect is computed
+again at the parameters that the step leads to, and a step is taken from there, until parameters
+settle; the remaining error is of second order in the amplitude. Error bars are those of any fit.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Misspecification hypotheses for a fit that misses its data: refits without a mistake, ranked by
 misfit.
 
-The tests of `modal` cost little. The others change the experiment that fits worst: it is fitted
-again with each mistake corrected, and the factor by which its misfit decreases is the strength of
-the hypothesis. Of the directions of gravity, the natural modes choose the one that is refitted.
+The tests of `modal_misspecifications` cost little. The others change the experiment that fits
+worst: it is fitted again with each mistake corrected, and the factor by which its misfit decreases
+is the strength of the hypothesis. Of the directions of gravity, the natural modes choose the one
+that is refitted.
 
 Hypotheses about measured wrenches are in `wrench_causes`.
 """

@@ -150,7 +150,10 @@ class NoiseLevel:
 
 
 def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseLevel:
-    """Compare the residuals of a fit with the stated σ.
+    """Return the size of the errors of each marker compared with the stated σ, with tests, from the
+    residuals of a fit.
+
+    Blocks with a floor of noise are left out.
 
     Parameters
     ----------

@@ -164,7 +164,8 @@ def fit_part(
 def compare_recordings(
     fit: LinearisedFit, alone: Mapping[str, tuple[Array, Array, Array]]
 ) -> RecordingComparison:
-    """Compare recordings by the result of each alone.
+    """Compare recordings by the result of each alone; a parameter that a recording hardly
+    determines has NaN there.
 
     Parameters
     ----------

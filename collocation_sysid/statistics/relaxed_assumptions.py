@@ -3,9 +3,8 @@ estimates.
 
 A relaxed assumption joins the linearised fit as one or several nuisance parameters: its prior has
 the deviation of the uncertainty budget, or a multiple of it, and its derivatives are the changes of
-the residuals if the assumption is wrong, see `changes_of_nuisances`. `routine_probes` uses this in
-every
-solve, `deep_probes` for a deeper check.
+the residuals if the assumption is wrong, see `consider_analysis`. `routine_probes` uses this in
+every solve, `deep_probes` for a deeper check.
 """
 
 from __future__ import annotations
@@ -247,7 +246,8 @@ def with_relaxed_assumption(
         Changes of its residuals by the assumptions, each off by its standard deviation, which is
         the unit of the new parameters.
     name : str
-        Name of the assumption with its component.
+        Name of the assumption with its component. If `changes` does not contain it, no parameter is
+        added.
     widening : float
         Standard deviation of the prior of the new parameters, in these deviations.
     """
@@ -284,7 +284,8 @@ def relaxed_probe(fit: SolvedFit, name: str, wide: LinearisedFit, p: Array) -> P
     Returns
     -------
     Probe
-        Its size is that of the most significant amplitude, if there are several. `report` is empty.
+        Its size is that of the most significant amplitude, if there are several; its `sentences`
+        are empty.
     """
     first = len(fit.fit.names)
     step = gauss_newton_step(wide)

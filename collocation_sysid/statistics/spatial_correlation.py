@@ -66,8 +66,8 @@ def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialC
 
     Returns
     -------
-    SpatialErrors or None
-        None if the block has no places or no samples.
+    SpatialCorrelation or None
+        None if the block has no places, no samples, or too few points in each.
     """
     residual, _, present = block.channels
     if block.places_m is None or not present.any():

@@ -2,11 +2,10 @@
 wrong.
 
 An assumption is a row of `ASSUMPTIONS`: its standard deviation, and its effect on the equations of
-motion, c = Σ w F − M a, or on the prescribed displacements; `changes_of_nuisances` propagates
-effects to the
-residuals. Assumptions that change only the measurements (cameras, clocks) are nuisance parameters,
-see `recording.nuisance`. `Assumptions` is the table of the problem file in which users state
-standard deviations.
+motion, c = Σ w F − M a, or on the prescribed displacements; `consider_analysis` propagates effects
+to the residuals. Assumptions that change only the measurements (cameras, clocks) are nuisance
+parameters, see `recording.nuisance`. `Assumptions` is the table of the problem file in which users
+state standard deviations.
 """
 
 from __future__ import annotations

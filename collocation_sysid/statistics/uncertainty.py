@@ -9,12 +9,11 @@ The block of the shared parameters q is reported; nuisance parameters of single 
 by what they could have explained. For independent errors of the stated σ, C is A⁻¹. If the
 residuals are larger or smaller than σ, Cov(e) = s² I with their variance s², and where markers
 differ each has its own variance (see `noise_level`); intervals are then Student's. If a test finds
-the residuals correlated, in time or among markers, Cov(e) is that of `process_autocorrelation`. The
-output states which was used.
+the residuals correlated, in time or among markers, Cov(e) is that of `autocorrelation`. The output
+states which was used.
 
 Use `uncertainty_at` at a solution, or `uncertainty_from_fit` where the linearised fit is known.
-Estimated
-marker places have error bars too, see `marker_places`.
+Estimated marker places have error bars too, see `marker_places`.
 """
 
 from __future__ import annotations

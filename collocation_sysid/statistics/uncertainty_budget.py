@@ -249,7 +249,7 @@ def budget(
     Parameters
     ----------
     sources : VarianceSources
-        What moves the estimates beside the noise.
+        Covariances and sensitivities of the fit.
     uncertainty : Uncertainty
         Statistical uncertainty of the fit.
     numerical : mapping of estimate to DiscretisationError

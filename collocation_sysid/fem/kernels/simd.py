@@ -117,7 +117,7 @@ class SimdEvaluator:
 
 
 def _emit_kernel(kernel: ElementKernel, points: int, lanes: int) -> ir.Module:
-    """Return the LLVM module of a kernel; see `_SkylineEmitter` for the arguments."""
+    """Return the LLVM module of a kernel; see `_KernelEmitter` for the arguments."""
     return _KernelEmitter(kernel, points, lanes).emit()
 
 

@@ -131,7 +131,7 @@ class _ScaledMerit:
     ----------
     start : (free,) array
         Initial s, zeros.
-    bounds : HandBounds
+    bounds : Bounds
         Bounds of s.
     replacement_value : float
         Value that replaces an infinite merit, for solvers that interpolate values.

@@ -184,7 +184,7 @@ class PenaltyOptions(Options):
 
         Raises
         ------
-        Ended
+        SearchEnded
             If further stages would not improve the solution.
         """
         raise NotImplementedError

@@ -6,7 +6,7 @@ This is the usual method in the literature, as a baseline: the only variables ar
 optimum is that of the other methods. The gradient is computed
 
 - "forward": from the sensitivities Z = dx/dp, solved with the trajectory, for Gauss–Newton steps in
-a trust region (SciPy's `least_squares_of_fit`, "dogbox": steps of at most one in each parameter's
+a trust region (SciPy's `least_squares`, "dogbox": steps of at most one in each parameter's
 logarithm at first);
 - "adjoint": from one sweep backward in time for the multipliers y of c_xᵀ y = −∂L/∂x, as dL/dp =
 ∂L/∂p + yᵀ ∂c/∂p for any number of parameters, for SciPy's L-BFGS-B.
