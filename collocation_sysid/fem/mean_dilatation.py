@@ -142,7 +142,8 @@ class _VolumeSums:
         }
 
     def volume_pieces(self, order: int) -> Pieces:
-        """Return the pieces V, s and, for derivatives, ∂s/∂x of the first phase.
+        """Return the pieces of the first phase: the volume of the mesh ("volume", summed to V), σ
+        ("volumes", summed to s) and, if `order` is at least 1, ∂σ/∂x ("volumes_by_x").
 
         Parameters
         ----------

@@ -166,7 +166,7 @@ class MemoryLayout:
 
     def sum_over_branches(self, values: Array) -> Array:
         """Return the sums (…, width) over the branches of each point: the transpose of
-        `to_branches`.
+        `to_branches`. For a single branch the argument itself is returned.
 
         Parameters
         ----------

@@ -1,9 +1,8 @@
 """Custom forces on nodes or faces of a body: laws f(x, v, at, constants) in CasADi.
 
 Use `NodeForce.from_law` for a force that depends on position, velocity and time of a node, such as
-air
-drag, a foundation or a magnet; or, on faces of the surface, on their current area and normal, such
-as a pressure. Its constants follow those of the body's parts in θ and are estimated like them.
+air drag, a foundation or a magnet; or, on faces of the surface, on their current area and normal,
+such as a pressure. Its constants follow those of the body's parts in θ and are estimated like them.
 """
 
 from __future__ import annotations

@@ -257,9 +257,9 @@ def _part_forces(
         Constants of the material.
     material : Material
     averages : bool
-        Whether the element averages the dilatation.
+        Whether the element averages the dilatation, and with it the pressure.
     slopes : bool
-        Whether to compute derivatives.
+        Whether to compute derivatives; otherwise their arrays are empty.
     """
     count, points = geometry.shape[:2]
     shape_slopes = geometry[..., :-1].reshape(count, points, -1, 3)

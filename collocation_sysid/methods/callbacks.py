@@ -1,8 +1,7 @@
 """CasADi callbacks that evaluate the NLP's functions and observe the iterations of a solver.
 
 Use `NlpFunctions` for functions with derivatives and `IterationMonitor` for the history; `nlpsol`
-combines
-them.
+combines them.
 """
 
 from __future__ import annotations

@@ -2,10 +2,9 @@
 
 Where the pose of the body in its grasps is estimated, the positions of grasped nodes follow from φ.
 `CondensedCollocation` removes these variables and the constraints that prescribe them; derivatives
-with
-respect to them are added to the columns of φ by the chain rule. The optimum is that of the complete
-program, and so are the multipliers: those of the removed constraints balance the gradient with
-respect to the removed variables.
+with respect to them are added to the columns of φ by the chain rule. The optimum is that of the
+complete program, and so are the multipliers: those of the removed constraints balance the gradient
+with respect to the removed variables.
 
 An estimated clock interpolates between samples, so that the loss couples more time steps than the
 equations of motion do. The Hessian omits these entries: summed over a recording, products of slopes

@@ -1,8 +1,7 @@
 """Least-squares problem on the first rows of every experiment, linearised by sweeps.
 
 `Horizon` distributes the work on the experiments to `ExperimentExecutor` and joins the results to
-an
-`Iterate`. It is used by the reduced-space method and by shooting.
+an `Iterate`. It is used by the reduced-space method and by shooting.
 """
 
 from __future__ import annotations

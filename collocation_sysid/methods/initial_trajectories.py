@@ -1,10 +1,8 @@
 """Initial trajectories: simulations at given parameters, as far as they succeed.
 
 Use `initial_variables` for a method that needs variables at the guess, and `simulate_trajectories`
-for
-simulations at any parameters. Where a simulation fails, `complete_variables` appends the initial
-shape moved
-rigidly with the grasp.
+for simulations at any parameters. Where a simulation fails, `complete_variables` appends the
+initial shape moved rigidly with the grasp.
 """
 
 from __future__ import annotations

@@ -3,8 +3,7 @@
 The Hessian of ‖r‖² is 2 (SᵀS + B) with S = ∂r/∂p and B = Σ r_i ∇²r_i, which is small if the
 residuals are small. If they are not, as with measurement noise, Gauss–Newton converges slowly.
 `secant_update` approximates B from the steps by the update of Dennis, Gay and Welsch (NL2SOL,
-1981),
-which converges superlinearly at no cost; `exact_curvature` computes B from the Lagrangian.
+1981), which converges superlinearly at no cost; `exact_curvature` computes B from the Lagrangian.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Construction of methods from options by name, and shares of recordings.
 
 Use `method_from_options` to make a method from a table of the problem file. `Shares` is the type of
-options that
-list growing first parts of every recording, which are solved one after another.
+options that list growing first parts of every recording, which are solved one after another.
 """
 
 from __future__ import annotations

@@ -8,8 +8,7 @@ simulation fails. So the best start is found by cheap simulations, and the searc
 where simulations succeed.
 
 The same scan is used if a guess cannot be simulated, or fits worse than a rigid body. Use
-`start_problem`
-before a method is called.
+`start_problem` before a method is called.
 """
 
 from __future__ import annotations

@@ -2,8 +2,7 @@
 
 These functions run where the experiment is stored, in this process or on a worker of a cluster. A
 `SweepResult` is stored there because its size grows with the number of time steps; the search needs
-only
-its `SweepReport`, whose size does not. Parameters p are the (q, φ) of the experiment alone.
+only its `SweepReport`, whose size does not. Parameters p are the (q, φ) of the experiment alone.
 """
 
 from __future__ import annotations
@@ -208,9 +207,8 @@ def sweep_after_step(
     """Return the result of one sweep after a step of the parameters to p.
 
     The positions are those of `previous` extrapolated along the sensitivities. Static experiments
-    are
-    first solved for the equilibrium if one is near: a linear extrapolation stretches slender bodies
-    that rotate much, so that its loss would be meaningless.
+    are first solved for the equilibrium if one is near: a linear extrapolation stretches slender
+    bodies that rotate much, so that its loss would be meaningless.
 
     Parameters
     ----------

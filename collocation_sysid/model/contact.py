@@ -1,9 +1,8 @@
 """Contact pressure and friction between a deformable body and rigid obstacles.
 
 Use `contact_terms` to get the contact terms of an experiment. At points of the surface with
-undeformed
-areas A and the gap g(x, X) to an obstacle whose frame has the pose X, the contact energy Ψ, the
-normal force N and the dissipation potential of friction D are
+undeformed areas A and the gap g(x, X) to an obstacle whose frame has the pose X, the contact energy
+Ψ, the normal force N and the dissipation potential of friction D are
 
     Ψ = Σ A κ/(3δ) (⟨δ − g⟩³ − ⟨−g⟩³),    N = A κ/δ (⟨δ − g⟩² − ⟨−g⟩²),
     D = Σ μ N (√(|v_t|² + ε²) − ε),
@@ -213,7 +212,8 @@ class ContactLaw:
     def scaled_pressure(self, gap: ca.SX, data: ca.SX) -> ca.SX:
         """Return b, the pressure divided by κ [m], at a gap.
 
-        With relaxed contact b is r δ² / g, limited to `LARGEST_SCALED_PRESSURE` widths.
+        With relaxed contact b is r δ² / g, limited to `LARGEST_SCALED_PRESSURE` widths δ; otherwise
+        it is (⟨δ − g⟩² − ⟨−g⟩²) / δ.
 
         Parameters
         ----------

@@ -10,8 +10,8 @@ so that with G = ∂F/∂ξ and C = ∂F/∂ν at evaluation t (see `schemes`)
     −∂c_t/∂x_t = s_0 M − w_0 (p_0 G + q_0 C).
 
 Use `Dynamics.from_experiment` to discretise an experiment, `Dynamics.residual` and
-`Dynamics.linearise` to
-evaluate all rows, and `StencilRow` for time-marching methods that need the coefficients of one row.
+`Dynamics.linearise` to evaluate all rows, and `StencilRow` for time-marching methods that need the
+coefficients of one row.
 """
 
 from __future__ import annotations
@@ -405,6 +405,8 @@ class Dynamics:
 
     def assemble_residual(self, x: Array, force: Array) -> Array:
         """Return the residuals c (N, 3n) [N] from forces that have been evaluated.
+
+        Forces on temporarily prescribed dofs and those before `first_row` count as zero.
 
         Parameters
         ----------

@@ -10,8 +10,8 @@ and backward in time, with weights λ_k of the forces and μ_k of h_k,
     μ_{k−1} = (∂h/∂b)ᵀ μ_k + (∂F/∂b)ᵀ λ_k,   y_k gets (∂h/∂y)ᵀ μ_k, and ẏ_k likewise.
 
 `ForceHistory` holds all evaluations; `ForceForwardColumns` propagates columns forward,
-`ForceAdjoint` propagates
-weights backward. `ForcePreviousState` is the state at one time, for time-marching methods.
+`ForceAdjoint` propagates weights backward. `ForcePreviousState` is the state at one time, for
+time-marching methods.
 """
 
 from __future__ import annotations

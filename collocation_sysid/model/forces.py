@@ -1,11 +1,10 @@
 """All forces on a body at some times: F(ξ, ν; u) = f(ξ, ν; θ) + Σ terms.
 
 Use `Forces.from_experiment` for an experiment and `Forces.of_body_alone` for a body alone. The sum
-includes the internal
-forces f of materials and damping laws (see `fem.body`), the weight, tendons, pressures, contact,
-air drag and custom forces; no other module adds forces. Derivatives by the state are on the
-sparsity pattern of all couplings. Columns of derivatives by θ are followed by those by the other
-inputs u, in the order of the terms, see `inputs`.
+includes the internal forces f of materials and damping laws (see `fem.body`), the weight, tendons,
+pressures, contact, air drag and custom forces; no other module adds forces. Derivatives by the
+state are on the sparsity pattern of all couplings. Columns of derivatives by θ are followed by
+those by the other inputs u, in the order of the terms, see `inputs`.
 """
 
 from __future__ import annotations

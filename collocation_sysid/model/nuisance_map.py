@@ -326,7 +326,7 @@ class NuisanceMap:
         Parameters
         ----------
         phi : SX
-            Parameters at the indices `indices_of_rows`.
+            Parameters at the indices `places`.
         places : array of int
             Indices in φ of the marker, a row of `marker_indices`.
         t_s : SX
@@ -344,7 +344,7 @@ class NuisanceMap:
         ----------
         y : (3,) SX
         phi : SX
-            Parameters at the indices `indices_of_rows`.
+            Parameters at the indices `places`.
         places : array of int
             Indices in φ of the marker, a row of `marker_indices`.
         t_s : SX
@@ -519,7 +519,7 @@ class NuisanceMap:
         Parameters
         ----------
         phi : SX
-            Parameters at the indices `indices_of_rows`.
+            Parameters at the indices `places`.
         places : array of int
             Indices in φ.
         """

@@ -17,10 +17,9 @@ and backward in time, with weights λ_k of the forces and μ_k of m_k,
     μ_{k−1} = d_k μ_k + (∂f_H/∂H)ᵀ λ_k,   ξ_k gets (∂S_k/∂ξ_k)ᵀ Σ a_k μ_k.
 
 `MemoryHistory` holds all evaluations; `MemoryForwardColumns` propagates columns forward,
-`MemoryAdjoint` propagates weights
-backward; `MemoryState` is the state at one time, for time marching. The recursion is one of
-`recursion`; since it is linear in m and S, all points of a branch share its coefficients, which
-avoids most of the cost of a generated recursion for each point.
+`MemoryAdjoint` propagates weights backward; `MemoryState` is the state at one time, for time
+marching. The recursion is one of `recursion`; since it is linear in m and S, all points of a branch
+share its coefficients, which avoids most of the cost of a generated recursion for each point.
 """
 
 from __future__ import annotations
@@ -367,10 +366,8 @@ class MemoryHistory:
         """Add the second derivatives of Σ μ_k (d_k m_{k−1} + a_k S_k) that involve (g, τ).
 
         The derivatives are added in place to the N states of a `SecondDerivatives` that already has
-        those
-        of Σ σ_k S_k, see `with_variable_weights`. Mixed derivatives are those with ξ and with
-        elastic constants,
-        through S.
+        those of Σ σ_k S_k, see `with_variable_weights`. Mixed derivatives are those with ξ and with
+        elastic constants, through S.
 
         Parameters
         ----------

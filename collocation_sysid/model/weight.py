@@ -333,7 +333,8 @@ def _own_kg(body: Body) -> Array:
 
 
 def _no_loads(rows: Array, count: int = 0) -> tuple[Array, Array, Array]:
-    """Return zero arrays for `joining_kg`, `joining_n` and `share` of `count` loads.
+    """Return zero arrays for `joining_kg` (count, 3n), `joining_n` (count, T, 3n) and `share` (T,
+    count) of `count` loads.
 
     Parameters
     ----------

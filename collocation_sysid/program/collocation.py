@@ -16,8 +16,7 @@ x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axi
 
 Lifted variables (history variables, reaction forces, wrenches, contact pressures) are eliminated by
 default; with `Collocation.has_lifted_variables` they follow at the end of z, and their equations at
-the end of
-g.
+the end of g.
 
 Constraints g, in this order:
 
@@ -125,8 +124,7 @@ class Collocation:
         If true, prescribed displacements are constraints instead of bounds.
     huber : float, optional
         Threshold of Huber's loss in standard deviations, see `measurement_residual`; None means a
-        quadratic
-        loss.
+        quadratic loss.
     associations : mapping of experiment name to MarkerAssociation
         Elements, clock samples and correspondences of the measurements. Experiments that are
         missing, or whose association belongs to another body or other priors, get that of the

@@ -342,8 +342,7 @@ def _classify_pixels(
     """Classify pixels (…, 2) of an image beside a body at given depths as BODY, UNKNOWN or EMPTY.
 
     Pixels outside the image are UNKNOWN. `is_missing_empty` states whether a missing depth (NaN)
-    means that
-    nothing is there.
+    means that nothing is there.
     """
     column, row = np.moveaxis(np.round(pixels).astype(np.int64), -1, 0)
     inside = (column >= 0) & (column < image_m.shape[1]) & (row >= 0) & (row < image_m.shape[0])

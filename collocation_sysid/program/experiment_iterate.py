@@ -2,8 +2,7 @@
 observables.
 
 Methods and statistics use a `ExperimentIterate` to evaluate the loss, its gradient and the forces
-at one
-iterate; derived quantities are computed once and cached.
+at one iterate; derived quantities are computed once and cached.
 """
 
 from __future__ import annotations

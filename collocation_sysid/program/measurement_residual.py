@@ -460,7 +460,11 @@ class MeasurementResidual(ABC):
     def linearise(
         self, values: Array, observable_derivatives: ObservableDerivatives, phi: Array, size: int
     ) -> tuple[Array, Array]:
-        """Return residuals (s, G, g) and their derivatives (s, G, g, size) by all parameters.
+        """Return residuals (y − ŷ) / σ (s, G, g), zero where missing, and their derivatives (s, G,
+        g, size) by all parameters.
+
+        Samples s are those that the values suffice for; G is the number of `names` and g the
+        `group_size`. Without values the arrays are zero.
 
         Parameters
         ----------

@@ -60,7 +60,8 @@ class Modes:
 
 
 def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6) -> Modes:
-    """Return the lowest modes of a body about a state.
+    """Return the lowest modes of a body about a state; those without restoring force are left out
+    and counted in `omitted_count`.
 
     Parameters
     ----------
@@ -69,7 +70,7 @@ def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
     x : (n, 3) or (3n,) array
         The state [m], which should be an equilibrium.
     free_dofs : (k,) array
-        Sorted dofs that are not prescribed.
+        Sorted dofs that are not prescribed; their masses must be positive.
     count : int
         Number of modes; there may be fewer.
     """

@@ -89,7 +89,8 @@ def _instability(iterate: ExperimentIterate) -> Instability | None:
 
 
 def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
-    """Return the largest Re(s) of M s² + D s + K at a state [1/s]; 0 where none is positive.
+    """Return the largest Re(s) of M s² + D s + K at a state [1/s]; 0 where none exceeds the
+    rounding errors, or no dof is free.
 
     Parameters
     ----------
@@ -98,7 +99,7 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
     x : (3n,) array
         State [m].
     free_dofs : (k,) array
-        Sorted dofs that are not prescribed.
+        Sorted dofs that are not prescribed; their masses must be positive.
     """
     if not len(free_dofs):
         return 0.0

@@ -339,8 +339,7 @@ class Transcription:
     @property
     def rows_to_place(self) -> int:
         """Number of rows of x that `place_unknown_markers` needs; 0 if all places are stated and
-        there is
-        no depth camera.
+        there is no depth camera.
         """
         unknown = ~self.experiment.markers.located
         first = self.experiment.markers.is_present[:, unknown].argmax(axis=0)

@@ -225,8 +225,7 @@ class Experiment:
     @cached_property
     def free_dofs(self) -> Index:
         """Sorted dofs that are not in `prescribed_dofs`; grasps with a time window may hold some of
-        them
-        for a while.
+        them for a while.
         """
         return np.setdiff1d(np.arange(self.body.nodes_m.size), self.prescribed_dofs)
 
@@ -290,8 +289,7 @@ class Experiment:
 
         In a motion the share rises, or falls, from one sample before to one sample after `from_s`
         or `until_s`, see `loads.smooth_ramp`; a load that joins at or before the first sample acts
-        fully
-        from the start. In a static experiment the share jumps at these times.
+        fully from the start. In a static experiment the share jumps at these times.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         first_share, last_share = (

@@ -127,10 +127,13 @@ def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
 def _label_chooser(names: Sequence[str] | None, renamed: Mapping[str, str]) -> LabelChooser:
     """Return the function that picks the requested markers from the labels in a file.
 
+    It raises an `InputError` if labels or names repeat, if a label of `renamed` or a name is not
+    there, or if nothing is chosen.
+
     Parameters
     ----------
     names : sequence of str or None
-        Names after renaming; None for all.
+        Names after renaming, in the order of the result; None for all but the excluded labels.
     renamed : mapping of str to str
         From labels in the file to names.
     """

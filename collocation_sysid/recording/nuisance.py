@@ -58,8 +58,7 @@ class NuisanceRow:
     """A kind of nuisance parameter of a recording; its values have normal priors with mean zero.
 
     A recording has one value for each component (marker, grasp, …) and axis. Custom kinds state
-    what they do to a marker's predicted position (`reading`) or to its time (`clock`),
-    and go into
+    what they do to a marker's predicted position (`reading`) or to its time (`clock`), and go into
     `Nuisance(own=[…])`.
 
     Attributes

@@ -147,7 +147,7 @@ class Obstacle(Grasp):
         return orthogonal_axes(self.shape.offset_direction)
 
     def displaced(self, offset_m: float, tilt_rad: Array, delay_s: float) -> Obstacle:
-        """Return the obstacle shifted, tilted and delayed.
+        """Return a copy of the obstacle, shifted and tilted in its own frame, and delayed.
 
         Parameters
         ----------
@@ -156,7 +156,7 @@ class Obstacle(Grasp):
         tilt_rad : (2,) array
             Rotation about the axes `tilt_axes`, through the middle of its shape.
         delay_s : float
-            Delay of its motion.
+            Delay of its motion, added to the times of its poses.
         """
         motion = np.eye(4)
         middle = self.shape.tilt_centre_m

@@ -61,8 +61,7 @@ def write_gauge_csv(
     path: str | Path, t_s: ArrayLike, names: Sequence[str], values: ArrayLike
 ) -> None:
     """Write values (S, m) of a custom sensor as `read_custom_sensor` reads them; NaN becomes a
-    blank
-    cell.
+    blank cell.
     """
     _write_csv(path, ["t_s", *names], np.column_stack([np.asarray(t_s), np.asarray(values)]))
 

@@ -81,6 +81,9 @@ def fit_poses(
 ) -> RigidFit:
     """Fit the rigid motion of markers at every frame.
 
+    Where the visible markers of positive weight do not determine a rotation, the pose is NaN and
+    the frame is counted as missing.
+
     Parameters
     ----------
     reference_m : (B, 3) array

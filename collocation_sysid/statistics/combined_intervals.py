@@ -5,8 +5,7 @@ statistical part (noise of the measurements, nuisance parameters), the discretis
 step, and mesh where it was refined), and the systematic effects of the budget (type B evaluation,
 JCGM 100:2008, 4.3). All three are added in quadrature in the coordinate in which the parameter is
 estimated, its logarithm as a rule, see `IntervalCoordinate`. The known part of the discretisation
-error is
-corrected, not only budgeted (ibid., 3.2.4): the reported value is the extrapolated one.
+error is corrected, not only budgeted (ibid., 3.2.4): the reported value is the extrapolated one.
 """
 
 from __future__ import annotations

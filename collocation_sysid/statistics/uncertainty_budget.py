@@ -361,8 +361,7 @@ def _estimate_derivatives(fit: LinearisedFit, parameters: Parameters, q: Array) 
 
 def main_sources(shares: Mapping[str, Mapping[str, float]], minimum_share: float) -> list[str]:
     """Return the sources with at least a share `minimum_share` in the variance of some estimate,
-    the
-    largest first.
+    the largest first.
 
     Parameters
     ----------

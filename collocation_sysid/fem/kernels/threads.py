@@ -1,8 +1,7 @@
 """Distribution of time steps, or of experiments, over threads.
 
 `run_in_slices` distributes consecutive time steps of one evaluation; `map_experiments` distributes
-whole
-experiments, each of which then runs on one thread.
+whole experiments, each of which then runs on one thread.
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ def read_columns(
     requires_times: bool = True,
     requires_all: bool = False,
 ) -> QuantityTable:
-    """Read those of the `quantities` quantities that a table has, in any order.
+    """Read those of some quantities that a table has, in any order, in SI units.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def read_columns(
         follow the name, as in "Load (N)". Other columns are not looked for if a quantity besides
         the time is mapped; without mapping, columns are recognised by name.
     blank_allowed : bool
-        Whether cells may be blank.
+        Whether cells may be blank, which become NaN; a column of blank cells alone is refused.
     requires_times : bool
         Whether times are required; otherwise rows are numbered in seconds if there are no times.
     requires_all : bool
