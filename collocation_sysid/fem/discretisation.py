@@ -356,6 +356,8 @@ class Discretisation(ConstantsModel):
     ) -> Array:
         """Evaluate a kernel on all parts and add up the results (T, width).
 
+        Evaluators are made at the first use of a kernel and kept.
+
         Parameters
         ----------
         name : str
@@ -367,6 +369,11 @@ class Discretisation(ConstantsModel):
             Memory for the result; overwritten.
         memory_input : MemoryInput, optional
             Internal variables of a body with memory; zero by default.
+
+        Raises
+        ------
+        InputError
+            If θ has another length than the constants of the body.
         """
         if len(theta) != len(self.constants):
             raise InputError(

@@ -78,7 +78,19 @@ def read_tetrahedra(
 def _tetrahedra(
     data: MeshContent, metres: float
 ) -> tuple[np.ndarray, np.ndarray, Arrays, Arrays, Arrays, tuple[str, ...]]:
-    """Return the same as `read_tetrahedra` from the data of meshio."""
+    """Return the same as `read_tetrahedra` from the data of meshio.
+
+    Parameters
+    ----------
+    data : MeshContent
+    metres : float
+        Factor from the file's unit to metres.
+
+    Raises
+    ------
+    InputError
+        If there are no tetrahedra.
+    """
     counts = _cell_counts(data)
     points_m = np.asarray(data.points, dtype=float) * metres
     blocks = [block for block in data.cells if block.type in _TETRAHEDRA and len(block.data)]
@@ -140,6 +152,15 @@ def write_tetrahedra(
 ) -> None:
     """Write a mesh, in metres, to any format that meshio knows by the file's extension; booleans
     become integers.
+
+    Parameters
+    ----------
+    path : str or Path
+        Replaced if it exists.
+    points_m : (n, 3)
+    tetrahedra : (E, 4) int
+    point_arrays, cell_arrays : mapping of name to array, optional
+        Values of each point and each tetrahedron; none by default.
 
     Raises
     ------

@@ -435,7 +435,13 @@ class InverseEquilibrium:
         return np.arange(count * points * size).reshape(count, points, size)
 
     def weight_sensitivity(self, theta: ArrayLike) -> Array:
-        """Return the change (n, 3) of X for a relative change of gravity, to first order."""
+        """Return the change (n, 3) of X [m] per relative change of gravity, to first order.
+
+        Raises
+        ------
+        RestShapeError
+            If no stress-free shape is found at the constants θ, or its equations are singular.
+        """
         constants = np.asarray(theta, dtype=float)
         at = self._assemble_forces(self.solve(constants).positions_m, constants, slopes=True)
         factor = self._factorise(at.by_position)

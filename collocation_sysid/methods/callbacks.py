@@ -187,7 +187,9 @@ class NlpFunctions:
         """
 
         def evaluate(inputs: list[Array], buffers: list[Array | None]) -> None:
-            """Evaluate the requested outputs, which are those with memory."""
+            """Evaluate those outputs that are requested: their buffers are not None, and are
+            overwritten.
+            """
             requests = zip(outputs, buffers, strict=True)
             self._evaluate(inputs, {output: b for output, b in requests if b is not None})
 

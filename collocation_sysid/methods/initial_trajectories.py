@@ -110,7 +110,9 @@ def simulate_trajectories(
     parts = collocation.iterates_at(p, known_rows or _empty_trajectories(collocation))
 
     def simulate_one(k: int) -> tuple[Array, SimulationError | None]:
-        """Simulate experiment number k, from 0."""
+        """Simulate experiment number k, from 0; return its trajectory as far as it succeeded, and
+        the failure or None.
+        """
         count = parts[k].segment.grid_times if rows is None else rows[k]
         own_guess = None if guess is None else guess[k]
         return continue_trajectory(parts[k], count, options, stopwatch, own_guess)

@@ -495,8 +495,10 @@ class _TrialSimulation:
     def _simulate(
         self, p: Array, warm: list[Array] | None, rows: Sequence[int]
     ) -> tuple[list[Array], SimulationError | None]:
-        """Return trajectories of the given numbers of rows at p (np,), near those of `warm` where
-        equilibria are searched, and the first failure, see `simulate_trajectories`.
+        """Return trajectories of the given numbers of rows at p (np,), and the first failure or
+        None, see `simulate_trajectories`.
+
+        Equilibria are searched near the trajectories `warm`; None for no guess.
         """
         return simulate_trajectories(self.collocation, p, None, rows, LOOSE, guess=warm)
 

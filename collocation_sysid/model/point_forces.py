@@ -122,7 +122,7 @@ class Pointwise(ForceTerm):
         self, previous_state: PreviousState, variable_weights: Array | None = None
     ) -> Self:
         """Return this force with given internal variables, and with weights of h in second
-        derivatives.
+        derivatives, which are zero for None.
         """
         return replace(self, previous_state=previous_state, variable_weights=variable_weights)  # type: ignore[type-var]
 
@@ -443,7 +443,7 @@ class CustomForce(Pointwise):
 
     def data(self, chosen: Index | None) -> Array:
         """Return the data (d, T, I) of the law at all instances, in the order in which a
-        `ForceContext` reads them; the indices of the chosen points are not used.
+        `ForceContext` reads them; `chosen` is not used.
         """
         data = np.empty((CONTEXT_SIZE, len(self.t_s), self.points.count))
         data[0] = self.t_s[:, None]

@@ -180,7 +180,7 @@ def huber_as_weights(
 
     Derivatives get the square root of the weight in the normal equations. Residuals are shortened
     to the threshold, so that a few outliers do not determine the noise of the others. Arguments as
-    in `huber_as_least_squares`.
+    in `huber_as_least_squares`; without threshold (None) both are returned as they are.
     """
     if huber is None:
         return residual, derivatives

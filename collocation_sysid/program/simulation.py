@@ -192,7 +192,7 @@ def _with_automatic_steps(
 ) -> Trajectory:
     """Return the simulation of a dynamic experiment whose steps are halved until it is accurate.
 
-    A number of steps that cannot be simulated counts as inaccurate.
+    A number of steps that cannot be simulated counts as inaccurate. Arguments as in `simulate`.
 
     Raises
     ------

@@ -589,6 +589,23 @@ class Sweep:
     ) -> list[Factor]:
         """Return the factors of −∂c_t/∂x_t of some rows, computed on several threads; dofs that are
         prescribed for a part of the time have a diagonal entry alone.
+
+        Parameters
+        ----------
+        dynamics : Dynamics
+        linearisation : Linearisation
+            Derivatives of the forces at these rows alone.
+        grid_times : slice
+            Grid times of the rows.
+        rows : list of StencilRow
+            Coefficients of each row.
+        buffers : sequence of FactorMemory or None
+            Memory that the factors reuse, see `Factoriser.factorise_each`.
+
+        Raises
+        ------
+        SimulationError
+            If a matrix is singular.
         """
         pattern = self.pattern
         is_prescribed = dynamics.is_temporarily_prescribed[grid_times]

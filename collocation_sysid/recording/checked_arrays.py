@@ -46,8 +46,8 @@ def read_only_floats(
 def float_converter(
     shape: tuple[int | None, ...], name: str, finite: bool = True
 ) -> Callable[[ArrayLike], Array]:
-    """Return a function that copies values to a read-only array, see `read_only_floats` for the
-    arguments.
+    """Return a function that copies values to a read-only array; arguments and errors are those of
+    `read_only_floats`.
     """
     return lambda values: read_only_floats(values, shape, name, finite)
 

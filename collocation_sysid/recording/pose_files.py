@@ -134,6 +134,12 @@ def _column_error(grid: TextTable) -> InputError:
 def _position_columns(grid: TextTable, length_unit: str | None) -> tuple[list[int], float]:
     """Return the indices of the columns of x, y, z, and the factor from their unit to metres.
 
+    Parameters
+    ----------
+    grid : TextTable
+    length_unit : str or None
+        Unit of columns whose names state none; None if it is not given.
+
     Raises
     ------
     InputError

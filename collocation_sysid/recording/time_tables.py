@@ -211,8 +211,8 @@ def displaced_axes(
     axis: str = "z",
     length_m: float | None = None,
 ) -> str:
-    """Return the axes along which a file has displacements, such as "z"; see
-    `read_displacement`.
+    """Return the axes along which a file has displacements, such as "z"; empty if it has none.
+    Arguments and errors are those of `read_displacement`.
     """
     shifts = _axis_components(
         _read_displacements(path, columns, length_m, timed=False), DISPLACEMENTS, axis

@@ -49,6 +49,7 @@ def run_in_slices(run: Callable[[int, int], None], count: int, threads: int) -> 
     for all.
 
     On a thread of `map_experiments`, or with one thread, it is called once for the complete range.
+    An exception of ``run`` is passed on.
 
     Raises
     ------

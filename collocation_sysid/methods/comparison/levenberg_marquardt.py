@@ -60,19 +60,20 @@ def minimise_levenberg_marquardt(
     merit : MeritFunction
         Merit function.
     z : (variables,) array
-        Initial variables.
+        Initial variables; not modified.
     tolerance : float
         Largest entry of the projected gradient at the end.
     max_iterations : int
         Largest number of accepted steps.
     report : callable
         Function that is called with every iterate, its value and its projected gradient; an
-        exception ends the minimisation.
+        exception ends the minimisation. The last iterate is the result.
 
     Returns
     -------
     bool
-        Whether the tolerance was reached; false if rounding prevents it.
+        Whether the tolerance was reached; false after `max_iterations` steps, or if rounding
+        prevents it.
     """
     damping = DAMPING
     growth = 2.0

@@ -98,6 +98,13 @@ def simulate_variables(
 ) -> Array:
     """Return variables z (variables,) at the parameters p = (q, φ), with simulated positions.
 
+    Parameters
+    ----------
+    collocation : Collocation
+    p : (np,) array
+    stopwatch : Stopwatch, optional
+        Measures the simulations.
+
     Raises
     ------
     SimulationError

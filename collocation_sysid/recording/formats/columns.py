@@ -321,7 +321,9 @@ def _columns_error(
 
 
 def _unit_error(grid: TextTable, column: str, unit: str | None, quantity: Quantity) -> InputError:
-    """Return the error for a column without a unit, or with a unit of another dimension."""
+    """Return the error for a column without a unit (`unit` is None), or with a unit of another
+    dimension.
+    """
     has = f"has the unit {unit}" if unit else "names no unit"
     remedy = f"call it {quantity.column}, or {column.split('_')[0]} ({quantity.unit})"
     return grid.error_at(

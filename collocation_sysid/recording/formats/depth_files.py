@@ -275,7 +275,16 @@ def _scaled_cloud(points: Array, path: Path, length_m: float) -> Array:
 
 
 def _read_npz(path: Path) -> DepthFileContent:
-    """Read depth_m, depth_counts or points_m, and the camera model, from a NumPy archive."""
+    """Read depth_m, depth_counts or points_m, and the camera model, from a NumPy archive.
+
+    One image or cloud may lack the axis of samples. Counts are multiplied by count_m, by default
+    `USUAL_COUNT_M`.
+
+    Raises
+    ------
+    InputError
+        If the archive has none of the three arrays, or several.
+    """
     arrays = load_arrays(path)
     names = [name for name in ("depth_m", "depth_counts", "points_m") if name in arrays]
     if len(names) != 1:

@@ -172,7 +172,14 @@ def read_png(source: Path | BytesIO) -> Any:
 
 
 def decode_cloud(message: Any) -> dict[str, Array]:
-    """Return the columns (P,) of a cloud of points by name, as floats."""
+    """Return the columns (P,) of a cloud of points by name, as floats.
+
+    Raises
+    ------
+    InputError
+        If its fields are of unknown types, do not lie within the bytes of a point, or repeat, or
+        the message has another number of bytes.
+    """
     order = ">" if getattr(message, "is_bigendian", 0) else "<"
     fields = list(message.fields)
     try:
