@@ -176,7 +176,10 @@ class NlpFunctions:
         return sum(function.calls for function in self._functions)
 
     def function(self, name: str, *outputs: str) -> TimedFunction:
-        """Return a new callback.
+        """Return a new callback, and keep it for `seconds` and `calls`.
+
+        Its inputs are z and p, and also w and y if an output is of the Lagrangian. For "grad_l"
+        alone it is a `LagrangianGradient`, which has a directional derivative.
 
         Parameters
         ----------

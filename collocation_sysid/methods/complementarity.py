@@ -96,7 +96,8 @@ def reachable_obstacles(experiment: Experiment, x: Array) -> list[Obstacle]:
     Returns
     -------
     list of Obstacle
-        One per obstacle; unchanged if no face comes within `REACH` edges.
+        One per obstacle, with the faces that come within `REACH` edges of it; unchanged if none
+        does.
     """
     obstacles = []
     mesh = experiment.body.mesh

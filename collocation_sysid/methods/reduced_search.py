@@ -289,6 +289,10 @@ class ReducedSearch:
     def _minimise(self, horizon: Horizon, is_last: bool) -> Status:
         """Take Gauss–Newton steps on one horizon until convergence, and return the status.
 
+        Accepted steps change the parameters, trajectories and trust region of this object; they
+        need trajectories of the horizon. The status is that of convergence, of the iteration limit,
+        or `STALLED` if steps become tiny without a decrease.
+
         Parameters
         ----------
         horizon : Horizon

@@ -182,7 +182,7 @@ class Recorder:
         z : (variables,) array
             Final variables.
         multipliers : (constraints,) array or None
-            Multipliers of the method; None if it has none.
+            Multipliers of the method; None if it has none, and then also in the solution.
         iterations : int
             Iterations of the method.
         evaluations : int

@@ -298,6 +298,8 @@ def simulate_rows(
 ) -> SimulationResult:
     """Simulate the rows of the solver at parameters p, as far as the simulation succeeds.
 
+    A failure is part of the result. The stopwatch of the solver is read and reset.
+
     Parameters
     ----------
     solver : Sweep
@@ -345,18 +347,20 @@ def _sweep_result(
     previous: SweepResult | None,
     times_s: tuple[float, float, float],
 ) -> SweepResult:
-    """Return the sweep result: measurement residuals and slopes after the feasibility step.
+    """Return the sweep result: measurement residuals and slopes after the feasibility step, as
+    least squares with Huber's loss.
 
     Parameters
     ----------
     iterate : ExperimentIterate
         Experiment at the parameters and positions of the sweep.
     huber : float or None
-        See `sweep`.
+        Not used: each measurement residual has a threshold of its own.
     tangent : Tangent
         Feasibility step and sensitivities.
     previous : SweepResult or None
-        Previous trajectory; None for none.
+        Previous trajectory; for None the change of positions and `previous_slopes_residual` are
+        zero.
     times_s : tuple of three floats
         Times for `Stopwatch.add` [s].
     """

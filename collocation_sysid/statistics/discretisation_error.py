@@ -161,8 +161,8 @@ class Refinement:
         return max(moves.items(), key=lambda each: round(each[1], 6), default=("", 0.0))
 
     def suggested_substeps(self, estimates: Mapping[str, Estimate], order: float) -> int:
-        """Return the number of steps per sample that makes every correction small, if the errors
-        belong to one step; at most `MOST_SUBSTEPS`.
+        """Return the number of steps per sample, from 1 to `MOST_SUBSTEPS`, that makes every
+        correction small if the present errors are those of one step per sample.
 
         Parameters
         ----------

@@ -185,7 +185,8 @@ class FieldEstimate:
         Parameters
         ----------
         length_m : float, optional
-            Correlation length; None means the present one.
+            Correlation length; None means the present one. If the present one is given, the result
+            is 0 for any `factor`.
         factor : float
             Factor of the amplitude.
         """

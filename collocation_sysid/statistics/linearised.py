@@ -283,6 +283,9 @@ class LinearisedFit:
 def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
     """Linearise a fit at a solution.
 
+    Residuals and derivatives are weighted as Huber's loss does at the optimum, see
+    `huber_as_weights`.
+
     Parameters
     ----------
     collocation : Collocation

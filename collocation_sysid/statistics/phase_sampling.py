@@ -275,7 +275,7 @@ def _run_chain(
     seed: int,
     settings: SamplerSettings,
 ) -> PosteriorDraws:
-    """Draw phases, contrast and parameters by one chain.
+    """Draw phases, contrast and parameters by one chain, whose first quarter is discarded.
 
     Parameters
     ----------
@@ -284,7 +284,7 @@ def _run_chain(
     faces : InternalFaces
         Faces between elements.
     start : (E,) array
-        Initial phases, 0 or 1.
+        Initial phases, 0 or 1; not modified.
     seed : int
         Seed of the random numbers.
     settings : SamplerSettings
