@@ -481,8 +481,8 @@ class Concern:
 
 
 def concern_if(is_present: bool, is_gross: bool, code: str, **data: Any) -> list[Concern]:
-    """Return a list with a concern if `is_present`, graded "doubtful" if `is_gross` and else
-    "check"; otherwise an empty list.
+    """Return a list with the concern of a code and its data, graded "doubtful" if `is_gross` and
+    else "check"; an empty list unless `is_present`.
     """
     return [Concern(code, "doubtful" if is_gross else "check", data)] if is_present else []
 
