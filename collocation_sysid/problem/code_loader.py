@@ -97,7 +97,9 @@ class CodeLoader:
             )
 
     def nuisance_row(self, section: CustomNuisanceSection) -> NuisanceRow:
-        """Return a custom nuisance parameter; see `function` for the errors."""
+        """Return the `NuisanceRow` that a Python file defines under the name `row` of the section;
+        see `function` for the errors.
+        """
 
         def is_row(value: Any) -> bool:
             """Return whether a value of the file is a nuisance parameter."""
@@ -107,22 +109,25 @@ class CodeLoader:
         return self._load(section.file, section.row, key, "NuisanceRow", is_row)[1]
 
     def function(self, file: str, name: str, key: str) -> tuple[Path, Callable[..., Any]]:
-        """Return the path of a file and a function in it.
+        """Run a Python file, and return its path and the function in it that has a name.
+
+        A force with an energy, `NodeForce`, counts as a function.
 
         Parameters
         ----------
         file : str
-            Name of the file.
+            Name of the file, relative to the folder of the problem.
         name : str
             Name of the function.
         key : str
-            Key of the problem file that names it, for messages.
+            Key of the problem file that names the file, for messages.
 
         Raises
         ------
         InputError
-            If running code is not allowed, the file or the function does not exist, or the file
-            fails.
+            If running code is not allowed, the file or the function does not exist, the name
+            belongs
+            to something else, or the file fails.
         """
 
         def is_function(value: Any) -> bool:

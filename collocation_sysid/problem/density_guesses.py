@@ -54,7 +54,9 @@ def with_declared_densities(
 
 
 def _with_guessed_density(region: RegionSection, parameters: Sections) -> RegionSection:
-    """Return a region with its density; if it has none, the guess of its parameter."""
+    """Return a region with its density [kg/m³]: its own, else the guess of its parameter, else
+    None.
+    """
     if region.density_kg_m3 is not None:
         return region
     guess = _guess(parameters, f"{region.name}.{DENSITY.name}")
@@ -72,8 +74,10 @@ def _guess(parameters: Sections, name: str) -> float | None:
 
 
 def _declared_density(body: Body, name: str) -> float | None:
-    """Return the mass [kg] or density [kg/m³] that the body states for a parameter; None if
-    it has none.
+    """Return the value that the body states for a parameter called `name`; None if it has none.
+
+    The mass [kg] if that is the parameter, else the density [kg/m³] of the region that the name
+    begins with, or of the parts without an own density.
     """
     if without_region(name) == MASS.name:
         return body.mass_kg

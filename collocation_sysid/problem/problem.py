@@ -225,7 +225,7 @@ class Problem:
         )
 
     def solver(self, method: str | Method | None = None) -> Method:
-        """Return the method for a name; the problem's own by default.
+        """Return the method for a name, or the method itself; None means the method of the problem.
 
         Raises
         ------
@@ -309,7 +309,9 @@ def _require_equal_fields(bodies: Iterable[Body]) -> None:
 def _with_free_densities(
     experiments: Iterable[Experiment], parameters: Parameters
 ) -> tuple[Experiment, ...]:
-    """Return the experiments with bodies whose densities are free if parameters refer to them."""
+    """Return the experiments; where parameters name a density or the mass, with bodies whose
+    density follows from these parameters.
+    """
     bodies = {}
     experiments = tuple(experiments)
     for body in {id(e.body): e.body for e in experiments}.values():

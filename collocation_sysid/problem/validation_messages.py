@@ -129,10 +129,10 @@ def _value_at(key: Sequence[Part], content: dict[str, Any]) -> Any:
     return value
 
 
-def _item(container: Any, iterate: Part) -> Any:
+def _item(container: Any, part: Part) -> Any:
     """Return an item of a table or list; None if it does not exist."""
     try:
-        return container[iterate]
+        return container[part]
     except (KeyError, IndexError, TypeError):
         return None
 
@@ -177,7 +177,9 @@ def _table_model(annotation: Any) -> type[BaseModel] | None:
 
 
 def shortened(value: Any) -> str:
-    """Return a value as text of at most 60 characters."""
+    """Return a value as text of at most 60 characters, booleans as in TOML; a sentence with the
+    type if Python cannot print it.
+    """
     if isinstance(value, bool):
         return str(value).lower()
     try:
