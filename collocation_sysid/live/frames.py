@@ -432,7 +432,13 @@ def parse_time(time: Any) -> float:
 
 
 def _parse_cell(text: str) -> float:
-    """Return the number of a table cell; NaN for an empty cell."""
+    """Return the number of a table cell; NaN for an empty cell or "nan".
+
+    Raises
+    ------
+    InputError
+        For any other text.
+    """
     if text == "" or text.lower() == "nan":
         return float("nan")
     try:
