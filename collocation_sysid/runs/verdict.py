@@ -188,14 +188,18 @@ def allowance_concerns(solution: Solution) -> Iterator[Concern]:
 
 
 def _prediction_concerns(rollouts: Mapping[str, ForwardSimulation | str]) -> Iterator[Concern]:
-    """Yield concerns about simulations with given parameters that differ by more than the noise."""
+    """Yield concerns about forward simulations that differ from the measurements by more than the
+    noise; failed simulations, given by their reason, are ignored.
+    """
     for name, rollout in rollouts.items():
         for misfit in rollout.misfits if isinstance(rollout, ForwardSimulation) else ():
             yield from prediction_concerns(name, **vars(misfit))
 
 
 def _unseen_depth_concerns(name: str, rollout: ForwardSimulation | str) -> Iterator[Concern]:
-    """Yield a concern for each depth camera without a point near the simulated surface."""
+    """Yield a concern for each depth camera without a point within its gate of the simulated
+    surface; none if the simulation failed.
+    """
     for camera, error in rollout.depth.items() if isinstance(rollout, ForwardSimulation) else ():
         if not error.points:
             data = {"experiment": name, "camera": camera, "seen": error.compared_points}
@@ -205,7 +209,8 @@ def _unseen_depth_concerns(name: str, rollout: ForwardSimulation | str) -> Itera
 def _forward_concerns(
     name: str, rollout: ForwardSimulation | str, solution: Solution, noise_m: float
 ) -> list[Concern]:
-    """Return concerns about the forward simulation of an experiment.
+    """Return concerns about the forward simulation of an experiment: that it failed, or that its
+    errors are larger than the noise and the residuals of the fit.
 
     Parameters
     ----------
