@@ -2,7 +2,7 @@
 
 Beside the body a panel shows the distance of the markers from their measurements over time.
 `animate`
-works from a run folder, `write_film` from a `ReplayCommand`.
+works from a run folder, `write_film` from a `MotionRecord`.
 """
 
 from __future__ import annotations
@@ -122,12 +122,13 @@ def film(
 
     Parameters
     ----------
-    replay : ReplayCommand
+    replay : MotionRecord
         Experiment with at least one trajectory.
     file : Path
         Ends in .mp4 or .gif.
-    fps, slow, progress
-        See `animate`. A static experiment is shown with `STATES_A_SECOND` samples per second.
+    fps, slowdown, progress
+        See `animate`. A static experiment is shown with `STATIC_SAMPLES_PER_SECOND` samples per
+        second.
     names : (str, str)
         Labels of the fitted and of the simulated trajectory.
     headline : str
@@ -187,7 +188,7 @@ def film_samples(t_s: Array, fps: float, slowdown: float) -> NDArray[np.int64]:
     Raises
     ------
     InputError
-        If the film would have more than `MOST_FRAMES` frames.
+        If the film would have more than `MAX_FILM_FRAMES` frames.
     """
     duration = float(t_s[-1] - t_s[0])
     count = round(duration * slowdown * fps) + 1

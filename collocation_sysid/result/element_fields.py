@@ -114,10 +114,10 @@ _DEFORMATION_GRADIENT = ca.SX.sym("F", 9)
 
 
 def _point_fields(law: PointLaw, constants: ca.SX) -> tuple[ca.SX, ...]:
-    """Return det F, the energy density and the von Mises stress as expressions in `_F`.
+    """Return det F, the energy density and the von Mises stress as expressions.
 
-    `_F` has the nine components of the deformation gradient column after column; `constants` are
-    the constants of the law.
+    They depend on the symbol `_DEFORMATION_GRADIENT`, which has the nine components of the
+    deformation gradient column after column, and on `constants`, the constants of the law.
     """
     f = ca.reshape(_DEFORMATION_GRADIENT, 3, 3)
     j = ca.det(f)

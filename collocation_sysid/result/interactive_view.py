@@ -178,7 +178,7 @@ class _FrameWindow:
         Time [s] and file of each frame.
     field : str
         Point or cell data that colour the body.
-    replay : ReplayCommand
+    replay : MotionRecord
         The experiment, for markers, grasped nodes and obstacles.
     off_screen : bool
         Draw without a window.

@@ -100,7 +100,7 @@ def is_deeper_check_worthwhile(result: Result) -> bool:
 
 
 def _shown_estimates(result: Result) -> list[str]:
-    """Return the names of the estimates that the table has as columns, at most `SHOWN`."""
+    """Return the names of the estimates that the table has as columns, at most `MAX_ESTIMATES`."""
     known = [n for n, each in result.values.items() if each.statistical95]
     first = [name for name in known if name in STIFFNESS_NAMES[:1]]
     return [*first, *(n for n in known if n in result.parameters and n not in first)][

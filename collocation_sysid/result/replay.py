@@ -1,6 +1,6 @@
 """Motion of one experiment of a run: measured, fitted and simulated shapes and markers.
 
-Pictures, films and the 3-D view need nothing but a `ReplayCommand`. It can be read from the arrays
+Pictures, films and the 3-D view need nothing but a `MotionRecord`. It can be read from the arrays
 of a run folder (`read_run`), so that they can be drawn again without solving.
 """
 
@@ -288,7 +288,7 @@ class MotionRecord:
     @classmethod
     def from_arrays(cls, name: str, arrays: Mapping[str, Any]) -> MotionRecord:
         """Return the experiment called `name` from the arrays of a run, see
-        `ReplayCommand.to_arrays`.
+        `MotionRecord.to_arrays`.
 
         Raises
         ------

@@ -40,11 +40,9 @@ def write_run(
 
     The folder gets ``result.json``, ``problem.toml`` as it was run if the problem has a file,
     ``trajectory.npz``, and ``frames/`` with ``trajectory.pvd`` for ParaView. With several
-    experiments,
-    the name of the experiment precedes the names of arrays and the folders of frames. `draw_run`
-    adds
-    the pictures after the folder is in its place, so that an error while drawing does not lose the
-    result.
+    experiments, the name of the experiment precedes the names of arrays and the folders of
+    frames. `draw_run` adds the pictures after the folder is in its place, so that an error while
+    drawing does not lose the result.
 
     Parameters
     ----------
@@ -58,7 +56,7 @@ def write_run(
     Raises
     ------
     InputError
-        If the folder holds anything but an earlier run; see `writers.replaced_folder`.
+        If the folder holds anything but an earlier run; see `replaced_folder`.
     """
     result = build_result(solved)
     with replaced_folder(folder) as place:
@@ -225,7 +223,7 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
 def _depth_rows(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
     """Return the points of each depth camera on the fitted surface, or else on the simulated one.
 
-    The arrays are as in `ReplayCommand.fit_summary`, by name of the camera; empty where neither
+    The arrays are as in `MotionRecord.visible_points`, by name of the camera; empty where neither
     surface is known.
     """
     part = finished.solution.part_of(experiment.name)
@@ -270,7 +268,7 @@ def _surface_contact(
 def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
     """Return the estimates (E, 4) of each spatially varying constant, by name of the field.
 
-    The columns are those of `ReplayCommand.fields`. Rows of elements in other regions are NaN.
+    The columns are those of `MotionRecord.fields`. Rows of elements in other regions are NaN.
     """
     estimates = {}
     for part in body.parts:

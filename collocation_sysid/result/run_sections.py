@@ -634,7 +634,9 @@ def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
 
 
 def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
-    """Yield a table of what each marker's residuals suggest, and a table of the largest errors."""
+    """Yield a table with the diagnosis of each marker's residuals, and a headed table of the
+    largest errors in the folder `run`; a table without rows is left out.
+    """
     if result.residuals:
         rows = tuple(
             (

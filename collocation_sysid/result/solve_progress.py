@@ -43,12 +43,12 @@ class Heartbeat:
 
     Parameters
     ----------
-    doing : callable
+    current_activity : callable
         Returns the current activity as text.
-    tell : callable
+    show_line : callable
         Shows a line.
     first_s : float, optional
-        Time of the first line [s]; `FIRST_S` by default.
+        Time of the first line [s]; `FIRST_LINE_S` by default.
     """
 
     NAME = "heartbeat"

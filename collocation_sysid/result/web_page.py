@@ -83,11 +83,11 @@ def write_page(
     """Write the fitted and the simulated motion of an experiment as a stand-alone web page.
 
     The page draws on a plain canvas, in any browser and without a network. Of more than
-    `MOST_FRAMES` samples every second, third, … is kept.
+    `MAX_PAGE_FRAMES` samples every second, third, … is kept.
 
     Parameters
     ----------
-    replay : ReplayCommand
+    replay : MotionRecord
         Experiment with at least one trajectory.
     file : str or Path
         HTML file to write; it is replaced only after the page is complete.
@@ -174,7 +174,7 @@ def surface_strain(replay: MotionRecord, positions_m: Array) -> Array:
 
     Parameters
     ----------
-    replay : ReplayCommand
+    replay : MotionRecord
     positions_m : (T, n, 3)
         Node positions of one of its trajectories.
     """

@@ -260,8 +260,8 @@ def _power_law_card(region: IdentifiedRegion, volume: float) -> str:
 
 
 def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
-    """Run CalculiX (`ccx`), and compare the largest displacement at rest and the forces of
-    obstacles.
+    """Run CalculiX (the program ``ccx``), and compare the largest displacement at rest and the
+    forces of obstacles.
 
     Parameters
     ----------
@@ -272,7 +272,7 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     Raises
     ------
     InputError
-        If it is not installed, fails, or takes longer than `LONGEST_S`.
+        If it is not installed, fails, or takes longer than `TIME_LIMIT_S`.
     """
     program = shutil.which("ccx")
     if program is None:

@@ -263,7 +263,7 @@ def _import_mujoco() -> ModuleType:
     Raises
     ------
     InputError
-        If it is missing or older than version `SINCE`.
+        If it is missing or older than version `OLDEST_VERSION`.
     """
     try:
         import mujoco  # pyright: ignore[reportMissingImports]

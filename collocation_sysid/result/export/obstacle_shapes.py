@@ -113,8 +113,8 @@ class Facets:
         """Return the facets of a solid; of a plane a square.
 
         On round surfaces the middles of facets are as deep below the surface as their corners are
-        above it,
-        by `max_penetration_m` or as the allowed facet widths `FACET_RAD` permit.
+        above it: by `depth_m`, unless the facets would then be narrower or wider than
+        `FACET_WIDTH_LIMITS_RAD`.
 
         Parameters
         ----------

@@ -127,7 +127,7 @@ def _draw_declared_positions(
     Parameters
     ----------
     axes : Axes
-    view : DepthCameraModel
+    view : SheetView
     places_m, declared_m : (M, 3)
         Estimated and stated places; stated ones are NaN where there is none.
 
