@@ -134,7 +134,13 @@ def export(options: ExportCommand) -> None:
 
 
 def _export_recording(options: ExportCommand) -> None:
-    """Write the recording of a run for the Rerun viewer, and print what is missing in it."""
+    """Write the recording of a run for the Rerun viewer, and print what is missing in it.
+
+    Raises
+    ------
+    InputError
+        With the option --verify, because a recording predicts nothing, and as `write_rerun`.
+    """
     from ..result.export.rerun_recording import RECORDING_FILE, write_rerun
 
     if options.verify:

@@ -1,8 +1,7 @@
 """Frames of a live recording: validation, and reading from JSON lines or rows of a table.
 
 `FrameReader` reads text; `parse_pose`, `parse_markers`, `parse_custom_readings` and
-`parse_wrenches` validate values
-given in Python.
+`parse_wrenches` validate values given in Python.
 """
 
 from __future__ import annotations

@@ -2,8 +2,7 @@
 
 A short still recording with the same body, grasps and markers represents recordings of any length:
 its first rows have the stencils of the start, and its last row has those of all later rows.
-`LiveModel`
-holds this recording and everything that does not depend on the parameters.
+`LiveModel` holds this recording and everything that does not depend on the parameters.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ Akaike's criterion is −2 ln L + 2k. For n independent normal errors of unknown
 ln(RSS/n), up to a constant that all models of the same data share. Residuals of an imperfect model
 are not independent: ten samples with the same error count as one. n is therefore the equivalent
 number of independent samples: samples over 1 + 2 Σ_k (1 − k/T) ρ_k along time, and observables by
-(tr Σ)²/tr Σ² across, with the ρ and Σ of `process_autocorrelation`.
+(tr Σ)²/tr Σ² across, with the ρ and Σ of `statistics.autocorrelation`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Film of a run: the fitted body, the edges of its forward simulation over it, and the markers.
 
 Beside the body a panel shows the distance of the markers from their measurements over time.
-`animate`
-works from a run folder, `write_film` from a `MotionRecord`.
+`animate` works from a run folder, `film` from a `MotionRecord`.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ class ElementFields:
         return cls(body, theta, evaluators, volumes)
 
     def evaluate_at(self, positions_m: ArrayLike) -> dict[str, Array]:
-        """Return the fields at node positions, by `NAMES`.
+        """Return the fields at node positions, by `FIELD_NAMES`.
 
         Parameters
         ----------
@@ -99,8 +99,8 @@ class ElementFields:
 
 
 def field_kernel(element: Element, law: PointLaw) -> ElementKernel:
-    """Return the compiled fields at a quadrature point times its volume; see `expressions` for the
-    inputs.
+    """Return the compiled fields at a quadrature point times its volume; see `ElementKernel` for
+    the inputs.
     """
     point = quadrature_point(element, law, "x")
     fields = ca.vertcat(*_point_fields(law, point.local_constants))

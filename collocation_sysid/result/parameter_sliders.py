@@ -164,7 +164,7 @@ class ParameterSliders:
 
     @classmethod
     def from_run(cls, run: SolvedProblem, experiment: str | None = None) -> ParameterSliders:
-        """Return the sliders of a run, see `pipeline.Run.interactive`.
+        """Return the sliders of a run, see `Run.interactive`.
 
         Raises
         ------

@@ -136,8 +136,7 @@ def _conclusions(result: Result) -> Iterator[str]:
     """Yield sentences on the significant probes, or that there is none.
 
     First come windows and recordings that disagree with the rest, then relaxed assumptions, then
-    the most
-    important assumption that the data do not determine.
+    the most important assumption that the data do not determine.
     """
     significant = [probe for probe in result.probes if probe.sentences]
     relaxed = sorted(

@@ -243,8 +243,7 @@ class MotionRecord:
         `sample`.
 
         Of each camera, the image nearest in time counts if it is at most half a timestep away;
-        without one
-        the camera adds no points.
+        without one the camera adds no points.
         """
         tolerance_s = float(np.diff(self.t_s).max(initial=0.0)) / 2 + TIME_TOLERANCE_S
         nearest = [np.zeros((0, 3))]
@@ -266,8 +265,7 @@ class MotionRecord:
         """Return the arrays to store in a file, by name; attributes that are None are left out.
 
         The names begin with `prefix`, except those of the body, which all experiments of a run
-        share.
-        Simulated positions are rounded to single precision.
+        share. Simulated positions are rounded to single precision.
         """
         stored: dict[str, Any] = {key: getattr(self, key) for key in ARRAY_LAYOUT}
         stored |= {

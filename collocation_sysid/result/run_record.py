@@ -251,9 +251,10 @@ def _depth_rows(finished: SolvedProblem, experiment: Experiment) -> dict[str, Ar
 def _surface_contact(
     finished: SolvedProblem, experiment: Experiment, positions_m: Array
 ) -> tuple[Array, Array] | None:
-    """Return gap [m] and contact pressure [Pa] on the surface, (T, F) each; None without obstacles.
+    """Return gap [m] and contact pressure [Pa] on the boundary triangles, (T, F) each; None without
+    obstacles.
 
-    `positions_m` are the node positions (T, n, 3).
+    `positions_m` are the node positions (T, n, 3) [m].
     """
     if not experiment.obstacles:
         return None
@@ -283,8 +284,7 @@ def _wrench_columns(finished: SolvedProblem, experiment: Experiment) -> list[Arr
     simulated.
 
     The wrenches are those of the whole specimen also where symmetry reduces the model to a part of
-    it.
-    NaN where the experiment was not fitted or not simulated.
+    it. NaN where the experiment was not fitted or not simulated.
     """
     sensors = experiment.wrenches
     rollout = finished.rollouts[experiment.name]
@@ -321,8 +321,8 @@ def _custom_sensor_columns(finished: SolvedProblem, experiment: Experiment) -> d
 def _comparison_columns(t_s: Array, measured: Array, *models: Array | None) -> Array:
     """Return the columns time, measured values and the values of each model, as one array.
 
-    `t_s` is (S,), `measured` and each of `drawn_models` (S, m); the columns of a model that is None
-    are NaN.
+    `t_s` is (S,), `measured` and each of `models` (S, m); the columns of a model that is None are
+    NaN.
     """
     columns = (np.full_like(measured, np.nan) if each is None else each for each in models)
     return np.column_stack([t_s, measured, *columns])

@@ -657,7 +657,7 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
     """Return the largest marker residuals of a run folder as (error [m], time [s], marker), largest
     first.
 
-    Of each marker, two listed errors are more than `LEAST_DISAGREEMENT_RATIO` samples apart.
+    Of each marker, two listed errors are more than `ERROR_SPACING_SAMPLES` samples apart.
 
     Raises
     ------
@@ -689,14 +689,13 @@ def _captioned_pictures(run: Path) -> list[Picture]:
     """Return every PNG picture of the folder with its caption.
 
     A picture that compares measurement and fit is first; then follow the pictures known to
-    `CAPTIONS`
-    in that order, and unknown ones.
+    `PICTURE_CAPTIONS` in that order, and unknown ones.
     """
     order = [*PICTURE_CAPTIONS, ""]
     pictures: list[Picture] = []
 
     def kind(file: Path) -> str:
-        """Return the key of `CAPTIONS` with which the name of a picture begins; "" if none."""
+        """Return the key of `PICTURE_CAPTIONS` with which the name of a picture begins; "" if none."""
         return next(k for k in order if file.stem.startswith(k))
 
     for file in sorted(own_pictures(run), key=lambda file: (order.index(kind(file)), file.name)):

@@ -148,8 +148,7 @@ def write_frames(
     """Write a trajectory as frames/frame_0000.vtu, … and trajectory.pvd, and return the latter.
 
     Every frame has `displacement_m` and `velocity_m_s` at the points, and the `fields` in the
-    cells. Of
-    more than `max_frames` samples every second, third, … is written.
+    cells. Of more than `max_frames` samples every second, third, … is written.
 
     Parameters
     ----------

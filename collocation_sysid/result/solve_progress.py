@@ -241,7 +241,7 @@ def _remaining_time(elapsed_s: float, share: float) -> str:
 
 
 def _iteration_table(lines: list[Iteration]) -> Shown:
-    """Return the table of the last iterations; "" before the first."""
+    """Return the table of the last iterations; "" if `lines` is empty."""
     if not lines:
         return ""
     heads = ("", "RMS mm", "violation N", *map(symbol_of, lines[-1].parameters), "s")

@@ -107,12 +107,11 @@ def write_data(
     folder : str or Path
         Created if missing; gets ``<experiment>_markers.csv`` if there are markers,
         ``<experiment>_poses.csv`` (``_poses_2`` … by the number of the grasp) for grasps whose
-        poses the
-        problem reads, ``<experiment>_wrench.csv`` (``_wrench_2`` …) for grasps with a force sensor,
-        ``<experiment>_reading_<name>.csv`` for custom sensors, and ``<experiment>/`` with frames if
-        requested. An experiment whose displacements come from a table, as on a test bench, gets its
-        tables of displacement and load under their names in the problem file, in place of poses and
-        wrenches.
+        poses the problem reads, ``<experiment>_wrench.csv`` (``_wrench_2`` …) for grasps with a
+        force sensor, ``<experiment>_reading_<name>.csv`` for custom sensors, and ``<experiment>/``
+        with frames if requested. An experiment whose displacements come from a table, as on a test
+        bench, gets its tables of displacement and load under their names in the problem file, in
+        place of poses and wrenches.
     recipe : Recipe, optional
         Integrator, noise and seed; without noise by default.
     progress : callable, optional

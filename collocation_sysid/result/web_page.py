@@ -125,9 +125,7 @@ def _trajectories(replay: MotionRecord) -> dict[str, Array]:
 
 
 def _page_data(replay: MotionRecord, colouring: Colouring) -> dict[str, Any]:
-    """Return the data of the page, ready for JSON; arrays are in base64, see
-    `_pack_without_lifted`.
-    """
+    """Return the data of the page, ready for JSON; arrays are in base64, see `_base64`."""
     samples = np.arange(0, len(replay.t_s), -(-len(replay.t_s) // MAX_PAGE_FRAMES))
     surface_nodes, nodes = np.unique(replay.surface_nodes, return_inverse=True)
     nodes = nodes.reshape(len(replay.surface), -1)

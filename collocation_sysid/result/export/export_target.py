@@ -114,8 +114,7 @@ class TargetCapabilities:
         Name of the damping law that the simulator has, for which no sentence is needed.
     has_viscoelasticity, has_moving_grasps, has_moving_obstacles, has_quadratic_elements : bool
         Whether it has viscoelastic branches, moving grasps, moving obstacles, and elements with
-        nodes on
-        their edges (which are split otherwise).
+        nodes on their edges (which are split otherwise).
     node_forces : str
         Sentence for forces on nodes; empty if the simulator has them.
     obstacle_shapes : tuple of str

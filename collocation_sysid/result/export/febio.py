@@ -125,8 +125,7 @@ def _elastic_law(region: IdentifiedRegion, limits: list[str]) -> tuple[str, dict
 
 
 def _mesh_xml(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) -> str:
-    """Return the XML of nodes, elements, sets and prescribed displacements of the body and the
-    obstacles.
+    """Return the XML of nodes, elements, sets and prescribed displacements of body and obstacles.
     """
     solids, facets = _obstacle_mesh_xml(body, obstacles)
     xml = '<Mesh>\n<Nodes name="nodes">\n'

@@ -137,7 +137,7 @@ def _obstacle_xml(body: IdentifiedBody, step_s: float) -> str:
 
 
 def _geom_attributes(solid: Solid) -> str:
-    """Return the XML attributes of a solid: type, size and placement."""
+    """Return the XML attributes of a solid in MuJoCo: type, size, position and rotation."""
     shape = Primitive.from_solid(solid)
     turn = values_as_text(shape.rotation.as_quat(scalar_first=True))
     size = values_as_text(shape.size_m) if len(shape.size_m) else "0 0 1"
@@ -321,7 +321,7 @@ def _compare_motion(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> Pre
     Raises
     ------
     InputError
-        If more than `MOST_STEPS` steps are needed.
+        If more than `MAX_STEPS` steps are needed.
     """
     e = body.experiment
     free = ~body.is_node_prescribed

@@ -151,7 +151,7 @@ def _import_usd() -> Any:
 def _add_mesh(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Array) -> None:
     """Add the tetrahedra, masses, materials and simulated motion of the body to the stage.
 
-    `pxr` are the modules of `_emit_library_call`; `start_positions_m` (n, 3) are the initial node
+    `pxr` are the modules of `_import_usd`; `start_positions_m` (n, 3) are the initial node
     positions.
     """
     body_prim = pxr.UsdGeom.Xform.Define(stage, "/World/Body").GetPrim()

@@ -228,8 +228,7 @@ def elements_picture(nodes_m: Array, tetrahedra: NDArray[np.integer]) -> Figure:
     """Draw histograms of the size and the quality of the elements.
 
     The size is the root mean square edge, the quality the mean ratio 12 (3V)^(2/3) / Σ l², which is
-    1 for
-    the regular tetrahedron and near 0 for a flat one.
+    1 for the regular tetrahedron and near 0 for a flat one.
 
     Parameters
     ----------
