@@ -96,7 +96,9 @@ def parse_pose(
     else:
         each = list(pose) if isinstance(pose, Sequence) else [pose]
         if len(each) != len(grasp_numbers):
-            raise InputError(f"{len(each)} poses; expected {len(grasp_numbers)}, one of each grasp")
+            raise InputError(
+                f"found {len(each)} poses; expected {len(grasp_numbers)}, one for each moving grasp"
+            )
     if any(one is None for one in each):
         return None
     parts = [_parse_single_pose(one) for one in each]
@@ -211,7 +213,9 @@ def parse_wrenches(
     known = {str(number): k for k, number in enumerate(wrenches)}
     if not isinstance(wrench_data, Mapping) or set(wrench_data) & set(_SAMPLE_KEYS):
         if len(known) > 1:
-            raise InputError(f"one wrench; expected those of the grasps {' and '.join(known)}")
+            raise InputError(
+                f"found one wrench; expected those of the grasps {' and '.join(known)}, by number"
+            )
         wrench_data = dict.fromkeys(known, wrench_data)
     if unknown := [name for name in wrench_data if name not in known]:
         expected = ", ".join(known)

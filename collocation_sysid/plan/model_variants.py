@@ -235,9 +235,8 @@ def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list
     for problem, measured in zip(problems[1:], others, strict=True):
         if measured != first:
             raise InputError(
-                f"it fits {_measured_text(measured)}, but {problems[0].path} "
-                f"{_measured_text(first)}; expected "
-                "the same recordings and samples",
+                f"it fits {_measured_text(measured)}, but {problems[0].path} fits "
+                f"{_measured_text(first)}; expected the same recordings and samples in all files",
                 problem.path,
             )
     paths = [Path(str(problem.path)) for problem in problems]

@@ -34,7 +34,7 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
     """
     names = unique_items(text)
     if not names:
-        raise InputError(f"expected some of {', '.join(METHODS)}", None, option)
+        raise InputError(f"found no name; expected some of {', '.join(METHODS)}", None, option)
     for name in names:
         require_method(name, option)
     return names

@@ -161,7 +161,10 @@ def _apply_override(content: dict[str, Any], override: str) -> None:
     key = key.strip()
     parts = key.split(".")
     if len(parts) > DEEPEST:
-        raise InputError(f"found a key of {len(parts)} parts; expected a few")
+        raise InputError(
+            f"found a key of {len(parts)} parts; expected one such as parameters.mu_pa.guess, of "
+            f"at most {DEEPEST}"
+        )
     if not equals or not all(parts):
         expected = "expected key=value such as parameters.mu_pa.guess=200"
         raise InputError(f"found {override!r}, {expected}")

@@ -180,7 +180,10 @@ class ParameterSliders:
             each.name for each in run.start_parameters.free if not is_field_coefficient(each.name)
         ]
         if not names:
-            raise InputError("no parameter was estimated, so that there is nothing to slide")
+            raise InputError(
+                "no parameter was estimated; expected a run with one that is not fixed, because "
+                "sliders change estimated parameters"
+            )
         ranges = {}
         for each in names:
             linear, bounds = run.start_parameters.scale_and_bounds(each)

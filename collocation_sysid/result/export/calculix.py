@@ -283,7 +283,11 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
             job, cwd=folder, capture_output=True, text=True, timeout=TIME_LIMIT_S, check=False
         )
     except subprocess.TimeoutExpired:
-        raise InputError(f"CalculiX took more than {TIME_LIMIT_S:g} s", folder / DECK) from None
+        raise InputError(
+            f"CalculiX took more than {TIME_LIMIT_S:g} s and was stopped; verify with a coarser "
+            "mesh or fewer samples",
+            folder / DECK,
+        ) from None
     times = _step_times_s(body)
     theirs, their_forces = _read_final_state(folder / "body.dat", len(body.nodes_m), len(times))
     if theirs is None:

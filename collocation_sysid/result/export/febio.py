@@ -125,8 +125,7 @@ def _elastic_law(region: IdentifiedRegion, limits: list[str]) -> tuple[str, dict
 
 
 def _mesh_xml(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) -> str:
-    """Return the XML of nodes, elements, sets and prescribed displacements of body and obstacles.
-    """
+    """Return the XML of nodes, elements, sets and prescribed displacements, also of obstacles."""
     solids, facets = _obstacle_mesh_xml(body, obstacles)
     xml = '<Mesh>\n<Nodes name="nodes">\n'
     for k, point in enumerate(body.nodes_m, 1):

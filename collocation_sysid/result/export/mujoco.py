@@ -331,8 +331,8 @@ def _compare_motion(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> Pre
     steps = round(e.timestep_s / model.opt.timestep)
     if steps * len(e.t_s) > MAX_STEPS:
         raise InputError(
-            f"the prediction of the motion would need {steps * len(e.t_s)} time "
-            "steps, which are too many"
+            f"the prediction of the motion would need {steps * len(e.t_s)} time steps; expected at "
+            f"most {MAX_STEPS}: verify with a shorter recording or a coarser mesh"
         )
     first = 7 * len(e.grasps)
     shapes = [data.qpos[first:].reshape(-1, 3).copy()]
