@@ -525,9 +525,11 @@ class StreamingSweep:
         return solved, None
 
     def _store_rows(self, columns: Sequence[Array]) -> list[StoredRow]:
-        """Return the last rows for later passes, from their columns (3n, 1 + m).
+        """Return the last rows for later passes, from their columns (3n, 1 + m), which
+        `_solve_rows` returns.
 
-        Observed quantities of these rows are stored, too.
+        The reactions are corrected, and observed quantities of these rows are appended to those
+        stored, in place.
         """
         rows = slice(self.end - len(columns), self.end)
         all_columns = np.array(columns)

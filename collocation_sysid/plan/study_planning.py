@@ -88,7 +88,9 @@ class PlannedRun:
 
 
 def shortened_keys(keys: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield each dotted key with the shortest ending that distinguishes it from the others."""
+    """Yield each dotted key with the shortest ending that distinguishes it from the others; of
+    parameters at least two parts, name and key.
+    """
     for key in keys:
         parts = key.split(".")
         fewest_parts = 2 if parts[0] == "parameters" else 1

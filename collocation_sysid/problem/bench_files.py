@@ -177,7 +177,7 @@ def _named_quantities(layout: TableSection) -> list[str]:
 def bench_tables(
     section: ExperimentSection, experiment: Experiment, wrenches: Iterable[Array]
 ) -> dict[str, BenchTable]:
-    """The tables of a bench by file name, see `table_name`.
+    """Return the tables of a test bench that a simulation writes, by file name, see `table_name`.
 
     Parameters
     ----------

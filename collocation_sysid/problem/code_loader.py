@@ -23,12 +23,13 @@ from .schema import CodeSection, NodeForceSection
 
 
 def existing_file(folder: Path, name: str, key: str) -> Path:
-    """Return the path of a file, or of a topic of a log, that a key of the problem file names.
+    """Return the path of a file that a key of the problem file names, relative to `folder`; it may
+    also be a topic of a log, as "log#topic".
 
     Raises
     ------
     InputError
-        If it does not exist.
+        At `key`, if it does not exist or is a folder.
     """
     file = folder / name
     require_regular(file, key)
@@ -71,12 +72,13 @@ class CodeLoader:
             return Material.from_energy(cast(Energy, loaded), section.function)
 
     def force(self, section: NodeForceSection, key: str) -> NodeForce:
-        """Return a custom force on nodes.
+        """Return the custom force on nodes that a section names, on its nodes if it states some.
 
         Raises
         ------
         InputError
-            See `function`; also if the function is no force, see `NodeForce.from_law`.
+            See `function`; also if the function is no force, see `NodeForce.from_law`, or `carries`
+            is wrong.
         """
         file, loaded = self.function(section.file, section.function, f"{key}.file")
         nodes = None if section.nodes is None else selection_from_section(section.nodes)
@@ -126,8 +128,7 @@ class CodeLoader:
         ------
         InputError
             If running code is not allowed, the file or the function does not exist, the name
-            belongs
-            to something else, or the file fails.
+            belongs to something else, or the file fails.
         """
 
         def is_function(value: Any) -> bool:

@@ -15,12 +15,13 @@ Sections = Mapping[str, ParameterSection | float]
 
 
 def with_guessed_densities(section: ObjectSection, parameters: Sections) -> ObjectSection:
-    """Return [object] with missing densities taken from guesses of parameters.
+    """Return a copy of [object] in which missing densities of the body and of regions are guesses
+    of parameters.
 
     Raises
     ------
     InputError
-        If neither states the body's mass.
+        Unless exactly one of the body's mass and density is stated or guessed.
     """
     regions = [_with_guessed_density(region, parameters) for region in section.region]
     changes: dict[str, object] = {"region": regions}
@@ -40,7 +41,9 @@ def with_guessed_densities(section: ObjectSection, parameters: Sections) -> Obje
 def with_declared_densities(
     parameters: Sections, body: Body
 ) -> dict[str, ParameterSection | float]:
-    """Return [parameters] with missing guesses of densities taken from the body."""
+    """Return [parameters], where a density or mass that is to be estimated without a guess gets the
+    value that the body states.
+    """
     return {
         name: section.model_copy(update={"guess": _declared_density(body, name)})
         if isinstance(section, ParameterSection)

@@ -244,7 +244,11 @@ class Problem:
         return chosen
 
     def _validate(self) -> None:
-        """Raise `InputError` if experiments, parameters and options do not fit together."""
+        """Raise `InputError` if experiments, parameters and options do not fit together.
+
+        Checked are names, steps, constants of the bodies, stress-free shapes, fields, scopes of
+        nuisance parameters, scheme, method, and names of profiles.
+        """
         names = [experiment.name for experiment in self.experiments]
         if not names:
             raise InputError("there is no experiment; expected at least one")

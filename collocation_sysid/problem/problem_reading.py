@@ -150,7 +150,11 @@ def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
 
 
 def _apply_override(content: dict[str, Any], override: str) -> None:
-    """Set one value of the content, in place, from "key=value".
+    """Set one value of the content of a problem file, in place, from "key=value"; missing tables
+    are created.
+
+    If a part of a table that an experiment has from [experiment_defaults] is set, the experiment
+    gets a copy of the complete table.
 
     Raises
     ------

@@ -429,7 +429,10 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
 
     @model_validator(mode="after")
     def _require_static_keys(self) -> ExperimentSection:
-        """Raise `ValueError` for keys that make no sense for equilibria."""
+        """Raise `ValueError` if a series of equilibria has a key of motions: another `start` than
+        "equilibrium", another `start_rule` than "standard", `resample_hz`, or
+        `nuisance.time_shift`.
+        """
         if self.kind == "dynamic":
             return self
         usual = {"start": "equilibrium", "start_rule": "standard", "resample_hz": None}

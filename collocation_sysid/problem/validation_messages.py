@@ -122,7 +122,7 @@ def _written_key(key: Sequence[Part], content: dict[str, Any]) -> str:
 
 
 def _value_at(key: Sequence[Part], content: dict[str, Any]) -> Any:
-    """Return the value of a key; None if it does not exist."""
+    """Return the value of a key in the content of a file; None if it does not exist."""
     value: Any = content
     for part in key:
         value = _item(value, part)

@@ -90,8 +90,7 @@ def animate(
     ------
     InputError
         If `run` is not a run folder or has no such experiment, for another kind of file, if ffmpeg
-        is
-        missing, and for numbers out of range.
+        is missing, and for numbers out of range.
     """
     for name, value in (("--fps", fps), ("--slow", slowdown)):
         if not 0 < value < np.inf:

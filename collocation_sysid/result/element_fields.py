@@ -1,15 +1,13 @@
 """Fields in each element: det F, elastic energy density, and von Mises stress.
 
 Each value is the mean over an element, weighted by the volumes of its quadrature points. The stress
-is
-Cauchy's elastic stress, without the damping stress: with P = ∂ψ/∂F,
+is Cauchy's elastic stress, without the damping stress: with P = ∂ψ/∂F,
 
     σ = P Fᵀ / J,   s = σ − ⅓ (tr σ) I,   von Mises: √(3/2 s:s)
 
 (Holzapfel 2000, eqs. 3.9 and 6.4); the von Mises stress of uniaxial stress is that stress itself. F
-is
-the deformation gradient in the constitutive law: where an element averages the dilatation, J is the
-ratio of its volumes at every point.
+is the deformation gradient in the constitutive law: where an element averages the dilatation, J is
+the ratio of its volumes at every point.
 """
 
 from __future__ import annotations
@@ -82,8 +80,7 @@ class ElementFields:
         -------
         dict of str to (T, E)
             det F, elastic energy density [J/m³] and von Mises stress [Pa]. In an inverted element,
-            where
-            ln J does not exist, the values that need it are NaN.
+            where ln J does not exist, the values that need it are NaN.
         """
         body = self.body
         x = np.ascontiguousarray(positions_m, dtype=float).reshape(-1, body.nodes_m.size)

@@ -119,8 +119,7 @@ def view_run(
     ------
     InputError
         If pyvista is missing, `run` is not a run folder, or it has no frames, no such experiment or
-        no
-        such field.
+        no such field.
     """
     if find_spec("pyvista") is None:
         raise InputError(

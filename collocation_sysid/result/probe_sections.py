@@ -86,10 +86,8 @@ def is_deeper_check_worthwhile(result: Result) -> bool:
     """Return whether `solve --probe` may explain the concerns of the verdict.
 
     It may if the residuals, a prediction or a routine probe contradict the model, error bars exist,
-    and
-    nothing else has to be corrected first. A wide combined interval does not count, because its
-    budget
-    already says what to measure.
+    and nothing else has to be corrected first. A wide combined interval does not count, because its
+    budget already says what to measure.
     """
     concerns = result.trust.concerns
     if not result.budget or not is_routine(result):

@@ -114,8 +114,7 @@ class MotionRecord:
         Natural frequencies at the estimate, ascending; None if they are unknown.
     wrenches : sequence of (S, 19)
         For each force sensor: time [s], and six components as measured, fitted and simulated; NaN
-        where
-        one of these is missing.
+        where one of these is missing.
     static : bool
         Whether every sample is an equilibrium of its own.
     tendons_m : (p, 3), or None

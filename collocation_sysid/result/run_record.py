@@ -141,10 +141,8 @@ def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
     constants.
 
     Each array has one row for each of the E elements. A constant has four: its estimate, the ends
-    of its
-    95 % interval (suffixes ``_lower``, ``_upper``), and its posterior over its prior standard
-    deviation
-    (suffix ``_over_prior``).
+    of its 95 % interval (suffixes ``_lower``, ``_upper``), and its posterior over its prior
+    standard deviation (suffix ``_over_prior``).
     """
     data: dict[str, Any] = {"region": body.part_of_cells} if len(body.parts) > 1 else {}
     for name, values in _field_estimates(finished, body).items():
@@ -186,8 +184,7 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
     files.
 
     The fitted experiments come first, then those for validation. A validation experiment whose
-    forward
-    simulation failed is left out.
+    forward simulation failed is left out.
     """
     fitted = {}
     collected = []

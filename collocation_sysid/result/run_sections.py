@@ -325,7 +325,9 @@ def budget_table(result: Result) -> Table:
 
 
 def _estimate_row(result: Result, name: str) -> tuple[str, ...]:
-    """Return the table row of an estimate: value, uncertainties, interval, guess, and a remark."""
+    """Return the cells of an estimate after its name: value, combined uncertainty and interval,
+    statistical and systematic uncertainty, guess, and a remark.
+    """
     each = result.values[name]
     interval = _interval_text(each.combined95)
     remark = each.reason or ""
@@ -448,8 +450,7 @@ def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str
     """Yield lines on how far a forward simulation is from the measurements.
 
     For a validation experiment, the errors of a blind prediction and of copied measurements follow
-    for
-    comparison.
+    for comparison.
 
     Parameters
     ----------

@@ -211,8 +211,7 @@ def replaced_folder(
     """Yield a temporary folder to write into, and rename it to `path` at the end.
 
     An earlier run at `path` is replaced completely, at the end, if this program wrote every file in
-    it
-    and none was changed since. After an exception the temporary folder is removed and `path` is
+    it and none was changed since. After an exception the temporary folder is removed and `path` is
     unchanged. The folder gets a list of its files, see `written_files`.
 
     Parameters
@@ -229,8 +228,7 @@ def replaced_folder(
     ------
     InputError
         If there is anything else at `path`, or a link; this is checked before the temporary folder
-        is
-        given, so that no work is lost, and again at the end.
+        is given, so that no work is lost, and again at the end.
     """
     target = _resolved_parent(Path(path))
     require_replaceable(target, overwrite, marker_file, content_word)

@@ -126,10 +126,8 @@ def write_data(
     ------
     InputError
         Before anything is written: for a parameter without a guess, if the folder has files of
-        others,
-        or if a file would be overwritten that the problem reads or that this program did not write.
-        The
-        problem's own folder may have other files.
+        others, or if a file would be overwritten that the problem reads or that this program did
+        not write. The problem's own folder may have other files.
     SimulationError
         If a simulation fails, before anything is written.
     """
@@ -270,8 +268,7 @@ def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> Non
     """Refuse to write into a folder with files of others, or over a file that the problem reads.
 
     A file that the problem reads may be a measured recording. The problem's own folder may have
-    other
-    files.
+    other files.
 
     Parameters
     ----------

@@ -167,8 +167,7 @@ def surface_strain(replay: MotionRecord, positions_m: Array) -> Array:
     """Return the largest principal strain (T, F) of the elements below the boundary triangles.
 
     The strain is the largest stretch minus one. It is computed from the corners of an element,
-    which
-    for a quadratic element gives an average. NaN where a position is not finite.
+    which for a quadratic element gives an average. NaN where a position is not finite.
 
     Parameters
     ----------

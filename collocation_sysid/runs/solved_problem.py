@@ -148,7 +148,9 @@ class SolvedProblem:
 
     @cached_property
     def budget(self) -> dict[str, BudgetLine]:
-        """The uncertainty budget of each estimate, by name; empty without error bars."""
+        """The uncertainty budget of each estimate, by name; empty without error bars or systematic
+        effects.
+        """
         if self.uncertainty is None or self.systematic_effects is None:
             return {}
         return budget(

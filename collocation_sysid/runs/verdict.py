@@ -132,7 +132,8 @@ def combined_concerns(
     estimates: Mapping[str, ReportedEstimate],
     shares: Mapping[str, Mapping[str, float]],
 ) -> list[Concern]:
-    """Return a concern for each estimated parameter with a combined interval wider than its value.
+    """Return a concern for each estimated parameter whose combined interval is wider than its
+    value, or that has a budget but no interval.
 
     Derived moduli give none: λ of a nearly incompressible material is rarely determined.
 

@@ -88,8 +88,7 @@ class ExportTarget:
         Returns the files for a body.
     verify : callable, optional
         Runs the files of a folder in the simulator, and compares predictions; None if it cannot be
-        run
-        from here.
+        run from here.
     """
 
     name: str
@@ -108,8 +107,7 @@ class TargetCapabilities:
         `other_materials` states.
     other_materials, stiffness_damping, mass_damping : str
         Sentences on other materials, and on the two kinds of damping; they may contain `{material}`
-        and
-        the names of constants of a region. Empty if the simulator expresses the damping.
+        and the names of constants of a region. Empty if the simulator expresses the damping.
     damping_law : str
         Name of the damping law that the simulator has, for which no sentence is needed.
     has_viscoelasticity, has_moving_grasps, has_moving_obstacles, has_quadratic_elements : bool

@@ -213,8 +213,7 @@ class FacetedObstacle:
     """Obstacle as facets whose contact pressure is proportional to the penetration.
 
     To match the pressure law of this package inside the obstacle, the surface is half of its width
-    δ
-    further out, and twice as stiff.
+    δ further out, and twice as stiff.
 
     Attributes
     ----------

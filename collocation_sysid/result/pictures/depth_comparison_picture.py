@@ -37,8 +37,7 @@ def depth_picture(rows: Array) -> Figure:
     surface.
 
     The samples that have outlines are shown side by side. Without a fit there is no second row; if
-    no
-    point counts, the picture has only a sentence about that.
+    no point counts, the picture has only a sentence about that.
 
     Parameters
     ----------

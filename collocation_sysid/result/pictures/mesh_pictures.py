@@ -56,8 +56,7 @@ def mesh_picture(replay: MotionRecord) -> Figure:
     """Draw the undeformed body from the front and from behind, with names of its markers.
 
     Tendons are drawn through the body. A cross is the stated place of a marker whose estimated
-    place
-    differs; a frame surrounds a marker whose place was not stated.
+    place differs; a frame surrounds a marker whose place was not stated.
     """
     nodes_m = replay.undeformed_m
     surface = replay.surface

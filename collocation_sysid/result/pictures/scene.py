@@ -104,8 +104,7 @@ def with_nearby_outlines(points_m: Array, outlines_m: Array | None) -> Array:
     """Return points (T, n, 3) of a body joined with outlines (T, o, 3) of obstacles near it.
 
     Outline points further away than half the body's extent are moved to that distance. Without
-    outlines
-    (None) the points alone are returned.
+    outlines (None) the points alone are returned.
     """
     if outlines_m is None:
         return points_m

@@ -72,8 +72,7 @@ def shapes_picture(
     """Draw the body at evenly spaced samples, side by side in one scale.
 
     Heights are true; horizontally the shapes are moved together. Samples that are not finite, as in
-    a
-    simulation that diverged, are left out.
+    a simulation that diverged, are left out.
 
     Parameters
     ----------
