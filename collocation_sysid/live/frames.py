@@ -156,7 +156,8 @@ def parse_markers(markers: ArrayLike | Mapping[str, Any] | None, names: Sequence
 def parse_custom_readings(
     readings: Mapping[str, Any] | None, gauges: Sequence[Gauge], t_s: float
 ) -> tuple[InstrumentSample, ...]:
-    """Return samples of custom sensors; a sample without a time has the time of the frame.
+    """Return samples of custom sensors, each as number of the instrument (from 1), time and values;
+    a sample without a time has the time of the frame.
 
     Parameters
     ----------
@@ -191,7 +192,8 @@ def parse_custom_readings(
 def parse_wrenches(
     wrench_data: Any, wrenches: Mapping[int, Wrench], instruments_before: int, t_s: float
 ) -> tuple[InstrumentSample, ...]:
-    """Return samples of the sensors of grasps; a sample without a time has the time of the frame.
+    """Return samples of the sensors of grasps, each as number of the instrument, time and values; a
+    sample without a time has the time of the frame.
 
     Parameters
     ----------
@@ -274,7 +276,13 @@ def _parse_samples(
 
 
 def _parse_array(raw_values: Any, shape: tuple[int, ...]) -> Array:
-    """Return an array of floats of the given shape, or raise an `InputError`."""
+    """Return an array of floats of the given shape; None becomes NaN.
+
+    Raises
+    ------
+    InputError
+        For anything else, another shape, or infinite numbers.
+    """
     size = " × ".join(map(str, shape))
     try:
         values = np.array(raw_values, dtype=float)
@@ -343,7 +351,9 @@ class FrameReader:
             raise InputError(f"{where}: {error.message}") from error
 
     def _parse_object(self, json_object: Mapping[str, Any]) -> Frame:
-        """Return the frame of a JSON object."""
+        """Return the frame of a JSON object; raise an `InputError` for unknown keys, and without
+        t_s.
+        """
         if unknown := [key for key in json_object if key not in _KEYS]:
             raise InputError(
                 f"found the key {reprlib.repr(unknown[0])}; expected {', '.join(_KEYS)}"

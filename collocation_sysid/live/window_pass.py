@@ -163,7 +163,9 @@ class WindowPass:
         return self.linearisation_points_from(0)
 
     def linearisation_points_from(self, row: int) -> list[Array]:
-        """Return the transformed parameters at which the rows from an index on are linearised."""
+        """Return the transformed parameters (P,) at which the rows from the index `row` of the
+        window on are linearised, in order of the rows; one for each change.
+        """
         before = [transformed for first, transformed in self._base_changes if first <= row]
         return [
             *before[-1:],

@@ -303,14 +303,18 @@ def _rest_shape(section: ObjectSection) -> UnderGravity | Literal["stress_free"]
 
 
 def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
-    """Return the friction parameters that obstacles name, each once."""
+    """Return the friction parameters that obstacles name, each once; frictions given as numbers are
+    left out.
+    """
     declared = (each.friction for section in file.experiment for each in section.obstacle)
     named = (one for one in declared if isinstance(one, str) and one.endswith(FRICTION.name))
     return tuple(dict.fromkeys(map(constant_named, named)))
 
 
 def _as_parameter(name: str, section: ParameterSection | float) -> Unknown | Tied | float:
-    """Return one parameter from its table, or from its fixed value."""
+    """Return one parameter from its table, or its fixed value; a table with `tied_to` gives a tied
+    parameter.
+    """
     if not isinstance(section, ParameterSection):
         return section
     if section.fixed is not None:

@@ -168,7 +168,9 @@ class Problem:
         return {name: each for body in self.bodies for name, each in body.field_lengths_m.items()}
 
     def with_lengths(self, lengths_m: Mapping[str, float]) -> Problem:
-        """Return the problem with other correlation lengths [m] of spatially varying constants."""
+        """Return the problem with other correlation lengths [m] of spatially varying constants, by
+        name of the constant; itself if nothing changes.
+        """
         if dict(lengths_m) == self.lengths_m:
             return self
         bodies = {id(body): body.with_field_lengths(lengths_m) for body in self.bodies}

@@ -387,6 +387,9 @@ class RecordingReader:
     def _from_table(self, kind: type, list_key: str, k: int) -> Any:
         """Return the object of a table in a list, such as a tendon or a pressure, on the body.
 
+        Values over time are read from the files that the table names. An object without a name is
+        numbered.
+
         Parameters
         ----------
         kind : type
@@ -395,6 +398,11 @@ class RecordingReader:
             Key of the list.
         k : int
             Index of the table in it.
+
+        Raises
+        ------
+        InputError
+            If a file is missing or unusable, or the object does not fit the body.
         """
         table = getattr(self.section, list_key)[k]
         where = f"{list_key}.{k}"

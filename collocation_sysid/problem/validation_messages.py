@@ -46,8 +46,8 @@ def explain_validation_error(
 
 
 def _fault_key(fault: Fault, root: type[BaseModel]) -> list[Part]:
-    """Return the key of a fault, without tags of unions and without indices in an array of
-    numbers.
+    """Return the parts of the key of a fault, without tags of unions and without indices in an
+    array of numbers.
     """
     loc = fault["loc"]
     own = len(loc) - 1 if fault["type"] == "extra_forbidden" else len(loc)  # that is the file's
@@ -102,7 +102,11 @@ def _fault_location(fault: Fault, content: dict[str, Any], root: type[BaseModel]
 
 
 def _written_key(key: Sequence[Part], content: dict[str, Any]) -> str:
-    """Return the key as it is written in the file, with experiments by their names."""
+    """Return a key as text, as it is written in the file: "experiment 'swing': markers.file" for a
+    key of an experiment with a name, else its parts joined by dots.
+
+    A value that an experiment has from [experiment_defaults] is located there.
+    """
     value: Any = content
     defaults = _item(content, "experiment_defaults")
     if key[:1] == ["experiment"] and len(key) > 2:
