@@ -373,7 +373,9 @@ def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
 
 
 def _starting_guess(name: str, shear_pa: float | None) -> dict[str, Any]:
-    """Return the table of a constant: with a guess as stiff as the file's, or empty for a scan."""
+    """Return the table of a constant: with a guess that gives the shear modulus `shear_pa`, or
+    empty, for a scan, if that is None or the constant has no usual value.
+    """
     if shear_pa is None:
         return {}
     usual = usual_value(name, 2 * (1 + USUAL_POISSON) * shear_pa, USUAL_POISSON)

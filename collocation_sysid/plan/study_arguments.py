@@ -46,7 +46,7 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
 def read_truth(
     sources: Sequence[str], known_names: Sequence[str], needed: Sequence[str]
 ) -> dict[str, float]:
-    """Return the true values of parameters, by name.
+    """Return the true values of parameters, by name; empty without sources.
 
     Parameters
     ----------

@@ -68,12 +68,13 @@ def export_page(
 def field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
     """Return a field (T, F) on the boundary triangles, at each sample that of the nearest frame.
 
-    Point data are averaged over the corners of a triangle; of vectors the norm is taken.
+    Point data are averaged over the corners of a triangle; of vectors the norm is taken. Contact
+    pressure and gap come from `replay` and need no frames.
 
     Raises
     ------
     InputError
-        If the frames have no such field.
+        If the frames have no such field, or there are none.
     """
     if field in CONTACT_FIELDS and (contact_values := getattr(replay, field)) is not None:
         return contact_values

@@ -268,7 +268,9 @@ class ParameterSliders:
         return "; ".join(texts) or "no measurement to compare with"
 
     def _figure(self, simulation: ForwardSimulation) -> Figure:
-        """Return the picture of the first kind of measurements that the recording has."""
+        """Return the picture of the first kind of measurements that the recording has: markers, a
+        wrench, a custom sensor; without these, the picture of the shapes.
+        """
         from .pictures.over_time import marker_tracks, sensor_picture
 
         experiment = self._experiment

@@ -432,8 +432,8 @@ def read_run(folder: str | Path) -> tuple[Result, list[MotionRecord]]:
 
 
 def run_headline(result: Result) -> str:
-    """Return Young's moduli with their combined standard uncertainties, and the verdict, in one
-    line.
+    """Return Young's moduli, each with its combined standard uncertainty if known, and the verdict,
+    as one line of text.
     """
     moduli = {
         symbol_of(n): each for n, each in result.values.items() if without_region(n) == "young_pa"

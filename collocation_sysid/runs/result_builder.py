@@ -365,7 +365,8 @@ def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Itera
 def _nuisance_sentence(
     part: ExperimentIterate, components: Sequence[int], values: Array, answer: SolvedProblem
 ) -> str:
-    """Return the sentence on a vector, or a number, of nuisance parameters.
+    """Return a sentence with the size of a nuisance parameter, or of a vector of them, its standard
+    error if known, and its prior.
 
     Parameters
     ----------

@@ -282,7 +282,9 @@ class _LinearisedMeasurements:
 def _linearise_in_elements(
     problem: Problem, search: _PhaseSearch, solution: Solution
 ) -> _LinearisedMeasurements:
-    """Return the measurements linearised at a solution in the logarithm of every element."""
+    """Return the measurements linearised at a solution with the logarithm of the constant in every
+    element as a parameter, instead of the shapes of the field.
+    """
     body = _two_phase_body(solution, search)
     part = body.parts[search.number]
     assert part.field is not None

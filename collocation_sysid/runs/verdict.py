@@ -175,7 +175,8 @@ def body_concerns(solution: Solution) -> Iterator[Concern]:
 
 
 def allowance_concerns(solution: Solution) -> Iterator[Concern]:
-    """Yield a concern for each static experiment with a `sigma_m` larger than the noise of cameras.
+    """Yield a concern for each static experiment whose `sigma_m`, relative to the size of the body,
+    is larger than the noise of cameras.
 
     In motions the autocorrelation of the residuals shows this; static experiments have none.
     """
@@ -250,7 +251,9 @@ def _depth_concerns(name: str, rollout: ForwardSimulation, solution: Solution) -
 
 
 def depth_errors(solution: Solution) -> dict[tuple[str, str], DepthError]:
-    """Distances of depth cameras' points from the fitted surface, by (experiment, camera)."""
+    """Return the distances of depth cameras' points from the fitted surface, by (experiment,
+    camera).
+    """
     return {
         (part.segment.experiment.name, reading.correspondences.camera.depth.name): (
             SurfaceComparison.from_fit(reading, part.x, observation, part.phi).error
@@ -261,7 +264,9 @@ def depth_errors(solution: Solution) -> dict[tuple[str, str], DepthError]:
 
 
 def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float:
-    """RMS distance of the fitted markers that is expected from noise with the stated σ [m]."""
+    """Return the RMS distance [m] of the fitted markers that is expected from noise with the stated
+    σ, less what the fitted parameters absorb; without `uncertainty` they absorb nothing.
+    """
     markers = [segment.experiment.markers for segment in solution.collocation.transcriptions]
     samples = np.concatenate([each.is_present.sum(axis=0) for each in markers]).astype(float)
     sigma_m = np.concatenate([each.sigma_m for each in markers])
@@ -271,7 +276,8 @@ def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float
 
 
 def modes_by_experiment(problem: Problem, solution: Solution) -> dict[str, ModesCheck]:
-    """Natural modes of each body at the estimates, by experiment; empty if the search failed.
+    """Return the natural modes of each body at the estimates, by experiment; empty if the search
+    failed.
 
     Static experiments, and those without an equilibrium, are left out.
     """

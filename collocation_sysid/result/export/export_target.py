@@ -212,7 +212,7 @@ def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
 
 def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
     """Return the equilibria of this package at the first samples, without the loads that exports
-    omit.
+    omit: tendons, pressures and air.
 
     Parameters
     ----------
@@ -226,6 +226,11 @@ def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
         Displacements of the nodes from `IdentifiedBody.nodes_m`.
     forces_n : (T, o, 3)
         Forces of each obstacle on the body.
+
+    Raises
+    ------
+    SimulationError
+        If an equilibrium cannot be found.
     """
     experiment = replace(
         body.experiment_with_obstacles or body.experiment,

@@ -72,8 +72,8 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 
 
 def _material_xml(number: int, region: IdentifiedRegion, limits: list[str]) -> str:
-    """Return the XML of the material numbered `number` from 1; limitations are appended to
-    `limits`.
+    """Return the XML of the material numbered `number` from 1, with its viscoelastic branches;
+    sentences on what it does not express are appended to `limits`, in place.
     """
     kind, values, uncoupled = _elastic_law(region, limits)
     inner = "".join(f"<{tag}>{value!r}</{tag}>" for tag, value in values.items())

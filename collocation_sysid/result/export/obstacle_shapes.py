@@ -168,7 +168,9 @@ class Facets:
 
 
 def _unit_normals(corners: Array) -> Array:
-    """Return the unit normals (f, 3) of triangles with corners (f, 3, 3)."""
+    """Return the unit normals (f, 3) of triangles with corners (f, 3, 3); NaN for a triangle
+    without area.
+    """
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normals / np.linalg.norm(normals, axis=1)[:, None]
 

@@ -89,7 +89,7 @@ class SheetView:
 
 
 def aspect_ratio(camera: ParallelCamera, points_m: Array) -> float:
-    """Return the aspect ratio of points (…, 3) as the camera shows them."""
+    """Return width over height of points (…, 3) in the picture of a camera."""
     low, high = _projected_extent(camera, points_m)
     return float((high - low)[0] / (high - low)[1])
 

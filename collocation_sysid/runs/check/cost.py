@@ -199,9 +199,11 @@ def cost_concerns(chosen: MethodCost, others: Sequence[MethodCost]) -> list[Conc
 def _estimated_sweeps_s(
     collocation: Collocation, short: Collocation, z: Array, factorisation: Choice
 ) -> float | None:
-    """Return the time of all sweeps [s], from one over the first rows of each experiment.
+    """Return the estimated time of all sweeps of a solve [s], from one timed sweep over the first
+    rows of each experiment.
 
-    None if the equations cannot be solved.
+    None if the equations cannot be solved. `z` has the variables of the program `short` at the
+    start.
     """
     total = 0.0
     for segment, part in zip(collocation.transcriptions, short.iterates(z), strict=True):
