@@ -17,6 +17,7 @@ from .mesh_checks import orient_elements
 
 # Sectors of a cylinder by edge length: a multiple of four, which a quarter of a cylinder needs.
 _SECTORS = 8
+# Largest number of elements that are made: more follow from a wrong unit of the edge length.
 _MOST_ELEMENTS = 1_000_000
 
 

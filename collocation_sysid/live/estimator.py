@@ -76,6 +76,7 @@ RADIUS_REDUCTION = 0.25
 # A pass is accepted if its sum of squares is at most TIMES · expected + SLACK: rows that arrived in
 # the meantime are fitted by the next pass.
 ACCEPTED_RATIO = 1.25
+# Slack of this sum of squares, for passes of few rows.
 ACCEPTED_EXCESS = 1.0
 # Default of the computing time of a frame, as a fraction of the time between samples.
 BUDGET_FRACTION = 0.8

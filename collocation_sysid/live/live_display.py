@@ -20,11 +20,17 @@ from .estimator import LiveUpdate
 
 # Characters of increasing height.
 BARS = "▁▂▃▄▅▆▇█"
+# Number of passes whose estimates are shown as bars: half of a terminal's 80 columns.
 COLUMNS = 40
+# Largest number of reasons of the verdict: more do not fit below the estimates.
 SHOWN_REASONS = 2
+# Width of the film [mm].
 WIDTH_MM = 160.0
+# Height of a parameter's panel in the film [mm].
 ROW_MM = 32.0
+# Resolution of the film [pixels per inch], which makes it 630 pixels wide.
 DPI = 100
+# Frame rate of the film [1/s], as of cinema.
 FRAMES_A_SECOND = 25
 
 

@@ -27,6 +27,7 @@ from .study_arguments import unique_items
 
 # Where a branch's share starts; time constants start evenly between a sample and the recording.
 SHARE = 0.1
+# Largest number of branches: no recording determines as many time constants.
 MOST_BRANCHES = 20
 # Constants of which a material needs one beside those of its shape.
 VOLUMETRIC = {"lambda_pa", "kappa_pa", "poisson"}
@@ -34,6 +35,7 @@ VOLUMETRIC = {"lambda_pa", "kappa_pa", "poisson"}
 DAMPING_ASSUMPTIONS = ("damping_law", "rayleigh_damping")
 # Of a material of which nothing is said; and of the shear modulus, what a constant about zero has.
 USUAL_POISSON = 0.3
+# Typical change of a constant about zero, over the shear modulus.
 LESS = 0.1
 
 

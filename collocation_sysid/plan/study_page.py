@@ -30,7 +30,9 @@ from .study_rows import (
     run_row,
 )
 
+# Resolution of the plots [pixels per inch], for a page.
 RESOLUTION_DPI = 150
+# Largest number of failures on the terminal; summary.md lists all.
 SHOWN_FAILURES = 8
 # Heads of the tables where there is room, on pages.
 WORDS = {

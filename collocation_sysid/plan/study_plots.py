@@ -46,10 +46,13 @@ from .study_rows import (
 
 Array = NDArray[Any]
 
+# Number of groups of distances from the truth, in which successes are counted.
 DISTANCE_BINS = 5
 # Estimates whose ratio is larger are drawn on a logarithmic axis.
 WIDE = 30.0
+# Largest number of labels on an axis: more would overlap.
 MOST_TICKS = 9
+# Width and height of a panel [mm].
 PANEL_MM = 32.0
 
 

@@ -42,7 +42,9 @@ OUTSIDE_PX = 1.5
 LEAST_BACKGROUND_SHARE = 0.1
 # What pixels show, compared with a point of the outline.
 BODY = 0
+# The pixel does not tell whether the body is there.
 UNKNOWN = 1
+# The body is not there.
 EMPTY = 2
 
 

@@ -30,6 +30,7 @@ STIFFNESSES = 12
 STIFFEST = 30.0
 # Damping ratios that are tried with each stiffness.
 DAMPING_RATIOS = (0.03, 0.25)
+# Gravity by which the sag of the softest body is estimated [m/s²].
 STANDARD_GRAVITY_M_S2 = 9.81
 # Largest number of samples that are predicted.
 MOST_SAMPLES = 300

@@ -36,9 +36,11 @@ from .wrench_residual import wrench_residuals
 
 # Name of the integrator that is no collocation scheme, and its order of accuracy.
 NEWMARK = "newmark"
+# Order of accuracy of Newmark's method with the trapezoidal rule.
 NEWMARK_ORDER = 2
 # Steps a sample that automatic refinement begins with.
 FIRST_NEWMARK_STEPS = 4
+# The same of a collocation scheme: the grid of a solve with one step.
 FIRST_SCHEME_STEPS = 1
 # Largest number of steps a sample that automatic refinement takes: the cost of all refinements
 # together is then 63 times that of one step a sample.

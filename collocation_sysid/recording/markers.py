@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Markers", "Placement", "place_markers"]
 
+# Largest number of marker names in the text of an object; others are replaced by an ellipsis.
 MOST_NAMES_SHOWN = 4
 
 UndeformedPlaces = Callable[[Array, Array], Array]

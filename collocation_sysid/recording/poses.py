@@ -25,6 +25,7 @@ from .sample_times import TIME_TOLERANCE_S, first_unordered_time
 
 Interpolation = Literal["smooth", "linear", "hold"]
 
+# Largest deviation of a quaternion's norm from one: files print four digits or more.
 QUATERNION_NORM_TOLERANCE = 1e-3
 # A held pose starts at its sample, also where the time asked for is rounded to just before it.
 _INTERVAL_SNAP_STEPS = 1e-6

@@ -37,9 +37,11 @@ Mask = NDArray[np.bool_]
 UNDETERMINED = 100.0
 # An interval wider than this factor, or this share of Poisson's (0, ½), identifies nothing.
 WIDE_FACTOR = 10.0
+# Width of an interval of Poisson's ratio beyond which it identifies nothing.
 WIDE_POISSON = 0.4
 # A correlation beyond this, for a deviation beyond that, leaves only a combination identified.
 CONFOUNDED = 0.98
+# Relative deviation that this requires in addition.
 CONFOUNDED_DEVIATION = 0.1
 
 

@@ -41,7 +41,9 @@ Say = Callable[[str], None]
 FORBIDDEN = 1e3
 # Motions that are tried to first order, which takes milliseconds each, for each simulated one.
 TO_FIRST_ORDER = 10
+# Motions evaluated to first order between two reports of the progress.
 NEWS = 500
+# Largest memory of the first-order prediction [GB]; with more, motions are simulated only.
 MOST_GIGABYTES = 1.0
 
 

@@ -41,6 +41,7 @@ CAPABILITIES = TargetCapabilities(
 _ARRUDA_BOYCE_COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 # Largest number of terms of Ogden's law and of the foam, and of values on a line.
 MOST_TERMS = 3
+# Largest number of values on a line of a card, by the manual of CalculiX.
 VALUES_PER_LINE = 8
 FOAM_LIMITATION = (
     "CalculiX 2.20 finds no equilibrium of a HYPERFOAM of one term, or of two with a negative "

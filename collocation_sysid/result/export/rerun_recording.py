@@ -38,9 +38,13 @@ MISSING = "--to rerun needs rerun-sdk: pip install 'collocation-sysid[rerun]'"
 MARKER_RADIUS_RATIO = 0.012
 # Colours (red, green, blue), from 0 to 255, as in the pictures of a run.
 ORANGE = (230, 159, 0)
+# Fitted markers.
 BLUE = (0, 114, 178)
+# Simulated markers.
 VERMILION = (213, 94, 0)
+# Grasped nodes and obstacles.
 BLACK = (20, 20, 20)
+# Surface without stress.
 GREY = (150, 160, 170)
 
 

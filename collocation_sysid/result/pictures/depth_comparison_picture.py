@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...array_types import Array
 from ..figure_style import PAGE_MM, SMALL_PT, VERMILION
 
+# Millimetres in an inch, the unit of lengths in Matplotlib.
 MM_PER_INCH = 25.4
 # Largest width of a panel, as a share of the page.
 MAX_PANEL_SHARE = 0.6

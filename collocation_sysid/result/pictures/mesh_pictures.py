@@ -32,13 +32,17 @@ from .scene import (
 
 # More names than this would be a list, not a picture.
 MAX_WRITTEN_NAMES = 24
+# Height of the titles [mm].
 HEAD_MM = 6.0
+# Height of directions, scale and legend below the body [mm].
 FOOT_MM = 14.0
+# Distance between two views [mm].
 GAP_MM = 3.0
 # Height of a line of text.
 LINE_MM = 3.2
 # Mean width of a letter.
 LETTER_MM = 1.4
+# Largest height of a view [mm], so that two fit on a page.
 MAX_BODY_HEIGHT_MM = 70.0
 # Shortest distance on paper at which two marks are drawn apart: nearer ones cover each other.
 MIN_MARK_DISTANCE_MM = 0.4
@@ -221,6 +225,7 @@ def spread_levels(levels: Array, gap: float) -> Array:
     return np.concatenate([*means, np.zeros(0)]) + steps
 
 
+# Bins of a histogram in half a column: 1.5 mm each.
 HISTOGRAM_BINS = 24
 
 

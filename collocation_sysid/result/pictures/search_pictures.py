@@ -141,6 +141,7 @@ def _positive_or_nan(values: Sequence[float] | Array) -> Array:
     return np.where((array > 0) & np.isfinite(array), array, np.nan)
 
 
+# Height of the picture of a scan [mm].
 HEIGHT_MM = 52
 
 

@@ -33,13 +33,21 @@ from .scene import (
     with_nearby_outlines,
 )
 
+# Number of shapes in a picture, evenly spaced in time: more would be too small on a page.
 SHOWN_SHAPES = 6
+# Height of the titles with the times [mm].
 HEAD_MM = 5.0
+# Height of directions, scale and legend below the bodies [mm].
 FOOT_MM = 5.0
+# Width of the directions at the left [mm].
 CORNER_MM = 14.0
+# Largest height of a body [mm].
 MAX_BODY_HEIGHT_MM = 60.0
+# Distance between two bodies [mm].
 GAP_MM = 4.0
+# Width of the colour bar [mm].
 BAR_MM = 2.5
+# Width of the colour bar with its labels [mm].
 BAR_ROOM_MM = 20.0
 # From pale to dark, on which markers and grasped nodes stand out; its darkest fifth is left out.
 FIELD_COLOURS = ListedColormap(colormaps["YlGnBu"](np.linspace(0.0, 0.8, 256))).with_extremes(

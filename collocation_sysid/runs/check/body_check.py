@@ -38,6 +38,7 @@ LINEAR = "tet4"
 FOR_BENDING = 'set object.element = "tet10"'
 FOR_VOLUME = 'set object.element = "tet10-p0"'
 
+# Corners of the faces of a tetrahedron; face k is opposite to corner k.
 _FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
 
 
