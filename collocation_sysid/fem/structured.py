@@ -54,7 +54,9 @@ def cylinder_of_edge(
     _require_element_limit(3 * _SECTORS * float(rings**2 * layers))
     corners = _SECTORS * rings
     radius_m = diameter_m / 2 * sqrt(2 * pi / corners / sin(2 * pi / corners))
-    full_cylinder = cylinder_mesh(radius_m, height_m, int(rings), int(layers), _SECTORS)
+    full_cylinder = cylinder_mesh(
+        radius_m, height_m, rings=int(rings), layers=int(layers), sectors=_SECTORS
+    )
     if not quarter:
         return full_cylinder
     points_m = np.where(

@@ -97,7 +97,8 @@ def write_film(updates: Sequence[LiveUpdate], file: str | Path) -> Path:
     names = list(updates[-1].estimates)
     figure = new_figure(WIDTH_MM, ROW_MM * len(names))
     lines = [
-        _draw_parameter(figure, k, len(names), name, t_s, updates) for k, name in enumerate(names)
+        _draw_parameter(figure, k, count=len(names), name=name, t_s=t_s, updates=updates)
+        for k, name in enumerate(names)
     ]
     step = max(1, round(len(t_s) / max(1.0, (t_s[-1] - t_s[0]) * FRAMES_A_SECOND)))
     writer = PillowWriter(fps=FRAMES_A_SECOND)

@@ -227,9 +227,9 @@ def scan_stiffness(
     return Scan(
         reason,
         young_pa,
-        misfit,
-        best,
-        start,
+        misfit=misfit,
+        best=best,
+        parameters=start,
         samples=sum(trial.samples),
         time_s=time.perf_counter() - began,
         starts=starts,
@@ -478,7 +478,9 @@ class _TrialSimulation:
         """Return trajectories of so many rows at p, and the first failure, see
         `simulate_trajectories`.
         """
-        return simulate_trajectories(self.collocation, p, None, rows, LOOSE, guess=warm)
+        return simulate_trajectories(
+            self.collocation, p, known_rows=None, rows=rows, options=LOOSE, guess=warm
+        )
 
 
 class _ScanState:

@@ -424,7 +424,9 @@ class MemoryState:
     @classmethod
     def at_start(cls, body: Body, x: Array, theta: Array, loaded_s: float) -> MemoryState:
         """Return the memory in the start shape x (3n,), loaded for a time `loaded_s`."""
-        return MemoryHistory.from_states(body, x[None], theta, np.ones(1), loaded_s).final_state
+        return MemoryHistory.from_states(
+            body, x[None], theta=theta, until_next_s=np.ones(1), loaded_s=loaded_s
+        ).final_state
 
     def insert_at_same_time(self, forces: Forces) -> Forces:
         """Return forces in the same state, with the overstress Q inserted."""

@@ -90,7 +90,7 @@ def _parse_names(text: str, known_rows: Iterable[str], option: str) -> tuple[str
     """
     names = unique_items(text)
     for name in names or ("",):
-        require_among(name, known_rows, None, option, "some")
+        require_among(name, known_rows, where=option, count="some")
     return names
 
 
@@ -138,7 +138,15 @@ def models(
         times_s = min(e.timestep_s for e in fitted), max(e.duration_s for e in fitted)
         files, compared = compared, []
         for file in files:
-            of_file = variants(file.path, overrides, materials, branches, times_s, region, dampings)
+            of_file = variants(
+                file.path,
+                overrides,
+                materials=materials,
+                branches=branches,
+                times_s=times_s,
+                region=region,
+                dampings=dampings,
+            )
             front = f"{file.label}: " * (len(files) > 1)
             compared += [replace(v, label=front + v.label, path=file.path) for v in of_file]
     if len(compared) < 2:

@@ -140,7 +140,13 @@ def load_report(
     """Return the report of planned runs from their stored records."""
     loaded = {run.key: store.load(run.key) for run in planned}
     records = {key: record for key, record in loaded.items() if record is not None}
-    return StudyReport(title, kind, tuple(planned), records, yardstick or SuccessCriterion())
+    return StudyReport(
+        title,
+        kind,
+        planned=tuple(planned),
+        records=records,
+        yardstick=yardstick or SuccessCriterion(),
+    )
 
 
 # In the terminal ---------------------------------------------------------------------------------

@@ -314,7 +314,15 @@ def _edges(
         "faces": points.faces,
         "weights": points.weights,
         "is_compared": has_edge | is_beyond,
-        **_planes(camera_in, camera, edges, outwards, points.depth_m, phi=phi, sample=sample),
+        **_planes(
+            camera_in,
+            camera,
+            edges=edges,
+            outwards=outwards,
+            depth_m=points.depth_m,
+            phi=phi,
+            sample=sample,
+        ),
     }
 
 

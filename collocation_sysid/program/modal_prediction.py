@@ -184,7 +184,13 @@ class ModalResponse:
         step_s = float(declared.t_s[1] - declared.t_s[0])
         omega = self._frequencies(scale)
         states = [
-            _oscillator_responses(omega, ratio, loads, step_s, self.is_initially_at_rest)
+            _oscillator_responses(
+                omega,
+                ratio,
+                loads=loads,
+                step_s=step_s,
+                is_initially_at_rest=self.is_initially_at_rest,
+            )
             for ratio in DAMPING_RATIOS
         ]
         q = np.concatenate([*states, np.zeros((1, *loads.shape))])

@@ -180,7 +180,12 @@ class Markers:
                 places[m] = weights @ body.nodes_m[nodes]
         nodes_m = body.nodes.points_m
         placement = place_markers(
-            places, nodes_m, body, self.attach, self.max_distance_m, self.names
+            places,
+            nodes_m,
+            body=body,
+            attach=self.attach,
+            max_distance_m=self.max_distance_m,
+            names=self.names,
         )
         return replace(self, places_m=None, placement=placement)
 

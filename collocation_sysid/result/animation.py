@@ -112,7 +112,7 @@ def animate(
         raise InputError(
             f"found '{file.suffix}'; expected {' or '.join(PIXELS_WIDE)}", file, "--to"
         )
-    return film(replay, file, fps, slowdown, progress, headline=text)
+    return film(replay, file, fps=fps, slowdown=slowdown, progress=progress, headline=text)
 
 
 def film(

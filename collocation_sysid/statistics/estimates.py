@@ -237,9 +237,9 @@ def _scaled_estimate(estimate: Estimate, ratio: float) -> Estimate:
         None
         if estimate.statistical_std_error is None
         else abs(ratio) * estimate.statistical_std_error,
-        None if not ends else (ends[0], ends[1]),
-        estimate.at_bound,
-        estimate.reason,
+        statistical95=None if not ends else (ends[0], ends[1]),
+        at_bound=estimate.at_bound,
+        reason=estimate.reason,
     )
 
 

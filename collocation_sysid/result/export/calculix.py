@@ -300,7 +300,11 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     what = "at rest" if len(times) == 1 else f"at {times[-1]:g} s"
     comparisons = [
         PredictionComparison(
-            f"largest displacement {what}", longest_displacement_m(theirs), sag_m, "m", remark
+            f"largest displacement {what}",
+            longest_displacement_m(theirs),
+            ours=sag_m,
+            unit="m",
+            remark=remark,
         )
     ]
     for each, push, force in zip(body.obstacles, their_forces, forces, strict=True):

@@ -222,7 +222,7 @@ def marker_errors(
     fitted_m, simulated_m : (T, M, 3) or None
         Fitted and simulated markers.
     """
-    figure = framed_figure(COLUMN_MM, 52, 13, 2, 9.5, 9)
+    figure = framed_figure(COLUMN_MM, 52, left_mm=13, right_mm=2, foot_mm=9.5, top_mm=9)
     axes = figure.subplots()
     totals = []
     for label, model_m, style in drawn_models(fitted_m, simulated_m):

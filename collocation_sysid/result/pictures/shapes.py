@@ -121,7 +121,13 @@ def shapes_picture(
     start = CORNER_MM + (gap - GAP_MM) / 2
     for t, first, last, colour in zip(shown, lefts, rights, colours, strict=True):
         view = SheetView(camera, scale, np.array([start - scale * first, FOOT_MM - scale * low]))
-        body = BodyDrawing(axes, view, replay.surface, replay.surface_parts, replay.surface_nodes)
+        body = BodyDrawing(
+            axes,
+            view,
+            surface=replay.surface,
+            parts=replay.surface_parts,
+            nodes=replay.surface_nodes,
+        )
         obstacles_m = None if replay.obstacles_m is None else replay.obstacles_m[t]
         body.update(positions_m[t], replay.is_prescribed[t], measured_m[t], colour, obstacles_m)
         text = {"ha": "center", "va": "center", "fontsize": SMALL_PT}
