@@ -26,12 +26,13 @@ LAYERS = (
     {"methods"},
     {"statistics"},
     {"problem"},
+    {"datasets"},
     {"runs"},
     {"result"},
     {"pipeline", "installation_check"},
     {"live"},
     {"plan"},
-    {"cli"},
+    {"cli", "testing"},
     {"__main__"},
 )
 

@@ -164,6 +164,19 @@ def _run(
 ) -> tuple[Array, Array, str, int]:
     """Run a solver, on a thread of its own if this is the main thread.
 
+    Parameters
+    ----------
+    solver : ca.Function
+        Solver of CasADi's `nlpsol`.
+    bounds : ((variables,) array, (variables,) array)
+        Lower and upper bounds of the variables.
+    start : (variables,) array
+        Initial variables.
+    monitor : IterationMonitor
+        Can stop the solver; receives its errors.
+    multipliers : InitialMultipliers or None
+        Initial multipliers; None for those of the solver.
+
     Returns
     -------
     tuple
@@ -201,6 +214,9 @@ def _run(
 def _run_on_thread(search: Callable[[], None], monitor: IterationMonitor) -> None:
     """Run a search on a thread, so that the main thread can handle signals during long
     factorisations.
+
+    After a request to stop, the search is abandoned if it does not end within `GRACE_S`: the thread
+    goes on, and `monitor.errors` receives an entry.
     """
     thread = threading.Thread(target=copy_context().run, args=(search,), daemon=True)
     with _interruptible(monitor):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
+from ..errors import InputError
 from ..fem.elements import ELEMENTS
 from ..fem.materials import DAMPINGS, MATERIALS
 from ..fem.spatial_field import Field as MaterialField
@@ -27,6 +28,7 @@ from ..validated_types import Count, Finite, Flag, NotNegative, Positive, Text
 from .problem_options import RolloutOptions, UncertaintyOptions
 from .recording_schema import ExperimentSection
 from .solver_schema import SolverSection
+from .specimen_schema import SpecimenSection
 
 MaterialName = Annotated[str, Among(tuple(MATERIALS))]
 DampingName = Annotated[str, Among(tuple(DAMPINGS))]
@@ -146,6 +148,10 @@ class ScanSection(Section):
     gravity_m_s2: Vector = (0.0, 0.0, -9.81)
 
 
+# Keys of the object that state its shape.
+SHAPES = ("mesh", "surface", "cylinder", "box_m")
+
+
 class ObjectSection(Section):
     """The soft object: its mesh, surface or shape, mass and material.
 
@@ -211,11 +217,17 @@ class ObjectSection(Section):
     scan: ScanSection | None = None
     evaluator: Literal["auto", "simd", "casadi"] = "auto"
 
+    @property
+    def has_shape(self) -> bool:
+        """Whether the table states a mesh, a surface or a shape."""
+        return bool(used_keys(self, *SHAPES)) or self.edge_length_m is not None
+
     @model_validator(mode="after")
     def _require_consistent(self) -> ObjectSection:
         """Raise `ValueError` for keys that exclude or require each other."""
-        require_one(self, "mesh", "surface", "cylinder", "box_m")
-        if (self.mesh is None) != (self.edge_length_m is not None):
+        if self.has_shape:
+            require_one(self, *SHAPES)
+        if self.has_shape and (self.mesh is None) != (self.edge_length_m is not None):
             raise ValueError(
                 "edge_length_m is used only with surface, cylinder or box_m; expected one of "
                 "these, or no edge_length_m"
@@ -360,6 +372,24 @@ class EnvironmentSection(Section):
     air_density_kg_m3: AirDensity = Field(default_factory=usual_air_density)
 
 
+def _kind_tag(value: Any) -> str:
+    """Return the tag of an experiment's table, which messages omit."""
+    kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
+    return SPECIMEN_TAG if kind == "specimen" else "<recording>"
+
+
+# Tag of the tables of specimens in the locations of validation errors.
+SPECIMEN_TAG = "<specimen>"
+if TYPE_CHECKING:
+    AnyExperimentSection = ExperimentSection | SpecimenSection
+else:
+    AnyExperimentSection = Annotated[
+        Annotated[ExperimentSection, Tag("<recording>")]
+        | Annotated[SpecimenSection, Tag(SPECIMEN_TAG)],
+        Discriminator(_kind_tag),
+    ]
+
+
 class ProblemFile(Section):
     """A problem file (TOML).
 
@@ -369,16 +399,16 @@ class ProblemFile(Section):
         Constants of the model by name: {} or a guess for a constant to estimate, a number for a
         known one, or a tie to another constant.
     experiment_defaults : mapping of name to Any
-        Default keys of every [[experiment]] table.
-    experiment : list of ExperimentSection
-        At least one [[experiment]] table, one for each recording.
+        Default keys of every [[experiment]] table; specimens get only the keys that they have.
+    experiment : list of ExperimentSection or SpecimenSection
+        At least one [[experiment]] table, one for each recording or specimen.
     """
 
     title: str = ""
     object: ObjectSection
     parameters: Parameters
     experiment_defaults: dict[str, Any] = Field(default_factory=dict)
-    experiment: list[ExperimentSection] = Field(min_length=1)
+    experiment: list[AnyExperimentSection] = Field(min_length=1)
     environment: EnvironmentSection = Field(default_factory=EnvironmentSection)
     transcription: TranscriptionSection = TranscriptionSection()
     solver: SolverSection = Field(default_factory=SolverSection)
@@ -391,6 +421,35 @@ class ProblemFile(Section):
         """Insert [experiment_defaults] into each experiment before the file is validated."""
         return with_experiment_defaults(content)
 
+    @model_validator(mode="after")
+    def _require_shape(self) -> ProblemFile:
+        """Raise an `InputError` if a recording has no mesh, or regions have none."""
+        if self.object.has_shape:
+            return self
+        if self.recordings:
+            raise InputError(
+                f"found no {' or '.join(SHAPES)}; expected exactly one of {', '.join(SHAPES)}",
+                where="object",
+            )
+        for key in ("region", "field", "force", "scan"):
+            if getattr(self.object, key):
+                raise InputError(
+                    f"found {key} in a problem of specimens without a mesh, which are homogeneous; "
+                    f"expected no {key}, or a mesh and a recording of it",
+                    where=f"object.{key}",
+                )
+        return self
+
+    @property
+    def recordings(self) -> list[ExperimentSection]:
+        """Experiments with the object's mesh."""
+        return [each for each in self.experiment if isinstance(each, ExperimentSection)]
+
+    @property
+    def specimens(self) -> list[SpecimenSection]:
+        """Material tests without a mesh."""
+        return [each for each in self.experiment if isinstance(each, SpecimenSection)]
+
 
 def with_experiment_defaults(content: Any) -> Any:
     """Return the content of a problem file with [experiment_defaults] inserted into each
@@ -401,6 +460,16 @@ def with_experiment_defaults(content: Any) -> Any:
     if not (isinstance(shared, dict) and isinstance(experiments, list)):
         return content
     completed_tables = [
-        shared | table if isinstance(table, dict) else table for table in experiments
+        _known_defaults(shared, table) | table if isinstance(table, dict) else table
+        for table in experiments
     ]
     return content | {"experiment": completed_tables}
+
+
+def _known_defaults(shared: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
+    """Return the defaults of an experiment: all, or of a specimen beside recordings those that
+    specimens know.
+    """
+    if table.get("kind") != "specimen" or shared.get("kind") == "specimen":
+        return shared
+    return {key: value for key, value in shared.items() if key in SpecimenSection.model_fields}

@@ -181,7 +181,7 @@ def huber_as_weights(
 
     Derivatives get the square root of the weight in the normal equations. Residuals are shortened
     to the threshold, so that a few outliers do not determine the noise of the others. Arguments as
-    in `huber_as_least_squares`.
+    in `huber_as_least_squares`; without threshold (None) both are returned as they are.
     """
     if huber is None:
         return residual, derivatives
@@ -387,7 +387,9 @@ class MeasurementResidual(ABC):
         return other
 
     def expression_for(self, vectors: int, data: int) -> ResidualExpression:
-        """Return the generated functions for stencils of `vectors` vectors and `data` data."""
+        """Return the generated functions for stencils with numbers of vectors and data; they are
+        created on the first call and stored.
+        """
         if (vectors, data) not in self._expressions:
             self._expressions[vectors, data] = ResidualExpression(
                 self.expression,
@@ -409,8 +411,8 @@ class MeasurementResidual(ABC):
     def _inputs_at(
         self, values: Array, phi: Array
     ) -> tuple[ResidualExpression, RowStencil, Array, Array]:
-        """Return generated functions, stencil, inputs u (k, s, E) and data of the samples
-        that can be computed.
+        """Return the generated functions, the stencil, the inputs u (k, s, E) and the data of the s
+        first samples that can be computed from values (n, e, 3) of the observable at φ.
         """
         window = self.stencil(phi, len(values))
         samples, each, vectors = window.indices.shape
@@ -459,13 +461,17 @@ class MeasurementResidual(ABC):
     def linearise(
         self, values: Array, observable_derivatives: ObservableDerivatives, phi: Array, size: int
     ) -> tuple[Array, Array]:
-        """Return residuals (s, G, g) and their derivatives (s, G, g, size) by all parameters.
+        """Return residuals (y − ŷ) / σ (s, G, g), zero where missing, and their derivatives (s, G,
+        g, size) by all parameters.
+
+        Samples s are those that the values suffice for; G is the number of `names` and g the
+        `group_size`. Without values the arrays are zero.
 
         Parameters
         ----------
         values : (n, e, 3) array
             Values of the observable.
-        observable_derivatives : MemoryForwardColumns
+        observable_derivatives : ObservableDerivatives
             Their derivatives.
         phi : (k,) array
             Nuisance parameters; they are the last of all parameters.
@@ -502,8 +508,8 @@ class MeasurementResidual(ABC):
         return grouped, derivatives.reshape(*grouped.shape, size)
 
     def _evaluate(self, values: Array, phi: Array) -> tuple[RowStencil, Array, Array]:
-        """Return the stencil, residuals (s, E, m) and their derivatives (s, E, m, u) by the
-        inputs.
+        """Return the stencil, residuals (s, E, m) in standard deviations and their derivatives (s,
+        E, m, u) by the inputs, from values (n, e, 3) of the observable at φ.
         """
         if self._linear_part is None or len(values) < self.observable.count:
             instrument, window, u, data = self._inputs_at(values, phi)
@@ -533,15 +539,17 @@ class MeasurementResidual(ABC):
         return window, np.ascontiguousarray(residual.transpose(1, 2, 0)), by_u
 
     def residual_changes(self, values: Array, by: Array, phi: Array) -> Array:
-        """Return the changes (s, M, 3, c) of the pooled residuals if the observable changes
-        by `by` (n, e, 3, c).
+        """Return the changes (s, M, 3, c) of the pooled residuals at values (n, e, 3) and φ if the
+        observable changes by `by` (n, e, 3, c), to first order.
         """
         size = by.shape[3] + len(phi)
         slopes = ObservableDerivatives.without_own(np.arange(by.shape[3]), by)
         return self.pool_values(self.linearise(values, slopes, phi, size)[1][..., : by.shape[3]])
 
     def loss(self, values: Array, phi: Array) -> float:
-        """Return the loss Σ ρ of values (n, e, 3) at φ (k,)."""
+        """Return the loss Σ ρ of values (n, e, 3) of the observable at φ (k,), over the samples
+        that these suffice for.
+        """
         if not len(values):
             return 0.0
         instrument, _, u, data = self._inputs_at(values, phi)

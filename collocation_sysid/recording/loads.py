@@ -64,7 +64,9 @@ class TimeSeries:
         vars(self).update(values=rows, t_s=t_s)
 
     def values_at(self, t_s: ArrayLike) -> Array:
-        """Return scalar values (T,) at the times (T,); the end values outside the samples."""
+        """Return scalar values (T,) at the times (T,) [s], linear between samples; outside the
+        samples the value of the first or last one. The values must be scalars.
+        """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         if self.t_s is None:
             return np.full(len(times), self.values[0])
@@ -92,12 +94,11 @@ class TimeSeries:
 
 
 def smooth_ramp(time_steps: Any) -> Any:
-    """Return a smooth ramp from 0 at u ≤ −1 to 1 at u ≥ 1, with a continuous derivative.
+    """Return a smooth ramp from 0 at u ≤ −1 to 1 at u ≥ 1, with a continuous derivative, for u =
+    `time_steps`: an array or a CasADi expression.
 
     The derivative is a hat function, so that the sum over an even grid with unit spacing is the
-    remaining length after u = 0, wherever u = 0 lies between grid points. `time_steps` is an array
-    or a
-    CasADi expression.
+    remaining length after u = 0, wherever u = 0 lies between grid points.
     """
     return (abs(time_steps) < 1) * (0.5 + time_steps - 0.5 * time_steps * abs(time_steps)) + (
         time_steps >= 1
@@ -211,8 +212,10 @@ class Force(Load):
         vars(self).update(force_n=course.values, t_s=course.t_s)
 
     def node_forces_n(self, t_s: ArrayLike, node_count: int) -> Array:
-        """Return the force on each node at the times `t_s` (T,), (T, n, 3) [N], without its time
-        window.
+        """Return the force on each node at the times `t_s` (T,), (T, n, 3) [N], distributed equally
+        over its nodes; zero outside the samples of a force that varies.
+
+        The window from `from_s` to `until_s` is not applied, see `Experiment.share`.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=float))
         total = np.repeat(self.force_n[:1], len(times), axis=0)
