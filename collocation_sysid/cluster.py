@@ -11,6 +11,7 @@ from typing import Any
 
 from .errors import InputError
 
+# Longest time for a connection to a scheduler [s]; one that runs answers much faster.
 CONNECT_WITHIN_S = 15
 
 

@@ -30,6 +30,7 @@ _MARKS = (
 )
 # Longest message, and longest quotation of a file in it [characters].
 LONGEST = 1500
+# Longest quotation of a file in a message [characters]: most of a line of a terminal.
 LONGEST_EXCERPT = 60
 _ENDLESS_WORD = re.compile(r"(\S{60})\S{340,}")
 

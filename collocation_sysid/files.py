@@ -33,6 +33,7 @@ DAMAGE = (
     ValueError,
     zlib.error,
 )
+# Longest reason of an error of another library in a message [characters]: about two lines.
 LONGEST_REASON = 200
 RESULT_FILE = "result.json"
 # The form of result.json and summary.json.

@@ -75,11 +75,15 @@ class ProcessLimits:
 
 # A busy machine may give a process this part of a processor, or less.
 WAITING_FACTOR = 10.0
-# What reading a file may take. meshio reads 0.2 s or less of imports and 2 to 20 MB of text a
-# second, and takes up to 20 times the size of a text file.
+# Limits of a process that reads a file. meshio takes 0.2 s or less for imports, reads 2 to 20 MB of
+# text a second, and takes up to 20 times the memory of a text file.
+# Time for a file of any size [s].
 READING_S = 10.0
+# Further time for each megabyte of the file [s/MB].
 READING_S_PER_MB = 5.0
+# Memory for a file of any size [MB].
 READING_MB = 1000.0
+# Further memory for each megabyte of the file [MB/MB].
 READING_MB_PER_MB = 60.0
 
 

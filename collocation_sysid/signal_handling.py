@@ -21,6 +21,7 @@ COMMAND = "collocation-sysid"
 ABANDONED_THREAD = "left behind"
 # File of the frames of an import, and how often a deferred signal tries again [s].
 IMPORTING = "<frozen importlib._bootstrap>"
+# Time after which a deferred signal tries again [s]: a person does not notice it.
 RETRY_S = 0.05
 
 

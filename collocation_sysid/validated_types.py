@@ -18,6 +18,7 @@ from .errors import InputError, hint_at
 
 # Magnitudes of meaningful input; their squares are still finite, nonzero floating-point numbers.
 SMALLEST = 1e-100
+# Largest magnitude.
 LARGEST = 1e100
 
 

@@ -14,8 +14,11 @@ from ..display import Shown, on_terminal, plain_text
 
 error_console = PlainConsole(stderr=True)
 
+# Exit code of a solve or simulation that ended without an answer.
 EXIT_NOT_CONVERGED = 1
+# Exit code of bad input, as of wrong usage in most command-line programs.
 EXIT_BAD_INPUT = 2
+# Exit code after Ctrl-C: 128 + SIGINT (2), as of shells.
 EXIT_INTERRUPTED = 130
 # Width of the output in columns if it is not a terminal: no line is longer.
 UNBROKEN_WIDTH = 100_000

@@ -63,4 +63,6 @@ def placed_unit_drag(nodes: ElementNodes, volume_m3: Array) -> LocatedForce:
     """
     on_surface = np.flatnonzero(surface_shares(nodes)[0] > 0)
     no_constants = np.zeros(0, dtype=np.int64)
-    return LocatedForce.on_mesh(unit_drag(), nodes, on_surface, volume_m3, no_constants)
+    return LocatedForce.on_mesh(
+        unit_drag(), nodes, chosen=on_surface, volume_m3=volume_m3, columns=no_constants
+    )

@@ -188,7 +188,14 @@ class Body(Discretisation):
         threads: int | None = None,
     ) -> None:
         parts = parts_from_regions(
-            mesh, material, damping, density_kg_m3, mass_kg, regions, prony, field
+            mesh,
+            material,
+            damping=damping,
+            density_kg_m3=density_kg_m3,
+            mass_kg=mass_kg,
+            regions=regions,
+            prony=prony,
+            field=field,
         )
         generated: Literal["stress_free"] | None = "stress_free" if mesh.is_generated else None
         self.rest_shape: UnderGravity | Literal["stress_free"] | None = (
@@ -289,7 +296,11 @@ class Body(Discretisation):
         positions_m = self.inverse_equilibrium.solve(theta).positions_m[: len(self.mesh.points_m)]
         mesh = self.mesh
         return TetMesh(
-            positions_m, mesh.tetrahedra, mesh.point_arrays, mesh.cell_arrays, mesh.face_sets
+            positions_m,
+            mesh.tetrahedra,
+            point_arrays=mesh.point_arrays,
+            cell_arrays=mesh.cell_arrays,
+            face_sets=mesh.face_sets,
         )
 
     @property
@@ -535,7 +546,11 @@ class Body(Discretisation):
             first += len(columns)
             nodes = np.arange(len(self.nodes_m)) if force.nodes is None else force.nodes
             nodes = self.select(nodes) if isinstance(nodes, Selection) else np.unique(nodes)
-            placed.append(LocatedForce.on_mesh(force, self.nodes, nodes, volume, columns))
+            placed.append(
+                LocatedForce.on_mesh(
+                    force, self.nodes, chosen=nodes, volume_m3=volume, columns=columns
+                )
+            )
         return tuple(placed)
 
     @cached_property
@@ -671,7 +686,14 @@ class Body(Discretisation):
             # A density also changes the stress-free shape of a mesh made under gravity.
             by_theta[:, :, column] += -slope * v
         self._apply_stiffening_chain_rule(by_theta, memory_input)
-        return Linearisation(force, by_position, by_velocity, by_theta, skew, skew[:, :0])
+        return Linearisation(
+            force,
+            by_position,
+            by_velocity=by_velocity,
+            by_theta=by_theta,
+            by_position_skew=skew,
+            by_velocity_skew=skew[:, :0],
+        )
 
     def _field_outputs(self, name: str, rows: Array) -> Iterator[tuple[int, dict[str, Array]]]:
         """Yield the index of each part with a field, and the outputs by the logarithm of each cell.
@@ -801,7 +823,16 @@ class Body(Discretisation):
                 mixed = -np.einsum("ti,ti,i->t", w, v, slope)
                 theta_theta[:, place, gamma] = theta_theta[:, gamma, place] = mixed
         empty = np.zeros((len(x), 0))
-        return SecondDerivatives(xx, xv, x_theta, v_theta, theta_theta, by_theta, skew, empty)
+        return SecondDerivatives(
+            xx,
+            xv,
+            position_theta=x_theta,
+            velocity_theta=v_theta,
+            theta_theta=theta_theta,
+            theta=by_theta,
+            position_velocity_skew=skew,
+            velocity_velocity=empty,
+        )
 
     @cached_property
     def _gamma_m_indices(self) -> list[int]:

@@ -69,6 +69,7 @@ class Constant:
         return 0.0 if self.scale == "log" else self.at_least
 
 
+# Default bounds of a stiffness [Pa]: softer than any gel, stiffer than any rubber.
 STIFFNESS = (1.0, 1e9)
 LAMBDA = Constant("lambda_pa", "λ", "first Lamé parameter", STIFFNESS)
 MU = Constant("mu_pa", "μ", "shear modulus", STIFFNESS)

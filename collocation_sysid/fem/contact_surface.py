@@ -16,6 +16,7 @@ VECTORS_PER_POINT = 4
 
 # Barycentric points and weights of a triangle, exact to order 2 and 4 (Dunavant 1985).
 _A = (0.445948490915965, 0.223381589678011)
+# Coordinate and weight of the second three points of the rule of order 4.
 _B = (0.091576213509771, 0.109951743655322)
 _ROTATIONS = np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0]])
 RULES = {

@@ -139,7 +139,9 @@ class Discretisation(ConstantsModel):
         part = self.parts[number]
         scaled = part.field.scaled_indices if part.field else ()
         rest = self.inverse_equilibrium.layout if self.inverse_equilibrium else None
-        return PointLaw(part.material, part.damping, memory, scaled, rest)
+        return PointLaw(
+            part.material, part.damping, has_memory=memory, scaled_indices=scaled, rest=rest
+        )
 
     @cached_property
     def inverse_equilibrium(self) -> InverseEquilibrium | None:
@@ -488,9 +490,9 @@ class Discretisation(ConstantsModel):
         return KernelBatch(
             kernel,
             cells,
-            geometry,
-            destinations,
-            self._width(name),
+            geometry=geometry,
+            destinations=destinations,
+            width=self._width(name),
             data_columns=internal_columns if internal_columns.shape[-1] else None,
         )
 

@@ -28,6 +28,7 @@ _FROM, _TO = np.array(EDGES).T
 # 4 · 6 = 24 strains, as many as 30 displacements less 6 rigid motions: none is without energy.
 # Fewer points would leave some that are; more would cost in proportion and gain no order.
 _BARYCENTRIC_OFFSET = (5 - 5**0.5) / 20
+# Barycentric coordinates (4, 4) of the points.
 POINTS = _BARYCENTRIC_OFFSET + (1 - 4 * _BARYCENTRIC_OFFSET) * np.eye(4)
 WEIGHTS = np.full(4, 0.25)
 

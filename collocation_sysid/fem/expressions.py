@@ -245,6 +245,7 @@ def symmetric_matrix(six: ca.SX) -> ca.SX:
     return ca.blockcat([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
+# Rows and columns of the entries xx, yy, zz, xy, xz, yz of a symmetric matrix.
 UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 

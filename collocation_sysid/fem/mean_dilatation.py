@@ -82,10 +82,10 @@ def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> Ele
     return ElementKernel(
         last.pieces,
         tuple(point.fields),
-        {key: last.contractions[key] for key in output_pieces},
-        tuple(previous_phases),
-        {key: last.contractions[key] for key in coupled},
-        _coupling(shape, chains, outputs, order) if order else None,
+        contractions={key: last.contractions[key] for key in output_pieces},
+        previous_phases=tuple(previous_phases),
+        coupled={key: last.contractions[key] for key in coupled},
+        coupling=_coupling(shape, chains, outputs, order) if order else None,
     )
 
 
@@ -283,7 +283,9 @@ def _scalar_derivatives(shape: _VolumeSums, outputs: Outputs) -> dict[int, _Scal
             # Where all is symmetric, what is by v is among what is by x.
             fields = ("x",) if parts == {"whole"} else ("x", "v")
             slopes = ca.SX.sym(f"slopes_{number}", shape.count)
-            chains[id(term.scalar)] = _ScalarDerivatives(shape, term.scalar, number, slopes, fields)
+            chains[id(term.scalar)] = _ScalarDerivatives(
+                shape, term.scalar, number=number, slopes=slopes, fields=fields
+            )
     return chains
 
 
@@ -325,7 +327,9 @@ def _coupling(
                 total[:count, :] += (by_s @ relation).T @ slopes
             elif term.contraction == "pairs":
                 second = by_s.T @ seconds[id(term.scalar)] @ by_s + second_of_logarithm
-                total += _pair_coupling(shape, chain, blocks, size, term, by_s, second)
+                total += _pair_coupling(
+                    shape, chain, blocks=blocks, size=size, term=term, by_s=by_s, second=second
+                )
         couplings.append(total)
     return ca.Function("coupling", [ca.vertcat(*sums)], couplings, ["sums"], list(outputs))
 

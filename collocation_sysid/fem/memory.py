@@ -152,7 +152,13 @@ class MemoryLayout:
                 columns = slice(start, start + points.stop - points.start)
                 first_constant = self.first_constants[number] + 2 * k
                 branches.append(
-                    BranchIndices(number, points, columns, first_constant, first_constant + 1)
+                    BranchIndices(
+                        number,
+                        points,
+                        columns=columns,
+                        share=first_constant,
+                        tau=first_constant + 1,
+                    )
                 )
                 start = columns.stop
         return branches

@@ -210,7 +210,13 @@ class TetMesh:
 
     def write(self, path: str | Path) -> None:
         """Write the mesh, in metres, to any format that meshio knows by the file's extension."""
-        write_tetrahedra(path, self.points_m, self.tetrahedra, self.point_arrays, self.cell_arrays)
+        write_tetrahedra(
+            path,
+            self.points_m,
+            tetrahedra=self.tetrahedra,
+            point_arrays=self.point_arrays,
+            cell_arrays=self.cell_arrays,
+        )
 
     def select(self, selection: NodeSelection) -> np.ndarray:
         """Return the nodes of a `selection.Selection`, as sorted int64 indices.

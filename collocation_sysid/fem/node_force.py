@@ -178,12 +178,14 @@ class NodeForce:
         at = ForceContext(*ca.vertsplit(data, [*CONTEXT_OFFSETS]))
         named = {c.name: values[k] for k, c in enumerate(self.constants)}
         if self.on == "nodes":
-            return ca.vertcat(*self._evaluate_law(x, v, before, at, named))
+            return ca.vertcat(*self._evaluate_law(x, v, before=before, at=at, named=named))
         places = ca.horzsplit(ca.reshape(x, 3, dofs // 3))
         area = area_vector(places)
         size = ca.norm_2(area)
         at = at._replace(area_m2=size, normal=area / size)
-        force, after = self._evaluate_law(face_middle(x), face_middle(v), before, at, named)
+        force, after = self._evaluate_law(
+            face_middle(x), face_middle(v), before=before, at=at, named=named
+        )
         return ca.vertcat(*[ca.SX.zeros(3)] * (len(places) - 3), *[force / 3] * 3, after)
 
     def _evaluate_law(
@@ -268,7 +270,7 @@ class NodeForce:
         x, v, before = (ca.SX.sym("u", size) for size in (3, 3, self.internal_variable_count))
         at = ForceContext(*ca.vertsplit(ca.SX.sym("data", CONTEXT_SIZE), [*CONTEXT_OFFSETS]))
         try:
-            force, after = self._evaluate_law(x, v, before, at, named)
+            force, after = self._evaluate_law(x, v, before=before, at=at, named=named)
             _ = self._symbols
         except (Exception, SystemExit) as error:
             internal_text = (

@@ -53,9 +53,11 @@ def split_in_eight(mesh: TetMesh) -> TetMesh:
     return TetMesh(
         points,
         orient_elements(points, children.reshape(-1, 4))[0],
-        {name: np.concatenate([a, a[ends].min(axis=1)]) for name, a in masks.items()},
-        {name: np.repeat(a, 8, axis=0) for name, a in mesh.cell_arrays.items()},
-        {name: split_faces_in_four(faces, mesh) for name, faces in mesh.face_sets.items()},
+        point_arrays={name: np.concatenate([a, a[ends].min(axis=1)]) for name, a in masks.items()},
+        cell_arrays={name: np.repeat(a, 8, axis=0) for name, a in mesh.cell_arrays.items()},
+        face_sets={
+            name: split_faces_in_four(faces, mesh) for name, faces in mesh.face_sets.items()
+        },
         is_generated=mesh.is_generated,
     )
 
@@ -76,10 +78,10 @@ def refine_body(body: Body) -> Body:
         Region(
             part.name,
             inside.ravel(),
-            part.material,
-            part.density_kg_m3 if part.has_own_density else None,
-            part.damping,
-            part.prony,
+            material=part.material,
+            density_kg_m3=part.density_kg_m3 if part.has_own_density else None,
+            damping=part.damping,
+            prony=part.prony,
         )
         for part, inside in zip(body.parts, cells, strict=True)
         if part.name

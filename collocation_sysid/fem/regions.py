@@ -174,13 +174,20 @@ def parts_from_regions(
         If regions overlap, share a name, are empty, or leave no mass for the rest.
     """
     claimed = _cells_of_regions(mesh, regions)
-    densities = _densities(mesh, regions, claimed, density_kg_m3, mass_kg)
+    densities = _densities(
+        mesh, regions, claimed=claimed, density_kg_m3=density_kg_m3, mass_kg=mass_kg
+    )
     rest = np.setdiff1d(
         np.arange(len(mesh.tetrahedra)), np.concatenate([np.zeros(0, int), *claimed])
     )
     branches = as_branches(prony)
     remainder = BodyPart(
-        "", rest, as_material(material), as_damping(damping), densities[0], branches
+        "",
+        rest,
+        material=as_material(material),
+        damping=as_damping(damping),
+        density_kg_m3=densities[0],
+        prony=branches,
     )
     if field is not None and not rest.size:
         raise InputError(
@@ -197,7 +204,13 @@ def parts_from_regions(
             memory = branches if region.prony is None else as_branches(region.prony)
             has_own = region.density_kg_m3 is not None
             part = BodyPart(
-                region.name, cells, law, region_damping, density, memory, has_own_density=has_own
+                region.name,
+                cells,
+                material=law,
+                damping=region_damping,
+                density_kg_m3=density,
+                prony=memory,
+                has_own_density=has_own,
             )
             parts.append(_with_field(part, region.field, mesh))
         except InputError as error:

@@ -42,6 +42,7 @@ from .selection import Selection
 CACHED_SHAPES = 16
 # Relative step of the differences of ∂X/∂θ that give ∂²X/∂θ²: the cube root of the rounding error.
 RELATIVE_DIFFERENCE_STEP = 1e-5
+# Largest accepted gravity of a scan [m/s²]: larger values are mistakes of units, such as mm/s².
 LARGEST_GRAVITY_M_S2 = 1e4
 # Largest relative change of a constant for which Newton's method starts from the latest solution.
 LARGEST_EXTRAPOLATION = 0.2

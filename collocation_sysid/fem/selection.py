@@ -150,7 +150,7 @@ class Face(_PositionSelection):
     name: FaceName
 
     def __post_init__(self) -> None:
-        require_among(self.name, get_args(FaceName), None, "face")
+        require_among(self.name, get_args(FaceName), where="face")
 
     def resolve(self, nodes: ElementNodes) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`, mid nodes

@@ -153,7 +153,9 @@ class StressEvaluator:
                 places = body.memory.part_columns(number)
                 field = part.stress_field
                 out = np.zeros((len(x), (count + bool(field)) * places.size))
-                self._evaluate_part("stress_by_theta", number, [x], theta, out, add=False)
+                self._evaluate_part(
+                    "stress_by_theta", number, fields=[x], theta=theta, out=out, add=False
+                )
                 first = body.starts[number]
                 part_columns = slice(places[0, 0, 0], places[0, 0, 0] + places.size)
                 by_constant = out.reshape(len(x), -1, places.size)
@@ -229,7 +231,9 @@ class StressEvaluator:
         self, name: str, fields: list[Array], theta: Array, point_data: Array
     ) -> Array:
         """Return node values (T, 3n) of a kernel."""
-        return self._evaluate_all_parts(name, fields, theta, np.zeros_like(fields[0]), point_data)
+        return self._evaluate_all_parts(
+            name, fields, theta=theta, out=np.zeros_like(fields[0]), point_data=point_data
+        )
 
     def _evaluate_all_parts(
         self,
@@ -244,7 +248,15 @@ class StressEvaluator:
         """
         for number, part in enumerate(self.body.parts):
             if part.prony:
-                self._evaluate_part(name, number, fields, theta, out, True, point_data)
+                self._evaluate_part(
+                    name,
+                    number,
+                    fields=fields,
+                    theta=theta,
+                    out=out,
+                    add=True,
+                    point_data=point_data,
+                )
         return out
 
     def _evaluate_part(
@@ -331,7 +343,14 @@ class StressEvaluator:
         internal_columns = (
             internal_columns[..., : kernel.point_data_count] if kernel.point_data_count else None
         )
-        return KernelBatch(kernel, cells, geometry, destinations, length, internal_columns)
+        return KernelBatch(
+            kernel,
+            cells,
+            geometry=geometry,
+            destinations=destinations,
+            width=length,
+            data_columns=internal_columns,
+        )
 
 
 # Number of states up to which one thread is faster than several.

@@ -17,6 +17,7 @@ from .mesh_checks import orient_elements
 
 # Sectors of a cylinder by edge length: a multiple of four, which a quarter of a cylinder needs.
 _SECTORS = 8
+# Largest number of elements that are made: more follow from a wrong unit of the edge length.
 _MOST_ELEMENTS = 1_000_000
 
 
@@ -54,7 +55,9 @@ def cylinder_of_edge(
     _require_element_limit(3 * _SECTORS * float(rings**2 * layers))
     corners = _SECTORS * rings
     radius_m = diameter_m / 2 * sqrt(2 * pi / corners / sin(2 * pi / corners))
-    full_cylinder = cylinder_mesh(radius_m, height_m, int(rings), int(layers), _SECTORS)
+    full_cylinder = cylinder_mesh(
+        radius_m, height_m, rings=int(rings), layers=int(layers), sectors=_SECTORS
+    )
     if not quarter:
         return full_cylinder
     points_m = np.where(

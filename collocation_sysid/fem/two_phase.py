@@ -131,7 +131,11 @@ class TwoPhaseModes(FieldModes):
         """Smooth field with which the search for the phases starts."""
         field = replace(self.field, prior=SMOOTH, amplitude=None)
         return FieldModes(
-            field, self.laplacian, self.scaled_indices, self.length_m, self.volumes_m3
+            field,
+            self.laplacian,
+            scaled_indices=self.scaled_indices,
+            length_m=self.length_m,
+            volumes_m3=self.volumes_m3,
         )
 
     @property

@@ -76,6 +76,7 @@ RADIUS_REDUCTION = 0.25
 # A pass is accepted if its sum of squares is at most TIMES · expected + SLACK: rows that arrived in
 # the meantime are fitted by the next pass.
 ACCEPTED_RATIO = 1.25
+# Slack of this sum of squares, for passes of few rows.
 ACCEPTED_EXCESS = 1.0
 # Default of the computing time of a frame, as a fraction of the time between samples.
 BUDGET_FRACTION = 0.8
@@ -213,7 +214,11 @@ class LiveEstimator:
         )
         stencils = [each.stencil for each in model.instruments]
         self.intake = FrameBuffer(
-            model.interval_s, model.substeps, neighbours, most_motion_m, stencils
+            model.interval_s,
+            model.substeps,
+            neighbouring_samples=neighbours,
+            largest_jump_m=most_motion_m,
+            instruments=stencils,
         )
         self.counts = self.intake.counts
         self.samples = 0
@@ -280,7 +285,13 @@ class LiveEstimator:
             wrench, self.model.wrenches, len(gauges), parse_time(t_s)
         )
         return self.process_frame(
-            Frame(parse_time(t_s), poses, tracks, wrench is not None, instrument_samples)
+            Frame(
+                parse_time(t_s),
+                poses,
+                tracks_m=tracks,
+                has_wrench=wrench is not None,
+                instrument_samples=instrument_samples,
+            )
         )
 
     @one_blas_thread()
@@ -325,7 +336,15 @@ class LiveEstimator:
         estimates, trust = self._estimates_and_trust(frame.t_s)
         self.budget.record_remainder(self.clock() - before)
         latency_s = self.clock() - began
-        self.last = LiveUpdate(frame.t_s, estimates, trust, rms_m, tuple(notes), latency_s, done)
+        self.last = LiveUpdate(
+            frame.t_s,
+            estimates,
+            trust=trust,
+            marker_rms_m=rms_m,
+            notes=tuple(notes),
+            latency_s=latency_s,
+            relinearised=done,
+        )
         return self.last
 
     @one_blas_thread()
@@ -557,7 +576,9 @@ class LiveEstimator:
         took_s: dict[int, float] = {}
         most = min(trial.rows - 1, ROWS_PER_CHUNK, self._block_rows - 1)
         for count in (1, most) * TIMING_REPETITIONS:
-            again = WindowPass(self.model, self.p, self.prior, self._block_rows, trial)
+            again = WindowPass(
+                self.model, self.p, prior=self.prior, block_rows=self._block_rows, base=trial
+            )
             again.repeat_rows([row])
             began = self.clock()
             again.repeat_rows([row] * count)
@@ -707,7 +728,9 @@ class LiveEstimator:
         of_q = factor * known.covariance()[:nq, :nq] / np.outer(rates, rates)
         bounded = ((p - self.lower < AT_BOUND) | (self.upper - p < AT_BOUND))[:nq]
         quantiles = np.full(nq, quantile)
-        return user_estimates(collocation.parameters, p[:nq], of_q, bounded, quantiles)
+        return user_estimates(
+            collocation.parameters, p[:nq], covariance_q=of_q, at_bound=bounded, quantiles=quantiles
+        )
 
     # Passing again ----------------------------------------------------------------------------
 
@@ -827,7 +850,7 @@ class LiveEstimator:
                 and not track.sweep.needs_another_pass
             ):
                 return None
-        return WindowPass(self.model, p, track.prior, self._block_rows, base)
+        return WindowPass(self.model, p, prior=track.prior, block_rows=self._block_rows, base=base)
 
     def _relinearise_if_moved(
         self, track: WindowPass, pass_to_move: WindowPass, began: float, distance: float

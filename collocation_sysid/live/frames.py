@@ -366,7 +366,9 @@ class FrameReader:
         wrench = json_object.get("wrench")
         samples = parse_custom_readings(json_object.get("readings"), self.gauges, t_s)
         samples += parse_wrenches(wrench, self.wrenches, len(self.gauges), t_s)
-        return Frame(t_s, pose, tracks, wrench is not None, samples)
+        return Frame(
+            t_s, pose, tracks_m=tracks, has_wrench=wrench is not None, instrument_samples=samples
+        )
 
     def _parse_row(self, cells: list[str]) -> Frame | None:
         """Return the frame of a row of a table; None for the header, whose columns are stored."""

@@ -20,11 +20,17 @@ from .estimator import LiveUpdate
 
 # Characters of increasing height.
 BARS = "▁▂▃▄▅▆▇█"
+# Number of passes whose estimates are shown as bars: half of a terminal's 80 columns.
 COLUMNS = 40
+# Largest number of reasons of the verdict: more do not fit below the estimates.
 SHOWN_REASONS = 2
+# Width of the film [mm].
 WIDTH_MM = 160.0
+# Height of a parameter's panel in the film [mm].
 ROW_MM = 32.0
+# Resolution of the film [pixels per inch], which makes it 630 pixels wide.
 DPI = 100
+# Frame rate of the film [1/s], as of cinema.
 FRAMES_A_SECOND = 25
 
 
@@ -93,7 +99,8 @@ def write_film(updates: Sequence[LiveUpdate], file: str | Path) -> Path:
     names = list(updates[-1].estimates)
     figure = new_figure(WIDTH_MM, ROW_MM * len(names))
     lines = [
-        _draw_parameter(figure, k, len(names), name, t_s, updates) for k, name in enumerate(names)
+        _draw_parameter(figure, k, count=len(names), name=name, t_s=t_s, updates=updates)
+        for k, name in enumerate(names)
     ]
     step = max(1, round(len(t_s) / max(1.0, (t_s[-1] - t_s[0]) * FRAMES_A_SECOND)))
     writer = PillowWriter(fps=FRAMES_A_SECOND)

@@ -242,7 +242,16 @@ class StreamingSweep:
         reactions = GraspReactions.zeros(
             rows, len(self.sensed), self.count, len(self.model.first_poses)
         )
-        return SweepState(0, 0, empty, empty, node_loads, reactions, None, ())
+        return SweepState(
+            0,
+            0,
+            x=empty,
+            force=empty,
+            prescribed_columns=node_loads,
+            reactions=reactions,
+            last_rows=None,
+            observed_rows=(),
+        )
 
     def _moved_state(self, state: SweepState, at: Array) -> SweepState:
         """Return `state` extrapolated to first order from the parameters `at` of its linearisation
@@ -501,12 +510,12 @@ class StreamingSweep:
                 step = FactorisedStep(
                     t,
                     row,
-                    at.force[k],
-                    by_position,
-                    by_velocity,
-                    factor,
-                    by_position_skew,
-                    by_velocity_skew,
+                    force=at.force[k],
+                    by_position=by_position,
+                    by_velocity=by_velocity,
+                    factor=factor,
+                    skew=by_position_skew,
+                    rate_skew=by_velocity_skew,
                 )
                 forward.solve_step(step, right, force, row_columns)
             except np.linalg.LinAlgError:
@@ -598,7 +607,13 @@ class StreamingSweep:
         equations = RowEquations(self.dynamics, self.x, self.force, t)
         goal = self.x[t, self.grasped]
         try:
-            return solve_row(self.model.newton, equations, self.x[t], self.x[t - 1], goal)
+            return solve_row(
+                self.model.newton,
+                equations,
+                guess=self.x[t],
+                previous=self.x[t - 1],
+                prescribed_m=goal,
+            )
         except NewtonFailure as failure:
             self._fail(failure)
 

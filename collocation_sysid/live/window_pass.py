@@ -145,7 +145,11 @@ class WindowPass:
     def relinearise_at(self, p: Array) -> None:
         """Continue with another linearisation point; previous rows keep theirs."""
         self.sweep = StreamingSweep(
-            self.model, p, self.information, self.sweep.state, self.linearisation_point
+            self.model,
+            p,
+            prior_information=self.information,
+            start=self.sweep.state,
+            at=self.linearisation_point,
         )
         self._base_changes.append((self.rows, self.sweep.transformed))
 

@@ -53,7 +53,7 @@ def require_method(name: str, option: str) -> None:
     if name not in METHODS:
         if (reason := refusal_reason(name)) is not None:
             raise InputError(reason, None, option)
-        require_among(name, METHODS, None, option)
+        require_among(name, METHODS, where=option)
 
 
 def method_summary(method: str) -> str:

@@ -128,7 +128,7 @@ class LagrangianGradient(TimedFunction):
         """Return the function of the directional derivative (CasADi's interface)."""
         inputs = [*self._inputs, *self._outputs, *self._inputs]
         self._forward = TimedFunction(
-            name, inputs, self._outputs, self.hessian_product, self._errors
+            name, inputs, outputs=self._outputs, evaluate=self.hessian_product, errors=self._errors
         )
         return self._forward
 

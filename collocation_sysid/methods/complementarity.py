@@ -67,7 +67,7 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
         for segment, x in zip(first.collocation.transcriptions, first.positions_m, strict=True)
     }
     solution = first
-    relaxed = _relax(first.collocation, obstacles_by_experiment, 0.0)
+    relaxed = _relax(first.collocation, obstacles_by_experiment, share=0.0)
     for share in RELAXED:
         # Its pressures are those of the solve before, not such as the smaller product asks for.
         z = relaxed.with_lifted_variables().pack(*solution.collocation.unpack(solution.z))

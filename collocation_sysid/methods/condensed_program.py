@@ -439,7 +439,11 @@ class CondensedCollocation(Collocation):
         column = np.concatenate([columns, rows[below]])
         for each in self.eliminated:
             own = np.concatenate([each.variables, each.phi])
-            through.append(EliminatedColumns.select(entries, row, column, each.variables, own))
+            through.append(
+                EliminatedColumns.select(
+                    entries, row, columns=column, selected=each.variables, further_rows=own
+                )
+            )
             i = number[through[-1].rows[:, None]]
             j = number[each.phi]
             pairs.append((np.minimum(i, j)[i[:, 0] >= 0], np.maximum(i, j)[i[:, 0] >= 0]))

@@ -221,7 +221,7 @@ class Horizon:
             fit = fit.with_rows(values, by)
             # The slopes of priors are the same everywhere.
             crossed += by.T @ values
-        return Iterate(p, trajectories, reports, fit, crossed)
+        return Iterate(p, trajectories, reports=reports, fit=fit, previous_slopes_residual=crossed)
 
     def simulate(
         self, p: Array, trajectories: Sequence[Any] | None = None, guess: Iterate | None = None

@@ -115,7 +115,9 @@ def simulate_trajectories(
         """
         count = parts[k].segment.grid_times if rows is None else rows[k]
         own_guess = None if guess is None else guess[k]
-        return continue_trajectory(parts[k], count, options, stopwatch, own_guess)
+        return continue_trajectory(
+            parts[k], count, options=options, stopwatch=stopwatch, guess=own_guess
+        )
 
     reached = map_experiments(simulate_one, range(len(parts)), collocation.threads)
     failures = [failure for _, failure in reached if failure is not None]

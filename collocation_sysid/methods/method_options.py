@@ -69,4 +69,5 @@ def _require_ascending(shares: tuple[float, ...]) -> tuple[float, ...]:
 
 
 Shares = Annotated[tuple[Positive, ...], AfterValidator(_require_ascending)]
+# Default shares of the recording that a method solves one after another.
 SHARES = (0.25, 0.5, 1.0)

@@ -98,7 +98,11 @@ def solve(
         solver = _create_solver(plugin, functions, options)
     initial_variables = convert_variables(start, collocation, program)
     z, multipliers, return_status, count = _run(
-        solver, program.bounds(), initial_variables, monitor, initial_multipliers
+        solver,
+        program.bounds(),
+        start=initial_variables,
+        monitor=monitor,
+        multipliers=initial_multipliers,
     )
     if errors and not isinstance(errors[0], _SolverAbandoned):
         raise errors[0]

@@ -245,7 +245,14 @@ class ReducedSearch:
         prior = None if last else self.options.rung_prior
         watch = self.recorder.stopwatch
         choice = self.options.factorisation
-        return Horizon(self.collocation, rows, prior, watch, choice, self.workers)
+        return Horizon(
+            self.collocation,
+            rows,
+            prior=prior,
+            stopwatch=watch,
+            factorisation=choice,
+            workers=self.workers,
+        )
 
     def _extend_to(self, horizon: Horizon) -> None:
         """Extend the trajectories to the length of a horizon.
@@ -569,4 +576,14 @@ class ReducedSearch:
         share = sum(each.rows for each in summaries) / sum(
             s.grid_times for s in self.collocation.transcriptions
         )
-        self.recorder.add(Iteration(self.sweeps, loss, rms_m, violation_n, values, time_s, share))
+        self.recorder.add(
+            Iteration(
+                self.sweeps,
+                loss,
+                rms_m=rms_m,
+                violation_n=violation_n,
+                parameters=values,
+                time_s=time_s,
+                share=share,
+            )
+        )

@@ -141,10 +141,10 @@ class Recorder:
         line = Iteration(
             number,
             loss,
-            collocation.rms_marker_distance_m(z),
-            violation_n,
-            collocation.parameter_values(z),
-            self.elapsed_s,
+            rms_m=collocation.rms_marker_distance_m(z),
+            violation_n=violation_n,
+            parameters=collocation.parameter_values(z),
+            time_s=self.elapsed_s,
         )
         self.add(line)
 
@@ -191,13 +191,13 @@ class Recorder:
         return Solution(
             status,
             message,
-            self.method,
-            self.collocation,
-            z,
-            multipliers,
-            iterations,
-            tuple(self.history),
-            Timing.since(self.stopwatch, self.start_s),
-            tuple(self.notes),
-            evaluations,
+            method=self.method,
+            collocation=self.collocation,
+            z=z,
+            initial_multipliers=multipliers,
+            iterations=iterations,
+            history=tuple(self.history),
+            timing=Timing.since(self.stopwatch, self.start_s),
+            notes=tuple(self.notes),
+            evaluations=evaluations,
         )

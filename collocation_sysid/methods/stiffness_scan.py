@@ -228,9 +228,9 @@ def scan_stiffness(
     return Scan(
         reason,
         young_pa,
-        misfit,
-        best,
-        start,
+        misfit=misfit,
+        best=best,
+        parameters=start,
         samples=sum(trial.samples),
         time_s=time.perf_counter() - began,
         starts=starts,
@@ -500,7 +500,9 @@ class _TrialSimulation:
 
         Equilibria are searched near the trajectories `warm`; None for no guess.
         """
-        return simulate_trajectories(self.collocation, p, None, rows, LOOSE, guess=warm)
+        return simulate_trajectories(
+            self.collocation, p, known_rows=None, rows=rows, options=LOOSE, guess=warm
+        )
 
 
 class _ScanState:

@@ -193,7 +193,9 @@ def sweep(
     if (massless := dynamics.body.mass_problem(dynamics.theta)) is not None:
         raise SimulationError(massless, float(dynamics.t_s[0]))
     tangent = solver.forward(part.x, part.equations, known_sweep.tangent if known_sweep else None)
-    return _sweep_result(part, huber, tangent, previous, solver.stopwatch.read_and_reset())
+    return _sweep_result(
+        part, huber, tangent=tangent, previous=previous, times_s=solver.stopwatch.read_and_reset()
+    )
 
 
 def sweep_after_step(
@@ -242,7 +244,7 @@ def sweep_after_step(
             approximate_solution=x,
         )
         x = equilibria if failure is None else x
-    return sweep(solver, transcription, huber, p, x, previous=previous)
+    return sweep(solver, transcription, huber=huber, p=p, trajectory=x, previous=previous)
 
 
 def reassociate(
@@ -272,9 +274,9 @@ def reassociate(
     return _sweep_result(
         _iterate(transcription, p, sweep_result.x),
         huber,
-        sweep_result.tangent,
-        None,
-        solver.stopwatch.read_and_reset(),
+        tangent=sweep_result.tangent,
+        previous=None,
+        times_s=solver.stopwatch.read_and_reset(),
     )
 
 
@@ -322,7 +324,11 @@ def simulate_rows(
     )
     guess_positions = None if guess is None else guess.x
     x, failure = continue_trajectory(
-        part, solver.dynamics.row_count, MARCHED, solver.stopwatch, guess_positions
+        part,
+        solver.dynamics.row_count,
+        options=MARCHED,
+        stopwatch=solver.stopwatch,
+        guess=guess_positions,
     )
     return SimulationResult(x, failure, solver.stopwatch.read_and_reset())
 

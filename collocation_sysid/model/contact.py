@@ -256,7 +256,7 @@ class ContactLaw:
         return GeneratedFunction(
             lambda y, _: self.gap_at(self.to_obstacle_frame(y)[0]),
             3 * VECTORS_PER_POINT,
-            0,
+            data_size=0,
             is_compiled=True,
         )
 
@@ -448,7 +448,7 @@ class ContactLaw:
         """
 
         def friction_values(u: ca.SX, data: ca.SX) -> ca.SX:
-            place, axes, slope, normal_n = self._normal(u, data, None)
+            place, axes, slope, normal_n = self._normal(u, data, pressing=None)
             limit_n, friction, tangential = self._friction(u, place, axes @ slope, normal_n)
             slips = ca.sumsqr(tangential) > (SLIP_THRESHOLD * self.slip) ** 2
             return ca.vertcat(limit_n, limit_n * slips, friction, -ca.dot(friction, tangential))
@@ -663,7 +663,13 @@ def contact_law(
     averaged : bool
         Whether the pressure is the mean over a time step.
     """
-    return ContactLaw(body, obstacle, obstacle.contact_surface(body), static, averaged)
+    return ContactLaw(
+        body,
+        obstacle,
+        surface=obstacle.contact_surface(body),
+        is_static=static,
+        is_averaged=averaged,
+    )
 
 
 def mean_square(first: ca.SX, second: ca.SX) -> ca.SX:

@@ -209,7 +209,7 @@ class Dynamics:
         t = self.tables
         return replace(
             self,
-            tables=StencilTables(t.p[:rows], t.q[:rows], t.w[:rows], t.s[:rows], t.r[:rows]),
+            tables=StencilTables(t.p[:rows], t.q[:rows], w=t.w[:rows], s=t.s[:rows], r=t.r[:rows]),
             t_s=self.t_s[:rows],
             mass=self.mass.at_times(slice(rows)),
             forces=self.forces.at_times(slice(rows)),

@@ -271,10 +271,12 @@ class Forces:
             at = Linearisation(
                 at.force,
                 spread(at.by_position),
-                spread(at.by_velocity),
-                self._with_input_columns(at.by_theta),
-                spread(at.by_position_skew),
-                np.zeros((len(at.force), self.pattern.entry_count * self.has_skew_damping)),
+                by_velocity=spread(at.by_velocity),
+                by_theta=self._with_input_columns(at.by_theta),
+                by_position_skew=spread(at.by_position_skew),
+                by_velocity_skew=np.zeros(
+                    (len(at.force), self.pattern.entry_count * self.has_skew_damping)
+                ),
             )
         for term, places in self._terms_with_indices:
             term.add_derivatives(at, places, states_for(term))
@@ -336,13 +338,13 @@ class Forces:
             at = SecondDerivatives(
                 spread(at.position_position),
                 spread(at.position_velocity),
-                with_columns(at.position_theta),
-                with_columns(at.velocity_theta),
-                with_columns(with_columns(at.theta_theta).swapaxes(1, 2)),
-                with_columns(at.theta),
-                spread(at.position_velocity_skew),
+                position_theta=with_columns(at.position_theta),
+                velocity_theta=with_columns(at.velocity_theta),
+                theta_theta=with_columns(with_columns(at.theta_theta).swapaxes(1, 2)),
+                theta=with_columns(at.theta),
+                position_velocity_skew=spread(at.position_velocity_skew),
                 # Room for the curvature by velocities, where forces may have some.
-                np.zeros(
+                velocity_velocity=np.zeros(
                     (len(at.theta), self.pattern.entry_count * self._is_nonlinear_in_velocity)
                 ),
             )

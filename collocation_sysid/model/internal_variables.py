@@ -50,12 +50,19 @@ def histories_of_trajectory(
     if forces.body.has_memory:
         collected.append(
             MemoryHistory.from_states(
-                forces.body, xi, forces.theta, until_next_s, loaded_s, previous_states.get(0)
+                forces.body,
+                xi,
+                theta=forces.theta,
+                until_next_s=until_next_s,
+                loaded_s=loaded_s,
+                previous_variables=previous_states.get(0),
             )
         )
     for number in forces.terms_with_internal_variables:
         before = previous_states.get(len(collected))
-        collected.append(ForceHistory.from_states(forces, number, xi, nu, since_s, before))
+        collected.append(
+            ForceHistory.from_states(forces, number, xi=xi, nu=nu, since_s=since_s, before=before)
+        )
     return tuple(collected)
 
 

@@ -481,7 +481,7 @@ class NuisanceMap:
     @cached_property
     def grasp_motion(self) -> GeneratedFunction:
         """Expression of H X for a point X, of the φ of `grasp_indices`."""
-        return GeneratedFunction(self._displaced_point, len(self.grasp_indices), 3)
+        return GeneratedFunction(self._displaced_point, len(self.grasp_indices), data_size=3)
 
     def _displaced_point(self, phi: ca.SX, point: ca.SX) -> ca.SX:
         """Return H X (3,) of a point X (3,) of the undeformed body [m], with the hand–eye transform
@@ -577,11 +577,13 @@ def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
             for row in applicable:
                 for axis, name, unit, sigma in _component_axes(experiment, row, number):
                     label = row.label.format(which=component_name, axis=name)
-                    yield NuisanceEntry(row, number, axis, f"{label} [{unit}]", sigma)
+                    yield NuisanceEntry(
+                        row, number, axis=axis, label=f"{label} [{unit}]", sigma=sigma
+                    )
     for number, gauge in enumerate(experiment.readings):
         for axis, (name, sigma) in enumerate(gauge.unknowns.items()):
             label = f"{without_unit(name)} of {gauge.name} [{unit_of(name) or '1'}]"
-            yield NuisanceEntry(GAUGE, number, axis, label, sigma)
+            yield NuisanceEntry(GAUGE, number, axis=axis, label=label, sigma=sigma)
 
 
 def _components(experiment: Experiment, of: Component) -> Iterable[tuple[int, str]]:

@@ -590,7 +590,7 @@ class ThetaMap:
     @cached_property
     def _theta(self) -> GeneratedFunction:
         """Expression of θ with derivatives."""
-        return GeneratedFunction(self.expression, len(self.parameters.free), 0)
+        return GeneratedFunction(self.expression, len(self.parameters.free), data_size=0)
 
     @cached_property
     def _derived(self) -> tuple[tuple[str, ...], GeneratedFunction]:
@@ -606,7 +606,7 @@ class ThetaMap:
         def values(q: ca.SX, _: ca.SX) -> ca.SX:
             return _derived_moduli(names, body, self.expression(q))[1]
 
-        return derived_names, GeneratedFunction(values, self._theta.input_size, 0)
+        return derived_names, GeneratedFunction(values, self._theta.input_size, data_size=0)
 
 
 # Data of an expression that depends on q alone.

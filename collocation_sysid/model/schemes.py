@@ -105,6 +105,7 @@ SLIDING = Scheme("sliding", 1, Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(0.0
 BACKWARD_EULER = Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(1.0, -2.0, 1.0))
 _FIRST_STEP = Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(1.0, -1.0), r=-1.0)
 MIDPOINT = Stencil(p=(0.5, 0.5), q=(1.0, -1.0), w=(0.5, 0.5), s=(1.0, -2.0, 1.0))
+# Weights of the latest three positions in the velocity by BDF2, over the time step.
 _BDF2_VELOCITY = (1.5, -2.0, 0.5)
 
 SCHEMES: dict[str, Scheme] = {

@@ -428,7 +428,9 @@ class MemoryState:
         """Return the memory in the start shape x (3n,) [m], loaded for a time `loaded_s` [s];
         infinite if the memory has relaxed.
         """
-        return MemoryHistory.from_states(body, x[None], theta, np.ones(1), loaded_s).final_state
+        return MemoryHistory.from_states(
+            body, x[None], theta=theta, until_next_s=np.ones(1), loaded_s=loaded_s
+        ).final_state
 
     def insert_at_same_time(self, forces: Forces) -> Forces:
         """Return forces in the state of this memory, with its overstress Q inserted."""

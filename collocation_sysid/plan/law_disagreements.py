@@ -105,14 +105,18 @@ def _disagreement(
     with the choice of the law as a further source; without a budget line the intervals are None.
     """
     if budget_line is None:
-        return Disagreement(name, values, None, None, 0.0)
+        return Disagreement(name, values, chosen_budget=None, combined95=None, share=0.0)
     line = BudgetLine(**budget_line)  # type: ignore[arg-type]
-    coordinate = IntervalCoordinate.for_estimate(name, (*values.values(), *line.combined95), False)
+    coordinate = IntervalCoordinate.for_estimate(
+        name, (*values.values(), *line.combined95), linear=False
+    )
     coordinates = np.array([coordinate.from_value(value) for value in values.values()])
     with_law = line.with_source(
         LAW, float(np.sqrt(np.mean((coordinates - coordinates[0]) ** 2))), coordinate
     )
-    return Disagreement(name, values, line, with_law.combined95, with_law.shares[LAW])
+    return Disagreement(
+        name, values, chosen_budget=line, combined95=with_law.combined95, share=with_law.shares[LAW]
+    )
 
 
 def law_table(differences: Sequence[Disagreement]) -> Table:

@@ -392,9 +392,9 @@ def evidence_from_fit(fit: LinearisedFit) -> Evidence:
     return Evidence(
         max(fit.chi_squared, rounding),
         float(np.sum(fit.prior_residual**2)),
-        factored.determined_count,
-        fit.measurement_count,
-        independent,
+        fitted=factored.determined_count,
+        measurements=fit.measurement_count,
+        independent=independent,
     )
 
 
@@ -485,7 +485,9 @@ def _budget_record(problem: Problem, solution: Solution, fit: LinearisedFit) -> 
     except (InputError, SimulationError):
         return {}  # without error bars there is none
     means = options.assumptions.means
-    sources = VarianceSources.from_fit(fit, changes, parameters, solution.q, known, means)
+    sources = VarianceSources.from_fit(
+        fit, changes, parameters=parameters, q=solution.q, uncertainty=known, means=means
+    )
     return {name: asdict(line) for name, line in budget(sources, known, {}, parameters).items()}
 
 

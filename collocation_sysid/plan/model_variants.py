@@ -27,6 +27,7 @@ from .study_arguments import unique_items
 
 # Where a branch's share starts; time constants start evenly between a sample and the recording.
 SHARE = 0.1
+# Largest number of branches: no recording determines as many time constants.
 MOST_BRANCHES = 20
 # Constants of which a material needs one beside those of its shape.
 VOLUMETRIC = {"lambda_pa", "kappa_pa", "poisson"}
@@ -34,6 +35,7 @@ VOLUMETRIC = {"lambda_pa", "kappa_pa", "poisson"}
 DAMPING_ASSUMPTIONS = ("damping_law", "rayleigh_damping")
 # Of a material of which nothing is said; and of the shear modulus, what a constant about zero has.
 USUAL_POISSON = 0.3
+# Typical change of a constant about zero, over the shear modulus.
 LESS = 0.1
 
 
@@ -88,7 +90,7 @@ def _parse_names(text: str, known_names: Iterable[str], option: str) -> tuple[st
     """
     names = unique_items(text)
     for name in names or ("",):
-        require_among(name, known_names, None, option, "some")
+        require_among(name, known_names, where=option, count="some")
     return names
 
 
@@ -137,7 +139,15 @@ def models(
         times_s = min(e.timestep_s for e in fitted), max(e.duration_s for e in fitted)
         files, compared = compared, []
         for file in files:
-            of_file = variants(file.path, overrides, materials, branches, times_s, region, dampings)
+            of_file = variants(
+                file.path,
+                overrides,
+                materials=materials,
+                branches=branches,
+                times_s=times_s,
+                region=region,
+                dampings=dampings,
+            )
             front = f"{file.label}: " * (len(files) > 1)
             compared += [replace(v, label=front + v.label, path=file.path) for v in of_file]
     if len(compared) < 2:

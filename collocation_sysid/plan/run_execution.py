@@ -46,6 +46,7 @@ ONE_THREAD = {
         "VECLIB_MAXIMUM_THREADS",
     )
 }
+# Time between two looks at a run that may be interrupted [s]: a person does not notice it.
 LOOK_EVERY_S = 0.2
 # What a run that is late has to write the best answer that it found.
 GRACE_S = 10.0

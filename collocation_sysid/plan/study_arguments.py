@@ -15,6 +15,7 @@ from ..methods import METHODS, require_method
 from ..problem.problem_reading import parse_toml
 from ..problem.validation_messages import shortened
 
+# Largest number of runs of a study: more would be a mistake in a list of values.
 MOST_RUNS = 10_000
 RANGE = "such as 50:5000:log:9 or 0:1:5"
 

@@ -30,7 +30,9 @@ from .study_rows import (
     run_row,
 )
 
+# Resolution of the plots [pixels per inch], for a page.
 RESOLUTION_DPI = 150
+# Largest number of failures on the terminal; summary.md lists all.
 SHOWN_FAILURES = 8
 # Heads of the tables where there is room, on pages.
 WORDS = {
@@ -138,7 +140,13 @@ def load_report(
     """Return the report of planned runs from their stored records."""
     loaded = {run.key: store.load(run.key) for run in planned}
     records = {key: record for key, record in loaded.items() if record is not None}
-    return StudyReport(title, kind, tuple(planned), records, yardstick or SuccessCriterion())
+    return StudyReport(
+        title,
+        kind,
+        planned=tuple(planned),
+        records=records,
+        yardstick=yardstick or SuccessCriterion(),
+    )
 
 
 # In the terminal ---------------------------------------------------------------------------------

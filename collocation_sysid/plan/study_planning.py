@@ -28,6 +28,7 @@ from ..validated_types import AtLeastOne, Count, OneOrMore, Options
 from .model_variants import ModelVariant
 from .study_arguments import require_few
 
+# Hexadecimal digits of a run's key: 80 bits, so that two of 10,000 runs never agree.
 KEY_LENGTH = 20
 
 

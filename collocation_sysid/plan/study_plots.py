@@ -46,10 +46,13 @@ from .study_rows import (
 
 Array = NDArray[Any]
 
+# Number of groups of distances from the truth, in which successes are counted.
 DISTANCE_BINS = 5
 # Estimates whose ratio is larger are drawn on a logarithmic axis.
 WIDE = 30.0
+# Largest number of labels on an axis: more would overlap.
 MOST_TICKS = 9
+# Width and height of a panel [mm].
 PANEL_MM = 32.0
 
 
@@ -120,7 +123,7 @@ def convergence_in_time(rows: Sequence[Row], records: Mapping[str, Record]) -> F
         axes.set_xscale("log", nonpositive="mask")
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
         format_plain_numbers(axes.xaxis)
-    add_legend_above(panels[0], 3, 1.1)
+    add_legend_above(panels[0], 3, height=1.1)
     return figure
 
 
@@ -162,7 +165,7 @@ def success_by_distance(
     axes.set_xticks(edges, [f"{edge:.2g}" for edge in edges])
     axes.xaxis.set_minor_locator(NullLocator())
     axes.set_ylim(-4, 104)
-    add_legend_above(axes, 2, 1.1)
+    add_legend_above(axes, 2, height=1.1)
     return figure
 
 
@@ -267,7 +270,15 @@ def estimates_against(rows: Sequence[Row], varied_keys: Sequence[str]) -> Figure
         places, texts = _axis_positions([row[key] for row in rows])
         for line, name in zip(panels, names, strict=True):
             for label, colour, shift, chosen in _groups(rows, varied_keys, key, shorts):
-                _draw_estimates(line[column], rows, places + shift, name, chosen, colour, label)
+                _draw_estimates(
+                    line[column],
+                    rows,
+                    places=places + shift,
+                    name=name,
+                    chosen=chosen,
+                    colour=colour,
+                    label=label,
+                )
             unit = f" [{unit_of(name)}]" if unit_of(name) else ""
             style_axes(line[column], "", "", "" if column else symbol_as_mathtext(name) + unit)
         bottom = panels[-1, column]

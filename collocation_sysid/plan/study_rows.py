@@ -87,6 +87,7 @@ COLUMNS = {
     ),
     "total_s": NumberColumn("total s", "in all [s]", from_result=lambda r: r.timing_s.total),
 }
+# 97.5 % quantile of the standard normal distribution.
 NORMAL_975 = 1.959963984540054
 
 

@@ -17,17 +17,24 @@ TEXT_MB_PER_S = 2.0
 TEXT_SUFFIXES = frozenset({".csv", ".tsv", ".txt", ".trc"})
 # What takes longer is announced.
 ANNOUNCED_READING_S = 5.0
+# Estimated time of a solve above which it is announced [s].
 ANNOUNCED_SOLVE_S = 60.0
+# Number of nodes above which equilibria of a body are announced, whatever their number.
 ANNOUNCED_NODES = 20_000
 # Timestep of a sweep on one thread, and numbers in the factor of its matrix, as measured in
 # docs/howto/large.md at this number of nodes, and the powers by which they grow.
 NODES = 4953
+# Time of a step of the sweep at `NODES` nodes [s].
 STEP_S = 0.57
+# Power of the number of nodes by which this time grows.
 STEP_POWER = 1.5
+# Numbers in the factor of the matrix at `NODES` nodes.
 FACTOR_ENTRIES = 4.8e6
+# Power of the number of nodes by which they grow.
 FACTOR_POWER = 1.4
 # Rows shorter than this take as long: Python calls [s].
 LEAST_STEP_S = 2e-3
+# Sweeps of a typical solve by reduced space.
 SWEEPS = 10
 # Number of markers of unknown position above which they, not the body, determine the memory.
 MANY_MARKERS = 100
@@ -36,7 +43,9 @@ MOST_SAMPLES = 10**15
 # Positions that a simulation keeps, and, at each of two points of a search, those and the
 # multipliers, with copies for the answer and its gradients; beside them the sensitivities.
 SIMULATION_COPIES = 3
+# The same at the two points of a search.
 SEARCH_COPIES = 10
+# Copies of the sensitivities.
 SENSITIVITY_COPIES = 2
 # Copies of the derivatives of the residuals: the array itself and its product with the weights.
 DERIVATIVE_COPIES = 2

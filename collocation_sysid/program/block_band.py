@@ -344,9 +344,9 @@ def _make_plan(kinds: Sequence[_ColumnBlock], starts: Index, count: int, adds: b
     return CombinePlan(
         np.array(first_task, dtype=np.int64),
         np.array(tasks, dtype=np.int64).reshape(-1, 5),
-        np.array(coefficients, dtype=float).reshape(-1, 2),
-        np.concatenate(targets).astype(np.int32),
-        np.concatenate(sources).astype(np.int32),
+        coefficients=np.array(coefficients, dtype=float).reshape(-1, 2),
+        targets=np.concatenate(targets).astype(np.int32),
+        sources=np.concatenate(sources).astype(np.int32),
     )
 
 

@@ -811,9 +811,9 @@ class Collocation:
                     Violation(
                         segment.experiment.name,
                         float(segment.dynamics.t_s[t]),
-                        node,
-                        "xyz"[axis],
-                        float(residual[t, place]),
+                        node=node,
+                        axis="xyz"[axis],
+                        residual_n=float(residual[t, place]),
                     )
                 )
         return sorted(violations, key=lambda violation: -abs(violation.residual_n))[:count]

@@ -244,7 +244,7 @@ def custom_sensor_residuals(
             grasp = experiment.grasps[gauge.grasp - 1]
             origin = np.zeros(3)
             channel = GraspWrench.from_experiment(
-                experiment, grasp, gauge.frame, origin, grid, nuisance
+                experiment, grasp, frame=gauge.frame, point_m=origin, grid=grid, nuisance=nuisance
             )
             at_s = channel.t_s
         models.append(

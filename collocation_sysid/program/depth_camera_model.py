@@ -131,7 +131,7 @@ class DepthCameraModel:
             values = self.nuisance.values_by_row(own, self.parameter_indices)
             return self.corrected_expression(data[:3], data[3:], values)
 
-        return GeneratedFunction(expression, len(self.parameter_indices), 6)
+        return GeneratedFunction(expression, len(self.parameter_indices), data_size=6)
 
     def world_points(self, phi: Array, image: int) -> Array:
         """Return the points (P, 3) of an image in the world [m].

@@ -134,10 +134,12 @@ class SurfaceComparison:
         view = residual.correspondences.camera
         body = residual.correspondences.body
         widest_m = max(initial_gate_m(body.nodes_m), view.depth.gate_m)
-        first = SurfaceCorrespondences.from_shapes(view, body, shapes_m, phi, widest_m)
+        first = SurfaceCorrespondences.from_shapes(
+            view, body, shapes_m=shapes_m, phi=phi, gate_m=widest_m
+        )
         reach_m = first.next_gate_m(shapes_m, phi)
         sighting = SurfaceCorrespondences.from_shapes(
-            view, body, shapes_m, phi, reach_m, settled=True
+            view, body, shapes_m=shapes_m, phi=phi, gate_m=reach_m, settled=True
         )
         return cls(sighting, shapes_m, sighting.signed_distances_m(shapes_m, phi), phi)
 

@@ -42,7 +42,9 @@ OUTSIDE_PX = 1.5
 LEAST_BACKGROUND_SHARE = 0.1
 # What pixels show, compared with a point of the outline.
 BODY = 0
+# The pixel does not tell whether the body is there.
 UNKNOWN = 1
+# The body is not there.
 EMPTY = 2
 
 
@@ -332,7 +334,15 @@ def _edges(
         "faces": points.faces,
         "weights": points.weights,
         "is_compared": has_edge | is_beyond,
-        **_planes(camera_in, camera, edges, outwards, points.depth_m, phi=phi, sample=sample),
+        **_planes(
+            camera_in,
+            camera,
+            edges=edges,
+            outwards=outwards,
+            depth_m=points.depth_m,
+            phi=phi,
+            sample=sample,
+        ),
     }
 
 

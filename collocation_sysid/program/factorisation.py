@@ -434,7 +434,9 @@ class Factoriser:
         # What is not finite in the matrix is not in its pivots.
         if not (pivots.min() > 0 and pivots.max() < np.inf and growth.max() < GROWTH):
             return None
-        return _SkylineFactor(skyline, buffer.sides[:count], pivots, self._order, self._rank)
+        return _SkylineFactor(
+            skyline, buffer.sides[:count], pivots=pivots, order=self._order, rank=self._rank
+        )
 
     def factorise_each(
         self,

@@ -54,7 +54,12 @@ def equilibrium(
     goals_m = experiment.prescribed_displacements([at_s])[1].ravel()
     forces = Forces.from_experiment(experiment, at_s, theta)
     return _solve_equilibrium(
-        experiment, forces, goals_m, at_s, start, solver or NewtonSolver(experiment)
+        experiment,
+        forces,
+        goals_m=goals_m,
+        at_s=at_s,
+        start=start,
+        solver=solver or NewtonSolver(experiment),
     )
 
 
@@ -204,7 +209,9 @@ def initial_state(
             if prescribed_m is None
             else prescribed_m
         )
-        return _solve_equilibrium(experiment, forces, prescribed_m, at_s, guess, solver), v0
+        return _solve_equilibrium(
+            experiment, forces, goals_m=prescribed_m, at_s=at_s, start=guess, solver=solver
+        ), v0
     if experiment.start_positions_m is not None:
         return experiment.start_positions_m.ravel().copy(), v0
     return experiment.rigid_positions(experiment.t_s[:1]).ravel(), v0

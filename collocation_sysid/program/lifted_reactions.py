@@ -76,7 +76,11 @@ class LiftedReactions(LiftedVariables):
             dynamics, is_temporarily_prescribed=np.zeros_like(dynamics.is_temporarily_prescribed)
         )
         return MotionJacobian(
-            untaken, self.sensed_dofs, self.sensed_dofs, segment.length_m, segment.force_n
+            untaken,
+            self.sensed_dofs,
+            free_dofs=self.sensed_dofs,
+            length_m=segment.length_m,
+            force_n=segment.force_n,
         )
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:

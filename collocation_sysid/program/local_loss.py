@@ -86,7 +86,9 @@ class LocalLoss:
         """Values of the entries at zero positions."""
         rows = max((points.rows[-1] + 1 for _, points in self.residuals), default=1)
         return self._evaluate_at(
-            np.zeros((rows, self.dof_count)), np.zeros(self.nuisance_count), True
+            np.zeros((rows, self.dof_count)),
+            np.zeros(self.nuisance_count),
+            has_observation_curvature=True,
         )
 
     def _evaluate_at(self, x: Array, phi: Array, has_observation_curvature: bool) -> Array:

@@ -162,7 +162,9 @@ def find_stability_loss(
     forces = Forces.from_experiment(experiment, time_s, theta)
     is_prescribed = experiment.is_prescribed([time_s])[0].ravel()
     free = np.flatnonzero(~is_prescribed)
-    reference, _ = _lowest(forces, experiment.rigid_positions([time_s])[0].ravel(), free, 0.0)
+    reference, _ = _lowest(
+        forces, experiment.rigid_positions([time_s])[0].ravel(), free=free, translation_m=0.0
+    )
     if not reference > 0:
         return None
     value, shape = _lowest(forces, x, free, SHIFT * reference)

@@ -28,6 +28,7 @@ from ..model.nuisance_map import NuisanceMap
 from .observables import ObservableDerivatives, PointPositions, SparseEntries
 from .wrench_observable import GraspWrench, ReactionGrid
 
+# Numbers of a vector [x, y, z], whose residuals share a weight of Huber's loss.
 GROUP = 3
 
 # What can be looked at.

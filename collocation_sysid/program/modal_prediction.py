@@ -30,6 +30,7 @@ STIFFNESSES = 12
 STIFFEST = 30.0
 # Damping ratios that are tried with each stiffness.
 DAMPING_RATIOS = (0.03, 0.25)
+# Gravity by which the sag of the softest body is estimated [m/s²].
 STANDARD_GRAVITY_M_S2 = 9.81
 # Largest number of samples that are predicted.
 MOST_SAMPLES = 300
@@ -186,7 +187,13 @@ class ModalResponse:
         step_s = float(declared.t_s[1] - declared.t_s[0])
         omega = self._frequencies(scale)
         states = [
-            _oscillator_responses(omega, ratio, loads, step_s, self.is_initially_at_rest)
+            _oscillator_responses(
+                omega,
+                ratio,
+                loads=loads,
+                step_s=step_s,
+                is_initially_at_rest=self.is_initially_at_rest,
+            )
             for ratio in DAMPING_RATIOS
         ]
         q = np.concatenate([*states, np.zeros((1, *loads.shape))])

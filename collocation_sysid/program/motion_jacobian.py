@@ -152,10 +152,10 @@ class MotionJacobian:
         return ReleasedGrasps.from_dynamics(
             self.dynamics,
             self.structure,
-            self._row_starts,
-            self.pattern,
-            self.constrained_dofs,
-            scale,
+            row_starts=self._row_starts,
+            pattern=self.pattern,
+            row_dofs=self.constrained_dofs,
+            scale=scale,
         )
 
     def fill(
@@ -282,7 +282,7 @@ class ReleasedGrasps:
             band.positions(np.array([t]), 0, place[[dof]], np.array([dof])).ravel()
             for t, dof in zip(times, dofs, strict=True)
         ]
-        dropped = tuple(_dropped_forces(dynamics, band, pattern, place, scale))
+        dropped = tuple(_dropped_forces(dynamics, band, pattern=pattern, place=place, scale=scale))
         return cls(dropped, zeros, np.concatenate([nothing, *ones]))
 
     def correct(

@@ -88,7 +88,9 @@ def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
     else:
         lower[pattern.diagonal[free_dofs]] += SHIFT * largest * mass
         factor = Factoriser.cached(pattern, free_dofs).factorise(lower)
-        squares, vectors = _lanczos_modes(stiffness, mass, factor, -SHIFT * largest, requested)
+        squares, vectors = _lanczos_modes(
+            stiffness, mass, factor=factor, translation_m=-SHIFT * largest, requested=requested
+        )
     oscillating = squares > RIGID * largest
     shapes = np.zeros((int(oscillating.sum()), pattern.size))
     shapes[:, free_dofs] = vectors[:, oscillating].T

@@ -155,7 +155,7 @@ class _Stepper:
         previous_histories = start_states(
             self._forces(time_s), x, v, self.experiment.loaded_since_s
         )
-        state = _State(time_s, x, v, np.zeros_like(x), previous_histories)
+        state = _State(time_s, x, v=v, a=np.zeros_like(x), previous_histories=previous_histories)
         if self.experiment.obstacles:
             state = replace(state, contact_n=self._contact_n(x, v, time_s))
         return self._balanced(state, time_s, solver.free)
@@ -310,8 +310,12 @@ class _Stepper:
             # Held dofs have the acceleration of the grasp.
             free = solver.free
             a[free] -= 2 * contact_n[free] / np.where(mass[free] > 0, mass[free], 1.0)
-        previous_histories = advance_states(forces, state.previous_histories, x, v, h)
-        return _State(end_s, x, v, a, previous_histories, contact_n)
+        previous_histories = advance_states(
+            forces, state.previous_histories, x=x, v=v, interval_s=h
+        )
+        return _State(
+            end_s, x, v=v, a=a, previous_histories=previous_histories, contact_n=contact_n
+        )
 
     def _prescribed_motion(
         self, solver: NewtonSolver, time_s: float, step_s: float, holding_s: float

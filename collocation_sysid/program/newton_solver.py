@@ -173,7 +173,14 @@ class NewtonSolver:
                 self._last_factor = factor
                 x[self.free] += step
                 return x
-            x, factor, step = self._backtrack(x, step, factor, residual, linearise, keep_definite)
+            x, factor, step = self._backtrack(
+                x,
+                step,
+                factor=factor,
+                residual=residual,
+                linearise=linearise,
+                keep_definite=keep_definite,
+            )
         raise NewtonFailure(
             x, f"Newton's method took more than {self.options.max_iterations} iterations"
         )

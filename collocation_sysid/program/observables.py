@@ -265,9 +265,9 @@ class PointPositions:
         return ObservableDerivatives(
             columns,
             changes,
-            estimated,
-            self.coordinate_parameters[estimated],
-            self._coordinate_derivatives(x, shape_functions),
+            entities=estimated,
+            own_parameters=self.coordinate_parameters[estimated],
+            by_own=self._coordinate_derivatives(x, shape_functions),
         )
 
     def vjp(self, motion: ObservedMotion, phi: Array, by_values: Array) -> VectorJacobianProduct:

@@ -154,7 +154,7 @@ class Observation:
 
         def forced(changes: Array) -> ReactionForces:
             return self._linearised_reactions(
-                x, response.grasp_forces, changes, step, is_by_parameters
+                x, response.grasp_forces, changes_m=changes, step=step, by_p=is_by_parameters
             )
 
         at = x if step is None else x + step

@@ -60,7 +60,9 @@ def simulate_scheme(
     SimulationError
         If a step fails; names its time and element.
     """
-    x, failure = continue_simulation(experiment, dynamics, None, options, progress)
+    x, failure = continue_simulation(
+        experiment, dynamics, known=None, options=options, progress=progress
+    )
     if failure is not None:
         raise failure
     return x
@@ -118,7 +120,9 @@ def continue_simulation(
             start_guess = None if approximate_solution is None else approximate_solution[0]
             solver = solvers.for_prescribed(is_prescribed[0])
             goals_m = dynamics.prescribed_m[0]
-            x[0], v0 = initial_state(experiment, at_start, solver, start_guess, goals_m)
+            x[0], v0 = initial_state(
+                experiment, at_start, solver=solver, guess=start_guess, prescribed_m=goals_m
+            )
         except SimulationError as failure:
             return x[:0], failure
         known = x[:1]
@@ -138,7 +142,7 @@ def continue_simulation(
     dynamics.zero_prescribed_forces(forces)
     previous_histories = tuple(history.final_state for history in histories)
     for t in range(done, dynamics.row_count):
-        row = RowEquations(dynamics, x, forces, t, previous_histories)
+        row = RowEquations(dynamics, x, forces=forces, t=t, previous=previous_histories)
         solver = solvers.for_prescribed(is_prescribed[t])
         goal = dynamics.prescribed_m[t, solver.is_prescribed]
         if not dynamics.is_static:
@@ -148,7 +152,7 @@ def continue_simulation(
         else:
             guess = approximate_solution[t]
         try:
-            x[t] = solve_row(solver, row, guess, x[t - 1], goal)
+            x[t] = solve_row(solver, row, guess=guess, previous=x[t - 1], prescribed_m=goal)
         except NewtonFailure as failure:
             time_s = float(dynamics.t_s[t])
             static = dynamics.is_static
@@ -160,7 +164,7 @@ def continue_simulation(
         if previous_histories:
             (xi_t,), (nu_t,) = row.states(x[t])
             previous_histories = advance_states(
-                row.forces, previous_histories, xi_t, nu_t, intervals[t - 1]
+                row.forces, previous_histories, x=xi_t, v=nu_t, interval_s=intervals[t - 1]
             )
         if progress:
             progress(t / (dynamics.row_count - 1))

@@ -36,9 +36,11 @@ from .wrench_residual import wrench_residuals
 
 # Name of the integrator that is no collocation scheme, and its order of accuracy.
 NEWMARK = "newmark"
+# Order of accuracy of Newmark's method with the trapezoidal rule.
 NEWMARK_ORDER = 2
 # Steps a sample that automatic refinement begins with.
 FIRST_NEWMARK_STEPS = 4
+# The same of a collocation scheme: the grid of a solve with one step.
 FIRST_SCHEME_STEPS = 1
 # Largest number of steps a sample that automatic refinement takes: the cost of all refinements
 # together is then 63 times that of one step a sample.
@@ -144,7 +146,15 @@ def simulate(
     """
     theta = resolve_theta(experiment.body, parameters)
     try:
-        return _simulate(experiment, theta, integrator, timestep_s, substeps, options, progress)
+        return _simulate(
+            experiment,
+            theta,
+            integrator=integrator,
+            timestep_s=timestep_s,
+            substeps=substeps,
+            options=options,
+            progress=progress,
+        )
     except SimulationError as error:
         if (reason := explain_failure(experiment, theta, error)) is error:
             raise
@@ -179,8 +189,17 @@ def _simulate(
     if experiment.is_static:
         substeps = 1
     if isinstance(substeps, int):
-        return _with_steps(experiment, theta, integrator, substeps, options, progress)
-    return _with_automatic_steps(experiment, theta, integrator, options, progress)
+        return _with_steps(
+            experiment,
+            theta,
+            integrator=integrator,
+            steps=substeps,
+            options=options,
+            progress=progress,
+        )
+    return _with_automatic_steps(
+        experiment, theta, integrator=integrator, options=options, progress=progress
+    )
 
 
 def _with_automatic_steps(
@@ -205,7 +224,14 @@ def _with_automatic_steps(
     coarser: Trajectory | None = None
     while True:
         try:
-            finer = _with_steps(experiment, theta, integrator, steps, options, progress)
+            finer = _with_steps(
+                experiment,
+                theta,
+                integrator=integrator,
+                steps=steps,
+                options=options,
+                progress=progress,
+            )
         except SimulationError:
             if steps >= MOST_AUTOMATIC_STEPS:
                 raise
@@ -245,7 +271,14 @@ def _with_steps(
     """Return the simulation with a number of time steps between samples, see `simulate`."""
     sensed = sensed_dofs(experiment)
     if integrator == NEWMARK and not experiment.is_static:
-        x, v, forced = simulate_newmark(experiment, theta, steps, options, progress, sensed)
+        x, v, forced = simulate_newmark(
+            experiment,
+            theta,
+            steps_per_sample=steps,
+            options=options,
+            progress=progress,
+            sensed=sensed,
+        )
         rows = (len(x) - 1) * steps + 1
         at = ReactionGrid.from_times(np.linspace(experiment.t_s[0], experiment.t_s[-1], rows))
     else:
@@ -271,12 +304,12 @@ def _with_steps(
     return Trajectory(
         experiment.t_s,
         positions,
-        v.reshape(shape),
-        markers,
-        (at, forced),
-        wrenches,
-        _custom_sensor_values(experiment, positions, (at, forced), ideal),
-        steps,
+        velocities_m_s=v.reshape(shape),
+        markers_m=markers,
+        reactions=(at, forced),
+        wrenches=wrenches,
+        custom_sensor_values=_custom_sensor_values(experiment, positions, (at, forced), ideal),
+        steps_per_sample=steps,
     )
 
 

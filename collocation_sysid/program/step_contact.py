@@ -80,12 +80,12 @@ class ContactCandidates:
         return ContactCandidates(
             law,
             some,
-            nodes,
-            points.node_weights[some, 0, :-VECTORS_PER_POINT],
-            dofs,
-            pattern.positions_of(row, column),
-            (1 + (row == column)) / 2,
-            np.sign(row - column) / 2,
+            nodes=nodes,
+            weights=points.node_weights[some, 0, :-VECTORS_PER_POINT],
+            dofs=dofs,
+            entries=pattern.positions_of(row, column),
+            symmetric_factors=(1 + (row == column)) / 2,
+            skew_factors=np.sign(row - column) / 2,
         )
 
     def inputs(self, contact: Contact, xi: Array, nu: Array, theta: Array) -> tuple[Array, Array]:

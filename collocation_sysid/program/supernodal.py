@@ -21,18 +21,27 @@ from numpy.typing import NDArray
 from ..array_types import Array, Index
 from ..errors import InputError
 
+# Type of a real symmetric positive definite matrix in PARDISO.
 POSITIVE_DEFINITE = 2
 # Phases, and the error that tells that a pivot is not positive.
 ANALYSE = 11
+# Numerical factorisation.
 FACTORISE = 22
+# Forward and backward substitution.
 SOLVE = 33
+# Release of all memory.
 RELEASE = -1
+# Error of a zero or negative pivot.
 NOT_POSITIVE = -4
+# Error of missing memory.
 NO_MEMORY = -2
 # Places in `iparm`.
 COUNTED = 17
+# Place of the flag for indices that count from zero.
 FROM_ZERO = 34
+# Threading layer of MKL without threads of its own.
 SEQUENTIAL = 1
+# Interface layer of MKL with 32-bit integers.
 INTS_OF_32_BITS = 0
 MISSING = (
     'factorisation = "supernodal" needs the mkl package (Intel and AMD processors): '

@@ -135,7 +135,9 @@ class SurfaceCorrespondences:
         """
         skin = VisibleSurface.from_body(body, camera.depth)
         images = [
-            _match_image(camera, skin, body, k, x, phi=phi, gate_m=gate_m, settled=settled)
+            _match_image(
+                camera, skin, body=body, sample=k, x=x, phi=phi, gate_m=gate_m, settled=settled
+            )
             for k, x in enumerate(shapes_m)
         ]
         most = max(1, *(len(each["is_compared"]) for each in images))
@@ -224,7 +226,7 @@ class SurfaceCorrespondences:
         if moved_m < SAME * depth.sigma_m and gate_m == self.gate_m and self.has_converged:
             return self
         return SurfaceCorrespondences.from_shapes(
-            self.camera, self.body, all_shapes_m, phi, gate_m, settled
+            self.camera, self.body, shapes_m=all_shapes_m, phi=phi, gate_m=gate_m, settled=settled
         )
 
     def distance_to_cloud_m(self, x: Array, phi: Array) -> Array:
@@ -307,7 +309,7 @@ def _match_image(
     cloud = camera.depth.clouds[sample]
     world = camera.world_points(phi, sample)
     eye_m = camera.eye_m(phi, sample)
-    indices, faces, places = _nearest_facing(world, surface, x, eye_m, gate_m)
+    indices, faces, places = _nearest_facing(world, surface, x=x, eye_m=eye_m, gate_m=gate_m)
     weights, feet, normals = surface.evaluate(x, faces, places)
     ways = normals if eye_m is None else eye_m - feet
     is_frontal = np.sum(normals * ways, axis=1) >= GRAZING * np.linalg.norm(ways, axis=1)

@@ -167,9 +167,9 @@ class Transcription:
         return MarkerResidual.from_markers(
             self.experiment.markers,
             np.arange(len(self.experiment.t_s)) * self.substeps,
-            self.nuisance,
-            self.association,
-            self.huber,
+            nuisance=self.nuisance,
+            association=self.association,
+            huber=self.huber,
             is_initially_at_rest=not self.dynamics.start_velocity_m_s.any(),
         )
 
@@ -184,7 +184,9 @@ class Transcription:
     def custom_sensors(self) -> tuple[CustomSensorResidual, ...]:
         """Measurement models of the custom sensors."""
         grid = ReactionGrid.from_dynamics(self.dynamics)
-        return custom_sensor_residuals(self.experiment, grid.t_s, grid, self.nuisance, self.huber)
+        return custom_sensor_residuals(
+            self.experiment, grid.t_s, grid=grid, nuisance=self.nuisance, huber=self.huber
+        )
 
     @cached_property
     def depths(self) -> tuple[DepthResidual, ...]:
@@ -552,7 +554,14 @@ class Transcription:
         prescribed = self.prescribed_motion.evaluate_at(phi)
         if prescribed.depends_on_phi:
             dynamics = replace(dynamics, prescribed_m=self._prescribed_positions(prescribed))
-        return EquationsAtParameters(self.inputs, p, self.nq, by_p, dynamics, prescribed)
+        return EquationsAtParameters(
+            self.inputs,
+            p,
+            nq=self.nq,
+            input_derivatives=by_p,
+            dynamics=dynamics,
+            prescribed=prescribed,
+        )
 
     @cached_property
     def inputs(self) -> Inputs:
@@ -649,7 +658,11 @@ class Transcription:
     def motion_rows(self) -> MotionJacobian:
         """Sparsity structure and entries of ∂c/∂x."""
         return MotionJacobian(
-            self.dynamics, self.constrained_dofs, self.free_dofs, self.length_m, self.force_n
+            self.dynamics,
+            self.constrained_dofs,
+            free_dofs=self.free_dofs,
+            length_m=self.length_m,
+            force_n=self.force_n,
         )
 
     @property
@@ -812,10 +825,10 @@ class Transcription:
                 BandBlock(
                     -distance,
                     rows[is_stored],
-                    columns[is_stored],
-                    source[is_stored],
-                    terms,
-                    entries,
+                    columns=columns[is_stored],
+                    lower_positions=source[is_stored],
+                    terms=terms,
+                    full_positions=entries,
                 )
             )
         return blocks

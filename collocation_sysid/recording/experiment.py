@@ -40,6 +40,7 @@ Kind = Literal["dynamic", "static"]
 Start = Literal["equilibrium", "undeformed", "given"]
 StartRule = Literal["standard", "paper"]
 
+# Default gravity [m/s²], with z upwards.
 EARTH_M_S2 = (0.0, 0.0, -9.81)
 DEFAULT_NUISANCE = Nuisance()
 

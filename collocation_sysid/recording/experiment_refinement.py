@@ -29,9 +29,9 @@ def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
     placement = place_markers(
         markers.predict_positions(body.nodes_m),
         finer.nodes.points_m,
-        finer,
-        "embedded",
-        float("inf"),
+        body=finer,
+        attach="embedded",
+        max_distance_m=float("inf"),
     )
     return replace(
         experiment,

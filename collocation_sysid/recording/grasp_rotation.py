@@ -85,4 +85,4 @@ def fastest_rotation(experiment: Experiment, substeps: int) -> GraspRotation:
     remedy = (
         'set interpolation = "smooth" in the grasp' if is_rigid_grasp else f"set {_KEY} = {needed}"
     )
-    return GraspRotation(experiment.name, largest, time_s, step_s, remedy)
+    return GraspRotation(experiment.name, largest, time_s=time_s, step_s=step_s, remedy=remedy)

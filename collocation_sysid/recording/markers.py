@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Markers", "Placement", "place_markers"]
 
+# Largest number of marker names in the text of an object; others are replaced by an ellipsis.
 MOST_NAMES_SHOWN = 4
 
 UndeformedPlaces = Callable[[Array, Array], Array]
@@ -186,7 +187,12 @@ class Markers:
                 places[m] = weights @ body.nodes_m[nodes]
         nodes_m = body.nodes.points_m
         placement = place_markers(
-            places, nodes_m, body, self.attach, self.max_distance_m, self.names
+            places,
+            nodes_m,
+            body=body,
+            attach=self.attach,
+            max_distance_m=self.max_distance_m,
+            names=self.names,
         )
         return replace(self, places_m=None, placement=placement)
 

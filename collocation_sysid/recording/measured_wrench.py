@@ -18,6 +18,7 @@ from .sample_times import first_unordered_time
 Frame = Literal["world", "grasp"]
 
 COMPONENTS = ("fx", "fy", "fz", "tx", "ty", "tz")
+# Units of the components: three forces and three torques.
 UNITS = ("N",) * 3 + ("N m",) * 3
 
 

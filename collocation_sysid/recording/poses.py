@@ -25,6 +25,7 @@ from .sample_times import TIME_TOLERANCE_S, first_unordered_time
 
 Interpolation = Literal["smooth", "linear", "hold"]
 
+# Largest deviation of a quaternion's norm from one: files print four digits or more.
 QUATERNION_NORM_TOLERANCE = 1e-3
 # A held pose starts at its sample, also where the time asked for is rounded to just before it.
 _INTERVAL_SNAP_STEPS = 1e-6
@@ -77,8 +78,10 @@ class PoseSequence:
         m = len(self.t_s)
         if not m:
             raise InputError("a pose sequence needs at least one pose")
-        positions_m = read_only_floats(self.positions_m, (m, 3), "positions_m", False)
-        quaternions = read_only_floats(self.quaternions_xyzw, (m, 4), "quaternions_xyzw", False)
+        positions_m = read_only_floats(self.positions_m, (m, 3), name="positions_m", finite=False)
+        quaternions = read_only_floats(
+            self.quaternions_xyzw, (m, 4), name="quaternions_xyzw", finite=False
+        )
         if fault := first_pose_fault(t_s, positions_m, quaternions):
             raise InputError(fault[1], where=f"row {fault[0] + 1}" if m > 1 else None)
         continuous = _unit_and_continuous(quaternions)
@@ -102,7 +105,9 @@ class PoseSequence:
             If shapes disagree, or a matrix is no rigid motion; the first such matrix is named.
         """
         times = read_only_floats(t_s, (None,), "t_s of the poses", finite=False)
-        motions = read_only_floats(matrices, (len(times), 4, 4), "matrices of the poses", False)
+        motions = read_only_floats(
+            matrices, (len(times), 4, 4), name="matrices of the poses", finite=False
+        )
         if fault := first_matrix_fault(times, motions):
             raise InputError(fault[1], where=f"matrix {fault[0] + 1}")
         quaternions = Rotation.from_matrix(motions[:, :3, :3]).as_quat()

@@ -126,9 +126,9 @@ def fit_poses(
     return RigidFit(
         np.where(gap, np.nan, translations),
         np.where(gap, np.nan, quaternions),
-        residual,
-        distance,
-        missing,
+        residual_m=residual,
+        marker_residual_m=distance,
+        missing=missing,
     )
 
 

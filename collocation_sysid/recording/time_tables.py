@@ -301,7 +301,7 @@ def read_custom_sensor(
             among = ", ".join(grid.columns)
             raise grid.error_at(f"{there} {name!r}; expected one among {among}{hint}")
     t_s = times_in_column(grid, grid.columns.index("t_s"))
-    values = numeric_cells(grid, [grid.columns.index(name) for name in names], True)
+    values = numeric_cells(grid, [grid.columns.index(name) for name in names], blank_allowed=True)
     return _without_rounding(t_s), np.asarray(values), names
 
 

@@ -38,14 +38,20 @@ from .pictures.scene import (
 )
 from .replay import MotionRecord, damaged_run_refused, read_run, run_headline
 
+# Width of the film [mm]; its pixels are in `PIXELS_WIDE`.
 FILM_WIDTH_MM = 160.0
+# Largest height of the body [mm], so that a film is not higher than a screen.
 MAX_BODY_HEIGHT_MM = 110.0
+# Smallest height of the body [mm], for the panel of errors beside it.
 MIN_BODY_HEIGHT_MM = 30.0
 # Width of a film in pixels, even for H.264 (see `_stiffening_of_interval`); smaller for GIF, which
 # compresses badly.
 PIXELS_WIDE = {".mp4": 1280, ".gif": 800}
+# Height of the titles above the body [mm].
 HEAD_HEIGHT_MM = 12.0
+# Height of scale, legend and time below the body [mm].
 FOOT_HEIGHT_MM = 12.0
+# Height of the headline, if there is one [mm].
 HEADLINE_HEIGHT_MM = 5.0
 # Width of the panel of marker errors beside the body.
 ERROR_PANEL_WIDTH_MM = 60.0
@@ -104,7 +110,7 @@ def animate(
         raise InputError(
             f"found '{file.suffix}'; expected {' or '.join(PIXELS_WIDE)}", file, "--to"
         )
-    return film(replay, file, fps, slowdown, progress, headline=text)
+    return film(replay, file, fps=fps, slowdown=slowdown, progress=progress, headline=text)
 
 
 def film(

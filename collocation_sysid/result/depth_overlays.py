@@ -160,7 +160,7 @@ def surface_rows(surface: SurfaceComparison, up: Array) -> Array:
     shapes_m = surface.shapes_m
     phi = surface.phi
     shown = DepthProjection.facing_shape(
-        correspondences.camera, correspondences.surface, phi, shapes_m[0], up
+        correspondences.camera, correspondences.surface, phi=phi, shape_m=shapes_m[0], up=up
     )
     samples = np.flatnonzero(correspondences.is_compared[: len(shapes_m)].any(axis=1)).tolist()
     rows = [np.zeros((0, 8))]
@@ -187,7 +187,7 @@ def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
         skin = VisibleSurface.from_body(experiment.body, depth)
         shape_m = skin.initial_positions_m(experiment, depth)
         shown = DepthProjection.facing_shape(
-            view, skin, np.zeros(nuisance.size), shape_m, experiment.upward_direction
+            view, skin, phi=np.zeros(nuisance.size), shape_m=shape_m, up=experiment.upward_direction
         )
         points_m = depth.points_m[depth.first_sample_with_points]
         rows = shown.point_rows(

@@ -64,7 +64,14 @@ class ElementFields:
                 histories = np.broadcast_to(logs, (*geometry.shape[:2], 1))
             elif body.inverse_equilibrium is not None:
                 histories = body.inverse_equilibrium.point_data_columns(number)
-            batch = KernelBatch(kernel, cells, geometry, places, width, histories)
+            batch = KernelBatch(
+                kernel,
+                cells,
+                geometry=geometry,
+                destinations=places,
+                width=width,
+                data_columns=histories,
+            )
             evaluators.append(body.make_evaluator(batch))
         volumes = body.stress_free_geometry(theta)[:, :, -1].sum(axis=1)
         return cls(body, theta, evaluators, volumes)

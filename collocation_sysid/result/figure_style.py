@@ -30,10 +30,15 @@ COLOUR_CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 
 # Sizes for a journal page, in whose column or width figures are printed without scaling.
 TEXT_PT = 8.0
+# Size of labels within figures [pt].
 SMALL_PT = 7.0
+# Width of curves [pt].
 LINE_PT = 1.1
+# Width of a column [mm].
 COLUMN_MM = 85.0
+# Width of a page without its margins [mm].
 PAGE_MM = 178.0
+# Resolution of PNG files [pixels per inch]: sharp on a screen and in a report.
 RESOLUTION_DPI = 200
 
 

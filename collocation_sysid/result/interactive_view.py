@@ -86,7 +86,7 @@ def field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
             frame = meshio.read(file)
             points = frame.point_data
             in_cells = frame.cell_data
-            require_among(field, [*in_cells, *points], None, "--field")
+            require_among(field, [*in_cells, *points], where="--field")
             if field in in_cells:
                 values = in_cells[field][0][cells]
             else:
@@ -194,7 +194,7 @@ class _FrameWindow:
         self.times = np.array([time for time, _ in frames])
         self.meshes: list[Any] = [pv.read(file) for _, file in frames]
         known = [*self.meshes[0].cell_data, *self.meshes[0].point_data]
-        require_among(field, known, None, "--field")
+        require_among(field, known, where="--field")
         self.plotter = pv.Plotter(off_screen=off_screen, window_size=list(WINDOW_SIZE_PIXELS))
         self.plotter.set_background("white")
         self.range = self._value_range()

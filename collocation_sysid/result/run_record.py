@@ -167,11 +167,11 @@ def _write_all_frames(finished: SolvedProblem, place: Path) -> None:
         write_frames(
             here,
             segment.dynamics.t_s,
-            positions,
-            body.cells,
-            body.element,
-            body.nodes_m,
-            {"residual_force_n": residual.reshape(positions.shape)},
+            positions_m=positions,
+            cells=body.cells,
+            element=body.element,
+            undeformed_m=body.nodes_m,
+            point_series={"residual_force_n": residual.reshape(positions.shape)},
             fields=ElementFields.from_body(
                 body, body.theta_from_values(finished.solution.parameters)
             ),

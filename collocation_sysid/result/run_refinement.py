@@ -90,7 +90,15 @@ def refine_run(
             draft.write_text(as_json(after) + "\n", encoding="utf-8")
         return after
 
-    refinement = solve_refined(problem, answer, estimates, levels, say, known, keep)
+    refinement = solve_refined(
+        problem,
+        answer,
+        estimates=estimates,
+        levels=levels,
+        report_progress=say,
+        solved_levels=known,
+        save_progress=keep,
+    )
     return refinement, keep(refinement)
 
 
@@ -112,7 +120,11 @@ def with_refinement(before: Result, refinement: Refinement, parameters: Paramete
         """Return estimates by name, corrected where the refinement measured their error."""
         return {
             name: _corrected_estimate(
-                name, each, optimum[name], refinement.errors[name], parameters
+                name,
+                each,
+                optimum=optimum[name],
+                error=refinement.errors[name],
+                parameters=parameters,
             )
             if name in optimum and name in refinement.errors
             else each

@@ -191,7 +191,14 @@ def write_frames(
             in_cells |= {
                 name: values[0] for name, values in fields.evaluate_at(positions[k]).items()
             }
-        write_vtu(file, positions[k], cells, element.meshio_type, data, in_cells)
+        write_vtu(
+            file,
+            positions[k],
+            cells=cells,
+            meshio_type=element.meshio_type,
+            point_data=data,
+            cell_data=in_cells,
+        )
         written.append((float(times[k]), file))
     listing = Path(folder) / FRAMES_FILE
     write_pvd(listing, written)

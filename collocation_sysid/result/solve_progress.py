@@ -22,6 +22,7 @@ from ..methods.solution import Iteration
 from ..problem import Problem
 from ..step_counting import listen_to_shares
 
+# Number of latest iterations on the terminal: half of its 24 lines.
 SHOWN_ITERATIONS = 12
 # Time until the first line.
 FIRST_LINE_S = 10.0

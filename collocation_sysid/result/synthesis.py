@@ -95,7 +95,7 @@ class Recipe(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_among(self.integrator, (NEWMARK, *SCHEMES), None, "integrator")
+        require_among(self.integrator, (NEWMARK, *SCHEMES), where="integrator")
 
 
 def write_data(
@@ -172,7 +172,9 @@ def write_data(
             drafts = [stack.enter_context(replaced_file(file)) for file in files]
             drafts_of |= dict(zip(files, drafts, strict=True))
             by_key = dict(zip(named, drafts, strict=True))
-            _write_tables(experiment, section, trajectory, by_key, rng, recipe)
+            _write_tables(
+                experiment, section, trajectory=trajectory, files=by_key, rng=rng, recipe=recipe
+            )
             written += files
             if recipe.frames:
                 folder = place / experiment.name

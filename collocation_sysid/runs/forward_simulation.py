@@ -201,7 +201,7 @@ def simulate_with_parameters(
     InputError, SimulationError
         Where the simulation fails.
     """
-    trajectory = _simulate(problem, segment, phi, parameters, report)
+    trajectory = _simulate(problem, segment, phi=phi, parameters=parameters, report=report)
     predicted, surfaces = _predict_instruments(segment, trajectory, phi)
     error = prediction_error(experiment, predicted)
     return ForwardSimulation(
@@ -384,7 +384,13 @@ def step_error(
     linear = problem.parameters.linear_names
     order = as_scheme(problem.scheme).order
     return Refinement(
-        discretisation_errors(estimates, [parameter_values(collocation, q)], [], order, linear)
+        discretisation_errors(
+            estimates,
+            [parameter_values(collocation, q)],
+            by_mesh=[],
+            step_order=order,
+            linear=linear,
+        )
     )
 
 

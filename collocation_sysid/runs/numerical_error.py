@@ -55,7 +55,10 @@ def refine(run: A, levels: int = 2, report_progress: Callable[[str], None] | Non
     problem = replace(run.problem, substeps=run.solution.collocation.substeps)
     estimates = run.optimum
     return replace(
-        run, refinement=solve_refined(problem, answer, estimates, levels, report_progress)
+        run,
+        refinement=solve_refined(
+            problem, answer, estimates=estimates, levels=levels, report_progress=report_progress
+        ),
     )
 
 
@@ -139,7 +142,11 @@ def _errors_from_levels(
     )
     order = as_scheme(problem.scheme).order
     errors = discretisation_errors(
-        estimates, by_step, by_mesh, order, problem.parameters.linear_names
+        estimates,
+        by_step,
+        by_mesh=by_mesh,
+        step_order=order,
+        linear=problem.parameters.linear_names,
     )
     return Refinement(errors, tuple(levels))
 

@@ -153,7 +153,12 @@ def instrument_misfits(
             what = f"the depth of {name}"
             results.append(
                 InstrumentMisfit(
-                    what, "its sigma_m", error.sigmas, error.tame_sigmas, error.points, size
+                    what,
+                    "its sigma_m",
+                    sigmas=error.sigmas,
+                    robust_sigmas=error.tame_sigmas,
+                    count=error.points,
+                    size=size,
                 )
             )
     return results
@@ -175,7 +180,9 @@ def _misfit(what: str, declared_size: str, ratio: Array, size: str = "") -> Inst
     """
     known = ratio[np.isfinite(ratio)]
     sigmas = root_mean(known**2)
-    return InstrumentMisfit(what, declared_size, sigmas, sigmas, known.size, size)
+    return InstrumentMisfit(
+        what, declared_size, sigmas=sigmas, robust_sigmas=sigmas, count=known.size, size=size
+    )
 
 
 # Blind predictions --------------------------------------------------------------------------------

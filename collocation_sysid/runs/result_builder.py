@@ -89,11 +89,11 @@ def build_result(answer: SolvedProblem) -> Result:
         problem=ProgramSize(
             sum(len(body.nodes_m) for body in problem.bodies),
             sum(len(body.cells) for body in problem.bodies),
-            collocation.substeps,
-            sum(segment.grid_times for segment in collocation.transcriptions),
-            collocation.variable_count,
-            collocation.constraint_count,
-            as_scheme(collocation.scheme).name,
+            substeps=collocation.substeps,
+            timesteps=sum(segment.grid_times for segment in collocation.transcriptions),
+            variables=collocation.variable_count,
+            constraints=collocation.constraint_count,
+            scheme=as_scheme(collocation.scheme).name,
         ),
         notes=tuple(dict.fromkeys([*problem.notes, *solution.notes, *answer.all_notes])),
         history=tuple(solution.history),
@@ -174,11 +174,23 @@ def _field_result(estimate: FieldEstimate) -> FieldResult:
     ends = (float(estimate.value.min()), float(estimate.value.max()))
     is_determined = estimate.is_informed
     if not np.isfinite(estimate.deviation).all():
-        return FieldResult(modes.resolution, ends, None, None, {}, estimate.phases)
+        return FieldResult(
+            modes.resolution,
+            ends,
+            determined_share=None,
+            identified=None,
+            likelier={},
+            phases=estimate.phases,
+        )
     share = float(volumes_m3[is_determined].sum() / volumes_m3.sum())
     likelier = {f"{each:g}": estimate.log_evidence_ratio(each) for each in modes.field.lengths_m}
     return FieldResult(
-        modes.resolution, ends, share, estimate.identified_modes, likelier, estimate.phases
+        modes.resolution,
+        ends,
+        determined_share=share,
+        identified=estimate.identified_modes,
+        likelier=likelier,
+        phases=estimate.phases,
     )
 
 
@@ -199,9 +211,9 @@ def _recordings_agreement(answer: SolvedProblem) -> dict[str, RecordingsAgreemen
         agreements[item.name] = RecordingsAgreement(
             dict(zip(scatter.recordings, values, strict=True)),
             dict(zip(scatter.recordings, deviations, strict=True)),
-            float(scatter.chi_squared[k]),
-            int(scatter.degrees_of_freedom[k]),
-            bool(scatter.is_disagreeing[k]),
+            chi_squared=float(scatter.chi_squared[k]),
+            degrees_of_freedom=int(scatter.degrees_of_freedom[k]),
+            disagree=bool(scatter.is_disagreeing[k]),
         )
     return agreements
 

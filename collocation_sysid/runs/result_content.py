@@ -88,7 +88,13 @@ class ReportedEstimate(Estimate):
         spread = self.statistical_std_error
         if spread is not None:
             spread *= at.derivative(self.value) / at.derivative(self.optimum)
-        return Estimate(self.optimum, spread, (low, high), self.at_bound, self.reason)
+        return Estimate(
+            self.optimum,
+            spread,
+            statistical95=(low, high),
+            at_bound=self.at_bound,
+            reason=self.reason,
+        )
 
     @property
     def _statistical(self) -> Estimate:
@@ -96,9 +102,9 @@ class ReportedEstimate(Estimate):
         return Estimate(
             self.value,
             self.statistical_std_error,
-            self.statistical95,
-            self.at_bound,
-            self.reason,
+            statistical95=self.statistical95,
+            at_bound=self.at_bound,
+            reason=self.reason,
         )
 
     @property

@@ -89,7 +89,7 @@ def follow_starts(
     solve : callable
         ``solve(method, collocation)``, with renewed correspondences.
     """
-    first = CompletedStart(collocation, scan, None, "")
+    first = CompletedStart(collocation, scan, solution=None, note="")
     if not scan.others or not has_local_minima(collocation):
         return first
     own = getattr(solver, "name", getattr(getattr(solver, "func", None), "name", ""))

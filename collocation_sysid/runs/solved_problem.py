@@ -187,9 +187,9 @@ class SolvedProblem:
         of_fit = solution_concerns(
             self.solution,
             self.rollouts,
-            self.modes_by_experiment.values(),
-            self.uncertainty,
-            self.diagnoses,
+            motions=self.modes_by_experiment.values(),
+            uncertainty=self.uncertainty,
+            diagnoses=self.diagnoses,
         )
         uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}
         numerical = numerical_concerns(self.optimum, uncertainties, self.refinement)

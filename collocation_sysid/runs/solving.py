@@ -174,9 +174,9 @@ def _solve_once(
             scanned = follow_starts(
                 solver,
                 collocation,
-                scan,
-                watch,
-                lambda by, of: solve_with_renewed_correspondences(by, of, watch),
+                scan=scan,
+                watch=watch,
+                solve=lambda by, of: solve_with_renewed_correspondences(by, of, watch),
             )
             collocation = associated_at_guess(scanned.collocation)
             scan = scanned.scan

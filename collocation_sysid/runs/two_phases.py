@@ -143,7 +143,11 @@ def solve_two_phases(
     rounds = 0
     for _ in range(MOST_ROUNDS):
         candidate = _solve_with_phases(
-            problem, search, phase, WarmStart.of(best or solution), solve_once
+            problem,
+            search,
+            phase=phase,
+            warm_start=WarmStart.of(best or solution),
+            solve_once=solve_once,
         )
         if not candidate.status.converged and best is None:
             return candidate
@@ -228,7 +232,9 @@ def _two_phase_search(problem: Problem) -> _PhaseSearch:
     number = next(k for k, part in enumerate(parts) if part.field_name == name)
     part = parts[number]
     elements = tuple(part.full_name(field_coefficient(k).name) for k in range(len(modes.phase)))
-    return _PhaseSearch(name, part.full_name(CONTRAST.name), modes, number, elements)
+    return _PhaseSearch(
+        name, part.full_name(CONTRAST.name), modes=modes, number=number, elements=elements
+    )
 
 
 def _likelier_phases(probability: Array) -> Array:

@@ -228,13 +228,17 @@ def _forward_concerns(
         return [Concern("roll-out/failed", "doubtful", {"experiment": name, "why": rollout})]
     fitted = name in fit_rms_m
     fit_m = fit_rms_m.get(name, solution.rms_m)
-    of_markers = forward_simulation_concerns(name, rollout.rms_m, fit_m, noise_m, fitted)
+    of_markers = forward_simulation_concerns(
+        name, rollout.rms_m, fit_rms_m=fit_m, noise_rms_m=noise_m, is_fitted=fitted
+    )
     predicted_n = rollout.wrench_rms[0]
     fit_n = pooled_wrench_rms(solution)[0]
     if fitted or of_markers:
         return of_markers
     if predicted_n is not None and fit_n is not None:
-        of_markers = forward_simulation_concerns(f"{name}/force", predicted_n, fit_n, 0.0, fitted)
+        of_markers = forward_simulation_concerns(
+            f"{name}/force", predicted_n, fit_rms_m=fit_n, noise_rms_m=0.0, is_fitted=fitted
+        )
     return [*of_markers, *_depth_concerns(name, rollout, solution)]
 
 
@@ -246,7 +250,11 @@ def _depth_concerns(name: str, rollout: ForwardSimulation, solution: Solution) -
     yardstick = max(1.0, root_mean(np.square(fitted)) if fitted else 0.0)
     for camera, error in rollout.depth.items():
         yield from forward_simulation_concerns(
-            f"{name}/{camera}", error.tame_sigmas, yardstick, 0.0, False
+            f"{name}/{camera}",
+            error.tame_sigmas,
+            fit_rms_m=yardstick,
+            noise_rms_m=0.0,
+            is_fitted=False,
         )
 
 

@@ -328,7 +328,7 @@ def analyse_dependence(fit: LinearisedFit, information: Information) -> Dependen
     tested in space.
     """
     if fit.chi_squared <= ROUNDING**2 * fit.measurement_count:
-        return Dependence(0.0, np.inf, 1.0)
+        return Dependence(0.0, np.inf, shared_p=1.0)
     pairs = zip(fit.blocks, information.scaled_jacobians, strict=True)
     tested = (each for each in pairs if not each[0].has_noise_floor)
     over_space = [moments for each in tested if (moments := estimate_spatial_correlation(*each))]

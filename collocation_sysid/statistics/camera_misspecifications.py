@@ -38,7 +38,10 @@ FRAMES = {
     "x to the left, y down, z backwards": [[-1, 0, 0], [0, 1, 0], [0, 0, -1]],
 }
 EXPECTED = "state the pose of a frame with x to the right, y down, z forward"
+# Factor between metres and millimetres, the most frequent wrong unit of a pose.
 MILLI = 1e-3
+# Smallest visible share of the body that counts, which limits the strength of a hypothesis.
+SMALLEST_SHARE = 1e-3
 # Largest power of ten of wrong units that are tried.
 LARGEST_POWER = 4
 # Clouds with fewer points are too small to cover the body, for instance because thinning in the
@@ -164,7 +167,7 @@ def camera_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
         data = {"percent": 100 * here, "within_mm": 1e3 * view.within_m}
         of = f"'{depth.name}' of '{experiment.name}'"
         code = "camera"
-        strength = 1 / max(here, MILLI)
+        strength = 1 / max(here, SMALLEST_SHARE)
         if mistakes := view.best_corrections():
             either = "; or if ".join(" and ".join(names) for names in mistakes)
             data = {"mistakes": either}

@@ -88,7 +88,7 @@ def combine(
     CombinedEstimate
     """
     if estimate.at_bound:
-        return CombinedEstimate(estimate.value, None, None)
+        return CombinedEstimate(estimate.value, None, statistical95=None)
     is_corrected = error is not None or known_effect != 0.0
     known = [estimate.value, *(estimate.statistical95 or ())]
     corrections = () if error is None else (error.extrapolated, *(error.interval95 or ()))
@@ -102,7 +102,7 @@ def combine(
     if spread is not None:
         spread *= at.derivative(estimate.value) / at.derivative(at.to_value(centre))
     if estimate.statistical95 is None:
-        return CombinedEstimate(value, spread, None, known_correction=correction)
+        return CombinedEstimate(value, spread, statistical95=None, known_correction=correction)
     low, high = (at.from_value(end) + centre - optimum for end in estimate.statistical95)
     statistical95 = _interval(at, low, high, bounds)
     if not is_corrected:
@@ -117,7 +117,14 @@ def combine(
     low, high = widened_interval((low, high), centre, systematic)
     combined95 = _interval(at, low, high, bounds)
     deviation = (high - low) / 2 / NORMAL_95 / at.derivative(at.to_value(centre))
-    return CombinedEstimate(value, spread, statistical95, deviation, combined95, correction)
+    return CombinedEstimate(
+        value,
+        spread,
+        statistical95=statistical95,
+        combined_std_error=deviation,
+        combined95=combined95,
+        known_correction=correction,
+    )
 
 
 def widened_interval(ends: Interval, centre: float, deviation: float) -> Interval:

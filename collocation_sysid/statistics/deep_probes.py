@@ -109,7 +109,7 @@ def _recording_probes(at: SolvedFit) -> Iterator[Probe]:
     if len(blocks_by_recording(at.fit)) < 2:
         return
     for alone, step in single_fits(at.fit):
-        yield from _part_probe(at, "recording", alone.blocks[0].name, alone, step)
+        yield from _part_probe(at, "recording", name=alone.blocks[0].name, alone=alone, step=step)
 
 
 def _part_probe(

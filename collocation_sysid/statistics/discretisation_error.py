@@ -267,10 +267,10 @@ def discretisation_error(
     return DiscretisationError(
         by_step[0] - estimate.value if by_step else None,
         by_mesh[0] - estimate.value if by_mesh else None,
-        step.order,
-        mesh.order,
-        at.to_value(limit),
-        interval,
+        step_order=step.order,
+        mesh_order=mesh.order,
+        extrapolated=at.to_value(limit),
+        interval95=interval,
     )
 
 
@@ -300,7 +300,12 @@ def discretisation_errors(
         steps, meshes = ([values[name] for values in level] for level in (by_step, by_mesh))
         if any(value != estimate.value for value in (*steps, *meshes)):
             errors[name] = discretisation_error(
-                name, estimate, steps, meshes, step_order, name in linear
+                name,
+                estimate,
+                by_step=steps,
+                by_mesh=meshes,
+                step_order=step_order,
+                linear=name in linear,
             )
     return errors
 

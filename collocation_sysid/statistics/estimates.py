@@ -37,9 +37,11 @@ Mask = NDArray[np.bool_]
 UNDETERMINED = 100.0
 # An interval wider than this factor, or this share of Poisson's (0, ½), identifies nothing.
 WIDE_FACTOR = 10.0
+# Width of an interval of Poisson's ratio beyond which it identifies nothing.
 WIDE_POISSON = 0.4
 # A correlation beyond this, for a deviation beyond that, leaves only a combination identified.
 CONFOUNDED = 0.98
+# Relative deviation that this requires in addition.
 CONFOUNDED_DEVIATION = 0.1
 
 
@@ -259,9 +261,9 @@ def _scaled_estimate(estimate: Estimate, ratio: float) -> Estimate:
         None
         if estimate.statistical_std_error is None
         else abs(ratio) * estimate.statistical_std_error,
-        None if not ends else (ends[0], ends[1]),
-        estimate.at_bound,
-        estimate.reason,
+        statistical95=None if not ends else (ends[0], ends[1]),
+        at_bound=estimate.at_bound,
+        reason=estimate.reason,
     )
 
 

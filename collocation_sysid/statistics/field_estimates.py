@@ -412,4 +412,4 @@ def _mean_logarithm(constants: ThetaMap, part_index: int, modes: FieldModes) -> 
         lame = part.material.lame(own[: len(part.material.constants)])
         return ca.log(engineering_constants(lame[0], lame[1])[0])
 
-    return GeneratedFunction(logarithm, len(constants.parameters.free), 0)
+    return GeneratedFunction(logarithm, len(constants.parameters.free), data_size=0)

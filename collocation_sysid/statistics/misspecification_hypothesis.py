@@ -122,7 +122,7 @@ def clock_hypothesis(
     """
     when, do = ("late", "add") if lag_s > 0 else ("early", "subtract")
     data = {"when": when, "by_ms": 1e3 * abs(lag_s), "do": do}
-    return Hypothesis("clock", subject, data, corrected, handicap)
+    return Hypothesis("clock", subject, data=data, corrected=corrected, handicap=handicap)
 
 
 def rank(hypotheses: Iterable[Hypothesis]) -> tuple[Hypothesis, ...]:

@@ -107,7 +107,9 @@ def _axes(name: str, tracks_m: Array) -> Iterator[Hypothesis]:
     """
     for axes, (order, signs) in OTHER_AXES.items():
         turned = np.array(signs) * tracks_m[..., list(order)]
-        yield Hypothesis("markers-axes", name, {"axes": axes}, turned, ONE_OF_MANY)
+        yield Hypothesis(
+            "markers-axes", name, data={"axes": axes}, corrected=turned, handicap=ONE_OF_MANY
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -182,11 +182,11 @@ def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseL
     level = _solve_noise_level(
         tuple(names),
         np.array(squares),
-        np.array(counts, dtype=float),
-        besides,
-        np.array(shares).reshape(len(names), *information.prior.shape),
-        information.prior + prior_score,
-        of_score + prior_score,
+        counts=np.array(counts, dtype=float),
+        besides=besides,
+        shares=np.array(shares).reshape(len(names), *information.prior.shape),
+        prior=information.prior + prior_score,
+        of_score=of_score + prior_score,
     )
     sigma_keys = [b.sigma_key for b in fit.blocks if b.is_present.any() and not b.has_noise_floor]
     # That of places stands for all.

@@ -256,7 +256,10 @@ def sample_phases(
     settings : SamplerSettings
         Constants of the sampler.
     """
-    chains = [_run_chain(data, faces, start, seed, settings) for seed in range(settings.chains)]
+    chains = [
+        _run_chain(data, faces, start=start, seed=seed, settings=settings)
+        for seed in range(settings.chains)
+    ]
     phases = np.concatenate([chain.phases for chain in chains])
     return PosteriorDraws(
         phases=phases,

@@ -197,7 +197,9 @@ def _common_jump(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]
     k = int(sizes.argmax())
     grasp_step_m = step_sizes(moved_m[rows]).max(axis=1)[k]
     usual_m = max(_usual_change(sizes), float(grasp_step_m), 2 * float(np.median(sigma_m)))
-    yield from _step_hypothesis("markers-jump", experiment, int(rows[k]), float(sizes[k]), usual_m)
+    yield from _step_hypothesis(
+        "markers-jump", experiment, k=int(rows[k]), size_m=float(sizes[k]), usual_m=usual_m
+    )
 
 
 # Motion of markers that may be none, over the size of the body.
@@ -272,7 +274,9 @@ def _pose_jump_hypotheses(experiment: Experiment, moved_m: Array) -> Iterator[Hy
     sigma_m = float(np.median(experiment.markers.sigma_m))
     if np.isfinite(markers).any():
         usual_m = max(_usual_change(moved), float(np.nanmedian(markers)), 2 * sigma_m)
-        yield from _step_hypothesis("pose-jump", experiment, k, float(sizes[k]), usual_m)
+        yield from _step_hypothesis(
+            "pose-jump", experiment, k=k, size_m=float(sizes[k]), usual_m=usual_m
+        )
 
 
 def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
@@ -288,7 +292,9 @@ def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
         most_m = float(others[np.isfinite(others)].max(initial=0.0))
         usual_m = max(_usual_change(sizes[:, m]), most_m, 2 * float(markers.sigma_m[m]))
         if _is_lasting(markers.positions_m, m, k + 2, size_m):
-            yield from _step_hypothesis("marker-slip/alone", experiment, k, size_m, usual_m, name)
+            yield from _step_hypothesis(
+                "marker-slip/alone", experiment, k=k, size_m=size_m, usual_m=usual_m, marker=name
+            )
 
 
 def _step_hypothesis(

@@ -153,8 +153,10 @@ def _residual_samples(
     displacements_m = np.zeros((*prescribed.positions_m.shape, count))
     pose_errors = []
     for grasp, noise in zip(segment.experiment.grasps, noises, strict=True):
-        shifts, rotations = _pose_samples(iterate, grasp, noise, rng, count)
-        _add_displacements(displacements_m, iterate, grasp, shifts, rotations)
+        shifts, rotations = _pose_samples(iterate, grasp, noise=noise, rng=rng, count=count)
+        _add_displacements(
+            displacements_m, iterate, grasp=grasp, shifts=shifts, rotations=rotations
+        )
         pose_errors.append((grasp, shifts, rotations))
     solver = Sweep(segment)
     changes = []

@@ -134,7 +134,14 @@ def compute_profile(
             f"; at {better:.4g} the loss is lower than at the estimate: solve again with "
             "this value as the guess"
         )
-    return Profile(parameter, values, losses, threshold, (lower, upper), message)
+    return Profile(
+        parameter,
+        values,
+        losses=losses,
+        threshold=threshold,
+        interval=(lower, upper),
+        message=message,
+    )
 
 
 def _find_end(rise: Callable[[float], float], step: float, bound: float) -> float | None:
@@ -225,10 +232,10 @@ def profile_of_solution(
     return compute_profile(
         solve_fixed,
         name,
-        (solution.parameters[name], _loss_of(solution)),
-        (item.lower, item.upper),
-        float(np.sqrt(variance)),
-        _noise_scale(solution, fit, uncertainty, k),
+        best=(solution.parameters[name], _loss_of(solution)),
+        bounds=(item.lower, item.upper),
+        deviation=float(np.sqrt(variance)),
+        noise_scale=_noise_scale(solution, fit, uncertainty, k),
     )
 
 

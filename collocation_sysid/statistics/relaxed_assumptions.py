@@ -159,7 +159,11 @@ class SolvedFit:
                 of_statistical = _share_of_interval(change, joint.statistical95)
                 of_combined = _share_of_interval(change, combined95)
                 changes[name] = EstimateChange(
-                    each.value, error, change, of_statistical, of_combined
+                    each.value,
+                    error,
+                    change=change,
+                    of_statistical95=of_statistical,
+                    of_combined95=of_combined,
                 )
         return changes
 

@@ -99,7 +99,12 @@ def diagnose_markers(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
     alone = {outlier.series: outlier for outlier in reversed(remove_outliers(fit)[1])}
     return tuple(
         _diagnose_marker(
-            block, marker, fit.shared_count, _estimated_kinds(fit, block), level, alone
+            block,
+            marker,
+            shared=fit.shared_count,
+            estimated_kinds=_estimated_kinds(fit, block),
+            level=level,
+            outliers=alone,
         )
         for block in fit.blocks
         if block.sigma_key == "sigma_m"
@@ -172,7 +177,7 @@ def _diagnose_marker(
         return replace(diagnosis, sentence=f"{name}: {1e3 * diagnosis.rms_m:.2g} mm RMS; {message}")
     pairs = int(np.sum(present[1:] & present[:-1]))
     motion = block.jacobian[:, marker, :, :shared].reshape(len(residual), -1)
-    message = _message(diagnosis, pairs, block, motion, estimated_kinds)
+    message = _message(diagnosis, pairs, block=block, motion=motion, estimated=estimated_kinds)
     if diagnosis.wild > MOST_WILD * samples:
         message += (
             f"; {diagnosis.wild} samples are outliers, beyond the threshold of the Huber "
@@ -399,10 +404,10 @@ def _find_outlier(block: ResidualBlock, marker: int, significance: float) -> Out
     return Outlier(
         f"{block.name}/{block.marker_names[marker]}",
         sample,
-        float(block.t_s[sample]),
-        share,
-        float(np.sqrt(power[sample])),
-        block.is_relaxed_at_start and sample == 0,
+        t_s=float(block.t_s[sample]),
+        share=share,
+        deviations=float(np.sqrt(power[sample])),
+        is_relaxed_start=block.is_relaxed_at_start and sample == 0,
     )
 
 

@@ -31,6 +31,7 @@ MOST_NODES = 600
 # Largest deflection over the longest extent: a mesh that had sagged further would not be taken for
 # the stress-free shape.
 MOST_SAG = 0.2
+# Gravity under which the mesh sags [m/s²].
 GRAVITY_M_S2 = 9.81
 # A body that nothing grips stood on its nodes in this share of its height.
 STANDING = 0.02

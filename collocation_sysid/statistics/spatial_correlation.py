@@ -98,7 +98,7 @@ def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialC
     count = sum(len(z) for z, _, _ in contrasts)
     nearest = float(np.median(np.where(distances_m > 0, distances_m, np.inf).min(axis=1)))
     longest = max(LONGEST * float(distances_m.max()), 2 * nearest)
-    white, _ = _restricted_likelihood(contrasts, 0.0, 1.0)
+    white, _ = _restricted_likelihood(contrasts, 0.0, length_m=1.0)
     candidates = [
         (*_restricted_likelihood(contrasts, share, length), share, length)
         for share in SHARES

@@ -63,7 +63,11 @@ def strain_stability_concerns(iterates: Iterable[ExperimentIterate]) -> Iterator
         if any(is_examined(part.material) for part in body.parts):
             stretches = principal_stretches(body, states, theta)
             yield from _part_concerns(
-                body, theta, stretches, experiment.name, experiment.t_s[samples]
+                body,
+                theta,
+                stretches=stretches,
+                experiment=experiment.name,
+                t_s=experiment.t_s[samples],
             )
 
 

@@ -248,7 +248,9 @@ def uncertainty_from_fit(
     of_all, bounded = _reported_covariance(all_free, fit, parameters, q)
     scatter = _compare_recordings(fit, parameters, q, error_model)
     of_q, quantiles, wider = _widen_by_scatter(of_all[:shared, :shared], quantiles, scatter)
-    estimates = user_estimates(parameters, q, of_q, bounded, quantiles)
+    estimates = user_estimates(
+        parameters, q, covariance_q=of_q, at_bound=bounded, quantiles=quantiles
+    )
     longest_s = max((float(np.ptp(block.t_s)) for block in fit.blocks), default=0.0)
     sizes = relative_derivatives(parameters, q)
     deviations = np.sqrt(np.diag(of_all)[shared:]).tolist()
@@ -307,7 +309,7 @@ def _error_bars(
     return (
         covariance,
         student_ppf(0.975, freedom),
-        ErrorBasis(kind, used, level, dependence, outliers),
+        ErrorBasis(kind, used, level=level, dependence=dependence, outliers=outliers),
     )
 
 

@@ -83,10 +83,10 @@ class BudgetLine:
         return BudgetLine(
             self.value,
             _ranked(shares),
-            (coordinate.to_value(least), coordinate.to_value(most)),
-            (most - least) / 2 / NORMAL_95 / coordinate.derivative(self.value),
-            float(np.hypot(self.systematic, deviation)),
-            self.known_effect,
+            combined95=(coordinate.to_value(least), coordinate.to_value(most)),
+            combined_std_error=(most - least) / 2 / NORMAL_95 / coordinate.derivative(self.value),
+            systematic=float(np.hypot(self.systematic, deviation)),
+            known_effect=self.known_effect,
         )
 
 
@@ -261,7 +261,9 @@ def budget(
     for name, estimate in {**uncertainty.estimates, **uncertainty.derived}.items():
         by_q = sources.derivatives[name]
         if estimate.statistical95 is not None and by_q.any():
-            lines[name] = _line(name, estimate, sources, numerical.get(name), parameters)
+            lines[name] = _line(
+                name, estimate, sources=sources, error=numerical.get(name), parameters=parameters
+            )
     return lines
 
 
@@ -322,10 +324,10 @@ def _line(
     return BudgetLine(
         combined.value,
         _ranked({source: part / total for source, part in variances.items() if part > 0}),
-        combined.combined95,
-        combined.combined_std_error,
-        systematic,
-        known_effect,
+        combined95=combined.combined95,
+        combined_std_error=combined.combined_std_error,
+        systematic=systematic,
+        known_effect=known_effect,
     )
 
 

@@ -316,13 +316,21 @@ class _OneSensor:
         wrench = self.declared.wrench
 
         def hypothesis(code: str, without: Wrench, handicap: float = 1.0, **data) -> Hypothesis:
-            return Hypothesis(code, of, data, replace(self.declared, wrench=without), handicap)
+            return Hypothesis(
+                code,
+                of,
+                data=data,
+                corrected=replace(self.declared, wrench=without),
+                handicap=handicap,
+            )
 
         values = np.array(wrench.values)
         yield hypothesis("wrench-sign", replace(wrench, values=-values))
         for what, columns in (("forces", FORCES), ("torques", TORQUES)):
             if wrench.measured_components[columns].any():
-                yield hypothesis("wrench-sign/part", _multiplied(wrench, columns, -1.0), what=what)
+                yield hypothesis(
+                    "wrench-sign/part", _multiplied(wrench, columns, factor=-1.0), what=what
+                )
         other: Frame = "grasp" if wrench.frame == "world" else "world"
         yield hypothesis("wrench-frame", replace(wrench, frame=other), other=other)
         for axes, (order, signs) in OTHER_AXES.items():

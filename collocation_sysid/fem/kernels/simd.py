@@ -82,7 +82,9 @@ class SimdEvaluator:
         points = self._points
         build = partial(_emit_kernel, kernel, points, lanes)
         quickly = count * points < OPTIMISED_FROM_POINTS
-        self._run = compile_function(NativeCode("run", key, tuple(signature), build, quickly))
+        self._run = compile_function(
+            NativeCode("run", key, signature=tuple(signature), build=build, is_unoptimised=quickly)
+        )
 
     def __call__(
         self,
@@ -254,7 +256,7 @@ class _KernelEmitter:
                         self._evaluate_pieces(
                             phase, [*gathered, address, parameters, *point_data, totals], pieces
                         )
-                        self._contract(phase, pieces, address, half, totals)
+                        self._contract(phase, pieces, geometry=address, half=half, totals=totals)
                 if self.coupling:
                     self._couple(self.coupling, totals, combined)
                 address = b.gep(geometry, [b.mul(first, I64(geometry_size * self.lanes))])
@@ -391,10 +393,14 @@ class _KernelEmitter:
                     gradient = self._gradient(geometry, node)
                     for column, row, value in self._at_node(piece_base, 9, gradient):
                         self._store(value, half, I64(column + 9 * row))
-                    self._add_node_block(half, gradient, node, node, output_base)
+                    self._add_node_block(half, gradient, a=node, node=node, outputs=output_base)
                     with for_range(b, b.add(node, I64(1)), I64(self.nodes), "row") as other:
                         self._add_node_block(
-                            half, self._gradient(geometry, other), other, node, output_base
+                            half,
+                            self._gradient(geometry, other),
+                            a=other,
+                            node=node,
+                            outputs=output_base,
                         )
 
     def _add_node_block(

@@ -175,7 +175,9 @@ def minimise_cg_descent(
 
     def result(ending: Ending, iterations: int) -> CgResult:
         """Return the last iterate as the result."""
-        return CgResult(x, f, g, iterations, counted.evaluations, ending)
+        return CgResult(
+            x, f, gradient=g, iterations=iterations, evaluations=counted.evaluations, ending=ending
+        )
 
     if not (np.isfinite(f) and np.isfinite(g).all()):
         return result("not-finite", 0)
@@ -183,19 +185,39 @@ def minimise_cg_descent(
     step = 0.0
     change = np.inf
     average = _AverageValue(options)
-    if callback is not None and callback(CgState(0, x, f, g, d, 0.0, 0.0)):
+    if callback is not None and callback(
+        CgState(0, x, value=f, gradient=g, direction=d, slope=0.0, step=0.0)
+    ):
         return result("stopped", 0)
     for k in range(options.max_iterations):
         if np.abs(g).max(initial=0.0) <= options.tolerance:
             return result("converged", k)
         average.add(f)
-        line = _LineSearch(counted, x, f, g, d, average.error, average.approximate, options)
+        line = _LineSearch(
+            counted,
+            x,
+            value=f,
+            gradient=g,
+            direction=d,
+            error=average.error,
+            approximate=average.approximate,
+            options=options,
+        )
         trial = line.search(
             _initial_step(x, f, g) if k == 0 else _initial_step_after(line, step, change)
         )
         if trial is None and line.slope > -float(g @ g) * (1 - 1e-12):  # once down the gradient
             d = -g
-            line = _LineSearch(counted, x, f, g, d, average.error, average.approximate, options)
+            line = _LineSearch(
+                counted,
+                x,
+                value=f,
+                gradient=g,
+                direction=d,
+                error=average.error,
+                approximate=average.approximate,
+                options=options,
+            )
             trial = line.search(_initial_step(x, f, g))
         if trial is None:
             return result("line-search", k)
@@ -209,8 +231,10 @@ def minimise_cg_descent(
         f = trial.value
         g = trial.gradient
         last_direction = d
-        d = _next_direction(d, before, g, y, options.truncation)
-        state = CgState(k + 1, x, f, g, last_direction, slope, step)
+        d = _next_direction(d, before, g=g, y=y, truncation=options.truncation)
+        state = CgState(
+            k + 1, x, value=f, gradient=g, direction=last_direction, slope=slope, step=step
+        )
         if callback is not None and callback(state):
             return result("stopped", k + 1)
     if np.abs(g).max(initial=0.0) <= options.tolerance:

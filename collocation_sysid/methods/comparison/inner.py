@@ -65,7 +65,9 @@ def minimise_merit(
         Whether the tolerance was reached.
     """
     if inner == "levenberg-marquardt":
-        return levenberg_marquardt(merit, z, tolerance, max_iterations, report)
+        return levenberg_marquardt(
+            merit, z, tolerance=tolerance, max_iterations=max_iterations, report=report
+        )
     scaled = _ScaledMerit(merit, z, smooth=inner != "l-bfgs-b")
     follow = _ConvergenceCheck(scaled, tolerance, report)
     follow(scaled.start)
@@ -76,9 +78,9 @@ def minimise_merit(
         cg_descent(
             scaled.value_and_gradient,
             scaled.start,
-            options,
-            lambda state: state.iteration > 0 and follow(state.x),
-            scaled.value,
+            options=options,
+            callback=lambda state: state.iteration > 0 and follow(state.x),
+            value=scaled.value,
         )
         return follow.converged
 

@@ -90,7 +90,7 @@ def minimise_levenberg_marquardt(
         while True:
             step = system.step(damping)
             if step is None and system.exact:
-                system = _quadratic_model(merit, point, False, order)
+                system = _quadratic_model(merit, point, exact=False, order=order)
                 continue
             if step is not None:
                 predicted = system.predicted_decrease(step)
@@ -163,7 +163,14 @@ def _quadratic_model(
     with merit.problem.stopwatch.evaluating():
         hessian = merit.problem.nlp.hessian(point.z, 1.0, weights)
     return _QuadraticModel(
-        merit.problem, point.z, merit.rho, point.jacobian, hessian, point.gradient, exact, order
+        merit.problem,
+        point.z,
+        rho=merit.rho,
+        jacobian=point.jacobian,
+        hessian=hessian,
+        gradient=point.gradient,
+        exact=exact,
+        order=order,
     )
 
 

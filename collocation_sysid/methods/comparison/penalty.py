@@ -382,7 +382,12 @@ class _PenaltySolve:
 
         limit = options.inner_iterations
         reached = minimise_merit(
-            options.inner, stage.merit, self.variables, tolerance, limit, report
+            options.inner,
+            stage.merit,
+            z=self.variables,
+            tolerance=tolerance,
+            max_iterations=limit,
+            report=report,
         )
         if recorder.history[-1].number < self.iterations:
             self._record()

@@ -322,10 +322,14 @@ class _ShootingSearch:
         if self.horizon is not None:
             point = self.horizon.evaluate(p, collocation.unpack(z)[1])
             value = point.loss * collocation.loss_scale
-            shot = _SimulatedPoint(p.copy(), z, value, point.fit.residual, point.fit.jacobian)
+            shot = _SimulatedPoint(
+                p.copy(), z, objective=value, residual=point.fit.residual, slope=point.fit.jacobian
+            )
         else:
             slope = adjoint_gradient(collocation, z, self.recorder.stopwatch)
-            shot = _SimulatedPoint(p.copy(), z, collocation.objective(z), np.zeros(0), slope)
+            shot = _SimulatedPoint(
+                p.copy(), z, objective=collocation.objective(z), residual=np.zeros(0), slope=slope
+            )
         if self.best is None or shot.objective < self.best.objective:
             self.best = shot
             self.recorder.add_variables(

@@ -34,7 +34,9 @@ WRENCH_FILE = "predicted_wrench.csv"
 PROBLEM_FILE = "problem.toml"
 FILM_FILE = "motion.gif"
 NAME = "designed"
+# Form of design.json.
 SCHEMA = 1
+# Frame rate of the film [1/s], as of cinema.
 FRAMES_PER_SECOND = 25.0
 # What says how the files of a recording are read; those of a design are in the package's own form.
 OF_POSES = MovedSection.model_fields.keys() - {"gripper_to_body"}

@@ -16,6 +16,7 @@ from ...array_types import Array
 
 # Share of the evaluations that are drawn at random, and the first deviation about the best.
 EXPLORED = 0.2
+# First standard deviation of the other coefficients about the best: each is of order one.
 FIRST_DEVIATION = 0.5
 # The deviation about a start that is known to be good.
 SMALLEST_DISTANCE = 0.15

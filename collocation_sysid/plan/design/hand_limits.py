@@ -20,6 +20,7 @@ from .hand_motion import HandMotion, angular_motion
 
 # Peaks are sought on a grid; between its points they may be this much larger.
 WITHIN = 1 - 6e-3
+# Factor that keeps a motion within its limits in spite of rounding.
 TIGHTER = 1 - 1e-4
 # A peak beyond this share of its limit is at it.
 REACHED = 0.98

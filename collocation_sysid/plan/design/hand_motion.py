@@ -32,8 +32,11 @@ ACTIVE = 0.6, 1.0
 FEWEST_PERIODS = 0.4
 # Points of the grid in a period of the fastest wave on which peaks are sought.
 POINTS_PER_PERIOD = 60
+# Points of the grid besides these, for a window that opens and closes.
 FEWEST_POINTS = 200
+# Coefficients of the window: its rise and its share of the motion.
 OWN = 2
+# Coefficients of a wave in each of six directions: amplitude, two frequencies and phase.
 PER_WAVE = 4
 
 

@@ -41,7 +41,9 @@ Say = Callable[[str], None]
 FORBIDDEN = 1e3
 # Motions that are tried to first order, which takes milliseconds each, for each simulated one.
 TO_FIRST_ORDER = 10
+# Motions evaluated to first order between two reports of the progress.
 NEWS = 500
+# Largest memory of the first-order prediction [GB]; with more, motions are simulated only.
 MOST_GIGABYTES = 1.0
 
 
@@ -252,7 +254,7 @@ class MotionObjective:
             return self.criterion.log_size(self.errors(information, middle))
 
         size = HandMotion.coefficient_count(options.waves)
-        return minimise(value, size, count, options.seed, report)
+        return minimise(value, size, evaluations=count, seed=options.seed, watch=report)
 
     def value(self, coefficients: Array, bound: float) -> float:
         """Return the logarithm of the error bar of a motion; `FORBIDDEN` or more if a simulation
@@ -346,7 +348,9 @@ def design_motion(
         _require_guesses(problem)
         draws = prior_draws(problem.parameters, options.spread, options.pairs, options.seed)
         known = np.zeros((len(draws[0]),) * 2)
-    judge = MotionObjective(recording, limits, criterion, draws, known)
+    judge = MotionObjective(
+        recording, limits, criterion=criterion, draws=draws, known_information=known
+    )
     criterion.require_known(judge.errors(0.0, draws[0]))
     first = judge.first_guess(options, say)
     say("searching for a motion")
@@ -354,10 +358,10 @@ def design_motion(
     best = minimise(
         judge.value,
         HandMotion.coefficient_count(options.waves),
-        evaluations,
-        options.seed,
-        watch,
-        first.coefficients,
+        evaluations=evaluations,
+        seed=options.seed,
+        watch=watch,
+        start=first.coefficients,
     )
     best.is_interrupted |= first.is_interrupted
     if best.coefficients is None or best.value >= FORBIDDEN:
@@ -382,16 +386,16 @@ def _evaluate_design(judge: MotionObjective, best: SearchResult, add: bool) -> D
     return Design(
         recording,
         motion,
-        with_markers(experiment, predicted.markers_m),
-        predicted,
-        judge.criterion,
-        _before(judge, add),
-        after,
-        add,
-        judge.limits,
-        judge.bounds.shares(motion),
-        best,
-        len(judge.draws),
+        experiment=with_markers(experiment, predicted.markers_m),
+        predicted=predicted,
+        criterion=judge.criterion,
+        before=_before(judge, add),
+        after=after,
+        added=add,
+        limits=judge.limits,
+        shares=judge.bounds.shares(motion),
+        best=best,
+        draws=len(judge.draws),
     )
 
 
@@ -453,7 +457,9 @@ def _draws_from_recordings(problem: Problem, options: DesignOptions) -> tuple[li
     deviations = np.sqrt(np.diag(errors.covariance))
     factors = np.minimum(1.0, largest_deviation / deviations)
     root = factors[:, None] * np.linalg.cholesky(errors.covariance)
-    return symmetric_draws(problem.parameters, solution.q, root, options.pairs, options.seed), known
+    return symmetric_draws(
+        problem.parameters, solution.q, root=root, pairs=options.pairs, seed=options.seed
+    ), known
 
 
 def _select_experiment(problem: Problem, name: str | None) -> Experiment:

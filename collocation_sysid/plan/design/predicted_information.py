@@ -74,8 +74,8 @@ class DesignCriterion:
     over: Over = "mean"
 
     def __post_init__(self) -> None:
-        require_among(self.kind, get_args(Kind), None, "--criterion")
-        require_among(self.over, get_args(Over), None, "--over")
+        require_among(self.kind, get_args(Kind), where="--criterion")
+        require_among(self.over, get_args(Over), where="--over")
 
     def log_size(self, errors: PredictedErrors) -> float:
         """Return the logarithm of the error bar of the named parameters that is minimised: the
@@ -100,7 +100,7 @@ class DesignCriterion:
         depend on each other.
         """
         for name in self.names:
-            require_among(name, errors.slopes, None, "--for", "some")
+            require_among(name, errors.slopes, where="--for", count="some")
         slopes = errors.slopes_of(self.names)
         if self.kind == "D" and np.linalg.matrix_rank(slopes) < len(slopes):
             raise InputError(
@@ -200,7 +200,7 @@ def prior_draws(parameters: Parameters, spread: float, pairs: int, seed: int) ->
         if item.prior is not None:
             middle[k] = item.to_coordinate(item.prior[0])
             deviation[k] = item.prior[1] / (1.0 if item.scale == "log" else item.unit)
-    return symmetric_draws(parameters, middle, np.diag(deviation), pairs, seed)
+    return symmetric_draws(parameters, middle, root=np.diag(deviation), pairs=pairs, seed=seed)
 
 
 def symmetric_draws(

@@ -20,6 +20,7 @@ _KEY = 0x50
 _BLOCK = 512
 # Processor types with other number formats than Intel's.
 _DEC = 85
+# Number of the processor type SGI/MIPS.
 _SGI = 86
 # Largest frame number that the header's 16 bits can hold.
 _COUNTER_LIMIT = 65535

@@ -114,7 +114,9 @@ def read_depth(
     """
     if (address := TopicAddress.from_path(path)) is not None:
         with located(path):
-            return _read_topic(path, address, count_m, length_m, known_camera_fields)
+            return _read_topic(
+                path, address, count_m=count_m, length_m=length_m, known=known_camera_fields
+            )
     if path.is_dir():
         return _read_folder(path, count_m, length_m)
     require_regular(path)

@@ -34,9 +34,9 @@ def _read_wide(table: TextTable, choose: LabelChooser) -> RawTracks:
     return tracks_of_table(
         table,
         labels,
-        places,
-        choose(labels),
-        place["t_s"],
+        coordinate_columns=places,
+        chosen=choose(labels),
+        time=place["t_s"],
         zeros_are_missing=False,
         default_unit="m",
     )
@@ -98,7 +98,14 @@ def _read_long(table: TextTable, choose: LabelChooser) -> RawTracks:
             raise rows.error_at(f"marker '{label}': {fault[1]}", fault[0])
         columns = [table.columns.index(axis) for axis in axes]
         coordinates[frame[own], k] = numeric_cells(rows, columns, blank_allowed=True)
-    return RawTracks(chosen, coordinates, unit, "the columns' names", t_s, zeros_are_missing=False)
+    return RawTracks(
+        chosen,
+        coordinates,
+        unit=unit,
+        unit_key="the columns' names",
+        t_s=t_s,
+        zeros_are_missing=False,
+    )
 
 
 def _long_columns(table: TextTable) -> tuple[list[str], str | None]:

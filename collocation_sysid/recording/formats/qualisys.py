@@ -41,11 +41,11 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     return tracks_of_frames(
         header,
         "NO_OF_FRAMES",
-        "FREQUENCY",
-        leading,
-        labels,
-        frames,
-        choose,
+        rate_key="FREQUENCY",
+        leading=leading,
+        labels=labels,
+        frames=frames,
+        choose=choose,
         unit_key="a Qualisys TSV (QTM writes mm)",
     )
 

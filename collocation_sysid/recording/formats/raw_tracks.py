@@ -188,4 +188,6 @@ def tracks_of_frames(
     places = [range(k, k + 3) for k in range(len(leading), len(table.columns), 3)]
     time = leading.index("Time") if "Time" in leading else None
     fields |= {"rate_hz": header.number(rate_key), "rate_key": rate_key}
-    return tracks_of_table(table, labels, places, chosen, time, **fields)
+    return tracks_of_table(
+        table, labels, coordinate_columns=places, chosen=chosen, time=time, **fields
+    )

@@ -174,7 +174,14 @@ def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
         serves = _possible_uses(columns, messages[0])
         if serves.startswith("positions"):
             write.append(f"{write[0]}#ROBOT.urdf#BASE>TOOL")
-    return LogTopic(name, kind, count, rate, serves, tuple(write if serves else ()))
+    return LogTopic(
+        name,
+        kind,
+        messages=count,
+        rate_hz=rate,
+        serves=serves,
+        write=tuple(write if serves else ()),
+    )
 
 
 def _possible_uses(columns: set[str], message: Any) -> str:

@@ -45,11 +45,11 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     return tracks_of_frames(
         header,
         "NumFrames",
-        "DataRate",
-        ["Frame#", "Time"],
-        labels,
-        frames,
-        choose,
+        rate_key="DataRate",
+        leading=["Frame#", "Time"],
+        labels=labels,
+        frames=frames,
+        choose=choose,
         unit=unit,
         unit_key="Units",
     )

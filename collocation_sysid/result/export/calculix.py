@@ -41,6 +41,7 @@ CAPABILITIES = TargetCapabilities(
 _ARRUDA_BOYCE_COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 # Largest number of terms of Ogden's law and of the foam, and of values on a line.
 MOST_TERMS = 3
+# Largest number of values on a line of a card, by the manual of CalculiX.
 VALUES_PER_LINE = 8
 FOAM_LIMITATION = (
     "CalculiX 2.20 finds no equilibrium of a HYPERFOAM of one term, or of two with a negative "
@@ -303,7 +304,11 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     what = "at rest" if len(times) == 1 else f"at {times[-1]:g} s"
     comparisons = [
         PredictionComparison(
-            f"largest displacement {what}", longest_displacement_m(theirs), sag_m, "m", remark
+            f"largest displacement {what}",
+            longest_displacement_m(theirs),
+            ours=sag_m,
+            unit="m",
+            remark=remark,
         )
     ]
     for each, push, force in zip(body.obstacles, their_forces, forces, strict=True):

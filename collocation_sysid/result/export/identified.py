@@ -119,7 +119,9 @@ def without_obstacles(experiment: Experiment) -> Experiment:
         for name in ("start_positions_m", "start_velocities_m_s")
     }
     # Exports need no measurements, and all of them may be of the obstacles.
-    some = Markers(t_s, np.zeros((len(t_s), 1, 3)), 1e-3, ["corner"], body.nodes_m[:1])
+    some = Markers(
+        t_s, np.zeros((len(t_s), 1, 3)), sigma_m=1e-3, names=["corner"], places_m=body.nodes_m[:1]
+    )
     unmeasured: dict[str, Any] = {"markers": some, "readings": (), "depths": ()}
     try:
         return replace(experiment, grasps=experiment.body_grasps, **started, **unmeasured)

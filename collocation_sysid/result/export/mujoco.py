@@ -309,7 +309,7 @@ def _compare_first_frequency(
     dofs = np.flatnonzero(np.repeat(free, 3))
     in_vacuum = replace(body.experiment, air_density_kg_m3="none")
     forces = Forces.from_experiment(in_vacuum, body.start_s, body.theta)
-    ours = natural_modes(forces, body.nodes_m, dofs, 1).frequencies_hz
+    ours = natural_modes(forces, body.nodes_m, free_dofs=dofs, count=1).frequencies_hz
     return PredictionComparison("first natural frequency, undeformed", theirs, float(ours[0]), "Hz")
 
 
@@ -352,7 +352,9 @@ def _compare_motion(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> Pre
     share = f", {difference_m / size_m:.2%} of it" if size_m else ""
     remark = f"both simulations differ by {difference_m:.3g} m (RMS){share}"
     what = "RMS deformation over the recording"
-    return PredictionComparison(what, _rms_length(theirs - rigid_m), size_m, "m", remark)
+    return PredictionComparison(
+        what, _rms_length(theirs - rigid_m), ours=size_m, unit="m", remark=remark
+    )
 
 
 def _set_grasp_state(

@@ -38,9 +38,13 @@ MISSING = "--to rerun needs rerun-sdk: pip install 'collocation-sysid[rerun]'"
 MARKER_RADIUS_RATIO = 0.012
 # Colours (red, green, blue), from 0 to 255, as in the pictures of a run.
 ORANGE = (230, 159, 0)
+# Fitted markers.
 BLUE = (0, 114, 178)
+# Simulated markers.
 VERMILION = (213, 94, 0)
+# Grasped nodes and obstacles.
 BLACK = (20, 20, 20)
+# Surface without stress.
 GREY = (150, 160, 170)
 
 
@@ -220,7 +224,13 @@ class _Recording:
         shapes_m = replay.shapes_m
         assert shapes_m is not None
         grasped_m = [x[h] for x, h in zip(shapes_m, replay.is_prescribed, strict=True)]
-        self._write_points(self._path(name, "grasped"), replay.t_s, grasped_m, BLACK, radius_m / 2)
+        self._write_points(
+            self._path(name, "grasped"),
+            replay.t_s,
+            points_m=grasped_m,
+            colour=BLACK,
+            radius_m=radius_m / 2,
+        )
         for kind, markers_m, colour in (
             ("measured", replay.measured_m, ORANGE),
             ("fitted", replay.markers_m, BLUE),
@@ -228,11 +238,15 @@ class _Recording:
         ):
             if markers_m is not None and len(replay.marker_names):
                 path = self._path(name, "markers", kind)
-                self._write_points(path, replay.t_s, [*markers_m], colour, radius_m)
+                self._write_points(
+                    path, replay.t_s, points_m=[*markers_m], colour=colour, radius_m=radius_m
+                )
         depth_points_m = [replay.depth_points_m(k) for k in range(len(replay.t_s))]
         if any(map(len, depth_points_m)):
             path = self._path(name, "depth_points")
-            self._write_points(path, replay.t_s, depth_points_m, ORANGE, radius_m / 4)
+            self._write_points(
+                path, replay.t_s, points_m=depth_points_m, colour=ORANGE, radius_m=radius_m / 4
+            )
         self._write_obstacles(replay)
         self._write_residuals(replay)
         self._write_wrenches(replay)
@@ -330,7 +344,7 @@ class _Recording:
         is_finite = np.isfinite(curve)
         if is_finite.any():
             columns = self.rr.Scalars.columns(scalars=curve[is_finite])
-            self._send(path, t_s[is_finite], columns, None)
+            self._send(path, t_s[is_finite], columns=columns, counts=None)
 
     def _send(self, path: str, t_s: Array, columns: Any, counts: Sequence[int] | None) -> None:
         """Send columns at times [s]; `counts` are the numbers of rows per time, None for one."""

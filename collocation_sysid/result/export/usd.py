@@ -112,9 +112,9 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     placed_m = np.where(body.is_prescribed, body.prescribed_m, body.nodes_m)
     _add_mesh(pxr, stage, body, placed_m)
     for k, grasp in enumerate(body.experiment.grasps, start=1):
-        _add_gripper(pxr, stage, k, grasp, body, placed_m)
+        _add_gripper(pxr, stage, number=k, grasp=grasp, body=body, start_positions_m=placed_m)
     for k, obstacle in enumerate(body.obstacles, start=1):
-        _add_obstacle(pxr, stage, f"/World/Obstacle_{k}", obstacle, body)
+        _add_obstacle(pxr, stage, path=f"/World/Obstacle_{k}", obstacle=obstacle, body=body)
     return ExportedFiles({STAGE_FILE: stage.GetRootLayer().ExportToString()}, tuple(limits))
 
 
@@ -250,7 +250,13 @@ def _add_gripper(
     gripper = pxr.UsdGeom.Xform.Define(stage, path)
     pxr.UsdPhysics.RigidBodyAPI.Apply(gripper.GetPrim()).CreateKinematicEnabledAttr(True)
     matrices, positions_m = grasp.poses.at(body.experiment.t_s)
-    _set_poses(pxr, gripper, positions_m, Rotation.from_matrix(matrices), body.experiment.t_s)
+    _set_poses(
+        pxr,
+        gripper,
+        positions_m=positions_m,
+        rotations=Rotation.from_matrix(matrices),
+        t_s=body.experiment.t_s,
+    )
     nodes = np.intersect1d(grasp.nodes, np.flatnonzero(body.is_node_prescribed))
     prim = stage.DefinePrim(f"{path}/Grasp", "PhysicsAttachment")
     types = pxr.Sdf.ValueTypeNames
@@ -292,7 +298,9 @@ def _add_obstacle(
         moving = pxr.UsdGeom.Xform.Define(stage, path)
         pxr.UsdPhysics.RigidBodyAPI.Apply(moving.GetPrim()).CreateKinematicEnabledAttr(True)
         matrices, places_m = obstacle.poses.at(t_s)
-        _set_poses(pxr, moving, places_m, Rotation.from_matrix(matrices), t_s)
+        _set_poses(
+            pxr, moving, positions_m=places_m, rotations=Rotation.from_matrix(matrices), t_s=t_s
+        )
         place_m = shape.centre_m
         turn = shape.rotation
         frame = f"{path}/Shape"
@@ -300,7 +308,9 @@ def _add_obstacle(
         place_m, turn = shape.pose_at(obstacle, body.start_s)
     kinds = {"box": "Cube"}
     solid = getattr(pxr.UsdGeom, kinds.get(shape.kind, shape.kind.title())).Define(stage, frame)
-    _set_poses(pxr, solid, place_m[None], Rotation.concatenate([turn]), t_s[:0])
+    _set_poses(
+        pxr, solid, positions_m=place_m[None], rotations=Rotation.concatenate([turn]), t_s=t_s[:0]
+    )
     if shape.kind == "box":
         solid.CreateSizeAttr(2.0)
         solid.AddScaleOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Vec3d(*shape.size_m))
@@ -378,6 +388,10 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     remark = "".join(contact.limitations)
     return [
         PredictionComparison(
-            "largest displacement at rest", longest_displacement_m(theirs), sag_m, "m", remark
+            "largest displacement at rest",
+            longest_displacement_m(theirs),
+            ours=sag_m,
+            unit="m",
+            remark=remark,
         )
     ]

@@ -87,7 +87,10 @@ def _experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
             yield f"{name.replace(' ', '_')}_{replay.name}", picture
         return
     if len(names):
-        yield f"tracks_{replay.name}", marker_tracks(t_s, names, measured, fitted, rolled_out)
+        yield (
+            f"tracks_{replay.name}",
+            marker_tracks(t_s, names, measured_m=measured, fitted_m=fitted, simulated_m=rolled_out),
+        )
         yield f"error_{replay.name}", marker_errors(t_s, measured, fitted, rolled_out)
     if len(names) and not replay.static:
         yield f"spectrum_{replay.name}", spectrum_picture(t_s, measured, fitted, replay.natural_hz)

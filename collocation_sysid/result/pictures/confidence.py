@@ -115,7 +115,9 @@ def confidence_ellipses(confidence: Confidence) -> Figure:
     scales = [
         _DeviationAxis.from_reach(1.15 * min(JOINT_RADIUS * each, MAX_HALF_WIDTH)) for each in half
     ]
-    figure = framed_figure(COLUMN_MM, COLUMN_MM if count > 1 else 62, 14, 2, 11, 2)
+    figure = framed_figure(
+        COLUMN_MM, COLUMN_MM if count > 1 else 62, left_mm=14, right_mm=2, foot_mm=11, top_mm=2
+    )
     spaces = {"wspace": 0.12, "hspace": 0.12}
     panels = figure.subplots(count, count, squeeze=False, gridspec_kw=spaces)
     for (row, column), axes in np.ndenumerate(panels):
@@ -198,7 +200,7 @@ def correlation_matrix(confidence: Confidence) -> Figure:
     """
     correlation = correlation_from_covariance(confidence.covariance)
     count = len(confidence.names)
-    figure = framed_figure(64, 52, 8, 7, 6, 5)
+    figure = framed_figure(64, 52, left_mm=8, right_mm=7, foot_mm=6, top_mm=5)
     axes, bar_axes = figure.subplots(1, 2, width_ratios=(1, 0.06), gridspec_kw={"wspace": 0.06})
     image = axes.imshow(correlation, cmap="PuOr", vmin=-1, vmax=1)
     for (i, j), value in np.ndenumerate(correlation):
@@ -242,7 +244,14 @@ def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
     rows = list(shares)[::-1]
     sources = [*drawn, OTHERS]
     legend_mm = LEGEND_LINE_MM * -(-len(sources) // LEGEND_COLUMNS) + 3
-    figure = framed_figure(COLUMN_MM, 12 + legend_mm + 7 * len(rows), 14, 4, 10, legend_mm)
+    figure = framed_figure(
+        COLUMN_MM,
+        12 + legend_mm + 7 * len(rows),
+        left_mm=14,
+        right_mm=4,
+        foot_mm=10,
+        top_mm=legend_mm,
+    )
     axes = figure.subplots()
     starts = [0.0] * len(rows)
     for source, colour in zip(sources, [*COLOUR_CYCLE[: len(drawn)], GREY], strict=True):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...array_types import Array
 from ..figure_style import PAGE_MM, SMALL_PT, VERMILION
 
+# Millimetres in an inch, the unit of lengths in Matplotlib.
 MM_PER_INCH = 25.4
 # Largest width of a panel, as a share of the page.
 MAX_PANEL_SHARE = 0.6
@@ -61,7 +62,9 @@ def depth_picture(rows: Array) -> Figure:
     for column, t_s in zip(axes.T, times, strict=True):
         here = points[points[:, 0] == t_s]
         lines = rows[(rows[:, 0] == t_s) & np.isnan(rows[:, 3]), 1:3]
-        image = _draw_panel(column[0], here[:, 1:3], here[:, 3], lines, VERMILION, depth)
+        image = _draw_panel(
+            column[0], here[:, 1:3], values=here[:, 3], lines=lines, colour=VERMILION, style=depth
+        )
         scales = [(image, "depth [m]")]
         title = f"t = {t_s:.4g} s" if len(times) > 1 else ""
         column[0].set_title(title, fontsize=SMALL_PT)
@@ -69,7 +72,14 @@ def depth_picture(rows: Array) -> Figure:
             used = here[np.isfinite(here[:, 4])]
             unused = here[~np.isfinite(here[:, 4])]
             column[1].plot(*unused[:, 1:3].T, ".", ms=1.5, color="0.7")
-            distances = _draw_panel(column[1], used[:, 1:3], 1e3 * used[:, 4], lines, "0.6", behind)
+            distances = _draw_panel(
+                column[1],
+                used[:, 1:3],
+                values=1e3 * used[:, 4],
+                lines=lines,
+                colour="0.6",
+                style=behind,
+            )
             scales.append((distances, "distance behind the surface [mm]"))
             rms = np.sqrt(np.mean((1e3 * used[:, 4]) ** 2))
             column[1].set_title(f"{rms:.2g} mm RMS, {len(used):,} points", fontsize=SMALL_PT)

@@ -19,11 +19,17 @@ from .projection import ParallelCamera
 from .scene import BodyDrawing, SheetView, aspect_ratio, draw_directions, draw_scale, sheet
 from .shapes import FIELD_COLOURS
 
+# Height of the titles [mm].
 HEAD_MM = 5.0
+# Height of directions and scale below the bodies [mm].
 FOOT_MM = 8.0
+# Width of the directions at the left [mm].
 CORNER_MM = 14.0
+# Width of the colour bar with its labels [mm].
 BAR_ROOM_MM = 20.0
+# Distance between two bodies [mm].
 GAP_MM = 3.0
+# Largest height of a body [mm], so that two rows fit on a page.
 MAX_BODY_HEIGHT_MM = 55.0
 COLUMN_TITLES = "lower end", "estimate", "upper end"
 # Ratio of posterior to prior standard deviation above which colours fade.

@@ -13,9 +13,13 @@ from .projection import ParallelCamera
 from .scene import BodyDrawing, SheetView, aspect_ratio, draw_directions, draw_scale, sheet
 from .shapes import FIELD_COLOURS
 
+# Height of the title [mm].
 HEAD_MM = 6.0
+# Height of directions and scale below the body [mm].
 FOOT_MM = 8.0
+# Width of the margins at the left and the right [mm].
 MARGIN_MM = 14.0
+# Largest height of the body [mm], half of a page.
 MAX_BODY_HEIGHT_MM = 90.0
 # Longest drawn displacement over the largest extent of the body.
 RELATIVE_AMPLITUDE = 0.08

@@ -57,7 +57,7 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     largest = float(np.nan_to_num(matrix.data).max(initial=1e-300))
     norm = LogNorm(largest * 10.0**-DECADES, largest, clip=True)
 
-    figure = framed_figure(PAGE_MM, 88, 12, 13, 10.5, 6)
+    figure = framed_figure(PAGE_MM, 88, left_mm=12, right_mm=13, foot_mm=10.5, top_mm=6)
     widths = (0.05 * max(1, nq), 1, 0.2, 0.95, 0.01, 0.03)
     grid = figure.add_gridspec(1, 6, width_ratios=widths, wspace=0.03)
     full_axes, middle, right, bar_axes = (figure.add_subplot(grid[k]) for k in (0, 1, 3, 5))
@@ -70,10 +70,10 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
         np.arange(nq) + 0.5, [symbol_as_mathtext(p.name) for p in collocation.parameters.free]
     )
     full_axes.set_ylim(rows, 0)
-    _tick_blocks(full_axes, "y", "c", range(first, steps), height)
+    _tick_blocks(full_axes, "y", letter="c", times=range(first, steps), size=height)
     style_axes(middle, f"{steps} of {total} timesteps", "node positions")
-    _tick_blocks(middle, "x", "x", range(steps), width)
-    _tick_blocks(middle, "y", "c", range(first, steps), height)
+    _tick_blocks(middle, "x", letter="x", times=range(steps), size=width)
+    _tick_blocks(middle, "y", letter="c", times=range(first, steps), size=height)
     middle.tick_params(labelleft=False, left=False)
     name = rf"$\partial c_{{{steps - 1}}} / \partial x_{{{steps - 1}}}$"
     free = "" if segment.has_constraints_of_grasps else ", free dofs only"

@@ -32,13 +32,17 @@ from .scene import (
 
 # More names than this would be a list, not a picture.
 MAX_WRITTEN_NAMES = 24
+# Height of the titles [mm].
 HEAD_MM = 6.0
+# Height of directions, scale and legend below the body [mm].
 FOOT_MM = 14.0
+# Distance between two views [mm].
 GAP_MM = 3.0
 # Height of a line of text.
 LINE_MM = 3.2
 # Mean width of a letter.
 LETTER_MM = 1.4
+# Largest height of a view [mm], so that two fit on a page.
 MAX_BODY_HEIGHT_MM = 70.0
 # Shortest distance on paper at which two marks are drawn apart: nearer ones cover each other.
 MIN_MARK_DISTANCE_MM = 0.4
@@ -85,14 +89,14 @@ def mesh_picture(replay: MotionRecord) -> Figure:
         (margin, total - head - height),
         (margin + width + GAP_MM, FOOT_MM) if is_side_by_side else (margin, FOOT_MM),
     )
-    first = _are_named_in_front(front, behind, places_m, nodes_m, surface)
+    first = _are_named_in_front(front, behind, places_m=places_m, nodes_m=nodes_m, surface=surface)
     views = []
     marks = set[str]()
     for camera, corner, mine in zip((front, behind), corners, (first, ~first), strict=True):
         view = SheetView.fit_points(camera, everything, (width, height), corner)
-        BodyDrawing(axes, view, surface, replay.surface_parts, replay.surface_nodes).update(
-            nodes_m, is_grasped, places_m
-        )
+        BodyDrawing(
+            axes, view, surface=surface, parts=replay.surface_parts, nodes=replay.surface_nodes
+        ).update(nodes_m, is_grasped, places_m)
         marks |= _draw_declared_positions(axes, view, places_m, declared_m)
         if replay.tendons_m is not None:
             axes.plot(*view.to_sheet_mm(replay.tendons_m).T, zorder=5.5, **MARK_STYLES[TENDON])
@@ -100,11 +104,17 @@ def mesh_picture(replay: MotionRecord) -> Figure:
         if named:
             dots = view.to_sheet_mm(places_m[mine])
             own = [name for name, here in zip(names, mine, strict=True) if here]
-            _write_names(axes, dots, own, COLUMN_MM / 2, (margin - 1, COLUMN_MM - margin + 1))
+            _write_names(
+                axes,
+                dots,
+                names=own,
+                middle=COLUMN_MM / 2,
+                edges=(margin - 1, COLUMN_MM - margin + 1),
+            )
         views.append(view)
     for view, x in zip(views, (0.15, 0.85), strict=True):
-        draw_directions(axes, view.camera, (COLUMN_MM * x, 5.0), 4.5)
-    draw_scale(axes, views[0].mm_per_m, (COLUMN_MM / 2 - 12, 4.0), 15.0)
+        draw_directions(axes, view.camera, origin_mm=(COLUMN_MM * x, 5.0), length_mm=4.5)
+    draw_scale(axes, views[0].mm_per_m, corner_mm=(COLUMN_MM / 2 - 12, 4.0), longest_mm=15.0)
     entries = ["grasped"] if is_grasped.any() else []
     entries += ["markers", "behind the body"] if len(names) else []
     lines = [
@@ -220,6 +230,7 @@ def spread_levels(levels: Array, gap: float) -> Array:
     return np.concatenate([*means, np.zeros(0)]) + steps
 
 
+# Bins of a histogram in half a column: 1.5 mm each.
 HISTOGRAM_BINS = 24
 
 
@@ -238,7 +249,7 @@ def elements_picture(nodes_m: Array, tetrahedra: NDArray[np.integer]) -> Figure:
     """
     quality = np.minimum(mean_ratios(nodes_m, tetrahedra), 1.0)  # rounding
     size_mm = 1e3 * np.sqrt((edge_lengths(nodes_m, tetrahedra) ** 2).mean(axis=1))
-    figure = framed_figure(COLUMN_MM, 42, 13, 2, 9.5, 5.5)
+    figure = framed_figure(COLUMN_MM, 42, left_mm=13, right_mm=2, foot_mm=9.5, top_mm=5.5)
     size_axes, quality_axes = figure.subplots(1, 2, sharey=True, gridspec_kw={"wspace": 0.08})
     widest = float(size_mm.max())
     spread = np.ptp(size_mm) > 0.02 * widest

@@ -5,6 +5,7 @@ residual.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -47,14 +48,39 @@ Box = tuple[float, float, float, float]
 
 # More markers make a figure higher than a page, in which it is scaled down to illegible numbers.
 MAX_SHOWN_MARKERS = 3
-ROW_MM = 27.0
-GAP_MM = 6.5
-LEGEND_MM = 12.0
-FOOT_MM = 10.0
-LEFT_MM = 15.0
-RIGHT_MM = 2.0
-BETWEEN_MM = 10.0
-UPPER_SHARE = 0.64
+
+
+@dataclass(frozen=True)
+class TrackLayout:
+    """Measures of the figure of marker tracks, three columns wide.
+
+    Attributes
+    ----------
+    row_mm : float
+        Height of a marker's row: its tracks above its residuals.
+    row_gap_mm : float
+        Distance of two rows, for the labels of the times.
+    legend_mm, foot_mm : float
+        Height of the legend above the rows, and of the time axis below them.
+    first_margin_mm, last_margin_mm : float
+        Width of the margins at the left, with labels, and at the right.
+    column_gap_mm : float
+        Distance of two columns, with labels.
+    upper_share : float
+        Share of a row's height for the tracks; the others are for the residuals.
+    """
+
+    row_mm: float = 27.0
+    row_gap_mm: float = 6.5
+    legend_mm: float = 12.0
+    foot_mm: float = 10.0
+    first_margin_mm: float = 15.0
+    last_margin_mm: float = 2.0
+    column_gap_mm: float = 10.0
+    upper_share: float = 0.64
+
+
+TRACK_LAYOUT = TrackLayout()
 
 
 def marker_tracks(
@@ -86,8 +112,9 @@ def marker_tracks(
     shown = _worst_markers(measured_m, [model for _, model, _ in drawn], max_markers)
     some = f"{len(shown)} of {len(names)} markers, those with the largest errors"
     title = some if len(shown) < len(names) else ""
-    head = LEGEND_MM + (5.0 if title else 0.0)
-    height = head + len(shown) * (ROW_MM + GAP_MM) - GAP_MM + FOOT_MM
+    head = TRACK_LAYOUT.legend_mm + (5.0 if title else 0.0)
+    rows_mm = len(shown) * (TRACK_LAYOUT.row_mm + TRACK_LAYOUT.row_gap_mm)
+    height = head + rows_mm - TRACK_LAYOUT.row_gap_mm + TRACK_LAYOUT.foot_mm
     figure = NotebookFigure(figsize=(PAGE_MM / 25.4, height / 25.4))
     errors = [1e3 * (model - measured_m)[:, shown] for _, model, _ in drawn]
     reach = max((float(np.nanmax(np.abs(e), initial=0.0)) for e in errors), default=0.0) or 1.0
@@ -106,7 +133,9 @@ def marker_tracks(
             for each in (upper, lower):
                 each.set_xlim(start, stop)
                 each.xaxis.set_major_locator(MaxNLocator(4))
-                each.yaxis.set_label_coords((3.5 - LEFT_MM) / _column_width_mm(), 0.5)
+                each.yaxis.set_label_coords(
+                    (3.5 - TRACK_LAYOUT.first_margin_mm) / _column_width_mm(), 0.5
+                )
             upper.plot(t_s, measured, label="measured", zorder=3, **dots)
             lower.axhline(0.0, color=BLACK, lw=0.6)
             for label, model_m, style in drawn:
@@ -141,18 +170,25 @@ def _axes_boxes(row: int, axis: int, height: float, head: float) -> tuple[Box, B
         Heights of the figure and of the space above the first row [mm].
     """
     width = _column_width_mm()
-    x = (LEFT_MM + axis * (width + BETWEEN_MM)) / PAGE_MM
-    bottom = height - head - row * (ROW_MM + GAP_MM) - ROW_MM
-    split = (1 - UPPER_SHARE) * ROW_MM
+    layout = TRACK_LAYOUT
+    x = (layout.first_margin_mm + axis * (width + layout.column_gap_mm)) / PAGE_MM
+    bottom = height - head - row * (layout.row_mm + layout.row_gap_mm) - layout.row_mm
+    split = (1 - layout.upper_share) * layout.row_mm
     return (
-        (x, (bottom + split) / height, width / PAGE_MM, UPPER_SHARE * ROW_MM / height),
+        (
+            x,
+            (bottom + split) / height,
+            width / PAGE_MM,
+            layout.upper_share * layout.row_mm / height,
+        ),
         (x, bottom / height, width / PAGE_MM, (split - 2.0) / height),
     )
 
 
 def _column_width_mm() -> float:
     """Return the width of one of the three columns."""
-    return (PAGE_MM - LEFT_MM - RIGHT_MM - 2 * BETWEEN_MM) / 3
+    layout = TRACK_LAYOUT
+    return (PAGE_MM - layout.first_margin_mm - layout.last_margin_mm - 2 * layout.column_gap_mm) / 3
 
 
 def _worst_markers(measured_m: Array, models_m: Sequence[Array], count: int) -> list[int]:
@@ -186,7 +222,7 @@ def marker_errors(
     fitted_m, simulated_m : (T, M, 3) or None
         Fitted and simulated markers.
     """
-    figure = framed_figure(COLUMN_MM, 52, 13, 2, 9.5, 9)
+    figure = framed_figure(COLUMN_MM, 52, left_mm=13, right_mm=2, foot_mm=9.5, top_mm=9)
     axes = figure.subplots()
     totals = []
     for label, model_m, style in drawn_models(fitted_m, simulated_m):
@@ -216,6 +252,7 @@ def rms_over_markers(squares: Array) -> Array:
         return np.sqrt(total / present.sum(axis=1))
 
 
+# Height of a row of three panels [mm].
 HEIGHT_MM = 42.0
 
 

@@ -51,7 +51,7 @@ def convergence(
         True values by parameter, relative to which parameters are drawn; their final values by
         default.
     """
-    figure = framed_figure(COLUMN_MM, 132, 14, 2, 9.5, 4)
+    figure = framed_figure(COLUMN_MM, 132, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=4)
     heights = (1.0, 1.0, 1.0, 0.2, 1.4)  # a gap for the legend
     grid = figure.add_gridspec(5, 1, height_ratios=heights, hspace=0.12)
     panels = [figure.add_subplot(grid[row]) for row in (0, 1, 2, 4)]
@@ -141,6 +141,7 @@ def _positive_or_nan(values: Sequence[float] | Array) -> Array:
     return np.where((array > 0) & np.isfinite(array), array, np.nan)
 
 
+# Height of the picture of a scan [mm].
 HEIGHT_MM = 52
 
 
@@ -156,7 +157,7 @@ def scan_picture(young_pa: Array, misfit: Array, best: int) -> Figure:
     best : int
         Index of the modulus at which the solve starts.
     """
-    figure = framed_figure(COLUMN_MM, HEIGHT_MM, 14, 2, 9.5, 6)
+    figure = framed_figure(COLUMN_MM, HEIGHT_MM, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=6)
     axes = figure.subplots()
     axes.plot(young_pa, misfit, "o-", ms=2.5, lw=LINE_PT, color=BLUE, label="simulated")
     style_axes(axes, "", "Young's modulus E [Pa]", "misfit [σ]")

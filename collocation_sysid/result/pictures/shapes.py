@@ -33,13 +33,21 @@ from .scene import (
     with_nearby_outlines,
 )
 
+# Number of shapes in a picture, evenly spaced in time: more would be too small on a page.
 SHOWN_SHAPES = 6
+# Height of the titles with the times [mm].
 HEAD_MM = 5.0
+# Height of directions, scale and legend below the bodies [mm].
 FOOT_MM = 5.0
+# Width of the directions at the left [mm].
 CORNER_MM = 14.0
+# Largest height of a body [mm].
 MAX_BODY_HEIGHT_MM = 60.0
+# Distance between two bodies [mm].
 GAP_MM = 4.0
+# Width of the colour bar [mm].
 BAR_MM = 2.5
+# Width of the colour bar with its labels [mm].
 BAR_ROOM_MM = 20.0
 # From pale to dark, on which markers and grasped nodes stand out; its darkest fifth is left out.
 FIELD_COLOURS = ListedColormap(colormaps["YlGnBu"](np.linspace(0.0, 0.8, 256))).with_extremes(
@@ -112,7 +120,13 @@ def shapes_picture(
     start = CORNER_MM + (gap - GAP_MM) / 2
     for t, first, last, colour in zip(shown, lefts, rights, colours, strict=True):
         view = SheetView(camera, scale, np.array([start - scale * first, FOOT_MM - scale * low]))
-        body = BodyDrawing(axes, view, replay.surface, replay.surface_parts, replay.surface_nodes)
+        body = BodyDrawing(
+            axes,
+            view,
+            surface=replay.surface,
+            parts=replay.surface_parts,
+            nodes=replay.surface_nodes,
+        )
         obstacles_m = None if replay.obstacles_m is None else replay.obstacles_m[t]
         body.update(positions_m[t], replay.is_prescribed[t], measured_m[t], colour, obstacles_m)
         text = {"ha": "center", "va": "center", "fontsize": SMALL_PT}

@@ -46,7 +46,7 @@ def spectrum_picture(
     natural_hz : (k,) or None
         Natural frequencies; those above half the sampling rate are left out.
     """
-    figure = framed_figure(COLUMN_MM, 58, 14, 2, 9.5, 9)
+    figure = framed_figure(COLUMN_MM, 58, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=9)
     axes = figure.subplots()
     rate = (len(t_s) - 1) / (t_s[-1] - t_s[0])
     hertz, density = spectral_density(measured_m, rate)

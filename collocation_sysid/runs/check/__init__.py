@@ -341,7 +341,13 @@ def _program_fields(
     reduced = next(each for each in named if isinstance(each, ReducedSpace))
     method = problem.method
     name = method if isinstance(method, str) else getattr(method, "name", repr(method))
-    counted = method_costs(collocation, first, first_z, jacobian + hessian, reduced.factorisation)
+    counted = method_costs(
+        collocation,
+        first,
+        z=first_z,
+        nonzeros=jacobian + hessian,
+        factorisation=reduced.factorisation,
+    )
     return {
         "variables": collocation.variable_count,
         "constraints": collocation.constraint_count,

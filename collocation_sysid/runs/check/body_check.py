@@ -38,6 +38,7 @@ LINEAR = "tet4"
 FOR_BENDING = 'set object.element = "tet10"'
 FOR_VOLUME = 'set object.element = "tet10-p0"'
 
+# Corners of the faces of a tetrahedron; face k is opposite to corner k.
 _FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
 
 
@@ -403,12 +404,12 @@ def _check_grasp(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -
     return GraspCheck(
         name,
         len(nodes),
-        tuple(low.tolist()),
-        tuple(high.tolist()),
-        len(nodes) / len(points_m),
-        int(slightly_outside.any(axis=1).sum()),
-        int(slightly_inside.any(axis=1).sum()),
-        grasp.axes,
+        low_m=tuple(low.tolist()),
+        high_m=tuple(high.tolist()),
+        share=len(nodes) / len(points_m),
+        nearly_grasped=int(slightly_outside.any(axis=1).sum()),
+        nearly_free=int(slightly_inside.any(axis=1).sum()),
+        axes=grasp.axes,
     )
 
 

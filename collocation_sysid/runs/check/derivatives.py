@@ -107,12 +107,12 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
     program = collocation.with_lifted_variables()
     plain = collocation
     if program.has_lifted_variables:  # methods use these without memory and wrenches as variables
-        of_slopes = _slope_error(plain.objective, plain.gradient, z, rng, step)
+        of_slopes = _slope_error(plain.objective, plain.gradient, z=z, rng=rng, step=step)
         if plain.has_eliminated_histories:
             forces = rng.normal(size=plain.constraint_count)
             through = partial(plain.jacobian_vjp, multipliers=forces)
             pushed = lambda at: forces @ plain.constraint_values(at)  # noqa: E731
-            slope = _slope_error(pushed, through, z, rng, step)
+            slope = _slope_error(pushed, through, z=z, rng=rng, step=step)
             of_slopes = max(of_slopes, slope)
         if sum(program.lifted_nonzeros) > MOST_LIFTED_NONZEROS:
             return of_slopes, 0.0
@@ -127,8 +127,12 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
 
     hessian = collocation.hessian(point, 1.0, multipliers)
     slope = collocation.jacobian(point) @ direction
-    first = _deviation(collocation.constraint_values, slope, point, direction, step)
-    second = _deviation(lagrangian_gradient, hessian @ direction, point, direction, step)
+    first = _deviation(
+        collocation.constraint_values, slope, point=point, direction=direction, step=step
+    )
+    second = _deviation(
+        lagrangian_gradient, hessian @ direction, point=point, direction=direction, step=step
+    )
     return max(first, of_slopes), second
 
 
@@ -148,7 +152,9 @@ def _slope_error(function, gradient, z: Array, rng: np.random.Generator, step: f
     """
     point = z + 1e-3 * rng.normal(size=len(z))
     direction = rng.normal(size=len(z))
-    return _deviation(function, gradient(point) @ direction, point, direction, step)
+    return _deviation(
+        function, gradient(point) @ direction, point=point, direction=direction, step=step
+    )
 
 
 def _deviation(function, exact: Array, point: Array, direction: Array, step: float) -> float:

@@ -112,28 +112,30 @@ def check_recording(experiment: Experiment, positions_m: Array | None) -> Record
             MarkerCheck(
                 name,
                 float(markers.placement.distance_m[k]),
-                len(present),
-                int(missing[k]),
-                float(miss[present[0], k]) if len(present) and present[0] < len(miss) else None,
+                samples=len(present),
+                missing=int(missing[k]),
+                start_miss_m=float(miss[present[0], k])
+                if len(present) and present[0] < len(miss)
+                else None,
             )
         )
     return RecordingCheck(
         experiment.name,
         experiment.validation,
-        experiment.is_static,
-        experiment.duration_s,
-        1 / experiment.timestep_s,
-        len(experiment.t_s),
-        markers.sample_count,
-        int(missing.sum()),
-        tuple(findings),
-        (
+        static=experiment.is_static,
+        duration_s=experiment.duration_s,
+        rate_hz=1 / experiment.timestep_s,
+        frames=len(experiment.t_s),
+        samples=markers.sample_count,
+        missing=int(missing.sum()),
+        markers=tuple(findings),
+        instruments=(
             *["the wrench"] * bool(experiment.wrenches),
             *(gauge.name for gauge in experiment.readings),
             *(f"{sum(map(len, d.clouds)):,} points of '{d.name}'" for d in experiment.depths),
         ),
-        experiment.air_density_kg_m3,
-        "" if experiment.specimen is None else f"{experiment.specimen.test} specimen",
+        air_density_kg_m3=experiment.air_density_kg_m3,
+        test="" if experiment.specimen is None else f"{experiment.specimen.test} specimen",
     )
 
 

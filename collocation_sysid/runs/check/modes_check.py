@@ -130,12 +130,12 @@ def check_modes(experiment: Experiment, scheme: Scheme, step_s: float, theta: Ar
     return ModesCheck(
         experiment.name,
         about,
-        findings,
-        scheme.name,
-        step_s,
-        experiment.duration_s,
-        needed,
-        modes.omitted_count,
+        modes=findings,
+        scheme=scheme.name,
+        timestep_s=step_s,
+        duration_s=experiment.duration_s,
+        substeps_needed=needed,
+        not_oscillating=modes.omitted_count,
     )
 
 
@@ -170,10 +170,10 @@ def _mode_findings(
             ModeCheck(
                 float(frequency),
                 float(1 / frequency / experiment.timestep_s),
-                float(1 / frequency / step_s),
-                float(ratio),
-                round(damped.damping_ratio, ROUNDING) + 0.0,  # no −0
-                undamped.period_error,
+                steps_per_period=float(1 / frequency / step_s),
+                damping_ratio=float(ratio),
+                numerical_damping_ratio=round(damped.damping_ratio, ROUNDING) + 0.0,  # no −0
+                period_error=undamped.period_error,
             )
         )
     return tuple(findings)
