@@ -69,7 +69,7 @@ assert (measured_pa < np.maximum(*ends_pa))[-3:].all()
 assert (measured_pa > np.minimum(*ends_pa))[-3:].all()
 
 # %%
-# Planar tension (pure shear) as a second test determines μ₂ with a statistical uncertainty of a fifth
+# Planar tension (pure shear) as a second test determines μ₂: its statistical uncertainty is a fifth
 # of its value; the rest of its interval comes from the anisotropy that rubber may have. Now the
 # error of the prediction of the equibiaxial test, 10 kPa, is that of the measurements.
 both = fit("uniaxial", "planar")
