@@ -13,28 +13,177 @@ import ast as _ast
 from importlib import import_module as _import_module
 from importlib.metadata import version as _version
 from pathlib import Path as _Path
+from typing import TYPE_CHECKING
 from typing import Any as _Any
 
+# The public names. Type checkers and editors read these imports; at run time `__getattr__` imports
+# a module when one of its names is used, because the import of all takes seconds.
+if TYPE_CHECKING:
+    from . import datasets, live, testing
+    from .errors import InputError, SimulationError
+    from .fem.body import Body
+    from .fem.constants import Constant
+    from .fem.materials import DampingLaw, Material, Prony
+    from .fem.mesh import TetMesh
+    from .fem.node_force import NodeForce
+    from .fem.regions import Region
+    from .fem.rest_shape import UnderGravity
+    from .fem.selection import Ball, Box, Face, Indices, Named
+    from .fem.spatial_field import Field
+    from .fem.structured import box_mesh, cylinder_mesh
+    from .methods.comparison.casadi_nlp import Sleqp, SqpMethod
+    from .methods.comparison.penalty import AugmentedLagrangian, Penalty
+    from .methods.comparison.shooting import Shooting
+    from .methods.continuation import Continuation
+    from .methods.interior_point import InteriorPoint
+    from .methods.reduced_space import ReducedSpace
+    from .methods.solution import Iteration, Solution, Status
+    from .model.parameters import Parameter, Parameters, Tied, Unknown
+    from .model.schemes import Scheme, Stencil
+    from .pipeline import Run, run, solve
+    from .problem import Problem, RolloutOptions, UncertaintyOptions
+    from .program.collocation import Collocation
+    from .program.simulation import Trajectory, simulate, with_markers, with_readings, with_wrenches
+    from .recording import (
+        Capsule,
+        Cuboid,
+        Cylinder,
+        Depth,
+        DepthCamera,
+        Experiment,
+        Force,
+        Gauge,
+        Grasp,
+        Look,
+        Markers,
+        Nuisance,
+        NuisanceRow,
+        Obstacle,
+        Placement,
+        Plane,
+        PointMass,
+        PoseSequence,
+        Pressure,
+        Specimen,
+        Sphere,
+        Tendon,
+        Wrench,
+        depth_image,
+        place_markers,
+    )
+    from .runs.numerical_error import refine
+    from .statistics.systematic_effects import Assumptions
 
-def _homes() -> dict[str, str]:
-    """The module of each name, as the stub beside this file imports them."""
-    stub = _ast.parse(_Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
-    lines = (each for each in stub.body if isinstance(each, _ast.ImportFrom))
-    return {a.name: f".{each.module or a.name}" for each in lines for a in each.names}
+    __version__: str
+
+__all__ = [
+    "Assumptions",
+    "AugmentedLagrangian",
+    "Ball",
+    "Body",
+    "Box",
+    "Capsule",
+    "Collocation",
+    "Constant",
+    "Continuation",
+    "Cuboid",
+    "Cylinder",
+    "DampingLaw",
+    "Depth",
+    "DepthCamera",
+    "Experiment",
+    "Face",
+    "Field",
+    "Force",
+    "Gauge",
+    "Grasp",
+    "Indices",
+    "InputError",
+    "InteriorPoint",
+    "Iteration",
+    "Look",
+    "Markers",
+    "Material",
+    "Named",
+    "NodeForce",
+    "Nuisance",
+    "NuisanceRow",
+    "Obstacle",
+    "Parameter",
+    "Parameters",
+    "Penalty",
+    "Placement",
+    "Plane",
+    "PointMass",
+    "PoseSequence",
+    "Pressure",
+    "Problem",
+    "Prony",
+    "ReducedSpace",
+    "Region",
+    "RolloutOptions",
+    "Run",
+    "Scheme",
+    "Shooting",
+    "SimulationError",
+    "Sleqp",
+    "Solution",
+    "Specimen",
+    "Sphere",
+    "SqpMethod",
+    "Status",
+    "Stencil",
+    "Tendon",
+    "TetMesh",
+    "Tied",
+    "Trajectory",
+    "UncertaintyOptions",
+    "UnderGravity",
+    "Unknown",
+    "Wrench",
+    "box_mesh",
+    "cylinder_mesh",
+    "datasets",
+    "depth_image",
+    "live",
+    "place_markers",
+    "refine",
+    "run",
+    "simulate",
+    "solve",
+    "testing",
+    "with_markers",
+    "with_readings",
+    "with_wrenches",
+]
 
 
-_HOMES = _homes()
-__all__ = [*_HOMES]  # pyright: ignore[reportUnsupportedDunderAll]
+def _modules_of_names() -> dict[str, str]:
+    """Return the module of each public name, from the imports for type checkers above."""
+    tree = _ast.parse(_Path(__file__).read_text(encoding="utf-8"))
+    (block,) = (each for each in tree.body if isinstance(each, _ast.If) and _is_for_types(each))
+    imports = (each for each in block.body if isinstance(each, _ast.ImportFrom))
+    return {a.name: f".{each.module or a.name}" for each in imports for a in each.names}
 
 
-def __getattr__(name: str) -> _Any:
-    if name == "__version__":
-        return _version("collocation-sysid")
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = _import_module(_HOMES[name], __name__)
-    attribute = home if _HOMES[name] == f".{name}" else getattr(home, name)
-    return globals().setdefault(name, attribute)
+def _is_for_types(block: _ast.If) -> bool:
+    """Return whether a block is executed by type checkers alone."""
+    return isinstance(block.test, _ast.Name) and block.test.id == "TYPE_CHECKING"
+
+
+# Type checkers do not see the function, so that they report misspelt names.
+if not TYPE_CHECKING:
+    _MODULES = _modules_of_names()
+
+    def __getattr__(name: str) -> _Any:
+        """Return a public name; its module is imported at the first use."""
+        if name == "__version__":
+            return _version("collocation-sysid")
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module = _import_module(_MODULES[name], __name__)
+        attribute = module if _MODULES[name] == f".{name}" else getattr(module, name)
+        return globals().setdefault(name, attribute)
 
 
 def __dir__() -> list[str]:

@@ -29,7 +29,11 @@ from collocation_sysid.recording import (
 
 YOUNG_PA = 8e4
 SWUNG = {"young_pa": 8000.0, "poisson": 0.3, "gamma_r_s": 0.005, "gamma_m_1_s": 1.0}
-SEED = 1
+# Seeds of the noise. With 1, the swing has a rare draw, 2.6 standard deviations off: of ten others
+# the standardised errors have a root mean square of 0.85 to 1.1, and the headline intervals contain
+# the truth. The example for new users is one of the ten, with the verdict "good".
+SWING_SEED = 109
+BENCH_SEED = 1
 
 
 def swing(folder: Path) -> None:
@@ -47,7 +51,7 @@ def swing(folder: Path) -> None:
     grasp = Grasp(Box((-1, -1, -1e-3), (1, 1, 1e-3)), poses)
     swung = Experiment(body, t_s, [grasp], markers, air_density_kg_m3="none")
     tracks_m = simulate(swung, SWUNG).markers_m
-    tracks_m = tracks_m + np.random.default_rng(SEED).normal(scale=1e-3, size=tracks_m.shape)
+    tracks_m = tracks_m + np.random.default_rng(SWING_SEED).normal(scale=1e-3, size=tracks_m.shape)
     mesh.write(folder / "body.vtu")
     write_poses_csv(folder / "poses.csv", poses)
     write_markers_csv(folder / "markers.csv", t_s, ["low", "middle", "end_1", "end_2"], tracks_m)
@@ -84,7 +88,10 @@ def benched(folder: Path, names: str, t_s: Array, moved: Array, noise: float, sc
     problem = Problem.read(folder / "problem.toml", at_truth, simulation=True)
     (experiment,) = problem.experiments
     (reaction,) = simulate(experiment, problem.parameters).wrenches
-    write(scale * reaction[:, 2] + np.random.default_rng(SEED).normal(scale=noise, size=len(t_s)))
+    write(
+        scale * reaction[:, 2]
+        + np.random.default_rng(BENCH_SEED).normal(scale=noise, size=len(t_s))
+    )
 
 
 KINDS = {"swing": swing, "compression": compression, "tension": tension}

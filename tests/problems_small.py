@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from itertools import cycle, product
@@ -34,6 +34,8 @@ from collocation_sysid.recording import (
     Sphere,
     Tendon,
 )
+from collocation_sysid.testing.small_problems import shaken_variables, smooth_poses
+from collocation_sysid.testing.small_problems import uneven_box as uneven_box
 
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
 GUESS = Parameters(
@@ -66,13 +68,6 @@ def box(
     return Body(box_mesh(size_m, divisions), density_kg_m3=30.0, element=element)
 
 
-def uneven_box(divisions: int) -> TetMesh:
-    """A box of which no two elements are alike."""
-    made = box_mesh((0.10, 0.12, 0.09), (divisions,) * 3)
-    jitter = np.random.default_rng(1).uniform(-0.008, 0.008, made.points_m.shape)
-    return TetMesh(made.points_m + jitter, made.tetrahedra)
-
-
 def with_papers_damping(experiment: Experiment) -> Experiment:
     """The experiment with Rayleigh's law."""
     body = experiment.body
@@ -83,18 +78,6 @@ def with_papers_damping(experiment: Experiment) -> Experiment:
 def nodes_where(body: Body, axis: int, value_m: float) -> np.ndarray:
     """Nodes on a plane across an axis."""
     return np.flatnonzero(np.abs(body.nodes_m[:, axis] - value_m) < 1e-9)
-
-
-def smooth_poses(
-    t_s: np.ndarray,
-    sway_m: Sequence[float] = (0.02, 0.01, -0.015),
-    turn_rad: Sequence[float] = (0.2, -0.15, 0.3),
-    angular_frequency_rad_s: float = 20.0,
-) -> PoseSequence:
-    """A motion that starts at rest from the identity, sampled from its formula."""
-    share = 1 - np.cos(angular_frequency_rad_s * t_s)
-    turns = Rotation.from_rotvec(np.outer(share, turn_rad))
-    return PoseSequence(t_s, np.outer(share, sway_m), turns.as_quat())
 
 
 def vertex_markers(body: Body, nodes: ArrayLike, t_s: np.ndarray) -> Markers:
@@ -307,21 +290,7 @@ def relative_errors(solution: Solution) -> np.ndarray:
 
 def some_point(made: Collocation, rng: np.random.Generator | None = None) -> np.ndarray:
     """Variables that satisfy nothing, what is carried neither: rigid, then shaken."""
-    rng, positions = rng or np.random.default_rng(1), []
-    for segment in made.transcriptions:
-        rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(
-            -1, segment.dof_count
-        )
-        positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
-    p, nq = made.guess_p, made.nq
-    p[:nq] += 0.1 * rng.normal(size=nq)
-    p[nq:] += 0.5 * rng.normal(size=made.nphi)
-    lags = np.array(["lag of" in name for name in made.parameter_names], dtype=bool)
-    p[lags] = np.abs(p[lags]) + 0.1
-    z = made.pack(p, positions)
-    for carried in made.lifted:
-        z[carried.columns] += 0.01 * rng.normal(size=carried.count)
-    return z
+    return shaken_variables(made, rng or np.random.default_rng(1))
 
 
 def pressed_cube(steps: int = 5, friction: float | str = 0.0, **changes) -> Experiment:

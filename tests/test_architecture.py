@@ -32,7 +32,7 @@ LAYERS = (
     {"pipeline", "installation_check"},
     {"live"},
     {"plan"},
-    {"cli"},
+    {"cli", "testing"},
     {"__main__"},
 )
 

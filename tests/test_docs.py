@@ -67,7 +67,8 @@ def test_python_blocks_of_a_page_run_one_after_the_other(page: Path, checkout: P
 
 # What keeps a command of the pages short here.
 SHORT = {
-    "compare": ["--dry-run"],
+    "compare-methods": ["--dry-run"],
+    "compare-models": ["--dry-run"],
     "sweep": ["--dry-run"],
     "solve": ["--method", "reduced-space"],
     "design": ["--duration", "0.05", "--evaluations", "1", "--pairs", "0", "--no-film"],
@@ -163,6 +164,19 @@ def test_the_glossary_is_in_order_and_its_words_stand_on_the_pages_they_lead_to(
         assert "glossary.md" in page.read_text()
 
 
+def test_the_core_page_names_classes_that_there_are():
+    page = (ROOT / "docs" / "core.md").read_text()
+    paths = re.findall(r"^\| `collocation_sysid\.([\w.]+)\.(\w+)` \|", page, re.MULTILINE)
+    assert len(paths) > 11
+    for module, name in paths:
+        assert isinstance(
+            getattr(importlib.import_module(f"collocation_sysid.{module}"), name), type
+        )
+    figure = page.partition("```text\n")[2].partition("```")[0]
+    boxes = set(re.findall(r"^ ([A-Z]\w+)", figure, re.MULTILINE))
+    assert boxes - {name for _, name in paths} == {"PointPositions"}
+
+
 def test_the_front_page_shows_the_answer_that_the_readme_shows():
     (shown,) = blocks(ROOT / "docs" / "index.md", "console")
     lines = (ROOT / "README.md").read_text().splitlines()
@@ -211,14 +225,24 @@ def test_the_reference_lists_what_is_public_and_nothing_else():
     page = (ROOT / "docs" / "api.md").read_text()
     listed = re.findall(r"^   ([\w.]+)$", page, re.MULTILINE)
     live = [f"live.{name}" for name in cs.live.__all__]
+    checks = [f"testing.{name}" for name in cs.testing.__all__]
     datasets = [f"datasets.{name}" for name in cs.datasets.__all__]
-    modules = {"live", "datasets"}
-    assert sorted(listed) == sorted([*(set(cs.__all__) - modules), *live, *datasets])
+    modules = {"live", "datasets", "testing"}
+    public = set(cs.__all__) - modules
+    assert sorted(listed) == sorted([*public, *live, *datasets, *checks])
 
 
 def test_the_reference_of_the_command_line_has_every_command_and_option(reference):
     page = reference.command_line()
-    for command in ("solve", "check", "compare", "sweep", "report", "new"):
+    for command in (
+        "solve",
+        "check",
+        "compare-methods",
+        "compare-models",
+        "sweep",
+        "report",
+        "new",
+    ):
         assert f"\n## {command}\n" in page
     for option in ("--start", "--allow-code", "--time-limit", "--over"):
         assert f"`{option}`" in page

@@ -20,7 +20,7 @@ from collocation_sysid.fem.materials import MATERIALS, Material, as_material, ne
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.statistics.material_stability import (
+from collocation_sysid.statistics.stability_concerns import (
     rest_stability_concerns,
     strain_stability_concerns,
 )

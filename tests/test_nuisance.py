@@ -105,16 +105,6 @@ def test_the_start_given_says_where_the_body_is_in_its_grasp():
     assert NuisanceMap.from_experiment(cube).size == 0
 
 
-def test_a_camera_offset_moves_its_marker():
-    cube = replace(hung_cube(), nuisance=ONE_OF_EACH["offset"])
-    phi = np.zeros(NuisanceMap.from_experiment(cube).size)
-    phi[3:6] = [1.0, -2.0, 0.5]
-    change = readings(cube, phi) - readings(cube, 0 * phi)
-    expected = np.zeros_like(change)
-    expected[:, 1] = [0.003, -0.006, 0.0015]
-    np.testing.assert_allclose(change, expected, atol=1e-14)
-
-
 @pytest.mark.parametrize("share", [-0.6, 0.3, 1.0])
 def test_a_time_shift_reads_the_motion_at_another_time(share: float):
     cube = replace(hung_cube(20), nuisance=Nuisance.none(time_shift_s=0.01))

@@ -60,15 +60,6 @@ def test_readings_are_changed_as_said():
     np.testing.assert_allclose(scaled[:, 1], 1.01 * plain[:, 1] + sag, atol=1e-14)
 
 
-def test_a_clock_that_drifts_is_later_and_later():
-    cube = replace(hung_cube(), nuisance=only(DRIFT))
-    late = seen_with(cube, np.array([1.0])).markers.positions_m
-    shifted = replace(cube, nuisance=cs.Nuisance.none(time_shift_s=1.0))
-    for k in (0, 4, 9):
-        at_once = seen_with(shifted, np.array([0.05 * cube.t_s[k]])).markers.positions_m
-        np.testing.assert_allclose(late[k], at_once[k], atol=1e-12)
-
-
 # Every one by one method; by the others one of them.
 FOUND_BY = [
     *((name, "reduced-space") for name in ROWS),

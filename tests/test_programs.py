@@ -305,15 +305,6 @@ def loaded_cube(steps: int = 8) -> Experiment:
     )
 
 
-ONE_OF = {
-    "place": Nuisance.none(marker_offset_m=0.002),
-    "time": Nuisance.none(time_shift_s=0.002),
-    "turn": Nuisance.none(pose_turn_rad=0.02),
-    "tilt": Nuisance.none(gravity_rad=0.02),
-    "grasp-shift": Nuisance.none(hand_eye_m=0.002),
-    "grasp-turn": Nuisance.none(hand_eye_rad=0.02),
-    "offset": Nuisance.none(camera_offset_m=0.002),
-}
 PROGRAMS: dict[str, Make] = {
     **{
         f"{start}, {scheme}": lambda layout=(start, scheme, rows, steps): program(
@@ -367,12 +358,8 @@ PROGRAMS: dict[str, Make] = {
         )
         for steps in (1, 2)
     },
-    **{
-        f"{kind}": lambda one=one: program(replace(swung(), nuisance=one))
-        for kind, one in ONE_OF.items()
-    },
     "turn, all fixed": lambda: program(
-        replace(swung(), nuisance=ONE_OF["turn"]), parameters=ALL_FIXED
+        replace(swung(), nuisance=Nuisance.none(pose_turn_rad=0.02)), parameters=ALL_FIXED
     ),
     "clock before": lambda: cleared_clock(-4),
     "clock behind": lambda: cleared_clock(4),

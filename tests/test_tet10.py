@@ -26,7 +26,6 @@ from collocation_sysid.result.run_writers import write_frames
 from collocation_sysid.result.synthesis import Recipe, write_data
 
 TET10 = element_named("tet10")
-LENGTH_M = 0.03  # a large change of a position
 
 
 @cache
@@ -121,66 +120,6 @@ def test_mass_is_kept_and_positive_everywhere(patch):
     center = patch.node_mass @ patch.nodes_m / patch.mass_kg
     middles = patch.mesh.points_m[patch.mesh.tetrahedra].mean(axis=1)
     np.testing.assert_allclose(center, patch.mesh.volumes_m3 @ middles / patch.mesh.volume_m3)
-
-
-@pytest.mark.parametrize("material", COMPILED)
-def test_force_and_stiffness_are_slopes_of_the_energy(material, rng):
-    body = small_body(material)
-    x = deformed(body, rng, 1)[0]
-    constants = elastic(body)
-    force, K = body.elastic_force(x, **constants), body.stiffness(x, **constants)
-    assert_derivative(
-        lambda x: body.energy(x, **constants),
-        lambda d: -np.sum(force * d),
-        x,
-        rng,
-        scale=LENGTH_M,
-    )
-    assert_derivative(
-        lambda x: body.elastic_force(x, **constants).ravel(),
-        lambda d: -K @ d.ravel(),
-        x,
-        rng,
-        scale=LENGTH_M,
-    )
-
-
-def test_first_and_second_derivatives_are_slopes(rng):
-    body = small_body()
-    theta = theta_for(body)
-    x, v, w = deformed(body, rng, 1), *rng.standard_normal((2, 1, 3 * len(body.nodes_m)))
-    at, curvature = body.linearise(x, v, theta), body.second_derivatives(x, v, w, theta)
-
-    def weighted(matrix, d):
-        return body.pattern.matrix(matrix[0]) @ d.ravel()
-
-    for name, point, scale, rule in (
-        ("position", x, LENGTH_M, lambda d: weighted(at.by_position, d)),
-        ("velocity", v, 1.0, lambda d: weighted(at.by_velocity, d)),
-        ("theta", theta, theta, lambda d: at.by_theta[0] @ d),
-    ):
-        state = {"position": x, "velocity": v, "theta": theta}
-        assert_derivative(
-            lambda new, name=name, state=state: body.force(*(state | {name: new}).values())[0],
-            rule,
-            point,
-            rng,
-            scale=scale,
-        )
-    assert_derivative(
-        lambda x: weighted(body.linearise(x, v, theta).by_position, w),
-        lambda d: weighted(curvature.position_position, d),
-        x,
-        rng,
-        tolerance=1e-7,
-        scale=LENGTH_M,
-    )
-    assert_derivative(
-        lambda v: weighted(body.linearise(x, v, theta).by_position, w),
-        lambda d: weighted(curvature.position_velocity, d),
-        v,
-        rng,
-    )
 
 
 @pytest.mark.parametrize("material", ["neo-hookean", "linear"])

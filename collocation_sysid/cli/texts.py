@@ -115,8 +115,8 @@ def explain(options: ExplainCommand) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TopicsCommand:
-    """Options of `topics`.
+class LogCommand:
+    """Options of `log`.
 
     Attributes
     ----------
@@ -128,9 +128,9 @@ class TopicsCommand:
     as_json: AsJson = False
 
 
-@command(commands, "topics run.mcap", "topics bags/2026-05-04 --json")
-def topics(options: TopicsCommand) -> None:
-    """List the topics of a robot's log, their uses, and how a problem file names them."""
+@command(commands, "log trial.mcap", "log bags/2026-05-04 --json")
+def log(options: LogCommand) -> None:
+    """List the topics in a robot's log, their uses, and how a problem file names them."""
     from ..recording.formats.topics import list_topics
 
     with located(options.log):

@@ -50,7 +50,7 @@ class CodeSection(Section):
     file : str
         Python file; it is run, which needs --allow-code.
     function : str
-        Name of the energy function in it.
+        Name of the energy function in the file.
     """
 
     file: Text
@@ -63,11 +63,12 @@ class NodeForceSection(CodeSection):
     Attributes
     ----------
     function : str
-        Name of the function of the force in it.
+        Name of the force function in the file.
     nodes : ElementNodes, optional
         Selection of nodes; all by default.
     on : str
-        What it acts on: these nodes, or faces of the surface that have all of theirs among them.
+        "nodes": the force acts on the selected nodes. "faces": it acts on the faces of the surface
+        all of whose nodes are selected.
     carries : int
         Number of internal variables of each node or face from step to step: the function gets them
         after v, and returns the force and those for the next step.
@@ -87,7 +88,7 @@ class RegionSection(Section):
     Attributes
     ----------
     name : str
-        Letters, digits, - and _.
+        Name, made of letters, digits, - and _.
     cells : ElementNodes
         Selection of cells, by their centres: a table of box_m, ball_m or indices, or the name of a
         cell array or of a physical group.
@@ -109,9 +110,9 @@ class PronySection(Section):
     Attributes
     ----------
     name : str
-        Letters, digits, - and _.
+        Name, made of letters, digits, - and _.
     region : str, optional
-        Region that it belongs to; all without their own by default.
+        Region with this branch; by default all regions that have no branches of their own.
     """
 
     name: Annotated[str, Field(pattern="^[A-Za-z0-9_-]+$")]
@@ -165,32 +166,34 @@ class ObjectSection(Section):
     box_m : list, optional
         Lengths [x, y, z] of a box to mesh, with a corner at the origin.
     edge_length_m : float, optional
-        Edge length wanted of the mesh of a surface, cylinder or box.
+        Target edge length of the mesh of a surface, cylinder or box [m].
     length_unit : {"m", "cm", "mm", "in"}
         Unit of the coordinates in the file.
     mass_kg : float, optional
-        Weighed mass of the whole object; or a parameter, then it may be left out.
+        Weighed mass of the whole object [kg]. Left out if density_kg_m3 is stated here or is a
+        parameter.
     density_kg_m3 : float, optional
-        Uniform density instead of a mass; likewise.
+        Uniform density [kg/m³], instead of the mass.
     material : Material
         A material's name, or a table of file and function.
     damping : DampingName
-        Law of γ_r: kelvin-voigt, a viscous fluid in the current shape; material, viscous in the
-        rate of the Green strain, as in MuJoCo; rayleigh, the paper's, also damps rotation.
+        Law of the damping γ_r. "kelvin-voigt": a viscous stress in the current shape. "material": a
+        viscous stress by the rate of the Green strain, as in MuJoCo. "rayleigh": the law of the
+        paper, which also damps rigid rotation.
     region : list of RegionSection
-        [[object.region]] tables: cells that differ.
+        [[object.region]] tables: parts of the body with other properties.
     prony : list of PronySection
         [[object.prony]] tables: a material with memory, branch by branch.
     force : list of NodeForceSection
-        [[object.force]] tables: forces of the user's own on the nodes.
+        [[object.force]] tables: custom forces on the nodes.
     field : FieldSection, optional
-        A constant that differs from place to place: parameter, length_m, modes, amplitude.
+        A constant that varies in space: parameter, length_m, modes, amplitude.
     rest_shape : {"stress_free", "under_gravity"}, optional
         Whether the mesh is free of stress, or the shape in which the object hung or stood under its
         own weight while it was scanned; not known by default, which widens the intervals of a mesh
         from a file.
     scan : ScanSection, optional
-        Pose and held nodes of the scan: gravity_m_s2, nodes.
+        Gravity and held nodes during the scan: gravity_m_s2, nodes.
     evaluator : {"auto", "simd", "casadi"}
         How element kernels are evaluated.
     """
@@ -281,7 +284,7 @@ class ParameterSection(section_of(Unknown, "ParameterSection")):
     tied_to : str, optional
         Parameter that this one is a multiple of.
     ratio : float, optional
-        The multiple, 1 by default.
+        Ratio of this parameter to that of `tied_to`, 1 by default.
     """
 
     fixed: Finite | None = None
@@ -342,8 +345,8 @@ class TranscriptionSection(Section):
     Attributes
     ----------
     substeps : str
-        Grid steps between samples; auto: as many, up to 8, as move no parameter by more than half a
-        standard error.
+        Number of time steps between samples. "auto": one, or more (up to 8) if one step would
+        change a parameter by more than half a standard error.
     explicit_grasps : bool
         Grasped nodes as constraint rows (the paper's c^g) instead of bounds.
     """
@@ -393,10 +396,10 @@ class ProblemFile(Section):
     Attributes
     ----------
     parameters : Parameters
-        Names of the model's constants: each {} or a guess to estimate it, a value, or a tie.
+        Constants of the model by name: {} or a guess for a constant to estimate, a number for a
+        known one, or a tie to another constant.
     experiment_defaults : mapping of name to Any
-        Keys that every [[experiment]] has which does not give them itself; a specimen only those
-        that specimens know.
+        Default keys of every [[experiment]] table; specimens get only the keys that they have.
     experiment : list of ExperimentSection or SpecimenSection
         At least one [[experiment]] table, one for each recording or specimen.
     """
@@ -415,7 +418,7 @@ class ProblemFile(Section):
     @model_validator(mode="before")
     @classmethod
     def _merge_defaults(cls, content: Any) -> Any:
-        """Insert [experiment_defaults] before validation."""
+        """Insert [experiment_defaults] into each experiment before the file is validated."""
         return with_experiment_defaults(content)
 
     @model_validator(mode="after")

@@ -106,10 +106,11 @@ class StabilityLoss:
 def explain_failure(
     experiment: Experiment, theta: Array, error: SimulationError
 ) -> SimulationError:
-    """Return the error with the mode, if a static path ended by a loss of stability;
-    otherwise the same error.
-
+    """Return the error of a static simulation with the mode in which the body loses its stability,
+    as a new error; the same error if there is no state, no such mode, or the mode cannot be
+    computed.
     A homogeneous specimen has no mode: its message names the test and the strain.
+
     """
     if error.state_m is None:
         return error
@@ -178,7 +179,19 @@ def find_stability_loss(
 
 
 def _lowest(forces: Forces, x: Array, free: Index, translation_m: float) -> tuple[float, Array]:
-    """Return the lowest eigenvalue [1/s²] of K φ = λ M φ near a shift, and φ (free,)."""
+    """Return the lowest eigenvalue [1/s²] of K φ = λ M φ near a shift below zero, and φ (free,).
+
+    Parameters
+    ----------
+    forces : Forces
+        Forces at one time.
+    x : (3n,) array
+        Positions [m].
+    free : (free,) array of int
+        Free dofs.
+    translation_m : float
+        Negative of the shift [1/s²].
+    """
     state = x.reshape(1, -1)
     stiffness = -forces.linearise(state, np.zeros_like(state)).by_position[0]
     root = sp.diags_array(1 / np.sqrt(forces.mass.inertia_kg[0, free]))

@@ -34,11 +34,11 @@ from ..statistics.assessment import (
     stability_concerns,
 )
 from ..statistics.concerns import Concern
-from ..statistics.material_stability import strain_stability_concerns
 from ..statistics.plausibility import material_hypothesis, size_and_density_hypotheses
 from ..statistics.remedies import remedy_for
 from ..statistics.residual_diagnostics import MarkerDiagnosis
 from ..statistics.scale_identifiability import scale_concerns
+from ..statistics.stability_concerns import strain_stability_concerns
 from ..statistics.uncertainty import Uncertainty
 from ..statistics.uncertainty_budget import source_label
 from .check.modes_check import ModesCheck, check_modes

@@ -184,7 +184,7 @@ TOPICS: Mapping[str, Topic] = {
         "trust",
         "Look at the residuals over time: a constant part indicates a wrong position or "
         "offset, large residuals at the beginning a wrong time of release, an oscillation a "
-        "wrong stiffness or damping. The command compare --materials tests whether another "
+        "wrong stiffness or damping. The command compare-models --materials tests whether another "
         "material law predicts better.",
         {
             "outline": "{percent:.0f} % of the model's outline are more than {pixels:.0f} pixels "
@@ -481,8 +481,8 @@ class Concern:
 
 
 def concern_if(is_present: bool, is_gross: bool, code: str, **data: Any) -> list[Concern]:
-    """Return a list with a concern if `is_present`, graded "doubtful" if `is_gross` and else
-    "check"; otherwise an empty list.
+    """Return a list with the concern of a code and its data, graded "doubtful" if `is_gross` and
+    else "check"; an empty list unless `is_present`.
     """
     return [Concern(code, "doubtful" if is_gross else "check", data)] if is_present else []
 

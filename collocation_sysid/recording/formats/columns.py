@@ -135,7 +135,7 @@ def read_columns(
     requires_times: bool = True,
     requires_all: bool = False,
 ) -> QuantityTable:
-    """Read those of the `quantities` quantities that a table has, in any order.
+    """Read those of some quantities that a table has, in any order, in SI units.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def read_columns(
         follow the name, as in "Load (N)". Other columns are not looked for if a quantity besides
         the time is mapped; without mapping, columns are recognised by name.
     blank_allowed : bool
-        Whether cells may be blank.
+        Whether cells may be blank, which become NaN; a column of blank cells alone is refused.
     requires_times : bool
         Whether times are required; otherwise rows are numbered in seconds if there are no times.
     requires_all : bool
@@ -180,7 +180,24 @@ def read_columns(
 def _find_columns(
     grid: TextTable, quantities: Sequence[Quantity], mapped: Mapping[str, str]
 ) -> dict[str, tuple[int, float]]:
-    """Return column index and factor to SI of each quantity that the table has, by its key."""
+    """Return index of the column and factor to SI of each quantity that the table has, by the
+    quantity's key; quantities without a column are omitted.
+
+    Parameters
+    ----------
+    grid : TextTable
+    quantities : sequence of Quantity
+        Quantities that are searched for, besides the time.
+    mapped : mapping of str to str
+        Names of columns by key, as stated by the user. If it contains more than the time, only the
+        time is recognised by its name; other quantities are those stated.
+
+    Raises
+    ------
+    InputError
+        For an unknown key, a column that does not exist or exists twice, or a unit that is missing
+        or wrong.
+    """
     by_key = {quantity.key: quantity for quantity in (TIME, *quantities)}
     for key in mapped:
         if key not in by_key:
@@ -197,7 +214,15 @@ def _find_columns(
 
 
 def _column_named_by_user(grid: TextTable, quantity: Quantity, name: str) -> tuple[int, float]:
-    """Return index and factor to SI of the column that the user names for a quantity."""
+    """Return index and factor to SI of the column that the user names for a quantity; the unit is
+    in `name` or in the name of the column.
+
+    Raises
+    ------
+    InputError
+        If the column does not exist or exists twice, or its unit is missing or of another
+        dimension.
+    """
     bare, unit_of_user = name_and_unit(name)
     column = name if name in grid.columns else bare
     if grid.columns.count(column) != 1:
@@ -251,7 +276,9 @@ def find_column(grid: TextTable, quantity: Quantity) -> tuple[int, float] | None
 
 
 def _name_fits(column: str, quantity: Quantity) -> bool:
-    """Return whether the name of a column, without its unit, fits a quantity."""
+    """Return whether the name of a column, without its unit, is the key of a quantity or contains
+    one of its words; columns of deformed sizes (true stress) never fit by a word.
+    """
     name, _ = name_and_unit(column)
     words = _words(name)
     called = words & set(quantity.words.split())
@@ -279,7 +306,14 @@ def _words(name: str) -> set[str]:
 
 
 def _require_known_columns(grid: TextTable, quantities: Sequence[Quantity], all_of: bool) -> None:
-    """Raise an `InputError` if a column holds no known quantity."""
+    """Check that every column holds a known quantity; see `_columns_error` for `quantities` and
+    `all_of`.
+
+    Raises
+    ------
+    InputError
+        If one does not.
+    """
     known = {quantity.key for quantity in KNOWN_QUANTITIES}
     for column in grid.columns:
         if name_and_unit(column)[0].lower() not in known:
@@ -290,7 +324,18 @@ def _require_known_columns(grid: TextTable, quantities: Sequence[Quantity], all_
 def _columns_error(
     grid: TextTable, quantities: Sequence[Quantity], all_of: bool, why: str = ""
 ) -> InputError:
-    """Return the error for a table without the wanted columns; `why` is added to its message."""
+    """Return the error for a table without the wanted columns.
+
+    Parameters
+    ----------
+    grid : TextTable
+    quantities : sequence of Quantity
+        Wanted quantities.
+    all_of : bool
+        Whether all of them are needed, or one.
+    why : str
+        Addition to the message.
+    """
     expected = ", ".join(quantity.column for quantity in quantities)
     needed = [
         f"; a {quantity.key} needs {size} of the undeformed specimen"
@@ -306,7 +351,9 @@ def _columns_error(
 
 
 def _unit_error(grid: TextTable, column: str, unit: str | None, quantity: Quantity) -> InputError:
-    """Return the error for a column without a unit, or with a unit of another dimension."""
+    """Return the error for a column without a unit (`unit` is None), or with a unit of another
+    dimension.
+    """
     has = f"has the unit {unit}" if unit else "names no unit"
     remedy = f"call it {quantity.column}, or {column.split('_')[0]} ({quantity.unit})"
     return grid.error_at(

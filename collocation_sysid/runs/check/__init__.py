@@ -27,12 +27,12 @@ from ...statistics.assessment import contact_concerns, rotation_step_concerns, s
 from ...statistics.camera_misspecifications import camera_hypotheses
 from ...statistics.concerns import Concern
 from ...statistics.discretisation_error import MOST_SUBSTEPS
-from ...statistics.material_stability import strain_stability_concerns
 from ...statistics.misspecification_hypothesis import Hypothesis, rank
 from ...statistics.modal_misspecifications import find_misspecifications_by_modes
 from ...statistics.placement_causes import placement_mistakes
 from ...statistics.plausibility import size_and_density_hypotheses
 from ...statistics.scale_identifiability import scale_concerns, static_concerns
+from ...statistics.stability_concerns import strain_stability_concerns
 from ...statistics.wrench_causes import CHECKED_SAMPLES, wrench_mistakes
 from .body_check import (
     BodyCheck,

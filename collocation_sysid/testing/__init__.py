@@ -1,0 +1,34 @@
+"""Checks of extensions, from materials to methods.
+
+Call one function for each kind, in a test of your own. A check raises `AssertionError` with one
+sentence: which property failed, where, what was found and what was expected. See
+docs/howto/extend.md.
+
+- `material_check`: energy, stress, stiffness, objectivity, compiled forces.
+- `damping_check`: derivatives, dissipation, objectivity, compiled forces.
+- `force_check`, `sensor_check`, `nuisance_check`: values and derivatives in small programs.
+- `scheme_check`: coefficients, stability, order, simulated motions.
+- `method_check`: answer, history, restart and options.
+- `missing_constant_check`: message for a constant that a problem does not state.
+- `property_check`, `finite_differences`: comparisons; `program_derivatives`: matrices of a program;
+  `internal_force_check`: compiled internal forces; `round_trip`: pickling and problem files;
+  `small_problems`: bodies and recordings of the checks.
+"""
+
+from .damping_check import check_damping
+from .force_check import check_force
+from .material_check import check_material
+from .method_check import check_method
+from .nuisance_check import check_nuisance
+from .scheme_check import check_scheme
+from .sensor_check import check_sensor
+
+__all__ = [
+    "check_damping",
+    "check_force",
+    "check_material",
+    "check_method",
+    "check_nuisance",
+    "check_scheme",
+    "check_sensor",
+]

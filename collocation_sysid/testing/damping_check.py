@@ -1,0 +1,188 @@
+"""Check of a damping law: `check_damping`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from ..array_types import Array
+from ..fem.materials import DampingLaw, Energy, Material, as_damping, as_material
+from .internal_force_check import check_internal_forces, damping_stress
+from .material_check import deformation_gradients, random_rotation
+from .missing_constant_check import check_missing_constant
+from .property_check import PropertyCheck
+from .round_trip import check_pickling
+from .small_problems import usual_constants
+
+# Number of random deformations, and the largest entries of F − I: damping laws are used at large
+# strains, too.
+DEFORMATIONS = 6
+LARGEST_STRAIN = 0.5
+# Most negative power, relative to the largest one at the same deformation, that counts as rounding.
+ROUNDING = 1e-10
+
+
+def check_damping(
+    law: str | DampingLaw,
+    *,
+    material: str | Energy | Material = "neo-hookean",
+    constants: Mapping[str, float] | None = None,
+    is_objective: bool = True,
+    is_dissipative: bool = True,
+    elements: Sequence[str] = ("tet4",),
+    largest_strain: float = LARGEST_STRAIN,
+) -> None:
+    """Check a damping law: derivatives, dissipation, objectivity, compiled forces, pickling.
+
+    At random deformations the stress P_v is linear in the rate Ḟ, ∂P_v/∂Ḟ is symmetric, and a
+    stated ∂P_v/∂F is the derivative of P_v by CasADi's automatic derivative and by central
+    differences. The power P_v:Ḟ is not negative for any Ḟ, and a superposed spinning rotation
+    only rotates P_v. The compiled forces of a small body with this law are checked as by
+    `check_material`, and a missing constant is refused by its name.
+
+    Parameters
+    ----------
+    law : str or DampingLaw
+    material : str, Material or callable
+        Material whose energy density the law gets.
+    constants : mapping of name to float, optional
+        Values of constants of the law and the material, as in `check_material`.
+    is_objective : bool
+        Whether rotation is not damped; false for Rayleigh's law.
+    is_dissipative : bool
+        Whether the power never increases the energy at any strain; false for Rayleigh's law.
+    elements : sequence of str
+        Elements of the small body: "tet4", "tet10" and "tet10-p0".
+    largest_strain : float
+        Largest entry of F − I of the random deformations.
+
+    Raises
+    ------
+    AssertionError
+        For the first property that fails: which one, where, found and expected value.
+    """
+    made = as_damping(law)
+    known = as_material(material)
+    check = PropertyCheck(f"damping law {made.name!r}")
+    if (made.stress is None) == (made.potential is None):
+        check.fail("it has both or neither of a stress and a potential", made, "one of both")
+    values = usual_constants((*known.constants, *made.constants), constants)
+    stress = DampingStress(made, known, np.array([*values.values()]))
+    for number, F in enumerate(deformation_gradients(check.rng, DEFORMATIONS, largest_strain)):
+        where = f"at random deformation {number} (strains up to {largest_strain:g})"
+        rate = check.rng.standard_normal(9)
+        _check_derivatives(check, stress, F, rate, where)
+        if is_dissipative:
+            _check_dissipation(check, stress, F, where)
+        if is_objective:
+            _check_objectivity(check, stress, F, rate, where)
+    for element in elements:
+        check_internal_forces(
+            check,
+            known,
+            made,
+            values,
+            element,
+            is_objective=is_objective,
+            is_dissipative=is_dissipative,
+        )
+    own = {constant.name: values[constant.name] for constant in made.constants}
+    check_missing_constant(check, own, material=known, damping=made)
+    F = next(iter(deformation_gradients(check.rng, 1, largest_strain)))
+    check_pickling(
+        check, made, lambda each: DampingStress(each, known, stress.values).evaluate(F, F)[0]
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class DampingStress:
+    """Stress of a damping law and its derivatives as numbers.
+
+    Attributes
+    ----------
+    law : DampingLaw
+    material : Material
+    values : (k,) array
+        Values of the constants of the material, then of the law.
+    """
+
+    law: DampingLaw
+    material: Material
+    values: Array
+
+    @cached_property
+    def _function(self) -> ca.Function:
+        """Function of F and Ḟ: P_v, the stated ∂P_v/∂F, and both automatic derivatives."""
+        F = ca.SX.sym("F", 9)
+        rate = ca.SX.sym("rate", 9)
+        count = len(self.material.constants)
+        constants = [ca.SX(ca.DM(each)) for each in np.split(self.values, [count])]
+        stress, stated = damping_stress(self.law, self.material, [F, rate, *constants])
+        by_F = ca.jacobian(stress, F)
+        by_rate = ca.jacobian(stress, rate)
+        outputs = [stress, by_F if stated is None else stated, by_F, by_rate]
+        return ca.Function("damping", [F, rate], [ca.densify(each) for each in outputs])
+
+    def evaluate(self, F: Array, rate: Array) -> tuple[Array, Array, Array, Array]:
+        """Return P_v (9,), the stated and the automatic ∂P_v/∂F, and ∂P_v/∂Ḟ, each (9, 9)."""
+        stress, stated, by_F, by_rate = (o.full() for o in self._function.call([F, rate]))
+        return stress.ravel(), stated, by_F, by_rate
+
+
+def _check_derivatives(
+    check: PropertyCheck, stress: DampingStress, F: Array, rate: Array, where: str
+) -> None:
+    """Require linearity in the rate, a symmetric ∂P_v/∂Ḟ, and the right ∂P_v/∂F."""
+    value, stated, by_F, by_rate = stress.evaluate(F, rate)
+    check.require_equal(by_rate, by_rate.T, statement=f"∂P_v/∂Ḟ is not symmetric {where}")
+    check.require_equal(value, by_rate @ rate, statement=f"P_v is not linear in the rate Ḟ {where}")
+    check.require_equal(
+        stress.evaluate(F, -2.5 * rate)[0],
+        -2.5 * value,
+        statement=f"P_v is not linear in the rate Ḟ {where}",
+    )
+    check.require_equal(
+        stated, by_F, statement=f"the stated ∂P_v/∂F is not the automatic derivative of P_v {where}"
+    )
+    check.require_derivative(
+        lambda at: stress.evaluate(at, rate)[0],
+        stated,
+        F,
+        statement=f"∂P_v/∂F is wrong {where}",
+        scale=0.1,
+    )
+
+
+def _check_dissipation(check: PropertyCheck, stress: DampingStress, F: Array, where: str) -> None:
+    """Require that no eigenvalue of ∂P_v/∂Ḟ is negative: P_v:Ḟ ≥ 0 for every rate."""
+    by_rate = stress.evaluate(F, np.zeros(9))[3]
+    powers = np.linalg.eigvalsh((by_rate + by_rate.T) / 2)
+    if not powers[0] >= -ROUNDING * np.abs(powers).max():
+        check.fail(
+            f"it adds energy {where}: the smallest dissipated power P_v:Ḟ of a rate with "
+            "‖Ḟ‖ = 1/s is negative",
+            powers[0],
+            "at least 0 W/m³",
+        )
+
+
+def _check_objectivity(
+    check: PropertyCheck, stress: DampingStress, F: Array, rate: Array, where: str
+) -> None:
+    """Require P_v(QF, Q(Ḟ + ΩF)) = Q P_v(F, Ḟ) for a rotation Q and a spin Ω."""
+    value = stress.evaluate(F, rate)[0]
+    Q = random_rotation(check.rng)
+    spin = np.asarray(ca.skew(3 * check.rng.standard_normal(3)), dtype=float)
+    gradient, gradient_rate = (each.reshape(3, 3, order="F") for each in (F, rate))
+    spinning = Q @ (gradient_rate + spin @ gradient)
+    found = stress.evaluate((Q @ gradient).ravel(order="F"), spinning.ravel(order="F"))[0]
+    check.require_equal(
+        found.reshape(3, 3, order="F"),
+        Q @ value.reshape(3, 3, order="F"),
+        statement=f"a spinning rotation changes the stress in the body's axes {where}",
+        tolerance=1e-8,
+    )

@@ -1,0 +1,102 @@
+"""Derivatives by central differences, and orders of convergence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..array_types import Array
+
+# Default step of a difference, relative to the direction: its truncation error, of fourth order,
+# and its rounding error are then both about 1e-12 of a smooth function.
+STEP = 1e-3
+
+
+def directional_derivative(
+    function: Callable[[Array], ArrayLike], point: ArrayLike, direction: Array, step: float = STEP
+) -> Array:
+    """Return d/ds function(point + s direction) at s = 0, by fourth-order central differences.
+
+    Parameters
+    ----------
+    function : callable
+        Function of an array like `point` that returns an array of any shape.
+    point : array
+    direction : array like `point`
+        Size of a large change of `point`.
+    step : float
+        Step of s.
+    """
+
+    def evaluate_at(steps: int) -> Array:
+        """Return the function a number of steps along the direction."""
+        return np.asarray(function(np.asarray(point) + steps * step * direction))
+
+    return (8 * (evaluate_at(1) - evaluate_at(-1)) - (evaluate_at(2) - evaluate_at(-2))) / (
+        12 * step
+    )
+
+
+def assert_derivative(
+    function: Callable[[Array], ArrayLike],
+    jacobian_times: Callable[[Array], ArrayLike],
+    point: ArrayLike,
+    rng: np.random.Generator,
+    tolerance: float = 1e-8,
+    scale: ArrayLike = 1.0,
+    directions: int = 2,
+) -> None:
+    """Compare a derivative with differences of the function in random directions.
+
+    Parameters
+    ----------
+    function : callable
+        Function of an array like `point`.
+    jacobian_times : callable
+        Product of its derivative at `point` with a direction, of the same shape as the function.
+    point : array
+    rng : numpy.random.Generator
+        Source of the directions.
+    tolerance : float
+        Largest norm of the error, relative to the norm of the difference quotient.
+    scale : array or float
+        Size of a large change of `point`; a thousandth of it is one step.
+    directions : int
+        Number of directions.
+
+    Raises
+    ------
+    AssertionError
+        If the error exceeds the tolerance, or shapes differ.
+    """
+    for _ in range(directions):
+        direction = np.asarray(scale) * rng.standard_normal(np.shape(point))
+        expected = directional_derivative(function, point, direction)
+        found = np.asarray(jacobian_times(direction))
+        assert found.shape == expected.shape
+        error = np.linalg.norm(found - expected)
+        size = np.linalg.norm(expected)
+        assert error <= tolerance * size, f"off by {error:.3g}, the derivative's norm is {size:.3g}"
+
+
+def relative_error(found: ArrayLike, expected: ArrayLike) -> float:
+    """Return the largest error of an entry, relative to the largest expected entry.
+
+    Raises
+    ------
+    AssertionError
+        If the shapes differ.
+    """
+    values = np.asarray(found)
+    references = np.asarray(expected)
+    assert values.shape == references.shape
+    if not references.size:
+        return 0.0
+    return float(np.abs(values - references).max() / np.abs(references).max())
+
+
+def observed_order(steps: ArrayLike, errors: ArrayLike) -> float:
+    """Return the slope of log(error) over log(step): the order of convergence."""
+    return float(np.polyfit(np.log(steps), np.log(errors), 1)[0])

@@ -1,0 +1,382 @@
+"""Compiled internal forces of a body against the plain formula of its laws.
+
+The plain formula is the sum over elements and quadrature points of V P ∇N, with the stresses from
+the functions of the material and the damping law, and CasADi's automatic derivatives of this sum
+by node positions, velocities and constants. The compiled programs differentiate by the
+deformation gradient at a point and contract afterwards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..array_types import Array, Index
+from ..fem.body import Body
+from ..fem.materials import DampingLaw, Material
+from ..program.block_band import full_matrix
+from .property_check import EXACT, PropertyCheck
+from .small_problems import DENSITY_KG_M3, uneven_box, usual_constants
+
+# Size of random displacements of nodes [m] and their velocities [m/s]; edges are about 0.1 m long.
+DISPLACEMENT_M = 4e-3
+VELOCITY_M_S = 1.0
+# Size of the angular velocity of a superposed rotation: the velocities of its ends are then larger
+# than those of the deformation [rad/s].
+SPIN_RAD_S = 20.0
+# Largest relative difference of compiled second derivatives from automatic ones: they contain third
+# derivatives of powers of the stretches, with errors of some 1e-9.
+SECOND_DERIVATIVES = 1e-8
+# Size of a large change of a position [m], for differences.
+LARGE_CHANGE_M = 0.03
+
+
+def damping_stress(
+    law: DampingLaw, material: Material, symbols: list[ca.SX]
+) -> tuple[ca.SX, ca.SX | None]:
+    """Return the stress P_v (9,) of a damping law, and the stated ∂P_v/∂F (9, 9).
+
+    Parameters
+    ----------
+    law : DampingLaw
+    material : Material
+    symbols : list of SX
+        F (9,), its rate (9,), the constants of the material and those of the law.
+
+    Returns
+    -------
+    tuple
+        The second entry is None if the law has a potential, whose derivatives are all generated.
+    """
+    F, rate, material_values, law_values = symbols
+    psi = material.psi(ca.reshape(F, 3, 3), material_values)
+    named = {c.name: law_values[k] for k, c in enumerate(law.constants)}
+    if law.stress is not None:
+        stress, slope = law.stress(psi, F, rate, **named)
+        return ca.SX(stress), ca.SX(slope)
+    assert law.potential is not None
+    return ca.gradient(law.potential(psi, F, rate, **named), F), None
+
+
+@dataclass(frozen=True, eq=False)
+class PlainInternalForce:
+    """Internal force of a body by the plain formula, with automatic derivatives.
+
+    Attributes
+    ----------
+    body : Body
+        Body of one part, without memory or field, whose elements do not average the dilatation.
+    """
+
+    body: Body
+
+    @cached_property
+    def _symbols(self) -> list[ca.SX]:
+        """Symbols x, v, w of an element, the geometry of its points, constants of its laws."""
+        _, points, width = self.body.geometry.shape
+        size = 3 * self.body.element.nodes
+        part = self.body.parts[0]
+        constants = len(part.material.constants) + len(part.damping.constants)
+        node_fields = [ca.SX.sym(name, size) for name in "xvw"]
+        return [*node_fields, ca.SX.sym("geometry", width, points), ca.SX.sym("c", constants)]
+
+    @cached_property
+    def _element_force(self) -> ca.SX:
+        """Force (3·nodes,) of one element."""
+        x, v, _, geometry, constants = self._symbols
+        part = self.body.parts[0]
+        nodes = self.body.element.nodes
+        force = ca.SX(3 * nodes, 1)
+        for point in ca.horzsplit(geometry):
+            gradients = ca.reshape(point[:-1], 3, nodes).T
+            F, rate = (ca.vec(ca.reshape(field, 3, nodes) @ gradients) for field in (x, v))
+            stress = self._stress(F, rate, ca.vertsplit(constants, self._split(part.material)))
+            force -= point[-1] * ca.vec(ca.reshape(stress, 3, 3) @ gradients.T)
+        return force
+
+    def _split(self, material: Material) -> list[int]:
+        """Return the offsets of the constants of the material and of the damping law."""
+        count = len(material.constants)
+        return [0, count, self._symbols[-1].numel()]
+
+    def _stress(self, F: ca.SX, rate: ca.SX, constants: list[ca.SX]) -> ca.SX:
+        """Return the first Piola–Kirchhoff stress (9,) of material and damping law."""
+        part = self.body.parts[0]
+        symbols = [ca.SX.sym("F", 9), ca.SX.sym("rate", 9)]
+        psi = part.material.psi(ca.reshape(symbols[0], 3, 3), constants[0])
+        viscous, _ = damping_stress(part.damping, part.material, [*symbols, *constants])
+        total = ca.gradient(psi, symbols[0]) + viscous
+        return ca.substitute(total, ca.vertcat(*symbols), ca.vertcat(F, rate))
+
+    @cached_property
+    def _functions(self) -> tuple[ca.Function, ca.Function]:
+        """Functions of an element: force with first derivatives, and second derivatives of wᵀ f."""
+        x, v, w, _, constants = self._symbols
+        u = ca.vertcat(x, v, constants)
+        force = self._element_force
+        second, _ = ca.hessian(ca.dot(w, force), u)
+        inputs = self._symbols
+        return (
+            ca.Function("first", inputs, [force, ca.densify(ca.jacobian(force, u))]),
+            ca.Function("second", inputs, [ca.densify(second)]),
+        )
+
+    def evaluate(self, x: Array, v: Array, w: Array, theta: Array) -> tuple[Array, Array, Array]:
+        """Return f (3n,), ∂f/∂u (3n, u) and ∂²(wᵀf)/∂u² (u, u) by u = (x, v, θ), of one state.
+
+        Parameters
+        ----------
+        x, v, w : (3n,) arrays
+            Positions, velocities, and weights of the forces.
+        theta : (k,) array
+            Constants of the body; γ_m is the last one.
+        """
+        size = len(x)
+        laws = self._symbols[-1].numel()
+        count = 2 * size + len(theta)
+        force = np.zeros(size)
+        jacobian = np.zeros((size, count))
+        hessian = np.zeros((count, count))
+        for cell, geometry in zip(self.body.cells, self.body.geometry, strict=True):
+            dofs: Index = (3 * cell[:, None] + np.arange(3)).ravel()
+            state = [x[dofs], v[dofs], w[dofs], geometry.T, theta[:laws]]
+            columns = np.concatenate([dofs, size + dofs, 2 * size + np.arange(laws)])
+            element_force, element_jacobian = (o.full() for o in self._functions[0].call(state))
+            force[dofs] += element_force.ravel()
+            jacobian[np.ix_(dofs, columns)] += element_jacobian
+            hessian[np.ix_(columns, columns)] += self._functions[1].call(state)[0].full()
+        drag = theta[-1] * self.body.dof_mass
+        force -= drag * v
+        jacobian[:, size : 2 * size] -= np.diag(drag)
+        jacobian[:, -1] -= self.body.dof_mass * v
+        hessian[size : 2 * size, -1] -= self.body.dof_mass * w
+        hessian[-1, size : 2 * size] -= self.body.dof_mass * w
+        return force, jacobian, hessian
+
+
+def check_internal_forces(
+    check: PropertyCheck,
+    material: Material,
+    damping: DampingLaw,
+    values: dict[str, float],
+    element: str,
+    *,
+    is_objective: bool = False,
+    is_dissipative: bool = False,
+) -> None:
+    """Compare the compiled forces of a small body and all their derivatives with the plain formula.
+
+    Derivatives are compared with central differences, too; for elements that average the
+    dilatation with these alone. They are compared in a deformed shape with random velocities and
+    in the undeformed shape at rest, where principal stretches coincide and forces vanish.
+
+    Parameters
+    ----------
+    check : PropertyCheck
+    material : Material
+    damping : DampingLaw
+    values : dict of str to float
+        Values of constants by name; others are those of a soft foam.
+    element : str
+        Name of the elements of the body.
+    is_objective : bool
+        Whether a superposed rotation that spins only rotates the force.
+    is_dissipative : bool
+        Whether the derivative of the force by the velocities has no positive eigenvalue.
+
+    Raises
+    ------
+    AssertionError
+        If a force or derivative differs.
+    """
+    body = Body(uneven_box(1), material, DENSITY_KG_M3, element, damping=damping)
+    theta = np.array([*usual_constants(tuple(body.constants.values()), values).values()])
+    x = body.nodes_m.ravel() + check.rng.uniform(-DISPLACEMENT_M, DISPLACEMENT_M, body.nodes_m.size)
+    v = VELOCITY_M_S * check.rng.standard_normal(x.size)
+    w = check.rng.standard_normal(x.size)
+    plain = None if body.element.mean_dilatation else PlainInternalForce(body)
+    first = _check_derivatives(check, body, [x, v, w], theta, plain=plain, where="")
+    at_rest = [body.nodes_m.ravel(), np.zeros_like(v), w]
+    _check_derivatives(check, body, at_rest, theta, plain=plain, where=" undeformed")
+    _check_energy(check, body, x, theta)
+    if is_objective:
+        _check_objectivity(check, body, x, v, theta)
+    if is_dissipative:
+        _check_dissipation(check, body, first[:, x.size : 2 * x.size])
+
+
+def _check_derivatives(
+    check: PropertyCheck,
+    body: Body,
+    state: list[Array],
+    theta: Array,
+    *,
+    plain: PlainInternalForce | None,
+    where: str,
+) -> Array:
+    """Compare force and derivatives at a state x, v, w with the plain formula and differences.
+
+    Parameters
+    ----------
+    check : PropertyCheck
+    body : Body
+    state : list of (3n,) array
+        Positions, velocities, and weights of the forces.
+    theta : (k,) array
+        Constants of the body.
+    plain : PlainInternalForce, optional
+        Plain formula; without it derivatives are compared with differences alone.
+    where : str
+        Adjective of the elements in the sentence, after a space, or nothing.
+
+    Returns
+    -------
+    (3n, 6n + k) array
+        Derivative of the force by positions, velocities and constants.
+    """
+    x, v, w = state
+    elements = f"{where} {body.element.name} elements".strip()
+    force = body.force(x, v, theta)[0]
+    first = _first_derivatives(body, x, v, theta)
+    second = _second_derivatives(body, state, theta)
+    # Forces of an undeformed body are zero; what counts is their change by a large change of x.
+    size = max(float(np.abs(force).max()), LARGE_CHANGE_M * float(np.abs(first[:, : x.size]).max()))
+    check.require_equal(
+        body.second_derivatives(x, v, w, theta).theta[0],
+        w @ first[:, 2 * x.size :],
+        statement=f"∂(wᵀf)/∂θ of {elements} differs from the first derivatives",
+        scale=size,
+    )
+    if plain is not None:
+        expected = plain.evaluate(x, v, w, theta)
+        names = ("force", "first derivative of the force", "second derivative of the force")
+        for name, found, value in zip(names, (force, first, second), expected, strict=True):
+            check.require_equal(
+                found,
+                value,
+                statement=f"the compiled {name} of {elements} differs from the plain "
+                "formula with automatic derivatives",
+                tolerance=SECOND_DERIVATIVES if value is expected[2] else EXACT,
+                scale=size if value is expected[0] else None,
+            )
+    _check_differences(check, body, state=state, theta=theta, derivatives=(first, second))
+    return first
+
+
+def _check_energy(check: PropertyCheck, body: Body, x: Array, theta: Array) -> None:
+    """Require that the compiled force without velocities is minus the gradient of the energy."""
+    named = dict(zip(body.constants, theta, strict=True))
+    constants = {c.name: named[c.name] for c in body.parts[0].material.constants}
+    direction = LARGE_CHANGE_M * check.rng.standard_normal(x.size)
+    force = body.force(x, np.zeros_like(x), theta)[0]
+    check.require_product(
+        lambda at: np.atleast_1d(body.energy(at, **constants)),
+        np.atleast_1d(-force @ direction),
+        x,
+        direction,
+        statement=f"the compiled force of {body.element.name} elements is not minus the gradient "
+        "of the compiled energy",
+    )
+
+
+def _check_objectivity(check: PropertyCheck, body: Body, x: Array, v: Array, theta: Array) -> None:
+    """Require f(Qx, Q(v + ω × x)) = Q f(x, v) without mass-proportional damping."""
+    constants = theta.copy()
+    constants[-1] = 0.0
+    Q = Rotation.from_quat(check.rng.standard_normal(4)).as_matrix()
+    spin = SPIN_RAD_S * check.rng.standard_normal(3)
+    places, velocities = (field.reshape(-1, 3) for field in (x, v))
+    spinning = velocities + np.cross(spin, places)
+    found = body.force(places @ Q.T, spinning @ Q.T, constants)[0]
+    expected = body.force(places, velocities, constants)[0].reshape(-1, 3) @ Q.T
+    check.require_equal(
+        found,
+        expected.ravel(),
+        statement=f"a spinning rotation changes the force of {body.element.name} elements in the "
+        "body's axes",
+        tolerance=1e-8,
+    )
+
+
+def _check_dissipation(check: PropertyCheck, body: Body, by_velocity: Array) -> None:
+    """Require that no velocity increases the energy: no eigenvalue of ∂f/∂v is positive."""
+    powers = np.linalg.eigvalsh((by_velocity + by_velocity.T) / 2)
+    if not powers[-1] <= EXACT * np.abs(powers).max():
+        check.fail(
+            f"the damping of {body.element.name} elements adds energy: the largest eigenvalue of "
+            "∂f/∂v is positive",
+            powers[-1],
+            "at most 0 N s/m",
+        )
+
+
+def _check_differences(
+    check: PropertyCheck,
+    body: Body,
+    *,
+    state: list[Array],
+    theta: Array,
+    derivatives: tuple[Array, Array],
+) -> None:
+    """Compare first and second derivatives of compiled forces with differences in one direction."""
+    x, v, w = state
+    size = len(x)
+    point = np.concatenate([x, v, theta])
+    scale = np.concatenate([np.full(size, LARGE_CHANGE_M), np.ones(size), theta])
+    direction = scale * check.rng.standard_normal(len(point))
+
+    def force_at(u: Array) -> Array:
+        """Return the compiled force at (x, v, θ)."""
+        return body.force(u[:size], u[size : 2 * size], u[2 * size :])[0]
+
+    def weighted_derivative_at(u: Array) -> Array:
+        """Return the compiled first derivative of wᵀ f at (x, v, θ)."""
+        return w @ _first_derivatives(body, u[:size], u[size : 2 * size], u[2 * size :])
+
+    where = f"of the compiled force of {body.element.name} elements is wrong"
+    check.require_product(
+        force_at,
+        derivatives[0] @ direction,
+        point,
+        direction,
+        statement=f"the first derivative {where}",
+    )
+    check.require_product(
+        weighted_derivative_at,
+        derivatives[1] @ direction,
+        point,
+        direction,
+        statement=f"the second derivative {where}",
+    )
+
+
+def _first_derivatives(body: Body, x: Array, v: Array, theta: Array) -> Array:
+    """Return the compiled ∂f/∂(x, v, θ), (3n, 6n + k), at one state."""
+    at = body.linearise(x, v, theta)
+    by_x = full_matrix(body.pattern, at.by_position[0], at.by_position_skew[0])
+    by_v = full_matrix(body.pattern, at.by_velocity[0], np.zeros(0))
+    return np.hstack([by_x.toarray(), by_v.toarray(), at.by_theta[0]])
+
+
+def _second_derivatives(body: Body, state: list[Array], theta: Array) -> Array:
+    """Return the compiled second derivatives of wᵀ f by (x, v, θ) at a state x, v, w."""
+    x, v, w = state
+    at = body.second_derivatives(x, v, w, theta)
+    none = np.zeros(0)
+    by_xx = full_matrix(body.pattern, at.position_position[0], none).toarray()
+    by_xv = full_matrix(
+        body.pattern, at.position_velocity[0], at.position_velocity_skew[0]
+    ).toarray()
+    by_x_theta = at.position_theta[0]
+    by_v_theta = at.velocity_theta[0]
+    return np.block(
+        [
+            [by_xx, by_xv, by_x_theta],
+            [by_xv.T, np.zeros_like(by_xx), by_v_theta],
+            [by_x_theta.T, by_v_theta.T, at.theta_theta[0]],
+        ]
+    )

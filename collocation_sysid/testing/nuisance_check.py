@@ -1,0 +1,269 @@
+"""Check of a nuisance parameter of a recording: `check_nuisance`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ..array_types import Array
+from ..fem.body import Body
+from ..model.nuisance_map import NuisanceMap
+from ..problem.code_loader import CodeLoader
+from ..problem.nuisance_schema import CustomNuisanceSection
+from ..program.collocation import Collocation
+from ..program.marker_residual import MarkerResidual
+from ..recording.experiment import Experiment
+from ..recording.nuisance import KINDS, Nuisance, NuisanceRow
+from .program_derivatives import check_program
+from .property_check import PropertyCheck
+from .round_trip import check_pickling, check_problem_file
+from .small_problems import DENSITY_KG_M3, program_of, swung_experiment, uneven_box
+
+# Standard deviation of a kind that has none by default.
+USUAL_SIGMA = 0.01
+# Values of the parameters in their prior standard deviations: large enough that nothing is linear
+# by accident.
+LARGEST_DEVIATION = 0.5
+# First sample of which all neighbours, which a clock interpolates from, are within the recording.
+FIRST_INNER_SAMPLE = 2
+
+
+def check_nuisance(
+    row: NuisanceRow,
+    *,
+    experiment: Experiment | None = None,
+    file: str | Path | None = None,
+    name_in_file: str | None = None,
+) -> None:
+    """Check a nuisance parameter: effect, derivatives in programs, messages and round trips.
+
+    Zero changes nothing; the reading's first and second derivatives agree with central
+    differences. In a small recording the predicted markers are the reading of those without the
+    parameter, or the markers at the later time of its clock; gradient, Jacobian and Hessian of
+    the program agree with central differences. A second parameter of the same name, and a prior
+    without width, are refused by name. The parameter can be pickled.
+
+    Parameters
+    ----------
+    row : NuisanceRow
+        Parameter of your own, or one of the package.
+    experiment : Experiment, optional
+        Recording that has the parameter; by default a swung box with markers. Other parameters of
+        its `nuisance` are kept.
+    file : str or Path, optional
+        Python file that contains the row, to check that a problem file can name it. The file is
+        run.
+    name_in_file : str, optional
+        Name of the row in the file; by default its own name.
+
+    Raises
+    ------
+    AssertionError
+        For the first property that fails: which one, where, found and expected value.
+    InputError
+        If the reading or clock cannot be evaluated, has the wrong shape, or is not finite at zero.
+    """
+    check = PropertyCheck(f"nuisance parameter {row.name!r}")
+    base = experiment or swung_experiment(Body(uneven_box(1), density_kg_m3=DENSITY_KG_M3))
+    changed = _with_row(base, row)
+    size = NuisanceMap.from_experiment(changed).size
+    if size == NuisanceMap.from_experiment(base).size:
+        check.fail(
+            f"the recording {base.name!r} does not have it", "no value", "at least one value"
+        )
+    collocation = program_of(changed, {})
+    data = collocation.transcriptions[0].nuisance
+    _check_round_trips(check, row, data, file, name_in_file)
+    if row not in KINDS:
+        _check_messages(check, row, base)
+    if row.reading is not None:
+        _check_reading(check, row, collocation)
+    if row.clock is not None:
+        _check_clock(check, row, collocation)
+    check_program(check, collocation)
+
+
+def _with_row(experiment: Experiment, row: NuisanceRow) -> Experiment:
+    """Return the experiment in which the parameter of a row is estimated."""
+    nuisance = experiment.nuisance
+    if row not in KINDS:
+        return replace(experiment, nuisance=replace(nuisance, own=(*nuisance.own, row)))
+    sigma = row.sigma or row.considered or USUAL_SIGMA
+    return replace(experiment, nuisance=replace(nuisance, **{row.name: sigma}))
+
+
+def _value_count(row: NuisanceRow) -> int:
+    """Return the number of values of one component of a row."""
+    return len(row.axes.split()) or 1
+
+
+def _read(row: NuisanceRow, y: Array, values: Array, t_s: float, data: NuisanceMap) -> Array:
+    """Return the reading (3,) or the delay (1,) of a row by calling its function with numbers."""
+    argument = ca.DM(values)
+    result = (
+        row.reading(ca.DM(y), argument, t_s, data)
+        if row.reading
+        else row.clock(argument, t_s, data)  # type: ignore[misc]
+    )
+    return np.ravel(ca.evalf(ca.SX(result)).full())
+
+
+def _check_reading(check: PropertyCheck, row: NuisanceRow, collocation: Collocation) -> None:
+    """Require no effect of zero, right derivatives, and the reading in predicted markers."""
+    assert row.reading is not None
+    (transcription,) = collocation.transcriptions
+    data = transcription.nuisance
+    count = _value_count(row)
+    sigma = row.sigma or row.considered or USUAL_SIGMA
+    t_s = float(np.mean(data.recorded_s))
+    y = check.rng.uniform(0.01, 0.1, 3)
+    check.require_equal(
+        _read(row, y, np.zeros(count), t_s, data),
+        y,
+        statement="zero changes the reading of a marker",
+    )
+    symbol = ca.SX.sym("u", 3 + count)
+    weights = check.rng.standard_normal(3)
+    expression = ca.SX(row.reading(symbol[:3], symbol[3:], t_s, data))
+    first = ca.jacobian(expression, symbol)
+    second, _ = ca.hessian(ca.dot(ca.DM(weights), expression), symbol)
+    derivatives = ca.Function("d", [symbol], [ca.densify(first), ca.densify(second)])
+    u = np.concatenate([y, sigma * check.rng.uniform(-LARGEST_DEVIATION, LARGEST_DEVIATION, count)])
+    jacobian, hessian = (each.full() for each in derivatives.call([u]))
+    scale = np.concatenate([np.full(3, 0.01), np.full(count, sigma)])
+    check.require_derivative(
+        lambda at: _read(row, at[:3], at[3:], t_s, data),
+        jacobian,
+        u,
+        statement="the first derivative of the reading is wrong",
+        scale=scale,
+    )
+    check.require_derivative(
+        lambda at: weights @ derivatives.call([at])[0].full(),
+        hessian,
+        u,
+        statement="the second derivative of the reading is wrong",
+        scale=scale,
+    )
+    _check_predicted_reading(check, row, collocation)
+
+
+def _marker_residual(collocation: Collocation) -> MarkerResidual:
+    """Return the measurement model of the markers of a small recording."""
+    (transcription,) = collocation.transcriptions
+    (markers,) = (r for r in transcription.residuals if isinstance(r, MarkerResidual))
+    return markers
+
+
+def _check_predicted_reading(
+    check: PropertyCheck, row: NuisanceRow, collocation: Collocation
+) -> None:
+    """Require that predicted markers are the reading of those without the parameter."""
+    residual = _marker_residual(collocation)
+    data = residual.nuisance
+    x = _smooth_motion(check, collocation)
+    phi = np.zeros(data.size)
+    plain = residual.predict_positions(x, phi)
+    for marker in range(plain.shape[1]):
+        of_marker = [k for k in residual.own_parameters[marker] if data.entries[k].row == row]
+        values = check.rng.uniform(-LARGEST_DEVIATION, LARGEST_DEVIATION, len(of_marker))
+        phi[of_marker] = values
+        predicted = residual.predict_positions(x, phi)[:, marker]
+        physical = values * data.scales[of_marker]
+        for sample, t_s in enumerate(residual.t_s):
+            check.require_equal(
+                predicted[sample],
+                _read(row, plain[sample, marker], physical, float(t_s), data),
+                statement=f"the predicted marker {residual.names[marker]} is not the reading "
+                f"at t = {t_s:.4g} s",
+                scale=float(np.abs(plain).max()),
+            )
+
+
+def _check_clock(check: PropertyCheck, row: NuisanceRow, collocation: Collocation) -> None:
+    """Require no delay at zero, and markers of a known motion at the later time."""
+    residual = _marker_residual(collocation)
+    data = residual.nuisance
+    count = _value_count(row)
+    late = _read(row, np.zeros(3), np.zeros(count), float(data.recorded_s[1]), data)
+    check.require_equal(late, np.zeros(1), statement="zero changes the clock", scale=1.0)
+    indices = np.array([k for k, entry in enumerate(data.entries) if entry.row == row])
+    phi = np.zeros(data.size)
+    phi[indices] = LARGEST_DEVIATION
+    x = _smooth_motion(check, collocation)
+    predicted = residual.predict_positions(x, phi)
+    own = residual.own_parameters[0]
+    values = (phi * data.scales)[[k for k in own if k in indices]]
+    for sample in range(FIRST_INNER_SAMPLE, len(residual.t_s)):
+        t_s = float(residual.t_s[sample])
+        delay = _read(row, np.zeros(3), values, t_s, data)[0]
+        later = _smooth_motion(check, collocation, shift_s=float(delay))
+        check.require_equal(
+            predicted[sample, 0],
+            residual.predict_positions(later, np.zeros(data.size))[sample, 0],
+            statement=f"the marker {residual.names[0]} is not seen at the time of the clock "
+            f"at t = {t_s:.4g} s",
+            tolerance=1e-7,
+        )
+
+
+def _smooth_motion(check: PropertyCheck, collocation: Collocation, shift_s: float = 0.0) -> Array:
+    """Return grid positions (N, 3n) of a motion that is affine in space and quadratic in time."""
+    (transcription,) = collocation.transcriptions
+    nodes_m = transcription.body.nodes_m
+    rates = np.random.default_rng(3).standard_normal((2, 3, 3))
+    t_s = transcription.dynamics.t_s + shift_s
+    steps = rates[0] * t_s[:, None, None] + 10 * rates[1] * t_s[:, None, None] ** 2
+    return np.einsum("tij,nj->tni", np.eye(3) + steps, nodes_m).reshape(len(t_s), -1)
+
+
+def _check_messages(check: PropertyCheck, row: NuisanceRow, experiment: Experiment) -> None:
+    """Require that a repeated name and a prior without width are refused by the name."""
+    nuisance = experiment.nuisance
+    check.require_refusal(
+        lambda: replace(nuisance, own=(*nuisance.own, row, row)),
+        naming=row.name,
+        statement="a second parameter of the same name",
+    )
+    check.require_refusal(
+        lambda: Nuisance.none(own=[replace(row, sigma=0.0)]),
+        naming=row.name,
+        statement="a prior with a standard deviation of zero",
+    )
+
+
+def _check_round_trips(
+    check: PropertyCheck,
+    row: NuisanceRow,
+    data: NuisanceMap,
+    file: str | Path | None,
+    name_in_file: str | None,
+) -> None:
+    """Require the same effect and prior after pickling and from a problem file."""
+    y = np.array([0.03, 0.05, 0.02])
+    values = (row.sigma or USUAL_SIGMA) * np.linspace(0.3, 0.5, _value_count(row))
+    t_s = float(np.mean(data.recorded_s))
+
+    def evaluate(each: NuisanceRow) -> Array:
+        """Return prior, limits and effect of a row."""
+        has_effect = each.reading is not None or each.clock is not None
+        effect = _read(each, y, values, t_s, data) if has_effect else np.zeros(0)
+        limits = np.array([each.low, each.high, each.reach])
+        limits = np.where(np.isfinite(limits), limits, 0.0)
+        return np.concatenate([[each.sigma or 0.0], limits, effect])
+
+    def load(loader: CodeLoader, table: Mapping[str, Any]) -> NuisanceRow:
+        """Return the row of a table of a problem file."""
+        return loader.nuisance_row(CustomNuisanceSection.model_validate(table))
+
+    check_pickling(check, row, evaluate)
+    if file is not None:
+        table = {"file": Path(file).name, "row": name_in_file or row.name}
+        check_problem_file(
+            check, file, table, load=load, extension=row, evaluate=evaluate, key="row"
+        )

@@ -1,0 +1,83 @@
+"""Derivatives of a collocation program, as the methods use them, against central differences."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..array_types import Array
+from ..program.collocation import Collocation
+from .property_check import PropertyCheck
+from .small_problems import shaken_variables
+
+# Weight of the loss in the Lagrangian; not 1, so that a missing weight is noticed.
+LOSS_WEIGHT = 1.3
+# Size of a large change of the scaled variables.
+CHANGE = 0.05
+
+
+def check_program(check: PropertyCheck, collocation: Collocation) -> None:
+    """Compare gradient, Jacobian and exact Hessian of a program with central differences.
+
+    The program is the one with lifted variables, whose matrices contain the derivatives of every
+    term.
+
+    Parameters
+    ----------
+    check : PropertyCheck
+        Subject of the sentences.
+    collocation : Collocation
+        Program with the extension.
+
+    Raises
+    ------
+    AssertionError
+        If a derivative differs.
+    """
+    program = collocation.with_lifted_variables()
+    z = shaken_variables(program, check.rng)
+    multipliers = check.rng.normal(size=program.constraint_count)
+
+    def lagrangian_gradient(at: Array) -> Array:
+        """Return the gradient of the Lagrangian by z."""
+        return LOSS_WEIGHT * program.gradient(at) + program.jacobian(at).T @ multipliers
+
+    jacobian = program.jacobian(z)
+    hessian = program.hessian(z, LOSS_WEIGHT, multipliers)
+    gradient = program.gradient(z)
+    for columns, meaning in _blocks(program):
+        direction = np.zeros(len(z))
+        direction[columns] = CHANGE * check.rng.standard_normal(len(direction[columns]))
+        if not direction.any():
+            continue
+        check.require_product(
+            lambda at: np.atleast_1d(program.objective(at)),
+            np.atleast_1d(gradient @ direction),
+            z,
+            direction,
+            statement=f"the gradient of the loss by {meaning} is wrong in a small program",
+        )
+        check.require_product(
+            program.constraint_values,
+            jacobian @ direction,
+            z,
+            direction,
+            statement=f"the Jacobian of the equations of motion by {meaning} is wrong "
+            "in a small program",
+        )
+        check.require_product(
+            lagrangian_gradient,
+            hessian @ direction,
+            z,
+            direction,
+            statement=f"the Hessian of the Lagrangian by {meaning} is wrong in a small program",
+        )
+
+
+def _blocks(program: Collocation) -> list[tuple[slice, str]]:
+    """Return the blocks of variables of a program with their meaning."""
+    return [
+        (slice(program.nq), "the parameters"),
+        (slice(program.nq, program.phi_columns.start), "the positions"),
+        (program.phi_columns, "the nuisance parameters"),
+        (slice(program.phi_columns.stop, None), "the lifted variables"),
+    ]

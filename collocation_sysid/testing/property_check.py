@@ -1,0 +1,255 @@
+"""Comparisons of a check; they fail with property, place, found and expected value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..array_types import Array
+from ..errors import InputError
+from .finite_differences import STEP, directional_derivative
+
+# Largest relative difference of two exact formulas of one quantity: rounding of some thousand
+# operations.
+EXACT = 1e-9
+# Largest relative difference of a derivative from central differences of fourth order.
+DIFFERENCES = 1e-6
+# Smallest size of a derivative, relative to the value of its function: differences of smaller ones
+# are rounding.
+ROUNDING = 1e-6
+# Steps of the differences, relative to the size of a large change. The step with the best
+# agreement counts: a function that bends within the first step needs the last, where rounding is
+# the larger error.
+STEPS = (STEP, STEP / 30, STEP / 1000)
+
+
+@dataclass(frozen=True)
+class PropertyCheck:
+    """Comparisons of one check, with its subject and its random numbers.
+
+    Attributes
+    ----------
+    subject : str
+        Kind and name of what is checked, as a sentence begins with them: "material 'gel'".
+    rng : numpy.random.Generator
+        Random numbers of the states, the same in every run.
+    """
+
+    subject: str
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+
+    def fail(self, statement: str, found: Any, expected: Any) -> NoReturn:
+        """Raise the `AssertionError` of a property.
+
+        Parameters
+        ----------
+        statement : str
+            The failed property, and where it fails.
+        found, expected : object
+            Values for the sentence.
+        """
+        raise AssertionError(
+            f"{self.subject}: {statement}; found {_shown(found)}, expected {_shown(expected)}"
+        )
+
+    def require_equal(
+        self,
+        found: ArrayLike,
+        expected: ArrayLike,
+        *,
+        statement: str,
+        tolerance: float = EXACT,
+        scale: float | None = None,
+    ) -> None:
+        """Compare two arrays, and name the entry with the largest difference.
+
+        Parameters
+        ----------
+        found, expected : array
+            Arrays of one shape.
+        statement : str
+            What it means if they differ, such as "P is not ∂ψ/∂F at F = …".
+        tolerance : float
+            Largest difference, relative to `scale`.
+        scale : float, optional
+            Size of the quantity; by default the largest expected entry.
+
+        Raises
+        ------
+        AssertionError
+            If they differ, or an entry of `found` is not finite.
+        """
+        values = np.asarray(found, dtype=float)
+        references = np.asarray(expected, dtype=float)
+        if values.shape != references.shape:
+            self.fail(f"{statement} (shapes)", values.shape, references.shape)
+        if not values.size:
+            return
+        size = np.abs(references).max() if scale is None else scale
+        errors = np.abs(values - references)
+        worst = np.unravel_index(int(np.argmax(np.nan_to_num(errors, nan=np.inf))), errors.shape)
+        if not errors[worst] <= tolerance * size:
+            entry = f", entry {tuple(map(int, worst))}" if worst else ""
+            self.fail(f"{statement}{entry}", values[worst], references[worst])
+
+    def require_derivative(
+        self,
+        function: Callable[[Array], ArrayLike],
+        derivative: ArrayLike,
+        point: Array,
+        *,
+        statement: str,
+        scale: ArrayLike = 1.0,
+        tolerance: float = DIFFERENCES,
+    ) -> None:
+        """Compare all columns of a derivative with central differences of the function.
+
+        Parameters
+        ----------
+        function : callable
+            Function of an array like `point`, which returns m numbers.
+        derivative : (m, n) array
+            Derivative by the n entries of `point`.
+        point : (n,) array
+        statement : str
+            What it means if they differ.
+        scale : (n,) array or float
+            Size of a large change of each entry of `point`.
+        tolerance : float
+            Largest difference, relative to the largest entry of the derivative times its scale.
+
+        Raises
+        ------
+        AssertionError
+            If they differ.
+        """
+        steps = np.broadcast_to(np.asarray(scale, dtype=float), point.shape)
+        found = np.asarray(derivative, dtype=float).reshape(-1, point.size) * steps
+
+        def differences(step: float) -> Array:
+            """Return the derivative by differences, times the scale."""
+            columns = [
+                directional_derivative(function, point, direction, step)
+                for direction in np.diag(steps)
+            ]
+            return np.stack([np.ravel(column) for column in columns], axis=1)
+
+        size = _size(found, function(point))
+        self.require_equal(
+            found,
+            _closest(found, differences, tolerance=tolerance * size),
+            statement=f"{statement}, by central differences",
+            tolerance=tolerance,
+            scale=size,
+        )
+
+    def require_product(
+        self,
+        function: Callable[[Array], ArrayLike],
+        product: ArrayLike,
+        point: Array,
+        direction: Array,
+        *,
+        statement: str,
+        tolerance: float = DIFFERENCES,
+    ) -> None:
+        """Compare the product of a derivative with one direction with central differences.
+
+        Parameters
+        ----------
+        function : callable
+            Function of an array like `point`.
+        product : array
+            Derivative times `direction`.
+        point, direction : array
+        statement : str
+            What it means if they differ.
+        tolerance : float
+            Largest difference, relative to the largest entry of the product.
+
+        Raises
+        ------
+        AssertionError
+            If they differ.
+        """
+        found = np.asarray(product, dtype=float)
+        size = _size(found, function(point))
+        expected = _closest(
+            found,
+            lambda step: directional_derivative(function, point, direction, step),
+            tolerance=tolerance * size,
+        )
+        self.require_equal(
+            found,
+            expected,
+            statement=f"{statement}, by central differences",
+            tolerance=tolerance,
+            scale=size,
+        )
+
+    def require_refusal(self, call: Callable[[], Any], *, naming: str, statement: str) -> None:
+        """Require that a call raises an `InputError` that contains a name.
+
+        Parameters
+        ----------
+        call : callable
+            Call with invalid input.
+        naming : str
+            Key or name that the message has to contain.
+        statement : str
+            Description of the invalid input.
+
+        Raises
+        ------
+        AssertionError
+            If the call succeeds, raises another error, or the message lacks the name.
+        """
+        expected = f"an InputError that names {naming}"
+        try:
+            call()
+        except InputError as error:
+            if naming not in str(error):
+                self.fail(f"the message for {statement} lacks the name", str(error), expected)
+        except Exception as error:  # any other error is what the check reports
+            self.fail(f"{statement} is not refused", f"{type(error).__name__}: {error}", expected)
+        else:
+            self.fail(f"{statement} is not refused", "no error", expected)
+
+
+def _closest(found: Array, differences: Callable[[float], Array], *, tolerance: float) -> Array:
+    """Return the differences that are closest to a derivative.
+
+    Parameters
+    ----------
+    found : array
+        Derivative.
+    differences : callable
+        Differences with a step of this relative size.
+    tolerance : float
+        Largest error of an entry with which no other step is tried.
+    """
+    candidates = []
+    distances = []
+    for step in STEPS:
+        candidates.append(differences(step))
+        has_shape = candidates[-1].shape == found.shape
+        errors = np.abs(candidates[-1] - found) if has_shape else np.array(np.inf)
+        distances.append(float(np.nan_to_num(errors, nan=np.inf).max(initial=0.0)))
+        if distances[-1] <= tolerance:
+            break
+    return candidates[int(np.argmin(distances))]
+
+
+def _size(derivative: Array, value: ArrayLike) -> float:
+    """Return the size of a derivative, not less than the rounding of the function's value."""
+    largest = float(np.abs(derivative).max(initial=0.0))
+    return max(largest, ROUNDING * float(np.abs(value).max(initial=0.0)), np.finfo(float).tiny)
+
+
+def _shown(value: Any) -> str:
+    """Return a value as part of a sentence."""
+    return f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)

@@ -1,0 +1,256 @@
+"""Check of a custom sensor: `check_sensor`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ..array_types import Array
+from ..fem.body import Body
+from ..fem.mesh import TetMesh
+from ..fem.structured import box_mesh
+from ..problem.code_loader import CodeLoader
+from ..program.collocation import Collocation
+from ..recording.custom_sensor import GRASP_INPUTS, POINT_INPUTS, Gauge, Look
+from .program_derivatives import check_program
+from .property_check import PropertyCheck
+from .round_trip import check_pickling, check_problem_file
+from .small_problems import DENSITY_KG_M3, STEPS, TIMESTEP_S, program_of, swung_experiment
+
+# Number of random states.
+STATES = 3
+# Random velocities [m/s], accelerations [m/s²], forces [N] and torques [N m] of a hand-held body
+# of 0.1 m.
+SIZES = {
+    "position_m": 2e-3,
+    "velocity_m_s": 0.3,
+    "acceleration_m_s2": 10.0,
+    "force_n": 1.0,
+    "torque_nm": 0.05,
+}
+# Space between the points of a sensor and the surface of the small body [m].
+MARGIN_M = 0.02
+# Sample times of the sensor within the small recording: between its samples, too.
+SAMPLES = 7
+
+
+def check_sensor(
+    sensor: Gauge, *, file: str | Path | None = None, function: str | None = None
+) -> None:
+    """Check a custom sensor: values, derivatives, predictions, messages and round trips.
+
+    At random states the expression's first and second derivatives agree with central differences
+    of the expression called with numbers. In a small recording of a body around the sensor's
+    points, the prediction for a motion that is quadratic in time is the expression at the exact
+    positions, velocities and accelerations; gradient, Jacobian and Hessian of the program agree
+    with central differences. An unknown that the expression does not have is refused by its name.
+    The sensor can be pickled.
+
+    Parameters
+    ----------
+    sensor : Gauge
+        Sensor on points or on a grasp; its samples are not used.
+    file : str or Path, optional
+        Python file that contains the expression, to check that a problem file can name it. The
+        file is run.
+    function : str, optional
+        Name of the function in the file; by default that of the expression.
+
+    Raises
+    ------
+    AssertionError
+        For the first property that fails: which one, where, found and expected value.
+    """
+    check = PropertyCheck(f"sensor {sensor.name!r}")
+    expression = SensorExpression(sensor)
+    for number in range(STATES):
+        u = expression.random_state(check.rng)
+        _check_derivatives(check, expression, u, f"at random state {number}")
+    check.require_refusal(
+        lambda: replace(sensor, unknowns={**sensor.unknowns, "no_such_unknown": 1.0}),
+        naming="no_such_unknown",
+        statement="an unknown that the expression does not have",
+    )
+    _check_round_trips(check, sensor, file, function)
+    collocation = _small_program(sensor)
+    if sensor.grasp is None:
+        _check_prediction(check, expression, collocation)
+    check_program(check, collocation)
+
+
+@dataclass(frozen=True, eq=False)
+class SensorExpression:
+    """Expression of a sensor as a function of u: inputs, column after column, then unknowns.
+
+    Attributes
+    ----------
+    sensor : Gauge
+    """
+
+    sensor: Gauge
+
+    @property
+    def inputs(self) -> dict[str, Array]:
+        """Undeformed values of the inputs by name: (3, P) for points, (3,) at a grasp."""
+        if self.sensor.grasp is not None:
+            return {name: np.ones((3, 1)) for name in GRASP_INPUTS}
+        points = np.asarray(self.sensor.points_m).T
+        return {
+            name: points if name == "position_m" else np.zeros_like(points) for name in POINT_INPUTS
+        }
+
+    @property
+    def t_s(self) -> float:
+        """Time at which the expression is evaluated [s]."""
+        return 2.5 * TIMESTEP_S
+
+    def random_state(self, rng: np.random.Generator) -> Array:
+        """Return inputs near the undeformed ones, and unknowns of the size of their priors."""
+        changed = [
+            (each + SIZES[name] * rng.standard_normal(each.shape)).ravel(order="F")
+            for name, each in self.inputs.items()
+        ]
+        sigmas = np.array([*self.sensor.unknowns.values()], dtype=float)
+        return np.concatenate([*changed, sigmas * rng.standard_normal(len(sigmas))])
+
+    @property
+    def scale(self) -> Array:
+        """Size of a large change of each entry of u."""
+        sizes = [np.full(each.size, SIZES[name]) for name, each in self.inputs.items()]
+        return np.concatenate([*sizes, np.array([*self.sensor.unknowns.values()], dtype=float)])
+
+    def evaluate_plain(self, u: Array, t_s: float | None = None) -> Array:
+        """Return the numbers of the sensor by calling its expression with numbers.
+
+        Parameters
+        ----------
+        u : array
+        t_s : float, optional
+            Time of the sample; that of the random states by default.
+        """
+        shapes = [each.shape for each in self.inputs.values()]
+        ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
+        *parts, unknowns = np.split(u, ends)
+        values = (
+            ca.DM(part.reshape(shape, order="F")) for part, shape in zip(parts, shapes, strict=True)
+        )
+        named = dict(zip(self.sensor.unknowns, map(float, unknowns), strict=True))
+        at = Look(self.t_s if t_s is None else t_s, **dict(zip(self.inputs, values, strict=True)))
+        numbers = self.sensor.expression(at, **named)
+        column = ca.vertcat(*numbers) if isinstance(numbers, list | tuple) else numbers
+        return np.ravel(ca.evalf(ca.SX(column)).full(), order="F")
+
+    @cached_property
+    def automatic(self) -> ca.Function:
+        """Function of u and weights: y, ∂y/∂u and ∂²(wᵀy)/∂u², from the expression in SX."""
+        symbols = [ca.SX.sym(name, *each.shape) for name, each in self.inputs.items()]
+        unknowns = ca.SX.sym("unknowns", len(self.sensor.unknowns))
+        own = ca.vertsplit(unknowns) if self.sensor.unknowns else []
+        y = self.sensor.read(ca.SX(self.t_s), symbols, own)
+        u = ca.veccat(*symbols, unknowns)
+        weights = ca.SX.sym("w", y.numel())
+        second, _ = ca.hessian(ca.dot(weights, y), u)
+        outputs = [y, ca.densify(ca.jacobian(y, u)), ca.densify(second)]
+        return ca.Function("automatic", [u, weights], outputs)
+
+
+def _check_derivatives(
+    check: PropertyCheck, expression: SensorExpression, u: Array, where: str
+) -> None:
+    """Compare value and derivatives of the expression in SX with the one called with numbers."""
+    plain = expression.evaluate_plain(u)
+    weights = check.rng.standard_normal(len(plain))
+    y, jacobian, hessian = (each.full() for each in expression.automatic.call([u, weights]))
+    check.require_equal(
+        y.ravel(), plain, statement=f"the expression differs from its function {where}"
+    )
+    check.require_derivative(
+        expression.evaluate_plain,
+        jacobian,
+        u,
+        statement=f"the first derivative of the expression is wrong {where}",
+        scale=expression.scale,
+    )
+    check.require_derivative(
+        lambda at: weights @ expression.automatic.call([at, weights])[1].full(),
+        hessian,
+        u,
+        statement=f"the second derivative of the expression is wrong {where}",
+        scale=expression.scale,
+    )
+
+
+def _small_program(sensor: Gauge) -> Collocation:
+    """Return the program of a small recording with a sensor, whose body contains its points."""
+    points = np.asarray(sensor.points_m).reshape(-1, 3)
+    low = points.min(axis=0, initial=0.0) if not len(points) else points.min(axis=0)
+    high = points.max(axis=0) if len(points) else low + 0.06
+    size = tuple(float(each) for each in high - low + 2 * MARGIN_M)
+    box = box_mesh(size, (1, 1, 2))
+    mesh = TetMesh(box.points_m + low - MARGIN_M, box.tetrahedra)
+    t_s = np.linspace(1.3, STEPS - 1.3, SAMPLES) * TIMESTEP_S
+    grasp = None if sensor.grasp is None else 1
+    retimed = replace(sensor, t_s=t_s, values=None, grasp=grasp)
+    body = Body(mesh, density_kg_m3=DENSITY_KG_M3)
+    return program_of(swung_experiment(body, readings=[retimed]), {})
+
+
+def _check_prediction(
+    check: PropertyCheck, expression: SensorExpression, collocation: Collocation
+) -> None:
+    """Require the expression's value for a motion that is affine in space and quadratic in time."""
+    transcription = collocation.transcriptions[0]
+    rates = [scale * check.rng.standard_normal((3, 3)) for scale in (0.05, 1.0, 20.0)]
+    identity = np.eye(3)
+
+    def gradient_at(t: float) -> list[Array]:
+        """Return the matrix of the motion, its velocity and its acceleration at a time."""
+        zero, one, two = rates
+        return [identity + zero + one * t + two * t**2, one + 2 * two * t, 2 * two]
+
+    grid_s = transcription.dynamics.t_s
+    nodes_m = transcription.body.nodes_m
+    x = np.array([(nodes_m @ gradient_at(t)[0].T).ravel() for t in grid_s])
+    p = collocation.guess_p
+    p[collocation.nq :] = check.rng.standard_normal(collocation.nphi)
+    (iterate,) = collocation.iterates_at(p, [x])
+    (residual,) = transcription.custom_sensors
+    found = residual.without_padding(residual.predict_motion(iterate.motion, iterate.phi))
+    unknowns = iterate.phi * np.array([*expression.sensor.unknowns.values()], dtype=float)
+    points = np.asarray(expression.sensor.points_m).T
+    for t_s, numbers in zip(residual.t_s, found, strict=True):
+        exact = [(matrix @ points).ravel(order="F") for matrix in gradient_at(t_s)]
+        check.require_equal(
+            numbers,
+            expression.evaluate_plain(np.concatenate([*exact, unknowns]), float(t_s)),
+            statement=f"the prediction for a known motion is wrong at t = {t_s:.4g} s",
+            tolerance=1e-7,
+        )
+
+
+def _check_round_trips(
+    check: PropertyCheck, sensor: Gauge, file: str | Path | None, function: str | None
+) -> None:
+    """Require the same readings after pickling and from a problem file."""
+    u = SensorExpression(sensor).random_state(check.rng)
+
+    def evaluate(each: Gauge) -> Array:
+        """Return the numbers of a sensor at a state."""
+        return SensorExpression(each).evaluate_plain(u)
+
+    def load(loader: CodeLoader, table: Mapping[str, Any]) -> Gauge:
+        """Return the sensor with the expression that a table of a problem file names."""
+        _, expression = loader.function(table["code"], table["function"], "reading.0.code")
+        return replace(sensor, expression=expression)
+
+    check_pickling(check, sensor, evaluate)
+    if file is not None:
+        name = function or getattr(sensor.expression, "__name__", sensor.name)
+        table = {"code": Path(file).name, "function": name}
+        check_problem_file(check, file, table, load=load, extension=sensor, evaluate=evaluate)

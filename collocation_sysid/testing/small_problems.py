@@ -1,0 +1,158 @@
+"""Small bodies and experiments in which extensions are checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..array_types import Array, Index
+from ..fem.body import Body
+from ..fem.constants import Constant, is_modulus, usual_value
+from ..fem.mesh import TetMesh
+from ..fem.structured import box_mesh
+from ..model.parameters import Parameters, Unknown
+from ..program.collocation import Collocation
+from ..recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
+
+# A soft foam: stiffness [Pa], Poisson's ratio and density [kg/m³] of the bodies.
+YOUNG_PA = 800.0
+POISSON = 0.25
+DENSITY_KG_M3 = 30.0
+# Value of moduli that a soft foam lacks, such as the factor of (Ī₁ − 3)²: their terms count, too.
+SMALL_MODULUS_PA = 30.0
+# Time between samples [s], and their number: as many as the stencils of all schemes and sensors
+# need.
+TIMESTEP_S = 0.01
+STEPS = 6
+
+
+def uneven_box(divisions: int) -> TetMesh:
+    """Return the mesh of a box [m] of which no two elements are alike.
+
+    Parameters
+    ----------
+    divisions : int
+        Number of cells along each edge; each consists of six tetrahedra.
+    """
+    mesh = box_mesh((0.10, 0.12, 0.09), (divisions,) * 3)
+    jitter = np.random.default_rng(1).uniform(-0.008, 0.008, mesh.points_m.shape)
+    return TetMesh(mesh.points_m + jitter, mesh.tetrahedra)
+
+
+def smooth_poses(
+    t_s: Array,
+    sway_m: Sequence[float] = (0.02, 0.01, -0.015),
+    turn_rad: Sequence[float] = (0.2, -0.15, 0.3),
+    angular_frequency_rad_s: float = 20.0,
+) -> PoseSequence:
+    """Return a motion that starts at rest from the identity, sampled from its formula.
+
+    Parameters
+    ----------
+    t_s : (T,) array
+        Times.
+    sway_m, turn_rad : three floats
+        Half the largest translation and rotation vector.
+    angular_frequency_rad_s : float
+    """
+    share = 1 - np.cos(angular_frequency_rad_s * t_s)
+    turns = Rotation.from_rotvec(np.outer(share, turn_rad))
+    return PoseSequence(t_s, np.outer(share, sway_m), turns.as_quat())
+
+
+def usual_constants(
+    constants: Sequence[Constant], values: Mapping[str, float] | None
+) -> dict[str, float]:
+    """Return values of constants: those stated, else those of a soft foam, else 1.
+
+    Parameters
+    ----------
+    constants : sequence of Constant
+    values : mapping of name to value, optional
+        Stated values.
+    """
+    stated = dict(values or {})
+    return {c.name: float(stated.get(c.name, _usual_constant(c.name))) for c in constants}
+
+
+def _usual_constant(name: str) -> float:
+    """Return a value of a constant at which all terms of its law count."""
+    value = usual_value(name, YOUNG_PA, POISSON)
+    if value is None:
+        return 1.0
+    return SMALL_MODULUS_PA if is_modulus(name) and not value else value
+
+
+def highest_nodes(points_m: Array) -> Index:
+    """Return the indices of the nodes in the upper third of a body."""
+    low, high = points_m[:, 2].min(), points_m[:, 2].max()
+    return np.flatnonzero(points_m[:, 2] > high - (high - low) / 3)
+
+
+def swung_experiment(body: Body, **changes: Any) -> Experiment:
+    """Return an experiment in which a grasp at the top swings a body with four markers.
+
+    Parameters
+    ----------
+    body : Body
+    changes : Any
+        Arguments of `Experiment` that replace those of this one.
+    """
+    t_s: Array = TIMESTEP_S * np.arange(STEPS + 1, dtype=np.float64)
+    points_m = body.nodes_m[:: max(1, len(body.nodes_m) // 4)][:4]
+    tracks = np.repeat(points_m[None], len(t_s), axis=0)
+    names = [f"m{k}" for k in range(len(points_m))]
+    arguments: dict[str, Any] = {
+        "grasps": [Grasp(highest_nodes(body.nodes_m), smooth_poses(t_s))],
+        "markers": Markers(t_s, tracks, 1e-2, names, points_m),
+        "nuisance": Nuisance.none(),
+        "air_density_kg_m3": "none",
+        "name": "check",
+    }
+    return Experiment(body, t_s, **(arguments | changes))
+
+
+def program_of(experiment: Experiment, values: Mapping[str, float]) -> Collocation:
+    """Return the program of an experiment in which all constants of its body are estimated.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    values : mapping of name to float
+        Guesses; constants without one have the values of a soft foam.
+    """
+    constants = usual_constants(tuple(experiment.body.constants.values()), values)
+    unknowns: dict[str, Any] = {name: _unknown(value) for name, value in constants.items()}
+    return Collocation([experiment], Parameters.from_mapping(unknowns))
+
+
+def _unknown(value: float) -> Unknown | float:
+    """Return an estimated constant with its guess; zero is fixed, as it has no scale."""
+    return Unknown(value) if value else value
+
+
+def shaken_variables(collocation: Collocation, rng: np.random.Generator) -> Array:
+    """Return variables z that satisfy no equation: rigid motions and parameters with noise.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    rng : numpy.random.Generator
+    """
+    positions = []
+    for transcription in collocation.transcriptions:
+        rigid = transcription.experiment.rigid_positions(transcription.dynamics.t_s)
+        rigid = rigid.reshape(-1, transcription.dof_count)
+        positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
+    p = collocation.guess_p
+    p[: collocation.nq] += 0.1 * rng.normal(size=collocation.nq)
+    p[collocation.nq :] += 0.5 * rng.normal(size=collocation.nphi)
+    is_lag = np.array(["lag of" in name for name in collocation.parameter_names], dtype=bool)
+    p[is_lag] = np.abs(p[is_lag]) + 0.1
+    z = collocation.pack(p, positions)
+    for lifted in collocation.lifted:
+        z[lifted.columns] += 0.01 * rng.normal(size=lifted.count)
+    return z

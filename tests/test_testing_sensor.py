@@ -1,0 +1,101 @@
+"""`check_sensor`: sensors on points and grasps pass, and each fault is one sentence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import collocation_sysid as cs
+from collocation_sysid.program.custom_sensor_residual import CustomSensorResidual
+from collocation_sysid.testing import check_sensor
+
+TIMES_S = np.linspace(0.0, 0.1, 11)
+
+
+def specific_force(at, bias_m_s2):
+    return at.acceleration_m_s2[:, 0] + ca.vertcat(0, 0, 9.81 + bias_m_s2)
+
+
+def strain(at, scale):
+    way = at.position_m[:, 1] - at.position_m[:, 0]
+    return (1 + scale) * (ca.norm_2(way) / 0.06 - 1)
+
+
+def speed(at):
+    return [ca.sqrt(ca.sumsqr(at.velocity_m_s[:, 0]) + 1e-4), at.t_s]
+
+
+def pull(at, gain):
+    return (1 + gain) * at.force_n[2] * (1 + ca.sumsqr(at.torque_nm))
+
+
+TIP_M = [[0.05, 0.05, 0.01]]
+ENDS_M = [[0.0, 0.0, 0.02], [0.0, 0.0, 0.08]]
+SENSORS = {
+    "accelerometer": cs.Gauge(
+        "accelerometer", specific_force, TIMES_S, None, 0.05, TIP_M, {"bias_m_s2": 0.5}
+    ),
+    "foil": cs.Gauge("foil", strain, TIMES_S, None, 1e-4, ENDS_M, {"scale": 0.05}),
+    "speed": cs.Gauge("speed", speed, TIMES_S, None, 1e-3, TIP_M),
+    "load cell": cs.Gauge("cell", pull, TIMES_S, None, 1e-3, unknowns={"gain": 0.1}, grasp=1),
+    "load cell, world": cs.Gauge(
+        "cell", pull, TIMES_S, None, 1e-3, unknowns={"gain": 0.1}, grasp=1, frame="world"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_every_kind_of_sensor_passes(name: str):
+    check_sensor(SENSORS[name])
+
+
+def one_sided(at, scale):
+    """A reading that depends on whether it is differentiated."""
+    way = strain(at, scale)
+    return -way if isinstance(way, ca.SX) else way
+
+
+def test_a_reading_with_another_sign_in_programs_fails():
+    with pytest.raises(AssertionError, match=r"'foil': the expression differs from its functi"):
+        check_sensor(replace(SENSORS["foil"], expression=one_sided))
+
+
+def test_an_expression_that_takes_any_unknown_fails():
+    def careless(at, **unknowns):
+        return at.position_m[2, 1]
+
+    with pytest.raises(AssertionError, match="an unknown that the expression does not have is not"):
+        check_sensor(replace(SENSORS["foil"], expression=careless))
+
+
+def test_a_prediction_with_wrong_rates_fails(monkeypatch):
+    """Velocities of the wrong sign, as a stencil with exchanged neighbours would give them."""
+
+    def backward(self, values, phi, data):
+        return original(self, values[:, ::-1], phi, data)
+
+    original = CustomSensorResidual.expression
+    monkeypatch.setattr(CustomSensorResidual, "expression", backward)
+    with pytest.raises(AssertionError, match="the prediction for a known motion is wrong at t = 0"):
+        check_sensor(SENSORS["speed"])
+
+
+MINE = """
+import casadi as ca
+
+def strain(at, scale):
+    way = at.position_m[:, 1] - at.position_m[:, 0]
+    return (1 + scale) * (ca.norm_2(way) / 0.06 - 1)
+"""
+
+
+def test_a_problem_file_gives_the_same_reading_or_the_check_fails(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text(MINE)
+    check_sensor(SENSORS["foil"], file=file)
+    file.write_text(MINE.replace("0.06", "0.05"))
+    with pytest.raises(AssertionError, match=r"'foil': mine.py gives another one in a"):
+        check_sensor(SENSORS["foil"], file=file)
