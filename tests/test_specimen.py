@@ -438,7 +438,12 @@ def test_compare_ranks_laws_by_held_out_specimens(tmp_path):
     more = PROBLEM[PROBLEM.index("[[") :].replace("pull", "wide").replace("uniaxial", "planar")
     path.write_text(PROBLEM + more)
     outcome = run_command(
-        "compare", path, "--materials", "neo-hookean,stable-neo-hookean", "--out", tmp_path / "out"
+        "compare-models",
+        path,
+        "--materials",
+        "neo-hookean,stable-neo-hookean",
+        "--out",
+        tmp_path / "out",
     )
     assert outcome.code == 0, outcome.err
     assert "→  neo-hookean" in outcome.out
