@@ -142,7 +142,8 @@ def _hypotheses(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Ite
     experiment : Experiment
         Experiment of a specimen.
     other_slopes_pa : sequence of float
-        Initial slopes of the stresses of the other specimens, without which a wrong unit cannot be detected.
+        Initial slopes of the stresses of the other specimens, without which a wrong unit cannot be
+        detected.
     """
     deformation = experiment.specimen
     assert deformation is not None
