@@ -40,6 +40,7 @@ from .statistics.profile_likelihood import Profile, profile_of_solution
 from .statistics.relaxed_assumptions import Probe, SolvedFit, probed_changes
 from .statistics.residual_diagnostics import diagnose_markers
 from .statistics.routine_probes import probed_deviations
+from .statistics.specimen_notes import one_kind_notes
 from .statistics.uncertainty import Uncertainty, uncertainty_from_fit
 from .statistics.uncertainty_budget import VarianceSources
 from .step_counting import StepUnit, counted_phase
@@ -225,7 +226,8 @@ def run(
         refits = (
             c.message for e in problem.experiments for c in rotation_step_concerns(e, substeps)
         )
-        answer = replace(answer, notes=(*refits, *answer.notes))
+        of_tests = one_kind_notes(problem.experiments, problem.parameters)
+        answer = replace(answer, notes=(*refits, *of_tests, *answer.notes))
         if answer.uncertainty is not None and fit is not None:
             profiles = _profiles(answer, fit, say)
             changes = _changes(answer, say)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from problem_files import TRUTH, run_command, write_problem
+from problem_files import AT_TRUTH, TRUTH, run_command, write_problem
 from scipy.optimize import brentq
 
 import collocation_sysid as cs
 from collocation_sysid.program.simulation import with_readings
 from collocation_sysid.recording.homogeneous_deformation import TESTS
 from collocation_sysid.result.replay import read_run
+from collocation_sysid.result.synthesis import Recipe, write_data
 from collocation_sysid.runs.numerical_error import finer_mesh
 
 LAMBDA_PA = 4e5
@@ -315,6 +317,28 @@ def test_a_refit_finds_mistakes_that_leave_a_plausible_curve(mistake):
     assert causes[:1] == ([f"specimen-{mistake}"] if mistake else [])
 
 
+def test_a_refit_finds_percent_that_were_taken_for_ratios():
+    rng = np.random.default_rng(4)
+    strain = np.linspace(0.005, 0.08, 20)
+    stress_pa = simulated("uniaxial", strain)["stress"] + 50.0 * rng.normal(size=20)
+    percent = cs.Specimen("uniaxial", 100 * strain, stress_pa, 50.0).experiment(name="pull")
+    run = cs.run(cs.Problem([percent], {**NEO_HOOKEAN, "young_pa": cs.Unknown()}))
+    assert [each.cause for each in run.causes][:1] == ["specimen-percent"]
+
+
+def test_a_refit_finds_kilopascals_beside_pascals():
+    """Files are refused already when they are read; arrays in Python are not."""
+    specimens = []
+    for test, factor in (("uniaxial", 1.0), ("planar", 1e-3), ("equibiaxial", 1.0)):
+        stress_pa = factor * simulated(test, STRAIN)["stress"]
+        twin = cs.Specimen(test, STRAIN, stress_pa, factor * 500.0)
+        specimens.append(twin.experiment(name=test))
+    run = cs.run(cs.Problem(specimens, {**NEO_HOOKEAN, "young_pa": cs.Unknown()}))
+    assert [each.cause for each in run.causes][:1] == ["specimen-unit"]
+    assert "'planar'" in run.causes[0].message
+    assert "multiplied by 1000" in run.causes[0].message
+
+
 # Beside other recordings --------------------------------------------------------------------------
 
 
@@ -346,6 +370,49 @@ def test_specimens_and_a_motion_share_the_parameters(tmp_path):
         len(each.body.nodes.points_m) for each in problem.experiments
     ]
     assert records[1].strain == pytest.approx(STRAIN)
+
+
+BENCH = """
+[[experiment]]
+name = "press"
+kind = "static"
+file = "press.csv"
+gravity_m_s2 = [0.0, 0.0, 0.0]
+nuisance = "none"
+
+[[experiment.grasp]]
+nodes = { face = "bottom" }
+
+[[experiment.grasp]]
+nodes = { face = "top" }
+displacement = { sign = -1 }
+wrench = { sign = -1, sigma_n = 1e-3 }
+"""
+
+
+def test_a_motion_a_bench_and_a_specimen_share_the_parameters(tmp_path):
+    path = write_problem(tmp_path, {"swing": 8})
+    motion = path.read_text()
+    pressed = np.column_stack([np.arange(6.0), np.linspace(0.0, 12.0, 6), np.zeros(6)])
+    header = "Time (s),Displacement (mm),Force (N)"
+    np.savetxt(tmp_path / "press.csv", pressed, delimiter=",", header=header, comments="")
+    pulled = np.column_stack([STRAIN, 0 * STRAIN])
+    written(tmp_path, header="strain (-),stress (Pa)", rows=pulled)
+    pull = PROBLEM[PROBLEM.index("[[") :].replace("100.0", "0.5")
+    path.write_text(motion + BENCH + pull)
+    exact = cs.Problem.read(path, [*AT_TRUTH, "transcription.substeps=1"], simulation=True)
+    write_data(exact, tmp_path / "twin", Recipe("midpoint"))
+    for name in ("press.csv", "pull.csv"):
+        shutil.copy(tmp_path / "twin" / name, tmp_path / name)
+    problem = cs.Problem.read(path, ["solver.method=reduced-space"])
+    assert [len(each.t_s) for each in problem.experiments] == [9, 6, len(STRAIN)]
+    run = cs.run(problem)
+    assert {name: run.optimum[name].value for name in TRUTH} == pytest.approx(TRUTH, rel=2e-3)
+    assert run.result.fit.experiments["pull"].test == "uniaxial"
+    # Each recording alone determines less: only the motion has damping, the specimen no density.
+    together = run.estimates["mu_pa"].statistical_std_error
+    alone = cs.run(replace(problem, experiments=problem.experiments[:1]))
+    assert together < 0.5 * alone.estimates["mu_pa"].statistical_std_error
 
 
 def test_memory_relaxes_at_the_rate_of_its_branch():

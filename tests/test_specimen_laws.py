@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -62,6 +64,26 @@ def test_hills_foam_has_the_stress_and_the_lateral_stretch_of_the_closed_form():
     stress_pa = 2 * FOAM["mu_1_pa"] / alpha * (stretch**alpha - volume ** (-alpha * beta)) / stretch
     np.testing.assert_allclose(read["lateral stretch"], across, rtol=1e-8)
     np.testing.assert_allclose(read["stress"], stress_pa, rtol=1e-7)
+
+
+def notes_of(material, free, tests, validation=(), **fixed):
+    """Notes about one kind of test, of a fit of Kawabata's small stretches."""
+    specimens = cs.datasets.kawabata_1981(material, tests=tests, largest_stretch=1.3)
+    specimens = [replace(each, validation=each.name in validation) for each in specimens]
+    values = {**dict.fromkeys(free, cs.Unknown()), **fixed, "kappa_pa": 1e9, **UNDAMPED}
+    run = cs.run(cs.Problem(specimens, values))
+    return [note for note in run.notes if "intervals assume that the law" in note]
+
+
+def test_one_kind_of_test_does_not_test_a_law_with_several_constants():
+    mooney = ("c10_pa", "c01_pa")
+    (note,) = notes_of("mooney-rivlin", mooney, ("uniaxial",))
+    assert "all specimens are uniaxial tests" in note
+    assert "the law mooney-rivlin" in note
+    assert notes_of("mooney-rivlin", mooney, ("uniaxial", "planar")) == []
+    assert notes_of("mooney-rivlin", mooney, ("uniaxial", "planar"), validation=["planar"]) == []
+    assert notes_of("mooney-rivlin", mooney, ("biaxial",)) == []
+    assert notes_of("yeoh", ("c10_pa",), ("uniaxial",), c20_pa=0.0, c30_pa=0.0) == []
 
 
 def test_a_compression_test_with_lateral_stretch_determines_a_foam():

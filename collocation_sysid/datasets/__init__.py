@@ -62,7 +62,7 @@ def kawabata_1981(
     material : str, Material or callable
         Material law, as of `Body`.
     tests : tuple of str
-        Some of "uniaxial", "equibiaxial", "planar" (with the stress along the held width), and
+        Some of "uniaxial", "equibiaxial", "planar" (with the stress along the fixed width), and
         "biaxial", all other pairs of stretches.
     largest_stretch : float, optional
         Largest stretch of the samples to use; all by default.

@@ -93,8 +93,8 @@ class HomogeneousDeformation:
     def prescribed_axes(self, node: int) -> Axes:
         """Return the axes along which a node of the cell is prescribed, by its index."""
         own = AXES[node - 1] if node else ""
-        held = "".join(axis for axis in AXES if not (axis == own and axis in self.free))
-        return cast(Axes, held)
+        prescribed = "".join(axis for axis in AXES if not (axis == own and axis in self.free))
+        return cast(Axes, prescribed)
 
 
 DEFORMATIONS = {

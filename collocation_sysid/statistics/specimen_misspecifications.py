@@ -31,7 +31,7 @@ from .misspecification_hypothesis import Hypothesis, HypothesisTest
 NOISE_LEVEL = 1.3
 # Factor by which the misfit must decrease.
 REQUIRED_FACTOR = 1.5
-# Fewest samples of a specimen that a curve can be told by.
+# Fewest samples of a specimen whose curve distinguishes hypotheses.
 FEWEST_SAMPLES = 4
 # Most iterations of one refit, and its tolerance: a misfit is needed, not an estimate.
 MOST_ITERATIONS = 15
@@ -79,7 +79,7 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
     misfit = misfit_of(experiments[0])
     if misfit is None:
         return []
-    found: list[Hypothesis] = []
+    hypotheses: list[Hypothesis] = []
     test = HypothesisTest(
         misfit, misfit_of, REQUIRED_FACTOR, smallest_misfit=1.0, noise_level=NOISE_LEVEL
     )
@@ -88,10 +88,10 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
             continue
         others = [_initial_slope(each) for each in experiments if each is not experiment]
         for hypothesis in test.accepted(_hypotheses(experiment, others)):
-            found.append(hypothesis)
+            hypotheses.append(hypothesis)
             if hypothesis.strength > CERTAIN:
-                return found
-    return found
+                return hypotheses
+    return hypotheses
 
 
 def _thinned(experiment: Experiment) -> Experiment:
@@ -142,7 +142,8 @@ def _hypotheses(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Ite
     experiment : Experiment
         Experiment of a specimen.
     other_slopes_pa : sequence of float
-        Initial slopes of the stresses of the other specimens, without which a unit cannot be told.
+        Initial slopes of the stresses of the other specimens, without which a wrong unit cannot be
+        detected.
     """
     deformation = experiment.specimen
     assert deformation is not None
