@@ -41,7 +41,7 @@ class Discretisation(ConstantsModel):
 
     Parameters
     ----------
-    parts, forces : see `LiveModel`
+    parts, forces : see `ConstantsModel`
     mesh, element, evaluator, threads : see `Body`
 
     Attributes

@@ -1,7 +1,7 @@
 """Regions of a body with their own material, damping law and density, and the vector θ.
 
-Use `Region` to declare a region. `LiveModel` maps parameters by the names that users know to the
-constants θ of all parts of a body.
+Use `Region` to declare a region. `ConstantsModel` maps parameters by the names that users know to
+the constants θ of all parts of a body.
 """
 
 from __future__ import annotations
