@@ -19,7 +19,7 @@ from typing import Any as _Any
 # The public names. Type checkers and editors read these imports; at run time `__getattr__` imports
 # a module when one of its names is used, because the import of all takes seconds.
 if TYPE_CHECKING:
-    from . import live, testing
+    from . import datasets, live, testing
     from .errors import InputError, SimulationError
     from .fem.body import Body
     from .fem.constants import Constant
@@ -64,6 +64,7 @@ if TYPE_CHECKING:
         PointMass,
         PoseSequence,
         Pressure,
+        Specimen,
         Sphere,
         Tendon,
         Wrench,
@@ -127,6 +128,7 @@ __all__ = [
     "SimulationError",
     "Sleqp",
     "Solution",
+    "Specimen",
     "Sphere",
     "SqpMethod",
     "Status",
@@ -141,6 +143,7 @@ __all__ = [
     "Wrench",
     "box_mesh",
     "cylinder_mesh",
+    "datasets",
     "depth_image",
     "live",
     "place_markers",

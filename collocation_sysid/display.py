@@ -61,7 +61,7 @@ class Line:
 
     @property
     def spans(self) -> tuple[Span, ...]:
-        """Pieces of the sentence."""
+        """The sentence as pieces, each with a style of its own."""
         return (Span(self.text),) if isinstance(self.text, str) else self.text
 
 
@@ -127,7 +127,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Listing:
-    """Long preformatted text."""
+    """Long preformatted text, such as a file, below a title."""
 
     title: str
     text: str
@@ -246,7 +246,7 @@ class UnbrokenWords:
     text: Text
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield the lines."""
+        """Yield the lines of the text for rich."""
         for line in self.text.split(allow_blank=True):
             breaks = [0]
             for word in re.finditer(r"\S+", line.plain):
@@ -272,7 +272,7 @@ class TerminalTable:
     table: Table
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield the table."""
+        """Yield the table as one of rich."""
         yield _rich_table(self.table, parted=console.is_terminal)
 
 

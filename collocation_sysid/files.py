@@ -80,6 +80,25 @@ def require_own(file: Path) -> None:
         raise InputError("is a link to elsewhere; expected a file of this folder itself", file)
 
 
+def require_run_folder(path: Path) -> None:
+    """Refuse a file where a run folder is expected, such as the result.json of a run.
+
+    Raises
+    ------
+    InputError
+        Naming the folder of the file if that is a run folder.
+    """
+    if path.is_file():
+        raise _file_instead_of_folder(path, "a run folder", RESULT_FILE)
+
+
+def _file_instead_of_folder(path: Path, what: str, expected_file: str) -> InputError:
+    """Return the error for a file where `what` is expected, a folder with `expected_file`."""
+    is_within = (path.parent / expected_file).is_file()
+    likely = f", likely {path.parent}" if is_within else ""
+    return InputError(f"this is a file; expected {what}{likely}", path)
+
+
 def read_json(file: Path, what: str) -> dict[str, Any]:
     """The object in a JSON file of a folder.
 
@@ -98,9 +117,7 @@ def read_json(file: Path, what: str) -> dict[str, Any]:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except NotADirectoryError:
-        folder = file.parent.parent
-        likely = f", likely {folder}" if (folder / file.name).is_file() else ""
-        raise InputError(f"this is a file; expected {what}{likely}", file.parent) from None
+        raise _file_instead_of_folder(file.parent, what, file.name) from None
     except FileNotFoundError:
         raise InputError(f"this is not {what}: it has no {file.name}", file.parent) from None
     except (OSError, ValueError, RecursionError, MemoryError) as error:

@@ -132,8 +132,6 @@ class Kernels:
         Path of a C compiler; not needed.
     folder : str
         Folder of compiled kernels.
-    is_writable : bool
-        Whether kernels are stored there.
     fault : str or None
         Reason why kernels are not stored; None if they are.
     size_mb : float
@@ -142,13 +140,19 @@ class Kernels:
         Number of stored kernels.
     """
 
+    SERIALISED_PROPERTIES = ("is_writable",)
+
     compiler: str
     c_compiler: str | None
     folder: str
-    is_writable: bool
     fault: str | None
     size_mb: float
     count: int
+
+    @property
+    def is_writable(self) -> bool:
+        """Whether kernels are stored in the folder."""
+        return self.fault is None
 
 
 @dataclass(frozen=True)
@@ -261,14 +265,7 @@ def required_packages() -> Iterator[Dependency]:
     except ImportError:
         yield Dependency("packaging", None, "", False)
         return
-    for requirement in requirements:
-        installed = _installed_version(requirement.name)
-        yield Dependency(
-            name=requirement.name,
-            installed=installed,
-            required=str(requirement.specifier),
-            is_suitable=_is_suitable(requirement, installed),
-        )
+    yield from map(_dependency, requirements)
 
 
 def optional_packages() -> Iterator[Extra]:
@@ -280,14 +277,9 @@ def optional_packages() -> Iterator[Extra]:
         return
     names = metadata.metadata(PACKAGE).get_all("Provides-Extra") or []
     for name in sorted(set(names) - set(DEVELOPMENT_EXTRAS)):
-        missing = tuple(
-            sorted(
-                each.name
-                for each in _requirements(name)
-                if not _is_suitable(each, _installed_version(each.name))
-            )
-        )
-        yield Extra(name, missing, f'pip install "{PACKAGE}[{name}]"')
+        packages = map(_dependency, _requirements(name))
+        missing = sorted(each.name for each in packages if not each.is_suitable)
+        yield Extra(name, tuple(missing), f'pip install "{PACKAGE}[{name}]"')
 
 
 def _requirements(extra: str) -> Iterator[Requirement]:
@@ -316,17 +308,19 @@ def _is_importable(module: str) -> bool:
         return False
 
 
-def _installed_version(name: str) -> str | None:
-    """Return the installed version of a package; None if it is missing."""
+def _dependency(requirement: Requirement) -> Dependency:
+    """Return a requirement with the installed version, and whether that is suitable."""
     try:
-        return metadata.version(name)
+        installed = metadata.version(requirement.name)
     except metadata.PackageNotFoundError:
-        return None
-
-
-def _is_suitable(requirement: Requirement, installed: str | None) -> bool:
-    """Return whether an installed version meets a requirement; None meets none."""
-    return installed is not None and requirement.specifier.contains(installed, prereleases=True)
+        installed = None
+    return Dependency(
+        name=requirement.name,
+        installed=installed,
+        required=str(requirement.specifier),
+        is_suitable=installed is not None
+        and requirement.specifier.contains(installed, prereleases=True),
+    )
 
 
 def available_solvers() -> Solvers | None:
@@ -383,7 +377,6 @@ def kernel_state() -> Kernels | None:
     except ImportError:
         return None
     folder = cache_folder()
-    fault = cache_fault()
     files = [file.stat() for file in folder.glob("*.o")] if folder.is_dir() else []
     llvm_version = ".".join(map(str, llvm.llvm_version_info))
     compilers = (shutil.which(name) for name in C_COMPILERS)
@@ -391,8 +384,7 @@ def kernel_state() -> Kernels | None:
         compiler=f"LLVM {llvm_version} of llvmlite {llvmlite.__version__}",
         c_compiler=next((path for path in compilers if path), None),
         folder=str(folder),
-        is_writable=fault is None,
-        fault=fault,
+        fault=cache_fault(),
         size_mb=sum(each.st_size for each in files) / 1e6,
         count=len(files),
     )
@@ -476,5 +468,5 @@ def _identify_small_body() -> tuple[str, bool]:
     if not solution.status.converged:
         return f"the search did not converge ({solution.status.value}: {solution.message})", False
     deviation = abs(solution.parameters["mu_pa"] / truth_pa - 1)
-    message = f"the shear modulus of a block is identified to {deviation:.1e}"
+    message = f"relative error of an identified shear modulus {deviation:.1e}"
     return message, deviation < SELF_TEST_TOLERANCE

@@ -60,7 +60,7 @@ class ProcessLimits:
 
     @property
     def waiting_s(self) -> float:
-        """Wall-clock limit."""
+        """Wall-clock time after which the process is killed, on all systems [s]."""
         return WAITING_FACTOR * self.time_s
 
     @classmethod

@@ -18,7 +18,7 @@ from typing import NoReturn
 
 COMMAND = "collocation-sysid"
 # Name of a thread that is left in a library's code, which no signal reaches.
-LEFT_BEHIND = "left behind"
+ABANDONED_THREAD = "left behind"
 # File of the frames of an import, and how often a deferred signal tries again [s].
 IMPORTING = "<frozen importlib._bootstrap>"
 RETRY_S = 0.05
@@ -117,7 +117,7 @@ def leave(code: object) -> NoReturn:
     If a thread is still inside library code that would crash at exit, streams are flushed and the
     process ends without cleaning up.
     """
-    if not any(thread.name == LEFT_BEHIND for thread in threading.enumerate()):
+    if not any(thread.name == ABANDONED_THREAD for thread in threading.enumerate()):
         sys.exit(code if isinstance(code, int) else 1)
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError):

@@ -62,7 +62,7 @@ def hashes_of(contents: Mapping[str, Path]) -> dict[str, str]:
 
 
 def list_as_text(hashes: Mapping[str, str]) -> str:
-    """Content of a list."""
+    """Return the content of a list file from hashes by name."""
     return json.dumps({"written": dict(sorted(hashes.items()))}, indent=1) + "\n"
 
 

@@ -527,7 +527,7 @@ XML = (b"&a9;", b"<!--", b"-->", b"]]>", b"<![CDATA[", b"<a>", b"</a>", b'"', *C
 
 
 def _log_commands(name: str) -> tuple[tuple[str, ...], ...]:
-    return (*BOTH, ("topics", name))
+    return (*BOTH, ("log", name))
 
 
 FILES = (
@@ -774,6 +774,7 @@ WRITING = (
     ("plot", "run"),
     ("view", "run", "--html", "out/view.html"),
     ("export", "run", "--to", "json"),
+    ("export", "run", "--to", "out/body.inp"),
     ("new", "out/mine"),
 )
 

@@ -28,6 +28,7 @@ LAYERS = (
     {"methods"},
     {"statistics"},
     {"problem"},
+    {"datasets"},
     {"runs"},
     {"result"},
     {"pipeline", "installation_check"},

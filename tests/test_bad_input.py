@@ -712,11 +712,16 @@ def test_an_unknown_command_is_refused_with_the_likely_one(word, hint):
     assert f"No such command {word!r}{hint}\n" in outcome.err
 
 
-def test_the_result_in_place_of_its_run_folder_leads_to_the_folder(tiny):
+@pytest.mark.parametrize("command", ["report", "plot", "export", "animate", "view", "refine"])
+def test_the_result_in_place_of_its_run_folder_leads_to_the_folder(tiny, command):
     (tiny / "run").mkdir()
     (tiny / "run" / "result.json").write_text("{}")
     words = ("run/result.json: this is a file; expected a run folder, likely run",)
-    assert_refused(tiny, words, "report", "run/result.json")
+    options = ("--to", "febio") if command == "export" else ()
+    assert_refused(tiny, words, command, "run/result.json", *options)
+
+
+def test_another_file_in_place_of_a_run_folder_is_refused(tiny):
     words = ("problem.toml: this is a file; expected a run folder",)
     assert_refused(tiny, words, "report", "problem.toml")
 

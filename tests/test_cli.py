@@ -35,7 +35,7 @@ from rich.console import Console
 
 import collocation_sysid as cs
 from collocation_sysid import cli, pipeline
-from collocation_sysid.cli import command_options, common
+from collocation_sysid.cli import COMMAND_GROUPS, _command_sources, command_options, common
 from collocation_sysid.console import PlainConsole
 from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.problem.problem_reading import read_problem_file
@@ -658,6 +658,17 @@ def test_help_imports_nothing_that_solves():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert re.search(r"^  report +Write a report of a run or a study", done.stdout, re.MULTILINE)
+
+
+def test_every_command_is_in_exactly_one_group_of_the_help():
+    names = [name for group in COMMAND_GROUPS.values() for name in group]
+    assert sorted(names) == sorted(_command_sources())
+    words = [title.split()[0] for title in COMMAND_GROUPS]
+    assert words == ["Identify", "Inspect", "Extend", "Exchange", "Reference"]
+    sections = re.split(r"^(\w.*):$", run_command("--help").out, flags=re.MULTILINE)
+    listed = dict(zip(sections[1::2], sections[2::2], strict=True))
+    for title, group in COMMAND_GROUPS.items():
+        assert tuple(re.findall(r"^  ([a-z-]+)  ", listed[title], re.MULTILINE)) == group
 
 
 def test_version_and_help():

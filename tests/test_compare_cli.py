@@ -1,4 +1,4 @@
-"""`compare` and `sweep` from the command line: what they run, print, write and keep."""
+"""`compare-methods` and `sweep` from the command line: what they run, print, write and keep."""
 
 from __future__ import annotations
 
@@ -80,7 +80,16 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     folder = tmp_path_factory.mktemp("compared")
     file = state_vacuum(write_problem(folder, {"swing": 6}))
     out = folder / "study"
-    command = ["compare", file, "--methods", ",".join(METHODS), "--starts", 2, "--spread", 2]
+    command = [
+        "compare-methods",
+        file,
+        "--methods",
+        ",".join(METHODS),
+        "--starts",
+        2,
+        "--spread",
+        2,
+    ]
     command += ["--workers", 2, "--out", out, *KNOWN]
     first = run_command(*command)
     written = {path.name: path.stat().st_mtime_ns for path in (out / "runs").iterdir()}
@@ -154,7 +163,7 @@ def test_finished_runs_are_not_done_again(compared):
 
 def compare(*more: object) -> Outcome:
     return run_command(
-        "compare", "problem.toml", "--methods", "reduced-space", "--out", "out", *more
+        "compare-methods", "problem.toml", "--methods", "reduced-space", "--out", "out", *more
     )
 
 
@@ -217,8 +226,14 @@ def test_a_dry_run_only_lists_the_runs(tiny):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["compare", "problem.toml", "--methods", "interior"], "did you mean 'interior-point'?"),
-        (["compare", "nowhere.toml", "--methods", "reduced-space"], "there is no such file"),
+        (
+            ["compare-methods", "problem.toml", "--methods", "interior"],
+            "did you mean 'interior-point'?",
+        ),
+        (
+            ["compare-methods", "nowhere.toml", "--methods", "reduced-space"],
+            "there is no such file",
+        ),
         (["sweep", "problem.toml", "--over", "a=1:2"], "error: --over: found 1:2 for a; expected"),
         (["sweep", "problem.toml", "--over", "title=x", "--method", "nome"], "error: --method: "),
         (["sweep", "problem.toml", "--over", "object.mesh=a.vtu,b.vtu"], "a.vtu"),
@@ -229,6 +244,20 @@ def test_bad_input_is_refused_before_anything_runs(tiny, arguments, message):
     assert (outcome.code, outcome.out) == (2, "")
     assert message in outcome.err
     assert not (tiny / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        (("compare", "problem.toml", "--materials", "yeoh"), ("compare-methods", "compare-models")),
+        (("topics", "trial.mcap"), ("log LOG",)),
+    ],
+)
+def test_an_old_name_ends_with_the_new_names(tiny, words, names):
+    outcome = run_command(*words)
+    assert (outcome.code, outcome.out) == (2, "")
+    assert f"No such command '{words[0]}': it was" in outcome.err
+    assert all(name in outcome.err for name in names)
 
 
 # Sweeps -------------------------------------------------------------------------------------------

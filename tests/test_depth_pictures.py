@@ -199,7 +199,7 @@ def test_cameras_whose_names_meet_in_one_file_name_have_a_picture_each(tmp_path)
 def test_models_are_not_compared_by_what_only_a_depth_camera_sees(tmp_path):
     file = stated(tmp_path, POSE)
     both = "neo-hookean,st-venant-kirchhoff"
-    compared = run_command("compare", file, "--materials", both, "--out", tmp_path / "both")
+    compared = run_command("compare-models", file, "--materials", both, "--out", tmp_path / "both")
     assert compared.code == 2
     assert "'hanging' has neither markers nor a measured wrench" in " ".join(compared.err.split())
     assert not (tmp_path / "both").exists()

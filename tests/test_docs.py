@@ -67,7 +67,8 @@ def test_python_blocks_of_a_page_run_one_after_the_other(page: Path, checkout: P
 
 # What keeps a command of the pages short here.
 SHORT = {
-    "compare": ["--dry-run"],
+    "compare-methods": ["--dry-run"],
+    "compare-models": ["--dry-run"],
     "sweep": ["--dry-run"],
     "solve": ["--method", "reduced-space"],
     "design": ["--duration", "0.05", "--evaluations", "1", "--pairs", "0", "--no-film"],
@@ -225,12 +226,23 @@ def test_the_reference_lists_what_is_public_and_nothing_else():
     listed = re.findall(r"^   ([\w.]+)$", page, re.MULTILINE)
     live = [f"live.{name}" for name in cs.live.__all__]
     checks = [f"testing.{name}" for name in cs.testing.__all__]
-    assert sorted(listed) == sorted([*(set(cs.__all__) - {"live", "testing"}), *live, *checks])
+    datasets = [f"datasets.{name}" for name in cs.datasets.__all__]
+    modules = {"live", "datasets", "testing"}
+    public = set(cs.__all__) - modules
+    assert sorted(listed) == sorted([*public, *live, *datasets, *checks])
 
 
 def test_the_reference_of_the_command_line_has_every_command_and_option(reference):
     page = reference.command_line()
-    for command in ("solve", "check", "compare", "sweep", "report", "new"):
+    for command in (
+        "solve",
+        "check",
+        "compare-methods",
+        "compare-models",
+        "sweep",
+        "report",
+        "new",
+    ):
         assert f"\n## {command}\n" in page
     for option in ("--start", "--allow-code", "--time-limit", "--over"):
         assert f"`{option}`" in page

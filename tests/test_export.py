@@ -40,7 +40,14 @@ from collocation_sysid.recording import (
     Sphere,
     Wrench,
 )
-from collocation_sysid.result.export import TARGETS, IdentifiedBody, verify_export, write_export
+from collocation_sysid.result.export import (
+    MAIN_FILES,
+    TARGETS,
+    IdentifiedBody,
+    parse_destination,
+    verify_export,
+    write_export,
+)
 from collocation_sysid.result.export.export_target import equilibria
 from collocation_sysid.result.export.identified import without_obstacles
 from collocation_sysid.result.export.obstacle_shapes import Facets, faceted_obstacles
@@ -596,6 +603,103 @@ def test_an_earlier_export_is_replaced(run_folder, tmp_path):
     for to in ("sofa", "json"):
         assert run_command("export", run_folder, "--to", to, "--out", tmp_path / "out").code == 0
     assert not (tmp_path / "out" / "body.scn").exists()
+
+
+# Destinations
+
+
+def test_a_file_gets_the_format_of_its_suffix(run_folder, tmp_path):
+    file = tmp_path / "deck" / "swing.inp"
+    ended = run_command("export", run_folder, "--to", file, "--json")
+    assert ended.code == 0, ended.err
+    said = json.loads(ended.out)
+    assert (said["folder"], said["file"]) == (str(file.parent), str(file))
+    names = ["swing.inp", "swing_identified.json", "swing_poses_1.csv"]
+    assert sorted(f.name for f in file.parent.iterdir()) == [".collocation-sysid.json", *names]
+    assert run_command("export", run_folder, "--to", "calculix", "--out", tmp_path / "b").code == 0
+    for name, same in zip(names, ("body.inp", "identified.json", "poses_1.csv"), strict=True):
+        assert (file.parent / name).read_bytes() == (tmp_path / "b" / same).read_bytes()
+
+
+@pytest.mark.parametrize("to", MAIN_FILES)
+def test_every_format_is_found_by_its_name_and_by_its_suffix(to: str):
+    run = Path("run")
+    suffix = Path(MAIN_FILES[to]).suffix
+    by_name = parse_destination(to, MAIN_FILES, run)
+    assert (by_name.format_name, by_name.folder) == (to, run / f"export-{to}")
+    assert parse_destination(to, MAIN_FILES, run, Path("out")).folder == Path("out")
+    by_suffix = parse_destination(f"a/b{suffix.upper()}", MAIN_FILES, run)
+    assert (by_suffix.format_name, by_suffix.is_folder) == (to, False)
+    for folder in (f"a/{to}", f"export-{to}"):
+        found = parse_destination(folder, MAIN_FILES, run)
+        assert (found.format_name, found.folder, found.is_folder) == (to, Path(folder), True)
+
+
+def test_newton_finds_its_numbers_under_any_name(run_folder, tmp_path):
+    assert run_command("export", run_folder, "--to", tmp_path / "foam.py").code == 0
+    assert {"nodes_m", "cells"} <= json.loads((tmp_path / "foam.json").read_text()).keys()
+    assert 'Path(__file__).with_suffix(".json")' in (tmp_path / "foam.py").read_text()
+
+
+@needs_mujoco
+def test_a_file_is_verified_like_a_folder(run_folder, tmp_path):
+    ended = run_command("export", run_folder, "--to", tmp_path / "swing.xml", "--verify", "--json")
+    assert ended.code == 0, ended.err
+    assert all(abs(each["relative"]) < 0.1 for each in json.loads(ended.out)["verified"])
+    assert json.loads(ended.out)["verified"]
+
+
+@pytest.mark.parametrize("to", ["body.stl", "body", "out/body", "mujco"])
+def test_an_unknown_destination_is_refused_with_all_formats(run_folder, to: str, tmp_path):
+    ended = run_command("export", run_folder, "--to", to if to == "mujco" else tmp_path / to)
+    assert ended.code == 2
+    said = " ".join(ended.err.split())
+    for name, file in MAIN_FILES.items():
+        assert f"{name} ({Path(file).suffix})" in said
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_a_suffix_of_several_formats_needs_the_name():
+    several = {**MAIN_FILES, "abaqus": "model.inp"}
+    with pytest.raises(InputError, match="suffix of calculix and abaqus; write the name") as error:
+        parse_destination("deck.inp", several, Path("run"))
+    assert error.value.where == "--to"
+
+
+def test_a_destination_is_named_once(run_folder, tmp_path):
+    ended = run_command("export", run_folder, "--to", "body.inp", "--out", tmp_path / "out")
+    assert (ended.code, "leave out --out" in ended.err) == (2, True)
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_a_file_replaces_only_files_of_an_earlier_export(run_folder, tmp_path):
+    words = ("export", run_folder, "--to", tmp_path / "swing.json")
+    (tmp_path / "mine.txt").write_text("mine")
+    for _ in range(2):
+        assert run_command(*words).code == 0
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+    (tmp_path / "swing_poses_1.csv").write_text("edited")
+    (tmp_path / "swing.json").unlink()
+    ended = run_command(*words)
+    assert ended.code == 2
+    assert "swing_poses_1.csv: this file exists and was not written" in ended.err
+    assert (tmp_path / "swing_poses_1.csv").read_text() == "edited"
+    assert not (tmp_path / "swing.json").exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links of POSIX")
+def test_a_file_is_not_written_through_a_link(run_folder, tmp_path):
+    (tmp_path / "theirs.json").write_text("{}")
+    (tmp_path / "swing.json").symlink_to(tmp_path / "theirs.json")
+    ended = run_command("export", run_folder, "--to", tmp_path / "swing.json")
+    assert (ended.code, (tmp_path / "theirs.json").read_text()) == (2, "{}")
+    (tmp_path / "linked").symlink_to(tmp_path)
+    ended = run_command("export", run_folder, "--to", tmp_path / "linked" / "other.json")
+    assert (ended.code, "nothing is written through links" in ended.err) == (2, True)
+    assert not (tmp_path / "other.json").exists()
+    (tmp_path / "folder.json").mkdir()
+    ended = run_command("export", run_folder, "--to", tmp_path / "folder.json")
+    assert (ended.code, "is a folder; expected a file" in ended.err) == (2, True)
 
 
 def test_an_experiment_that_is_not_there_is_refused(run_folder, tmp_path):

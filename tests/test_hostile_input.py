@@ -136,6 +136,25 @@ def test_a_damaged_cloud_is_refused_in_one_line(
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize("name", ["cloud.xyz", "cloud.npz", "image.npz"])
+def test_a_depth_file_with_a_length_beyond_all_measures_is_refused(tmp_path: Path, name: str):
+    points_m = np.full((4, 3), 0.5)
+    points_m[2, 1] = 1e30
+    if name == "cloud.xyz":
+        np.savetxt(tmp_path / name, points_m)
+    else:
+        key = "points_m" if name == "cloud.npz" else "depth_m"
+        np.savez(tmp_path / name, **{key: points_m})
+    with pytest.raises(InputError, match=rf"{name}: contains the length 1e\+30 m; expected at"):
+        read_depth(tmp_path / name, None, 1.0)
+
+
+def test_lengths_in_a_depth_file_that_are_not_finite_are_missing_values(tmp_path: Path):
+    np.savez(tmp_path / "image.npz", depth_m=np.array([[0.5, np.nan], [np.inf, 0.6]]))
+    (image,) = read_depth(tmp_path / "image.npz", None, 1.0).images_m
+    assert np.isfinite(image).sum() == 2
+
+
 def test_an_array_that_its_header_states_too_large_is_refused(tmp_path: Path):
     array = np.zeros((20_000, 100, 100), dtype="u1")
     np.savez_compressed(tmp_path / "zeros.npz", depth_m=array)
@@ -163,7 +182,7 @@ def test_a_log_that_is_a_pipe_is_refused(tiny: Path, name: str):
     (tiny / "bag").mkdir(exist_ok=True)
     (tiny / "bag" / "metadata.yaml").write_text("")
     os.mkfifo(tiny / name)
-    words = ["topics", name.partition("/")[0]]
+    words = ["log", name.partition("/")[0]]
     done = subprocess.run(
         [sys.executable, "-c", COMMAND_LINE, *words], capture_output=True, text=True, timeout=300
     )
@@ -227,8 +246,11 @@ def test_so_is_such_an_override(tiny: Path, value: str):
 @pytest.mark.parametrize(
     ("words", "found"),
     [
-        (("compare", "--methods", "shooting", "--starts", "1000000"), "asks for 1,000,000 starts"),
-        (("compare", "--prony", "0,1000000"), "whole numbers up to 20"),
+        (
+            ("compare-methods", "--methods", "shooting", "--starts", "1000000"),
+            "asks for 1,000,000 starts",
+        ),
+        (("compare-models", "--prony", "0,1000000"), "whole numbers up to 20"),
         (("sweep", "--over", "solver.huber=1:2:1000000"), "asks for 1,000,000 values"),
         (("sweep", "--over", f"solver.huber=1:2:1{'0' * 30}"), "asks for more than 10"),
         (

@@ -167,12 +167,12 @@ def test_a_log_tells_what_its_topics_can_serve_as(tmp_path: Path) -> None:
         )
     ]
     log = bag(tmp_path / "trial", messages)
-    topics = {each["name"]: each for each in json.loads(run_command("topics", log, "--json").out)}
+    topics = {each["name"]: each for each in json.loads(run_command("log", log, "--json").out)}
     assert topics["/markers"]["serves"] == "marker tracks: left, right"
     assert topics["/tf"]["write"] == ["trial#/tf#base>tool"]
     assert topics["/wrench"]["rate_hz"] == pytest.approx(50, rel=1e-3)
     assert topics["/wrench"]["messages"] == len(T_S)
-    assert "trial#/tf#base>tool" in run_command("topics", log).out
+    assert "trial#/tf#base>tool" in run_command("log", log).out
 
 
 def test_topics_offer_the_chains_of_frames_that_can_be_read(tmp_path: Path) -> None:
@@ -201,7 +201,7 @@ def test_addresses_of_topics_are_lines_that_can_be_copied(tmp_path: Path, monkey
         [of.tree(t, of.transform(t, "world_of_the_robot", tool, (0, 0, t), STILL)) for t in T_S],
     )
     address = f"trial#/tf#world_of_the_robot>{tool}"
-    out = run_command("topics", log).out
+    out = run_command("log", log).out
     assert f"  {address}" in out.splitlines()
     row = next(line for line in out.splitlines() if line.startswith("/tf"))
     assert "TFMessage" in row
@@ -209,7 +209,7 @@ def test_addresses_of_topics_are_lines_that_can_be_copied(tmp_path: Path, monkey
     file = io.StringIO()
     console = PlainConsole(file=file, width=40, force_terminal=True, color_system=None)
     monkeypatch.setattr(common, "PlainConsole", lambda: console)
-    run_command("topics", log)
+    run_command("log", log)
     assert f"  {address}" in file.getvalue().splitlines()
 
 

@@ -624,14 +624,14 @@ def test_a_model_that_cannot_be_simulated_elsewhere_is_named():
 def test_a_comparison_of_models_from_the_command_line(tiny: Path, monkeypatch):
     monkeypatch.chdir(tiny)
     monkeypatch.setenv("COLUMNS", "80")
-    words = ("compare", "problem.toml", "--materials", "neo-hookean,st-venant-kirchhoff")
-    words = (*words, "--methods", "reduced-space", "--workers", "2", "--out", "models")
+    words = ("compare-models", "problem.toml", "--materials", "neo-hookean,st-venant-kirchhoff")
+    words = (*words, "--method", "reduced-space", "--workers", "2", "--out", "models")
     done = run_command(*words, "--quiet")
     assert done.code == 0, done.err
     assert "Use " in done.out
     assert "the last third of the recording" in done.out
     summary = json.loads((tiny / "models" / "summary.json").read_text())
-    assert summary["kind"] == "models"
+    assert summary["kind"] == "compare-models"
     assert summary["advice"] in done.out
     assert [row["model"] for row in summary["runs"]] == ["neo-hookean", "st-venant-kirchhoff"]
     assert sum(row["chosen"] for row in summary["runs"]) == 1
@@ -645,7 +645,14 @@ def test_a_comparison_of_models_from_the_command_line(tiny: Path, monkeypatch):
 @pytest.mark.long
 def test_a_comparison_of_laws_of_damping_from_the_command_line(tiny: Path, monkeypatch):
     monkeypatch.chdir(tiny)
-    words = ("compare", "problem.toml", "--damping", "kelvin-voigt,material", "--out", "laws")
+    words = (
+        "compare-models",
+        "problem.toml",
+        "--damping",
+        "kelvin-voigt,material",
+        "--out",
+        "laws",
+    )
     done = run_command(*words, "--quiet")
     assert done.code == 0, done.err
     summary = json.loads((tiny / "laws" / "summary.json").read_text())
@@ -656,7 +663,18 @@ def test_a_comparison_of_laws_of_damping_from_the_command_line(tiny: Path, monke
 
 
 def test_there_must_be_something_to_compare(tiny: Path):
-    nothing = run_command("compare", "problem.toml")
+    nothing = run_command("compare-models", "problem.toml")
     assert (nothing.code, "--materials, --damping, --prony or --with" in nothing.err) == (2, True)
-    several = ("compare", "problem.toml", "--materials", "gent,yeoh", "--methods")
-    assert "expected one method" in run_command(*several, "reduced-space,shooting").err
+    words = ("compare-models", "problem.toml", "--materials", "gent,yeoh", "--method")
+    refused = run_command(*words, "reduced-spaced")
+    assert (refused.code, "--method: " in refused.err) == (2, True)
+    assert "did you mean 'reduced-space'?" in refused.err
+
+
+def test_one_method_fits_all_models(tiny: Path):
+    words = ("compare-models", "problem.toml", "--materials", "gent,yeoh", "--dry-run", "--json")
+    planned = json.loads(run_command(*words, "--method", "interior-point").out)
+    assert planned
+    assert {run["method"] for run in planned} == {"interior-point"}
+    several = run_command(*words, "--method", "interior-point,reduced-space")
+    assert (several.code, "expected one method" in several.err) == (2, True)

@@ -170,7 +170,7 @@ def test_a_file_that_gives_no_material_is_refused(tiny, content, function, expec
 
 def test_a_study_runs_allowed_code_in_its_workers(tiny):
     OWN_MATERIAL(tiny)
-    command = ("compare", "problem.toml", "--methods", "reduced-space", "--workers", "1")
+    command = ("compare-methods", "problem.toml", "--methods", "reduced-space", "--workers", "1")
     outcome = run_command(*command, "--allow-code", "--quiet", "--out", "study")
     assert outcome.code == 0, outcome.err
     summary = json.loads((tiny / "study/summary.json").read_text())

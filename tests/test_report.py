@@ -197,7 +197,7 @@ def comparison(tmp_path_factory: pytest.TempPathFactory) -> Path:
     truth = ",".join(f"{name}={value}" for name, value in TRUTH.items())
     methods = ("--methods", "reduced-space,shooting", "--truth", truth)
     out = folder / "compare"
-    outcome = run_command("compare", folder / "problem.toml", *methods, "--out", out)
+    outcome = run_command("compare-methods", folder / "problem.toml", *methods, "--out", out)
     assert outcome.code == 0, outcome.err
     return out
 
@@ -213,7 +213,7 @@ def test_a_comparison_has_a_page_too(comparison: Path):
 
 
 def test_a_damaged_comparison_is_refused(comparison: Path, tmp_path: Path):
-    (tmp_path / "summary.json").write_text('{"schema": 4, "kind": "compare"}')
+    (tmp_path / "summary.json").write_text('{"schema": 4, "kind": "compare-methods"}')
     outcome = run_command("report", tmp_path)
     assert outcome.code == 2
     assert "summary.json is damaged" in outcome.err

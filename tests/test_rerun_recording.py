@@ -133,6 +133,16 @@ def test_one_experiment_is_written_alone(run_folder, tmp_path):
     assert run_command("export", run_folder, "--to", "rerun", "--experiment", "nod").code == 2
 
 
+def test_a_recording_can_be_a_file_beside_others(run_folder, tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    file = tmp_path / "swing.rrd"
+    outcome = run_command("export", run_folder, "--to", file)
+    assert (outcome.code, outcome.out.splitlines()[-1]) == (0, str(file))
+    names = [each.name for each in tmp_path.iterdir()]
+    assert sorted(names) == [".collocation-sysid.json", "mine.txt", "swing.rrd"]
+    assert "swing/body" in read_back(file)
+
+
 def test_missing_markers_are_left_out(run_folder, tmp_path):
     damaged = tmp_path / "run"
     shutil.copytree(run_folder, damaged)
@@ -153,7 +163,7 @@ def test_missing_markers_are_left_out(run_folder, tmp_path):
 def test_it_cannot_be_verified(run_folder):
     outcome = run_command("export", run_folder, "--to", "rerun", "--verify")
     assert outcome.code == 2
-    assert "a recording predicts nothing" in outcome.err
+    assert "has no predictions to verify" in outcome.err
 
 
 def test_without_the_extra_the_error_names_it(run_folder, tmp_path, monkeypatch):

@@ -101,10 +101,13 @@ def test_what_does_not_belong_in_a_table_is_refused(tiny, override: str, message
 def test_the_methods_are_listed_with_a_line_on_each():
     listed = run_command("methods").out
     assert all(method in listed for method in METHODS)
-    assert "Interior point, by IPOPT." in listed
+    assert "Interior-point method (IPOPT) for parameters and trajectories together." in listed
     told = json.loads(run_command("methods", "--json").out)
     assert list(told) == list(METHODS)
-    assert told["interior-point"] == "Interior point, by IPOPT."
+    assert (
+        told["interior-point"]
+        == "Interior-point method (IPOPT) for parameters and trajectories together."
+    )
 
 
 @each_method

@@ -98,7 +98,7 @@ def test_simulate_asks_for_a_value(folder):
 
 
 def test_starts_need_something_to_spread_about(folder):
-    command = ("compare", folder / "problem.toml", "--methods", "reduced-space", *UNGUESSED)
+    command = ("compare-methods", folder / "problem.toml", "--methods", "reduced-space", *UNGUESSED)
     outcome = run_command(*command, "--starts", 2, "--dry-run")
     assert outcome.code == 2
     assert "parameters.lambda_pa: has neither a guess nor a true value" in outcome.err
@@ -108,7 +108,7 @@ def test_starts_need_something_to_spread_about(folder):
 
 def test_a_comparison_without_a_guess_tells_where_it_started(folder):
     out = folder / "compared"
-    command = ("compare", folder / "problem.toml", "--methods", "reduced-space", *UNGUESSED)
+    command = ("compare-methods", folder / "problem.toml", "--methods", "reduced-space", *UNGUESSED)
     truth = [word for name, value in TRUTH.items() for word in ("--truth", f"{name}={value}")]
     outcome = run_command(*command, *truth, "--out", out, "--json", "--workers", 1)
     assert outcome.code == 0, outcome.err

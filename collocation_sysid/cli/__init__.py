@@ -1,10 +1,11 @@
 """Command line of the package: results on stdout, progress and messages on stderr.
 
 Each command is a function in one of the modules `FAMILIES`: `problem_commands` (solve, simulate,
-check), `run_commands` (refine, export, plot, report, animate, view), `study_commands` (compare,
-sweep), `design_commands` (design), `stream_commands` (live, replay) and `texts` (methods, schema,
-explain, topics, new). `command_options` makes command-line options from dataclasses, `common` has
-exit codes and output, and `markdown` shows documentation on a terminal.
+check), `run_commands` (refine, export, plot, report, animate, view), `study_commands`
+(compare-methods, compare-models, sweep), `design_commands` (design), `stream_commands` (live,
+replay), `installation_commands` (doctor, completion) and `texts` (methods, schema, explain, log,
+new). `command_options` makes command-line options from dataclasses, `common` has exit codes and
+output, and `markdown` shows documentation on a terminal.
 
 Exit codes: 0 converged, 1 not converged or, with ``solve --strict``, doubtful, 2 bad input,
 130 interrupted.
@@ -39,6 +40,20 @@ FAMILIES = (
     "texts",
     "installation_commands",
 )
+# Groups of commands in the help, in the order in which a user needs them.
+COMMAND_GROUPS = {
+    "Identify parameters": ("new", "check", "solve", "refine", "live", "replay"),
+    "Inspect a run": ("report", "plot", "animate", "view"),
+    "Extend a study": ("simulate", "compare-models", "compare-methods", "sweep", "design"),
+    "Exchange data": ("log", "export"),
+    "Reference and installation": ("explain", "methods", "schema", "doctor", "completion"),
+}
+# Commands that were replaced, with the message to who types their old name.
+REPLACED_COMMANDS = {
+    "compare": "it was divided in two. compare-methods compares the methods that --methods names, "
+    "and compare-models compares materials, laws of damping and branches by held-out data",
+    "topics": "it was renamed. log LOG lists the topics in a robot's log",
+}
 
 
 @cache
@@ -52,8 +67,13 @@ def _command_sources() -> dict[str, tuple[str, str]]:
         for each in ast.parse(text).body:
             if isinstance(each, ast.FunctionDef) and each.decorator_list:
                 summary = (ast.get_docstring(each) or "").partition("\n")[0]
-                commands[each.name] = f"{__name__}.{family}", summary
+                commands[_command_name(each.name)] = f"{__name__}.{family}", summary
     return commands
+
+
+def _command_name(function: str) -> str:
+    """Return the name of the command that a function called `function` implements."""
+    return function.replace("_", "-")
 
 
 class LazyCommands(TyperGroup):
@@ -72,25 +92,28 @@ class LazyCommands(TyperGroup):
             return None
         with error_console.status("starting"):  # on a terminal only; it takes a second
             family = import_module(_command_sources()[cmd_name][0]).commands.registered_commands
-        info = next(each for each in family if each.callback.__name__ == cmd_name)
+        info = next(each for each in family if _command_name(each.callback.__name__) == cmd_name)
         how = {"pretty_exceptions_short": False, "rich_markup_mode": None}
         return get_command_from_info(info, **how)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the name and the command that the arguments begin with, and the other arguments.
 
-        An unknown name ends the program with a message that suggests a similar command.
+        An unknown name ends the program with a message that suggests a similar command, or the
+        commands that replace it.
         """
+        if args and (replacement := REPLACED_COMMANDS.get(args[0])):
+            ctx.fail(f"No such command {args[0]!r}: {replacement}.")
         if args and args[0] not in _command_sources() and not ctx.resilient_parsing:
             ctx.fail(f"No such command {args[0]!r}{hint_at(args[0], _command_sources()) or '.'}")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a line on each command into the help."""
-        with formatter.section("Commands"):
-            formatter.write_dl(
-                [(name, summary) for name, (_, summary) in _command_sources().items()]
-            )
+        """Write a line on each command into the help, by groups."""
+        sources = _command_sources()
+        for title, names in COMMAND_GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name, sources[name][1]) for name in names])
 
 
 app = typer.Typer(

@@ -35,6 +35,7 @@ from typer.models import OptionInfo, ParameterInfo
 from ..declarations import attributes
 from ..display import Shown
 from ..errors import InputError
+from ..files import require_run_folder
 from ..serialisation import as_json
 from ..validated_types import Options
 from .common import error_console, print_result
@@ -235,6 +236,16 @@ class RunFolderOptions:
     """
 
     run_folder: Annotated[Path, typer.Argument()]
+
+    def __post_init__(self) -> None:
+        """Refuse a file of a run folder in its place, and name the folder.
+
+        Raises
+        ------
+        InputError
+            If the run folder is a file.
+        """
+        require_run_folder(self.run_folder)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,12 +23,14 @@ class DoctorCommand(OutputOptions):
 
 @command(commands, "doctor", "doctor --json")
 def doctor(options: DoctorCommand) -> None:
-    """Check the installation, with a self test.
+    """Check the installation and run a self test.
 
-    Versions of the dependencies, solvers, the kernel cache, threads and extras are listed.
+    The command lists the versions of the required packages, the solvers, the cache of compiled
+    kernels, the threads and the extras. The self test identifies the stiffness of a small simulated
+    block.
 
-    The self test identifies the stiffness of a small simulated block. The exit code is 0 if all
-    required packages are there and the test passes, and 2 otherwise; missing extras do not matter.
+    The exit code is 0 if all required packages are installed in suitable versions and the self test
+    passes, and 2 otherwise. Extras are optional and do not change it.
     """
     with error_console.status("checking the installation"):
         report = check_installation()
@@ -37,7 +39,7 @@ def doctor(options: DoctorCommand) -> None:
 
 
 class Shell(StrEnum):
-    """Shells with completion."""
+    """Shells for which a completion script can be printed."""
 
     BASH = "bash"
     ZSH = "zsh"
@@ -66,10 +68,10 @@ class CompletionCommand:
 def completion(options: CompletionCommand) -> None:
     """Print a script for completion in bash, zsh or fish.
 
-    It completes commands, options, values and files.
+    The script completes commands, options, their values and files.
 
-    New shells read it from the files of the examples; ~/.zfunc has to be in zsh's fpath before
-    compinit. Print it again after an upgrade.
+    Write it to the file of the example for your shell, from which new shells read it. For zsh, add
+    the folder ~/.zfunc to fpath before compinit. Print the script again after an upgrade.
     """
     from typer.main import get_command
 
@@ -141,7 +143,8 @@ def _kernel_rows(report: InstallationReport) -> dict[str, str]:
     kernels = report.kernels
     if kernels is None:
         return {
-            "compiler": "none, as llvmlite cannot be imported: CasADi evaluates, which is slower"
+            "compiler": "none, because llvmlite cannot be imported; CasADi evaluates the elements, "
+            "which is slower"
         }
     stored = f"{kernels.count} kernels, {number(kernels.size_mb, 3)} MB"
     state = "writable" if kernels.fault is None else f"not used: {kernels.fault}"

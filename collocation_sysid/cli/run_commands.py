@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.text import Text
@@ -24,6 +24,9 @@ from .command_options import (
     command,
 )
 from .common import error_console, interruption_exit, print_result
+
+if TYPE_CHECKING:
+    from ..result.export import ExportDestination  # which takes a second to import
 
 commands = typer.Typer()
 
@@ -74,14 +77,17 @@ class ExportCommand(RunFolderOptions):
 
     Attributes
     ----------
-    to : TARGET
-        mujoco, usd, newton, sofa, febio, calculix or json; rerun for a viewer.
+    to : FILE|FORMAT
+        Destination: a file .xml (MuJoCo), .usda, .py (Newton), .scn (SOFA), .feb, .inp (CalculiX),
+        .json or .rrd (Rerun); or a format: mujoco, usd, newton, sofa, febio, calculix, json, rerun.
+    out : DIR
+        Folder for a format, instead of export-FORMAT in the run folder.
     verify : bool
         Simulate the exported body in the target, and compare the results.
     """
 
     to: str
-    out: OutputFolder = None
+    out: Path | None = None
     experiment: OneExperiment = None
     verify: bool = False
     allow_code: AllowCode = False
@@ -89,35 +95,53 @@ class ExportCommand(RunFolderOptions):
 
 
 @command(
-    commands, "export runs/swing --to mujoco", "export runs/swing --to calculix --out deck --verify"
+    commands,
+    "export runs/swing --to body.inp",
+    "export runs/swing --to mujoco",
+    "export runs/swing --to calculix --out deck --verify",
 )
 def export(options: ExportCommand) -> None:
     """Write the identified body for another simulator: mesh, material, damping, grasp.
 
-    Properties that the target cannot represent are printed. The files are written to export-TARGET
-    in the run folder by default. The target rerun is a recording of the motion, of all experiments
-    or one, for the Rerun viewer.
+    Properties that the target cannot represent are printed. A file of --to gets the format of its
+    suffix; the poses and identified.json are written beside it, with its name before theirs. A
+    format writes a folder of files, export-FORMAT in the run folder by default. A folder whose name
+    is a format, such as out/mujoco, is a destination too.
+
+    The format rerun is a recording of the motion, of all experiments or one, for the Rerun viewer.
     """
-    if options.to == "rerun":
-        _export_recording(options)
-        return
+    from ..result.export import MAIN_FILES, parse_destination
+    from ..result.export.rerun_recording import TARGET as RECORDING
+
+    destination = parse_destination(options.to, MAIN_FILES, options.run_folder, options.out)
+    if destination.format_name == RECORDING:
+        _export_recording(options, destination)
+    else:
+        _export_body(options, destination)
+
+
+def _export_body(options: ExportCommand, destination: ExportDestination) -> None:
+    """Write the body of a run for a simulator, and print what the simulator cannot express."""
     from ..result.export import (
+        TARGETS,
         IdentifiedBody,
         comparison_table,
-        target_named,
         verify_export,
         write_export,
     )
 
-    target = target_named(options.to)
-    folder = options.out or options.run_folder / f"export-{options.to}"
-    require_possible(folder)
+    name = destination.format_name
+    target = TARGETS[name]
+    destination.require_possible()
     body = IdentifiedBody.read(options.run_folder, options.experiment, options.allow_code)
-    exported = write_export(body, options.to, folder)
-    compared = verify_export(body, options.to, folder) if options.verify else []
+    with destination.export_folder() as folder:
+        exported = write_export(body, name, folder)
+        destination.place_files(folder, target.main_file)
+        compared = verify_export(body, name, folder) if options.verify else []
     if options.as_json:
         report = {
-            "folder": str(folder),
+            "folder": str(destination.folder),
+            "file": str(destination.main_file),
             "warnings": body.warnings,
             "not_expressed": exported.limitations,
             "verified": [
@@ -130,23 +154,33 @@ def export(options: ExportCommand) -> None:
     print_result(f"not expressed: {each}" for each in exported.limitations)
     if options.verify:
         print_result(comparison_table(target.name, compared))
-    typer.echo(folder)
+    typer.echo(destination.folder if destination.is_folder else destination.main_file)
 
 
-def _export_recording(options: ExportCommand) -> None:
+def _export_recording(options: ExportCommand, destination: ExportDestination) -> None:
     """Write the recording of a run for the Rerun viewer, and print what is missing in it."""
     from ..result.export.rerun_recording import RECORDING_FILE, write_rerun
 
     if options.verify:
-        raise InputError("a recording predicts nothing; leave it out", None, "--verify")
-    folder = options.out or options.run_folder / f"export-{options.to}"
-    require_possible(folder)
-    missing = write_rerun(options.run_folder, folder, options.experiment)
+        raise InputError(
+            "a recording for a viewer has no predictions to verify; leave out --verify",
+            None,
+            "--verify",
+        )
+    destination.require_possible()
+    with destination.export_folder() as folder:
+        missing = write_rerun(options.run_folder, folder, options.experiment)
+        destination.place_files(folder, RECORDING_FILE)
     if options.as_json:
-        typer.echo(as_json({"folder": str(folder), "not_expressed": missing}))
+        report = {
+            "folder": str(destination.folder),
+            "file": str(destination.main_file),
+            "not_expressed": missing,
+        }
+        typer.echo(as_json(report))
         return
     print_result(f"not expressed: {each}" for each in missing)
-    typer.echo(folder / RECORDING_FILE)
+    typer.echo(destination.main_file)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,7 +212,7 @@ class ReportCommand:
     Attributes
     ----------
     folder : FOLDER
-        A run folder, or an output folder of compare or sweep.
+        A run folder, or the output folder of compare-methods, compare-models or sweep.
     to : FILE
         Output file, .html or .md; report.html in the folder by default.
     """
@@ -187,7 +221,7 @@ class ReportCommand:
     to: Path | None = None
 
 
-@command(commands, "report runs/swing", "report runs/compare --to comparison.html")
+@command(commands, "report runs/swing", "report runs/swing-sweep --to sweep.html")
 def report(options: ReportCommand) -> None:
     """Write a report of a run or a study as one HTML page or a Markdown file.
 

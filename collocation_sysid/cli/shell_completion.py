@@ -80,13 +80,13 @@ def named_values() -> dict[str, dict[str, tuple[str, ...]]]:
     """Return the possible values of texts, by command and parameter."""
     from ..methods import METHODS
     from ..pages import page_files
-    from ..result.export import TARGETS, rerun_recording
+    from ..result.export import MAIN_FILES
 
     return {
         "solve": {"method": tuple(METHODS)},
         "methods": {"name": tuple(METHODS)},
         "explain": {"topics": tuple(page_files())},
-        "export": {"to": (*TARGETS, rerun_recording.TARGET)},
+        "export": {"to": tuple(MAIN_FILES)},
     }
 
 

@@ -1,4 +1,4 @@
-"""Commands that run many problems: compare and sweep."""
+"""Commands that run many problems: compare-methods, compare-models and sweep."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from ..plan import (
 )
 from ..plan.model_variants import models, parse_branches, parse_dampings, parse_materials
 from ..plan.study_arguments import parse_methods, parse_varied_keys, read_truth
+from ..plan.study_kinds import METHOD_STUDY, MODEL_STUDY, STUDY_TITLES, SWEEP_STUDY
 from ..plan.study_rows import SuccessCriterion
 from ..problem import Problem
 from ..validated_types import Positive
@@ -48,13 +49,59 @@ class StudyOptions(ProblemOptions, OutputOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareCommand(StudyOptions):
-    """Options of `compare`.
+class CompareMethodsCommand(StudyOptions):
+    """Options of `compare-methods`.
 
     Attributes
     ----------
     methods : A,B,…
         Methods to compare, each with its options in the problem file.
+    truth : FILE|NAME=VALUE
+        True parameters: a TOML file, or values.
+    within : float
+        Largest relative error of a successful run.
+    """
+
+    methods: str
+    starts: Starts
+    truth: list[str] | None = None
+    within: Positive = 0.01
+
+
+@command(
+    commands,
+    "compare-methods problem.toml --methods reduced-space,shooting --starts 40",
+    "compare-methods problem.toml --methods penalty,interior-point --truth truth.toml",
+)
+def compare_methods(options: CompareMethodsCommand) -> None:
+    """Compare methods from several initial guesses by success, accuracy and time.
+
+    All methods solve the same problem from the same guesses. The materials, laws of damping or
+    branches of a body are compared by the command compare-models.
+
+    Finished runs are kept in the output folder: the same command resumes the study.
+    """
+    methods = parse_methods(options.methods)
+    problem = options.read_problem()
+    free = [item.name for item in problem.parameters.free]
+    truth = read_truth(options.truth or (), problem.parameters.names, free)
+    planned = plan_comparison(
+        problem,
+        methods,
+        overrides=options.set_ or (),
+        starts=options.starts,
+        truth=truth,
+        allow_code=options.allow_code,
+    )
+    _run_study(METHOD_STUDY, options, planned, yardstick=SuccessCriterion(truth, options.within))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareModelsCommand(StudyOptions):
+    """Options of `compare-models`.
+
+    Attributes
+    ----------
     materials : A,B,…
         Materials to compare, instead of the object's.
     damping : A,B,…
@@ -66,96 +113,51 @@ class CompareCommand(StudyOptions):
         body.
     with_ : FILE
         Another problem file of the same recordings, as a model.
-    truth : FILE|NAME=VALUE
-        True parameters: a TOML file, or values.
-    within : float
-        Largest relative error of a successful run.
+    method : str
+        The method that fits every model, instead of that in the problem file.
     """
 
-    methods: str | None = None
     materials: str | None = None
     damping: str | None = None
     prony: str | None = None
     region: str | None = None
     with_: list[Path] | None = None
-    starts: Starts
-    truth: list[str] | None = None
-    within: Positive = 0.01
+    method: str | None = None
 
 
 @command(
     commands,
-    "compare problem.toml --methods reduced-space,shooting --starts 40",
-    "compare problem.toml --methods penalty,shooting --truth truth.toml",
-    "compare problem.toml --materials neo-hookean,yeoh",
-    "compare problem.toml --damping kelvin-voigt,material,rayleigh",
+    "compare-models problem.toml --materials neo-hookean,yeoh",
+    "compare-models problem.toml --damping kelvin-voigt,material,rayleigh",
+    "compare-models problem.toml --prony 0,1 --region tip",
 )
-def compare(options: CompareCommand) -> None:
-    """Compare methods from several initial guesses, or fit several models and recommend one.
+def compare_models(options: CompareModelsCommand) -> None:
+    """Fit models of material and damping, and recommend one by held-out data.
 
-    With --materials, --damping, --prony or --with, each model is fitted to all recordings, and then
-    to all but one, which it predicts; of a single recording, the last third is held out. A model
-    applies to the whole body, or to the region named by --region. --with adds other problem files
-    as models, each combined with all stated materials, laws of damping and numbers of branches.
+    Each model is fitted to all recordings, and then to all but one, which it predicts; of a single
+    recording, the last third is held out. A model applies to the whole body, or to the region named
+    by --region. --with adds other problem files as models, each combined with all stated materials,
+    laws of damping and numbers of branches.
 
     Finished runs are kept in the output folder: the same command resumes the study.
     """
-    methods = parse_methods(options.methods) if options.methods is not None else ()
+    if not options.with_ and {options.materials, options.damping, options.prony} == {None}:
+        raise InputError("no models to compare; expected --materials, --damping, --prony or --with")
+    method = _single_method(options.method)
     problem = options.read_problem()
-    if options.with_ or {options.materials, options.damping, options.prony} != {None}:
-        _run_study("models", options, _planned_models(options, problem, methods))
-        return
-    if not methods:
-        raise InputError(
-            "nothing to compare; expected --methods, --materials, --damping, --prony or --with"
-        )
-    free = [item.name for item in problem.parameters.free]
-    truth = read_truth(options.truth or (), problem.parameters.names, free)
-    yardstick = SuccessCriterion(truth, options.within)
-    planned = plan_comparison(
-        problem,
-        methods,
-        options.set_ or (),
-        options.starts,
-        truth,
-        options.allow_code,
-    )
-    _run_study("compare", options, planned, yardstick)
-
-
-def _planned_models(
-    options: CompareCommand, problem: Problem, methods: Sequence[str]
-) -> Sequence[PlannedRun]:
-    """Return the runs that compare models: materials, damping laws, branches, or other problem
-    files.
-
-    Raises
-    ------
-    InputError
-        For more than one method, or a model that the problem cannot have.
-    """
-    if len(methods) > 1:
-        raise InputError(
-            f"found {', '.join(methods)}; expected one method to compare models by, or methods "
-            "without --materials, --damping and --prony",
-            None,
-            "--methods",
-        )
     others = [replace(options, problem=file).read_problem() for file in options.with_ or ()]
-    materials = parse_materials(options.materials) if options.materials is not None else ()
-    dampings = parse_dampings(options.damping) if options.damping is not None else ()
-    branches = parse_branches(options.prony) if options.prony is not None else ()
     variants = models(
         [problem, *others],
         options.set_ or (),
-        materials,
-        branches,
+        materials=parse_materials(options.materials) if options.materials is not None else (),
+        branches=parse_branches(options.prony) if options.prony is not None else (),
         region=options.region,
-        dampings=dampings,
+        dampings=parse_dampings(options.damping) if options.damping is not None else (),
     )
     for variant in variants:  # a model that cannot be would fail every run
         Problem.read(variant.path, variant.overrides, options.allow_code)
-    return plan_models(problem, variants, methods[0] if methods else None, options.allow_code)
+    planned = plan_models(problem, variants, method=method, allow_code=options.allow_code)
+    _run_study(MODEL_STUDY, options, planned)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,13 +183,29 @@ class SweepCommand(StudyOptions):
 )
 def sweep(options: SweepCommand) -> None:
     """Solve the problem for every combination of the values of some keys."""
-    method = parse_methods(options.method, "--method")[0] if options.method else None
+    method = _single_method(options.method)
     over = parse_varied_keys(options.over)
     overrides = options.set_ or ()
     planned = plan_sweep(options.problem, over, overrides, method, options.allow_code)
     # A missing file would fail every run.
     Problem.read(options.problem, planned[0].overrides, options.allow_code)
-    _run_study("sweep", options, planned)
+    _run_study(SWEEP_STUDY, options, planned)
+
+
+def _single_method(text: str | None) -> str | None:
+    """Return the method named by --method, or None if the option is not used.
+
+    Raises
+    ------
+    InputError
+        For an unknown method, or more than one.
+    """
+    if text is None:
+        return None
+    method, *others = parse_methods(text, "--method")
+    if others:
+        raise InputError(f"found {text}; expected one method", None, "--method")
+    return method
 
 
 def _run_study(
@@ -200,8 +218,8 @@ def _run_study(
 
     Parameters
     ----------
-    kind : str
-        Name of the study, for its folder and title.
+    kind : {METHOD_STUDY, MODEL_STUDY, SWEEP_STUDY}
+        Kind of study, which is the name of its command and part of its folder's name.
     options : StudyOptions
     planned : sequence of PlannedRun
     yardstick : SuccessCriterion, optional
@@ -241,7 +259,7 @@ def _run_study(
             run_all(remaining, store, limits, progress.count_run)
     except KeyboardInterrupt:
         is_complete = False
-    report = load_report(f"{kind.capitalize()}: {name}", kind, planned, store, yardstick)
+    report = load_report(f"{STUDY_TITLES[kind]}: {name}", kind, planned, store, yardstick)
     if report.records:
         write_report(report, folder)
     if not is_complete:

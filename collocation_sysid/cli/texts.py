@@ -14,7 +14,7 @@ import typer
 
 from ..console import PlainConsole
 from ..display import Shown, Table
-from ..errors import located, require_among
+from ..errors import InputError, located, require_among
 from ..pages import page_files, page_text, page_title
 from ..serialisation import as_json
 from .command_options import AsJson, command
@@ -115,8 +115,8 @@ def explain(options: ExplainCommand) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TopicsCommand:
-    """Options of `topics`.
+class LogCommand:
+    """Options of `log`.
 
     Attributes
     ----------
@@ -128,9 +128,9 @@ class TopicsCommand:
     as_json: AsJson = False
 
 
-@command(commands, "topics run.mcap", "topics bags/2026-05-04 --json")
-def topics(options: TopicsCommand) -> None:
-    """List the topics of a robot's log, their uses, and how a problem file names them."""
+@command(commands, "log trial.mcap", "log bags/2026-05-04 --json")
+def log(options: LogCommand) -> None:
+    """List the topics in a robot's log, their uses, and how a problem file names them."""
     from ..recording.formats.topics import list_topics
 
     with located(options.log):
@@ -164,22 +164,35 @@ class NewCommand:
         Name of the new folder.
     kind : str
         Add a simulated recording of this kind, so that the problem runs as it is.
+    dataset : str
+        Copy the files of this dataset instead, for example kawabata_1981.
     """
 
     name: Annotated[str, typer.Argument()]
     kind: NewProblemKind | None = None
+    dataset: str | None = None
 
 
 @command(
-    commands, "new my_object", "new silicone --kind compression", "check silicone/problem.toml"
+    commands,
+    "new my_object",
+    "new silicone --kind compression",
+    "new rubber --dataset kawabata_1981",
+    "check silicone/problem.toml",
 )
 def new(options: NewCommand) -> None:
     """Write a commented problem file as a starting point."""
+    from ..datasets.dataset_files import copy_dataset
     from ..problem.new_problem import create_problem
 
     folder = Path(options.name)
     kind = options.kind
-    file, *data = create_problem(folder, kind and kind.value)
+    if kind is not None and options.dataset is not None:
+        raise InputError("found --kind and --dataset; expected one of them", None, "--dataset")
+    if options.dataset is not None:
+        file, *data = copy_dataset(options.dataset, folder)
+    else:
+        file, *data = create_problem(folder, kind and kind.value)
     typer.echo(file)
     for each in data:
         typer.echo(each)
@@ -188,7 +201,10 @@ def new(options: NewCommand) -> None:
         "into the problem file"
     )
     example = "the problem runs as it is, with simulated data; then replace them by your own"
-    error_console.print(f"Next: {yours if kind is None else example}.", soft_wrap=True)
+    is_empty = kind is None and options.dataset is None
+    if options.dataset is not None:
+        example = "the problem runs as it is; its comments state the source of the data"
+    error_console.print(f"Next: {yours if is_empty else example}.", soft_wrap=True)
     for next_ in ("check", "solve"):
         error_console.print(f"  collocation-sysid {next_} {shlex.quote(str(file))}", soft_wrap=True)
 

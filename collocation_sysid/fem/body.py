@@ -115,7 +115,7 @@ class Body(Discretisation):
         Name in `materials.MATERIALS`, or energy function ``(F, **constants) -> ψ`` in CasADi SX,
         see `Material.from_energy`.
     density_kg_m3 : float, optional
-        Density of all regions without a density. Give either this or `total_node_mass_kg`.
+        Density of all regions without a density. Give either this or `mass_kg`.
     element : str, default "tet4"
         Name in `elements.ELEMENTS`. "tet10" adds a node on every edge of the mesh: about eight
         times as many unknowns, and much more accurate in bending. "tet10-p0" also averages the
@@ -161,7 +161,7 @@ class Body(Discretisation):
     pattern : SymmetricPattern
         Sparsity pattern of K.
     has_declared_mass : bool
-        Whether `total_node_mass_kg` was given.
+        Whether `mass_kg` was given.
 
     Raises
     ------
@@ -263,8 +263,8 @@ class Body(Discretisation):
         return other
 
     def _geometry_at(self, positions_m: Array) -> Array:
-        """Return shape gradients and volumes with nodes at other positions (n, 3) than in the
-        mesh.
+        """Return the geometry (E, q, 3·nodes + 1), shape gradients and volumes, of elements whose
+        nodes are at other positions (n, 3) [m] than in the mesh.
         """
         count, points = self.geometry.shape[:2]
         slopes = self.geometry[..., :-1].reshape(count, points, -1, 3)
@@ -276,7 +276,8 @@ class Body(Discretisation):
         return np.concatenate([gradients, volumes], axis=2)
 
     def stress_free_mesh(self, theta: Theta) -> TetMesh:
-        """Return the mesh in its stress-free shape at θ (k,), with straight sides.
+        """Return the mesh in its stress-free shape at θ (k,), without mid nodes; `mesh` itself if
+        that is stress-free.
 
         Raises
         ------
@@ -308,7 +309,7 @@ class Body(Discretisation):
         return {n for n in vars(self) if isinstance(getattr(type(self), n, None), cached_property)}
 
     def _lumped_volume(self, part: BodyPart, shares: ArrayLike = 1.0) -> Array:
-        """Return the lumped volume (n,) of a part, or of given fractions (E,) of its cells [m³]."""
+        """Return the lumped volume (n,) of a part [m³], or of given fractions (E,) of its cells."""
         volumes_m3 = self.mesh.volumes_m3[part.cells] * shares
         volume = np.zeros(len(self.nodes_m))
         np.add.at(volume, self.cells[part.cells], volumes_m3[:, None] * self.element.mass_shares)
@@ -336,8 +337,8 @@ class Body(Discretisation):
         return {part.field_name: part.field.length_m for part in self.parts if part.field}
 
     def with_field_lengths(self, lengths_m: Mapping[str, float]) -> Body:
-        """Return this body with other correlation lengths, by the names of the fields'
-        constants.
+        """Return this body with other correlation lengths [m] of its fields, by the names of the
+        fields' constants; every field must be named.
         """
         fields = (
             part.field and part.field.with_length(lengths_m[part.field_name]) for part in self.parts
@@ -418,8 +419,9 @@ class Body(Discretisation):
 
     @cached_property
     def frame_nodes_m(self) -> Array:
-        """Undeformed positions (4, 3) of an obstacle's frame: its origin and the ends of its axes
-        [m].
+        """Positions (4, 3) of the frame of an obstacle before it moves [m]: its origin in the
+        centre of the body's bounding box, and the ends of its axes, a quarter of the box's shortest
+        side away.
         """
         low = self.nodes.points_m.min(axis=0)
         high = self.nodes.points_m.max(axis=0)
@@ -456,7 +458,9 @@ class Body(Discretisation):
 
     @cached_property
     def _mass_slopes(self) -> list[dict[int, Array]]:
-        """Derivatives of the masses for each part."""
+        """For each part the derivatives of its masses (3n,) by entries of θ, by the index in θ:
+        [m³] by a free density, [kg] by coefficients of a density field.
+        """
         slopes: list[dict[int, Array]] = []
         places = zip(self._gamma_m_indices, self.field_slices, strict=True)
         for part, (gamma, modes), volume in zip(self.parts, places, self._lumped_m3, strict=True):
@@ -468,7 +472,7 @@ class Body(Discretisation):
         return slopes
 
     def densities(self, theta: Theta) -> list[float]:
-        """Return the density of each part at θ [kg/m³]; the mean where the density is a field."""
+        """Return the mean density of each part at θ (k,) [kg/m³]."""
         return [
             float(theta[place + 1]) if part.has_free_density else part.density_kg_m3
             for part, place in zip(self.parts, self._gamma_m_indices, strict=True)
@@ -481,7 +485,9 @@ class Body(Discretisation):
         return np.sum(self._part_masses(theta), axis=0)
 
     def mass_problem(self, theta: Theta) -> str | None:
-        """Return a message with a remedy if a node's mass at θ is not positive; None otherwise."""
+        """Return a message with a remedy if the mass of a node at θ (k,) is not positive, which
+        free densities and density fields can cause; None otherwise.
+        """
         if not self.mass_derivatives:
             return None
         masses = np.array(self._part_masses(theta))[:, ::3]
@@ -501,7 +507,9 @@ class Body(Discretisation):
         )
 
     def _part_masses(self, theta: Theta) -> list[Array]:
-        """Return the mass of every dof (3n,) for each part [kg]."""
+        """Return for each part the mass of every dof (3n,) [kg], without tied masses; zero outside
+        the part.
+        """
         masses = []
         for part, volume, slopes in zip(
             self.parts, self._lumped_m3, self._mass_slopes, strict=True
@@ -511,7 +519,9 @@ class Body(Discretisation):
         return masses
 
     def _masses_with_densities(self, densities: Sequence[float]) -> Array:
-        """Return the mass of every dof (3n,) for given densities of the parts [kg]."""
+        """Return the mass of every dof (3n,) [kg] for given densities of the parts [kg/m³], without
+        fields and tied masses.
+        """
         return np.sum([d * v for d, v in zip(densities, self._lumped_m3, strict=True)], axis=0)
 
     @cached_property
@@ -555,8 +565,13 @@ class Body(Discretisation):
     def energy(self, positions: ArrayLike, **constants: float) -> float:
         """Return the elastic energy Ψ [J] at (n, 3) node positions [m].
 
-        The constants are those of the material, or moduli in their place: ``young_pa=1e4,
-        poisson=0.3``.
+        The constants are those of the materials, or moduli in their place: ``young_pa=1e4,
+        poisson=0.3``. All others are zero.
+
+        Raises
+        ------
+        InputError
+            If an elastic constant is missing or unknown, or there are several states.
         """
         x = self._state(positions)
         return float(self._evaluate("energy", [x], self.elastic_theta(constants))[0, 0])
@@ -675,15 +690,16 @@ class Body(Discretisation):
     def _apply_stiffening_chain_rule(
         self, by_theta: Array, memory_input: MemoryInput | None
     ) -> None:
-        """Replace derivatives by the stiffening s by derivatives by the memory's constants, in
-        place.
+        """Replace derivatives by the stiffening s of each part by derivatives by the constants of
+        its memory, in place.
 
         Parameters
         ----------
-        by_theta : (…, k)
-            Derivatives; that by s is in the column of a part's first branch.
+        by_theta : (T, 3n, k)
+            Derivatives; the column of a part's first branch constant has those by s and is
+            overwritten.
         memory_input : MemoryInput or None
-            Provides ds/dθ; None for zero.
+            Provides ds/dθ; None for relaxed memory, where they are zero.
         """
         for first, columns in self._memory_columns:
             if memory_input is None:
@@ -803,10 +819,12 @@ class Body(Discretisation):
         return np.sum([theta[k] * share for k, share in self.tied_shares.items()], axis=0)
 
     def _damped_masses(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
-        """Yield index in θ of each part's γ_m, and the mass (3n,) or (T, 3n) damped by it.
+        """Yield for each part the index in θ of its γ_m, and the mass (3n,) or (T, 3n) [kg] damped
+        by it.
 
-        A tied mass is damped like the node to which it is tied, in proportion to the stated masses
-        of the parts that share the node.
+        A tied mass, `tied_kg` (3n,) or (T, 3n) [kg], is damped like the node to which it is tied,
+        in proportion to the stated masses of the parts that share the node. None stands for no tied
+        mass.
         """
         for k, damped in enumerate(self._part_masses(theta)):
             if tied_kg is not None:
@@ -821,15 +839,17 @@ class Body(Discretisation):
         return [part.density_kg_m3 * volume / total_kg for part, volume in parts]
 
     def _damping_coefficients(self, theta: Theta, tied_kg: Array | None) -> Array:
-        """Return the mass-proportional damping (3n,) or (T, 3n) of f = −drag v [N·s/m]."""
+        """Return the coefficients Σ γ_m M (3n,) or (T, 3n) of mass-proportional damping [N·s/m];
+        see `_damped_masses` for the tied masses.
+        """
         # `numpy.sum` of a list takes longer than the products.
         return reduce(np.add, (theta[k] * mass for k, mass in self._damped_masses(theta, tied_kg)))
 
     def _damping_derivatives(
         self, theta: Theta, tied_kg: Array | None
     ) -> Iterator[tuple[int, Array]]:
-        """Yield indices in θ and the derivatives of the mass-proportional damping by these
-        entries.
+        """Yield index and derivative of `_damping_coefficients` by each γ_m and by each constant of
+        a density; an index can occur more than once, then derivatives add up.
         """
         yield from self._damped_masses(theta, tied_kg)
         for gamma, own in zip(self._gamma_m_indices, self._mass_slopes, strict=True):

@@ -52,7 +52,9 @@ class SymbolicFunction:
         return [key for key, each in self.symbols.items() if each.__hash__() in occurring]
 
     def shifted(self, indices: Sequence[PartialIndex], arguments: Sequence[int]) -> ca.SX:
-        """Return the derivatives (k, a) of partial derivatives by some of the arguments."""
+        """Return the symbols (k, a) of the derivatives of k partial derivatives by a of the
+        arguments, which are given by index.
+        """
         return ca.vertcat(
             *(ca.horzcat(*(self.symbol((*index, a)) for a in arguments)) for index in indices)
         )
@@ -72,7 +74,9 @@ class ChainRule:
     functions: tuple[SymbolicFunction, ...] = ()
 
     def jacobian(self, expression: ca.SX, by: ca.SX) -> ca.SX:
-        """Return the total derivative (m, k) of an expression (m,) by symbols (k,)."""
+        """Return the total derivative (m, k) of an expression (m,) by symbols (k,), including the
+        dependence through functions that occur in the expression as symbols.
+        """
         total = ca.jacobian(expression, by)
         for function in self.functions:
             indices = function.indices_in([expression])
@@ -93,7 +97,9 @@ class ChainRule:
         return ca.densify(self.jacobian(scalar, by)).T
 
     def directional_derivative(self, expression: ca.SX, by: ca.SX, direction: ca.SX) -> ca.SX:
-        """Return the total derivative of an expression by symbols (k,) along a direction (k,)."""
+        """Return the total derivative (m,) of an expression (m,) by symbols (k,) along a direction
+        (k,), including the dependence through functions that occur in the expression as symbols.
+        """
         symbols = [by]
         rates = [direction]
         for function in self.functions:
@@ -103,8 +109,9 @@ class ChainRule:
         return ca.jtimes(expression, ca.vertcat(*symbols), ca.vertcat(*rates))
 
     def rates(self, by: ca.SX, direction: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Return the symbols of all functions, without their partial derivatives, and their total
-        derivatives by symbols (k,) along a direction (k,).
+        """Return the symbols (f,) of all functions, without those of partial derivatives, and their
+        total derivatives (f,) by symbols `by` (k,) along a direction (k,); both are empty without
+        functions.
         """
         symbols = [function.symbol() for function in self.functions]
         rates = [self._rates(function, [()], by, direction) for function in self.functions]
@@ -117,17 +124,29 @@ class ChainRule:
         by: ca.SX,
         direction: ca.SX,
     ) -> ca.SX:
-        """Return the derivatives of partial derivatives of a function along a direction."""
+        """Return the derivatives (i,) of partial derivatives of a function by symbols `by` (k,)
+        along a `direction` (k,), as expressions in symbols of the function.
+
+        Parameters
+        ----------
+        function : SymbolicFunction
+            Gets symbols for partial derivatives of the next order.
+        indices : sequence of PartialIndex
+            The i partial derivatives to differentiate.
+        by, direction : (k,) SX
+        """
         argument_rates = ca.jtimes(function.arguments, by, direction)
         arguments = sorted(set(ca.sparsify(argument_rates).sparsity().row()))
         return function.shifted(indices, arguments) @ argument_rates[arguments]
 
     def eliminate(self, expressions: Sequence[ca.SX]) -> list[ca.SX]:
-        """Return expressions with all symbols replaced by what they stand for."""
-        explicit = list(expressions)
+        """Return the expressions with all symbols of functions and their partial derivatives
+        replaced by expressions in the original variables.
+        """
+        expanded = list(expressions)
         for function in self.functions:
-            if indices := function.indices_in(explicit):
+            if indices := function.indices_in(expanded):
                 symbols = ca.vertcat(*map(function.symbol, indices))
                 values = ca.densify(ca.vertcat(*function.evaluate(indices)))
-                explicit = ca.substitute(explicit, [symbols], [values])
-        return explicit
+                expanded = ca.substitute(expanded, [symbols], [values])
+        return expanded

@@ -198,7 +198,9 @@ def unit_of(name: str) -> str:
 
 
 def symbol_of(name: str) -> str:
-    """Return the symbol of a constant, followed by its region if it has one."""
+    """Return the symbol of a constant, followed by a blank and its region if it has one; for an
+    unknown constant the name without its unit.
+    """
     region, _, name_in_region = name.rpartition(".")
     symbol = (
         KNOWN[name_in_region].symbol if name_in_region in KNOWN else without_unit(name_in_region)

@@ -121,10 +121,10 @@ class Discretisation(ConstantsModel):
     @cached_property
     def part_of_cells(self) -> Index:
         """Index of the part to which each cell belongs (E,)."""
-        part_numbers = np.zeros(len(self.cells), dtype=np.int64)
+        part_indices = np.zeros(len(self.cells), dtype=np.int64)
         for k, part in enumerate(self.parts):
-            part_numbers[part.cells] = k
-        return part_numbers
+            part_indices[part.cells] = k
+        return part_indices
 
     def law(self, number: int, memory: bool = False) -> PointLaw:
         """Return the law of the quadrature points of a part.
@@ -147,7 +147,7 @@ class Discretisation(ConstantsModel):
         return None
 
     def point_constants(self, number: int, theta: Theta) -> Array:
-        """Return the constants of the quadrature points of a part at θ.
+        """Return the constants of the quadrature points of a part at θ, by the index of the part.
 
         For a stress-free shape that is not the mesh, changes of its inputs follow; they are zero,
         because the shape has been computed at this θ.
@@ -197,7 +197,9 @@ class Discretisation(ConstantsModel):
 
     @cached_property
     def field_assemblies(self) -> dict[int, FieldAssembly]:
-        """Assembly of derivatives by fields, by the index of the part."""
+        """Assembly of derivatives by fields, by the index of the part; only of parts whose stress
+        depends on a field.
+        """
         assemblies = {}
         for number, part in enumerate(self.parts):
             if part.stress_field is not None:
@@ -208,8 +210,9 @@ class Discretisation(ConstantsModel):
         return assemblies
 
     def part_elements(self, part: BodyPart) -> tuple[Index, Array]:
-        """Return the elements of a part and their geometry, with nodes in the order of its
-        kernels.
+        """Return the nodes (E, nodes) and geometry (E, q, 3·nodes + 1) of the elements of a part,
+        in the order of its kernels: ascending nodes in each element if its damping law has a
+        stress.
         """
         cells = self.cells[part.cells]
         geometry = self.geometry[part.cells]
@@ -257,7 +260,9 @@ class Discretisation(ConstantsModel):
 
     @cached_property
     def is_unsymmetric(self) -> bool:
-        """Whether derivatives of the forces have a skew part."""
+        """Whether a derivative of the forces by position or velocity has a skew part: that of a
+        damping law with a stress, of contact with friction, or of a custom force.
+        """
         laws = any(part.damping.stress is not None for part in self.parts)
         return (
             laws
@@ -281,9 +286,11 @@ class Discretisation(ConstantsModel):
         return self._width("curvature")
 
     def volume_ratios(self, positions: ArrayLike) -> Array:
-        """Return J = det F at every quadrature point (T, E, q).
+        """Return J = det F at every quadrature point (T, E, q), at positions (n, 3) or (T, n, 3)
+        [m].
 
-        Elements with J ≤ 0 are inverted.
+        Elements with J ≤ 0 are inverted. F is relative to the mesh, also where the stress-free
+        shape differs.
         """
         nodes = len(self.nodes_m)
         count, points = self.geometry.shape[:2]
@@ -312,7 +319,8 @@ class Discretisation(ConstantsModel):
     # Assembly -------------------------------------------------------------------------------
 
     def _states(self, *fields: ArrayLike) -> list[Array]:
-        """Return every node field as (T, 3n), contiguous; native code relies on these shapes.
+        """Return every node field, (n, 3), (T, n, 3) or (T, 3n), as (T, 3n), contiguous; native
+        code relies on these shapes.
 
         Raises
         ------
@@ -348,6 +356,8 @@ class Discretisation(ConstantsModel):
     ) -> Array:
         """Evaluate a kernel on all parts and add up the results (T, width).
 
+        Evaluators are made at the first use of a kernel and kept.
+
         Parameters
         ----------
         name : str
@@ -359,6 +369,11 @@ class Discretisation(ConstantsModel):
             Memory for the result; overwritten.
         memory_input : MemoryInput, optional
             Internal variables of a body with memory; zero by default.
+
+        Raises
+        ------
+        InputError
+            If θ has another length than the constants of the body.
         """
         if len(theta) != len(self.constants):
             raise InputError(
@@ -407,7 +422,8 @@ class Discretisation(ConstantsModel):
         }[name]
 
     def _batch(self, name: str, number: int) -> KernelBatch:
-        """Return the batch of a kernel and part: where each output goes in the result row.
+        """Return the batch of a kernel and part, given by the name of the kernel and the index of
+        the part: where each output goes in the result row.
 
         A row holds vectors, lower triangles, and columns for all of θ.
         """

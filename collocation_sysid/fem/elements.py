@@ -84,7 +84,7 @@ class Element:
         For each node after the corners, the two corners between which it lies halfway.
     mean_dilatation : bool
         Whether the material is evaluated at the mean dilatation of the element, see
-        `averages_dilatation`.
+        `mean_dilatation`.
     """
 
     name: str

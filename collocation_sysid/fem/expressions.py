@@ -70,7 +70,9 @@ class PointLaw:
 
     @property
     def constant_count(self) -> int:
-        """Number of constants in θ."""
+        """Number of entries of θ at a point: constants of material and damping law, the stiffening
+        by memory, and changes of the inputs of the stress-free shape.
+        """
         count = len(self.material.constants) + len(self.damping.constants) + self.has_memory
         return count + (self.rest.input_count if self.rest else 0)
 
@@ -80,7 +82,9 @@ class PointLaw:
         return 6 if self.has_memory else 0
 
     def psi(self, F: ca.SX, theta: ca.SX) -> ca.SX:
-        """Return the energy density at the deformation gradient F (3, 3)."""
+        """Return the energy density [J/m³] at the deformation gradient F (3, 3), from the constants
+        θ of the law, which begin with those of the material.
+        """
         return self.material.psi(F, theta[: len(self.material.constants)])
 
     def damping_potential(self, psi: ca.SX, F: ca.SX, rate: ca.SX, theta: ca.SX) -> ca.SX:
@@ -122,7 +126,9 @@ class PointLaw:
         return stress, slope
 
     def _damping_constants(self, theta: ca.SX) -> dict[str, ca.SX]:
-        """Return the constants of the damping law by name."""
+        """Return the constants of the damping law by name, from θ of the law, where they follow
+        those of the material.
+        """
         constants = theta[len(self.material.constants) :]
         return {c.name: constants[k] for k, c in enumerate(self.damping.constants)}
 
@@ -157,7 +163,11 @@ def quadrature_point(
 
 
 def kernel_from_outputs(name: str, point: QuadraturePoint, outputs: Outputs) -> ElementKernel:
-    """Return the kernel whose outputs are derivatives of scalars of a quadrature point."""
+    """Return the kernel of a name whose outputs are sums of derivatives of scalars of a quadrature
+    point.
+
+    With mean dilatation (`point.stretches`) it is an averaging kernel, see `mean_dilatation`.
+    """
     if point.stretches:
         return averaging_kernel(name, point, outputs)
     pieces: Pieces = {}
@@ -183,7 +193,9 @@ def _energy(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _energy_density(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return ψ of a point, which may be a symbol of its `rule`."""
+    """Return ψ of a point: a symbol of `point.rule` if the material provides one, else an
+    expression.
+    """
     constants = _material_constants(point, law)
     return law.material.psi_in(point.rule, point.material_gradient, constants)
 
@@ -194,7 +206,9 @@ def _material_constants(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _potential(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return Θ of a point, whose negative derivative by x is an internal force."""
+    """Return the potential Θ of a point [J], whose negative derivative by x is the internal force:
+    elastic energy, damping potential and, with memory, the energy of the overstress.
+    """
     energy = _energy(point, law)
     damped = energy + _damping_potential(point, law, energy)
     if not law.has_memory:
@@ -252,7 +266,10 @@ def second_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _damping(point: QuadraturePoint, law: PointLaw) -> tuple[ca.SX, ca.SX] | None:
-    """Return V P_v of a point and its derivative by F; None if the damping law has a potential."""
+    """Return V P_v (9,) of a point and its derivative (9, 9) by F, with the viscous first
+    Piola–Kirchhoff stress P_v and the volume V of the point; None if the damping law is none or has
+    a potential.
+    """
     stress_and_slope = law.damping_stress(
         ca.vec(point.material_gradient), point.material_gradient_rate, point.local_constants
     )
@@ -287,7 +304,8 @@ def force_kernel(element: Element, law: PointLaw) -> ElementKernel:
 def linearisation_kernel(element: Element, law: PointLaw) -> ElementKernel:
     """Return the kernel of the force and its derivatives by position, velocity and θ.
 
-    With Rayleigh damping the derivatives by position and velocity are −K − γ_r D_vK and −γ_r K.
+    With Rayleigh damping the derivatives by position and velocity are −K − γ_r D_vK and −γ_r K. A
+    damping law with a stress also has the skew part of the derivative by position.
     """
     point = quadrature_point(element, law, "x", "v")
     potential = -_potential(point, law)

@@ -186,10 +186,10 @@ class ForcePoints:
         return self._assembly_matrix(skew=True)
 
     def _assembly_matrix(self, skew: bool) -> sp.csc_array:
-        """Return the matrix that sums lower triangles (i, d(d + 1)/2) into the entries of the
-        couplings.
+        """Return the sparse matrix that sums lower triangles (i, d(d + 1)/2) of all instances,
+        stacked column after column, into the entries of the couplings.
 
-        The lower triangles are stacked column after column.
+        With `skew`, an entry whose dofs are exchanged in the global triangle changes its sign.
         """
         instance, local, dof, weight = self.nonzero_weights
         order = np.argsort(instance, kind="stable")

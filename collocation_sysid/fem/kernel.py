@@ -68,9 +68,10 @@ class Phase:
         return ca.Function(sx.name(), inputs, dense, names, sx.name_out(), {"cse": True})
 
     def sum_over_points(self, *inputs: Any) -> list[Any]:
-        """Return the sums over the points, each in one column.
+        """Return the sums over the points of an element, one column for each output.
 
-        Inputs that differ between the points, see `OF_POINTS`, have one column for each point.
+        Inputs named in `OF_POINTS`, such as the geometry, have one column for each point; the
+        others are the same at all points.
         """
         names = self.pieces.name_in()
         point_columns = {
@@ -182,7 +183,9 @@ def from_lower_triangle(matrix: ca.SX) -> ca.SX:
 
 
 def _coupled(output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX) -> ca.MX:
-    """Return an output with the contribution of the coupling, see the module."""
+    """Return an output of an element with the contribution of the coupling between points, see the
+    module; unchanged for the contraction "none".
+    """
     if how == "none":
         return output
     if how == "nodes":
@@ -192,7 +195,9 @@ def _coupled(output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX) -
 
 
 def _contracted(piece: ca.SX, how: Contraction, gradients: ca.SX) -> ca.SX:
-    """Return a piece multiplied with the shape gradients (nodes, 3)."""
+    """Return a piece multiplied with the shape gradients (nodes, 3): unchanged for "none", the node
+    vectors (3·nodes, k) for "nodes", the matrix between nodes for "pairs".
+    """
     if how == "none":
         return piece
     nodes = gradients.shape[0]
@@ -250,9 +255,8 @@ class Derivative:
         return contractions[len(self.by) - self.by.count("theta")]
 
     def select_part(self, piece: ca.SX) -> ca.SX:
-        """Return the stated part of the (9, 9) piece of a second derivative by fields.
-
-        Others unchanged.
+        """Return the part (symmetric, skew or whole) that `part` states of the piece (9, 9) of a
+        second derivative by two fields; the pieces of other derivatives are returned unchanged.
         """
         if self.contraction != "pairs":
             return piece
@@ -287,7 +291,7 @@ class QuadraturePoint:
     stretches : tuple of SX
         If the element averages the dilatation: the logarithm m of the stretch that does so and,
         with v, its derivative along v, and with w, those of both along w; see
-        `averages_dilatation`.
+        `mean_dilatation`.
     point_data : SX
         Internal variables of the point, see `memory`; with a field, its logarithm comes last.
     scaled_indices : tuple of int
@@ -354,7 +358,7 @@ class QuadraturePoint:
 
     @property
     def local_constants(self) -> ca.SX:
-        """Constants θ at this point, multiplied by the field."""
+        """Constants θ at this point; those that a field scales are multiplied by its value."""
         constants = ca.SX(self.theta)
         for place in self.scaled_indices:
             constants[place] *= ca.exp(self.point_data[-1])
@@ -445,13 +449,19 @@ class QuadraturePoint:
         return ca.jtimes(ca.vec(self.material_gradient), self.strain_symbols, weights)
 
     def weighted_derivative(self, scalar: ca.SX) -> ca.SX:
-        """Return the derivative of a scalar of x and v by x along w."""
+        """Return the directional derivative of a scalar that depends on x and v: its derivative by
+        x along the weights w, at fixed v.
+        """
         inputs = ca.vertcat(self.gradients["x"], *self.stretches[:2])
         direction = ca.vertcat(self.gradients["w"], *self.stretches[2:])
         return self.directional_derivative(scalar, inputs, direction)
 
     def derivative(self, scalar: ca.SX, by: By) -> ca.SX:
-        """Return a derivative of a scalar, where fields stand for their gradients."""
+        """Return a derivative of a scalar by zero, one or two variables; x, v and w stand for their
+        gradients (9,), "theta" for the differentiated constants.
+
+        It is the scalar itself, a gradient as a column, or the matrix of second derivatives.
+        """
         inputs = [
             self.differentiated_constants if name == "theta" else self.gradients[name]
             for name in by
@@ -484,9 +494,9 @@ class QuadraturePoint:
             ca.vec(ca.reshape(field, 3, self.nodes) @ shape_gradients)
             for field in self.fields.values()
         ]
-        explicit = self.rule.eliminate([piece for _, piece in pieces.values()])
+        expanded = self.rule.eliminate([piece for _, piece in pieces.values()])
         outputs = ca.substitute(
-            [ca.densify(piece) for piece in explicit],
+            [ca.densify(piece) for piece in expanded],
             [ca.vertcat(*self.gradients.values())],
             [ca.vertcat(*gradients)],
         )

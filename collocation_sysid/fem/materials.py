@@ -10,12 +10,11 @@ Energies in the isochoric invariants Ī₁ = J^(−2/3) I₁, Ī₂ = J^(−4/3)
 energies by the chain rule through the invariants, see `Material.chain_rule`.
 
 A `DampingLaw` law is a potential or a stress that depends on the rate of deformation.
-"kelvin-voigt"
-and "material" are objective and dissipate at any strain, with viscosities proportional to the
-small-strain Lamé constants: the former is a viscous fluid in the current shape, the latter is
-viscous in the rate of the Green strain. Rayleigh's law agrees with both at small strain, but it
-also damps the rotation of a stretched body, and adds energy where the stiffness is not positive
-definite.
+"kelvin-voigt" and "material" are objective and dissipate at any strain, with viscosities
+proportional to the small-strain Lamé constants: the former is a viscous fluid in the current shape,
+the latter is viscous in the rate of the Green strain. Rayleigh's law agrees with both at small
+strain, but it also damps the rotation of a stretched body, and adds energy where the stiffness is
+not positive definite.
 
 Mass-proportional damping γ_m is part of `body`, the evolution of Prony branches part of `memory`.
 """
@@ -470,12 +469,13 @@ class Prony:
 
 
 def as_branches(branches_or_names: Sequence[str | Prony]) -> tuple[Prony, ...]:
-    """Return Prony branches from their names, or the given branches.
+    """Return Prony branches from a sequence of names or branches; branches are returned as they
+    are.
 
     Raises
     ------
     InputError
-        For an invalid name, or a name that occurs twice.
+        For a string in place of a sequence, an invalid name, or a name that occurs twice.
     """
     if isinstance(branches_or_names, str):
         raise InputError(f"prony is {branches_or_names!r}; expected a sequence of names")

@@ -135,14 +135,15 @@ class _VolumeSums:
         """
         m = _volume_logarithms(self.volumes, self.volume)
         m -= _volume_logarithms(self.own_volumes, self.point.mesh_volume)
-        explicit = self.point.rule.eliminate([piece for _, piece in pieces.values()])
+        expanded = self.point.rule.eliminate([piece for _, piece in pieces.values()])
         return {
             key: (how, ca.substitute(piece, self.stretches, m))
-            for (key, (how, _)), piece in zip(pieces.items(), explicit, strict=True)
+            for (key, (how, _)), piece in zip(pieces.items(), expanded, strict=True)
         }
 
     def volume_pieces(self, order: int) -> Pieces:
-        """Return the pieces V, s and, for derivatives, ∂s/∂x of the first phase.
+        """Return the pieces of the first phase: the volume of the mesh ("volume", summed to V), σ
+        ("volumes", summed to s) and, if `order` is at least 1, ∂σ/∂x ("volumes_by_x").
 
         Parameters
         ----------
@@ -221,7 +222,9 @@ class _ScalarDerivatives:
         return pieces
 
     def piece(self, by: By) -> ca.SX:
-        """Return the piece of a derivative: at fixed s, and Γ ∂n/∂s ∂²σ/∂α∂β."""
+        """Return the piece of a derivative of g by one or two variables: the derivative at fixed
+        sums s and, for two fields α and β, the term Γ ∂n/∂s ∂²σ/∂α∂β of the point's own volumes σ.
+        """
         shape = self.shape
         point = self.shape.point
         nodal = [field for field in by if field != "theta"]
@@ -287,7 +290,9 @@ def _scalar_derivatives(shape: _VolumeSums, outputs: Outputs) -> dict[int, _Scal
 def _coupling(
     shape: _VolumeSums, chains: dict[int, _ScalarDerivatives], outputs: Outputs, order: int
 ) -> ca.Function:
-    """Return C or D of each output as a function of all sums, see `kernel`."""
+    """Return the coupling of each output as a function of all sums over the points: C of order 1 or
+    D of order 2, see `kernel`.
+    """
     count = shape.count
     constants = shape.point.differentiated_constants.numel()
     sums = [shape.volume, shape.volumes, *(chain.slopes for chain in chains.values())]
@@ -367,7 +372,16 @@ def _pair_coupling(
 
 
 def _volume_logarithms(volumes: ca.SX, volume: ca.SX) -> ca.SX:
-    """Return n: ⅓ ln(v/V), its derivative along the velocities, and the derivatives along w."""
+    """Return n: ⅓ ln(v/V), its derivative along the velocities, and the derivatives of both along
+    w.
+
+    Parameters
+    ----------
+    volumes : (1, 2 or 4,) SX
+        Deformed volume v [m³], and its derivatives in the same order; as many entries are returned.
+    volume : SX
+        Undeformed volume V [m³].
+    """
     s = ca.SX.sym("s", volumes.numel())
     n = ca.log(s[0] / volume) / 3
     for known in (1, 2):
@@ -377,7 +391,9 @@ def _volume_logarithms(volumes: ca.SX, volume: ca.SX) -> ca.SX:
 
 
 def _logarithm_derivatives(volumes: ca.SX, volume: ca.SX, weights: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return ∂n/∂s, and Σ_k weights_k ∂²n_k/∂s²."""
+    """Return ∂n/∂s and Σ_k weights_k ∂²n_k/∂s² of the function n of `_volume_logarithms`, with s =
+    `volumes`, at the undeformed `volume`.
+    """
     s = ca.SX.sym("s", volumes.numel())
     c = ca.SX.sym("c", volumes.numel())
     n = _volume_logarithms(s, volume)

@@ -116,7 +116,9 @@ class MemoryLayout:
 
     @cached_property
     def starts(self) -> list[int]:
-        """First column of each part in the row, and the length of the row."""
+        """First column of each part in the row, then the length of the row; a part without memory
+        has no columns.
+        """
         sizes = [6 * self.points_per_element * len(p.cells) if p.prony else 0 for p in self.parts]
         return [0, *np.cumsum(sizes).tolist()]
 
@@ -156,13 +158,15 @@ class MemoryLayout:
         return branches
 
     def to_branches(self, values: Array) -> Array:
-        """Return values (…, all branches) for each branch from values (…, width) for each point."""
+        """Return values (…, all branches) from values (…, width) for each point: those of a part
+        are repeated for each of its branches.
+        """
         parts = [values[..., branch.points] for branch in self.branches]
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
 
     def sum_over_branches(self, values: Array) -> Array:
         """Return the sums (…, width) over the branches of each point: the transpose of
-        `to_branches`.
+        `to_branches`. For a single branch the argument itself is returned.
 
         Parameters
         ----------
@@ -190,7 +194,7 @@ class MemoryLayout:
         return np.stack([values[..., branch.columns].sum(axis=-1) for branch in self.branches])
 
     def relaxed(self, states: int) -> MemoryInput:
-        """Return the contribution of a memory that has relaxed to this many states: all zero."""
+        """Return the contribution of a memory that has relaxed, at a number of states: all zero."""
         count = self.constant_count
         sizes = (self.width,), (len(self.parts),), (count,), (count, count)
         return MemoryInput(*(np.zeros((states, *size)) for size in sizes))

@@ -1,8 +1,7 @@
 """Tetrahedral mesh of a body: generated or read, cleaned and checked once, then immutable.
 
 `TetMesh` holds the mesh. `ElementNodes` are the nodes of a body's elements: those of the mesh,
-then, for
-quadratic elements, one in the middle of each edge.
+then, for quadratic elements, one in the middle of each edge.
 """
 
 from __future__ import annotations

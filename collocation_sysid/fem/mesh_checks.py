@@ -31,7 +31,13 @@ LARGEST_SIDE_CURVATURE = 0.05
 
 
 def checked_points(points_m: ArrayLike) -> np.ndarray:
-    """Return a float64 copy of (n, 3) coordinates, or raise an `InputError`."""
+    """Return a float64 copy of (n, 3) coordinates; NaN is allowed.
+
+    Raises
+    ------
+    InputError
+        If the values are not numbers, of another shape, or beyond `LARGEST_M`.
+    """
     try:
         points = np.array(points_m, dtype=np.float64)
     except (TypeError, ValueError):
@@ -152,7 +158,9 @@ def clean_mesh(
 
 
 def orient_elements(points_m: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tetrahedra with positive volumes, and the indices of those that were reversed."""
+    """Return a copy of the tetrahedra (E, 4) in which all volumes are positive, and the indices of
+    those whose last two nodes were exchanged for it.
+    """
     reversed_elements = np.flatnonzero(signed_volumes(points_m, tetrahedra) < 0)
     oriented = tetrahedra.copy()
     oriented[reversed_elements, 2:] = tetrahedra[reversed_elements, :1:-1]
@@ -195,7 +203,7 @@ class MeshQuality:
 
 def mean_ratios(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     """Return 12 (3V)^(2/3) / Σ l² over the edges of each element (E,): 1 if regular, near 0 if
-    flat.
+    flat; NaN for a negative volume V.
     """
     volumes = signed_volumes(points_m, tetrahedra)
     squares = edge_lengths(points_m, tetrahedra) ** 2
@@ -203,7 +211,9 @@ def mean_ratios(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 
 def edge_lengths(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Return the lengths (E, 6) of the edges of the elements."""
+    """Return the lengths (E, 6) [m] of the edges between the corners of elements (E, 4) or (E, 10),
+    in the order of `EDGES`.
+    """
     ends = points[tetrahedra[:, EDGES]]
     return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2)
 

@@ -78,7 +78,19 @@ def read_tetrahedra(
 def _tetrahedra(
     data: MeshContent, metres: float
 ) -> tuple[np.ndarray, np.ndarray, Arrays, Arrays, Arrays, tuple[str, ...]]:
-    """Return the same as `read_tetrahedra` from the data of meshio."""
+    """Return the same as `read_tetrahedra` from the data of meshio.
+
+    Parameters
+    ----------
+    data : MeshContent
+    metres : float
+        Factor from the file's unit to metres.
+
+    Raises
+    ------
+    InputError
+        If there are no tetrahedra.
+    """
     counts = _cell_counts(data)
     points_m = np.asarray(data.points, dtype=float) * metres
     blocks = [block for block in data.cells if block.type in _TETRAHEDRA and len(block.data)]
@@ -138,7 +150,23 @@ def write_tetrahedra(
     point_arrays: Mapping[str, np.ndarray] | None = None,
     cell_arrays: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Write a mesh, in metres, to any format that meshio knows by the file's extension."""
+    """Write a mesh, in metres, to any format that meshio knows by the file's extension; booleans
+    become integers.
+
+    Parameters
+    ----------
+    path : str or Path
+        Replaced if it exists.
+    points_m : (n, 3)
+    tetrahedra : (E, 4) int
+    point_arrays, cell_arrays : mapping of name to array, optional
+        Values of each point and each tetrahedron; none by default.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
     import meshio  # slow to import
 
     point_data: dict[str, Any] = {n: _without_booleans(v) for n, v in (point_arrays or {}).items()}
@@ -177,7 +205,10 @@ def _read_with_meshio(path: str | Path) -> Iterator[MeshContent]:
 
 @contextlib.contextmanager
 def _as_input_error(path: str | Path, done: str) -> Iterator[None]:
-    """Context that turns any failure on an invalid file into one `InputError`, and prints nothing.
+    """Context that turns a failure on an invalid file into one `InputError` with the path, and
+    prints nothing.
+
+    An `OSError` while writing is raised unchanged.
 
     Parameters
     ----------
@@ -281,9 +312,9 @@ def _nodes_of(data: MeshContent, masks: list[np.ndarray]) -> np.ndarray:
 
 
 def _of_tetrahedra(data: MeshContent, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the values on tetrahedra of arrays given block by block.
+    """Return the values (E, …) on tetrahedra of arrays given block by block, by name.
 
-    All-false masks are omitted.
+    Masks without a true value are omitted.
     """
     tetrahedra = [block.type in _TETRAHEDRA and len(block.data) > 0 for block in data.cells]
     selected = {}
@@ -300,7 +331,9 @@ def _of_tetrahedra(data: MeshContent, arrays: Mapping[str, Any]) -> dict[str, np
 
 
 def _triangle_sets(data: MeshContent, arrays: Mapping[str, Any]) -> Arrays:
-    """Return the corners of the triangles on which arrays given block by block are 1."""
+    """Return for each name the corners (k, 3) of the triangles on which an array given block by
+    block is 1. Arrays with other values than 0 and 1, or without a 1, are omitted.
+    """
     blocks = [k for k, block in enumerate(data.cells) if block.type in _TRIANGLES]
     sets = {}
     for name, per_block in arrays.items():
@@ -321,7 +354,9 @@ def _cell_counts(data: MeshContent) -> Counter[str]:
 
 
 def _listed(counts: Mapping[str, int]) -> str:
-    """Return the numbers of cells as text."""
+    """Return numbers of cells by type as text, such as "12 tetra, 3 line"; "no cells at all" if
+    empty.
+    """
     return ", ".join(f"{count} {name}" for name, count in counts.items()) or "no cells at all"
 
 

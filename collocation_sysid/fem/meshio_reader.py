@@ -108,11 +108,13 @@ class MeshContent:
 def read_content(path: str | Path) -> MeshContent:
     """Read a mesh or point file, whose format follows from its extension.
 
+    Only small, harmless files are read in this process, all others in a separate one with limits of
+    time and memory.
+
     Raises
     ------
     InputError
-        With the reason, without the path, if meshio cannot read the file or exceeds the limits of
-        time or memory.
+        With the reason, without the path, if meshio cannot read the file or exceeds the limits.
     """
     if _is_small_and_safe(Path(path)):
         return _read_in_process(path)
@@ -148,7 +150,13 @@ def _is_small_and_safe(path: Path) -> bool:
 
 
 def _read_in_process(path: str | Path) -> MeshContent:
-    """Return the content of a file read in this process."""
+    """Return the content of a file read in this process; nothing is printed.
+
+    Raises
+    ------
+    InputError
+        With the reason, if meshio cannot read the file.
+    """
     import meshio  # slow to import
 
     captured = io.StringIO()

@@ -74,6 +74,9 @@ def find_source(
 ) -> ConstantSource:
     """Find the constants of a region among the names of the given parameters.
 
+    A constant is given by "region.constant" or else by the name of the constant alone, which is
+    that of the whole body; a density also by `MASS`.
+
     Parameters
     ----------
     region : str
@@ -87,7 +90,8 @@ def find_source(
     Raises
     ------
     InputError
-        If a constant is missing or given twice.
+        If a constant is missing or given twice, or if the elastic parameters do not determine
+        exactly one of the choices of the material.
     """
 
     def name_of(own: str) -> str | None:
@@ -164,7 +168,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def engineering_constants(lambda_pa: Any, mu_pa: Any) -> tuple[Any, Any]:
-    """Return (E, ν) from (λ, μ), as numbers or expressions."""
+    """Return Young's modulus and Poisson's ratio (E, ν) from (λ, μ), as numbers or expressions."""
     return (
         mu_pa * (3 * lambda_pa + 2 * mu_pa) / (lambda_pa + mu_pa),
         lambda_pa / (2 * (lambda_pa + mu_pa)),

@@ -1,9 +1,8 @@
 """Custom forces on nodes or faces of a body: laws f(x, v, at, constants) in CasADi.
 
 Use `NodeForce.from_law` for a force that depends on position, velocity and time of a node, such as
-air
-drag, a foundation or a magnet; or, on faces of the surface, on their current area and normal, such
-as a pressure. Its constants follow those of the body's parts in θ and are estimated like them.
+air drag, a foundation or a magnet; or, on faces of the surface, on their current area and normal,
+such as a pressure. Its constants follow those of the body's parts in θ and are estimated like them.
 """
 
 from __future__ import annotations
@@ -190,7 +189,19 @@ class NodeForce:
     def _evaluate_law(
         self, x: ca.SX, v: ca.SX, before: ca.SX, at: ForceContext, named: dict[str, ca.SX]
     ) -> tuple[ca.SX, ca.SX]:
-        """Return the force (3,) and the internal variables after the evaluation."""
+        """Return the force (3,) and the internal variables (h,) after the evaluation, empty without
+        memory.
+
+        Parameters
+        ----------
+        x, v : (3,) SX
+            Position [m] and velocity [m/s].
+        before : (h,) SX
+            Internal variables before the evaluation.
+        at : ForceContext
+        named : dict of str to SX
+            Constants by name.
+        """
         if not self.internal_variable_count:
             return _as_column(self.law(x, v, at, **named)), ca.SX.zeros(0)
         force, after = self.law(x, v, before, at, **named)
@@ -244,8 +255,13 @@ class NodeForce:
         return float(largest[0]), float(largest[1])
 
     def _check(self) -> None:
-        """Raise an `InputError` if the law cannot be evaluated, has the wrong shape or is not
-        finite.
+        """Evaluate the law and its derivatives once.
+
+        Raises
+        ------
+        InputError
+            If the law cannot be evaluated, its results have the wrong shape, or force or
+            derivatives are not finite for a node at rest.
         """
         dofs = self._smallest_dofs
         named = {c.name: ca.SX.sym(c.name) for c in self.constants}

@@ -100,13 +100,19 @@ class PowerLawEnergy:
 
 
 def ogden(terms: int) -> PowerLawEnergy:
-    """Return the energy of Ogden's material with a number of terms."""
+    """Return the energy of Ogden's material with a number of terms.
+
+    Its constants are ``mu_1_pa, alpha_1, mu_2_pa, …`` and, last, ``kappa_pa``.
+    """
     names = [name for p in range(1, terms + 1) for name in (f"mu_{p}_pa", f"alpha_{p}")]
     return PowerLawEnergy(_ogden_density, (*names, "kappa_pa"))
 
 
 def hyperfoam(terms: int) -> PowerLawEnergy:
-    """Return the energy of Hill's compressible foam with a number of terms."""
+    """Return the energy of Hill's compressible foam with a number of terms.
+
+    Its constants are ``mu_1_pa, alpha_1, beta_1, mu_2_pa, …``.
+    """
     names = [
         name for p in range(1, terms + 1) for name in (f"mu_{p}_pa", f"alpha_{p}", f"beta_{p}")
     ]
@@ -126,7 +132,17 @@ def term_numbers(names: Iterable[str]) -> range:
 def _ogden_density(
     ratio: ca.SX, scaled_excess: ScaledExcess, constants: Mapping[str, ca.SX]
 ) -> ca.SX:
-    """Return the energy density of Ogden's material from J, traces of powers and constants."""
+    """Return the energy density of Ogden's material.
+
+    Parameters
+    ----------
+    ratio : SX
+        J.
+    scaled_excess : callable
+        (tr C̄^(α/2) − 3)/α² as a function of α.
+    constants : mapping of str to SX
+        Constants by name, see `ogden`; their number determines the number of terms.
+    """
     energy = 0.5 * constants["kappa_pa"] * (ratio - 1) ** 2
     for p in term_numbers(constants):
         alpha = constants[f"alpha_{p}"]
@@ -137,7 +153,9 @@ def _ogden_density(
 def _hyperfoam_density(
     ratio: ca.SX, scaled_excess: ScaledExcess, constants: Mapping[str, ca.SX]
 ) -> ca.SX:
-    """Return the energy density of the foam from J, traces of powers and constants."""
+    """Return the energy density of the foam; see `_ogden_density` for the arguments and `hyperfoam`
+    for the constants.
+    """
     log_j = ca.log(ratio)
     energy = ca.SX(0)
     for p in term_numbers(constants):

@@ -42,7 +42,9 @@ class SymmetricPattern:
 
     @classmethod
     def from_entries(cls, rows: Index, columns: Index, nodes: int) -> SymmetricPattern:
-        """Return the pattern with these entries, rows >= columns, and the diagonal."""
+        """Return the pattern of size 3 · `nodes` with these entries of the lower triangle, rows ≥
+        columns, and the diagonal; repetitions are merged.
+        """
         size = 3 * nodes
         codes = np.unique(np.append(columns * size + rows, np.arange(size) * (size + 1)))
         return cls(size, codes % size, codes // size)
@@ -90,7 +92,9 @@ class SymmetricPattern:
         return sp.csc_array((values[source], (rows, columns)), shape=(self.size, self.size))
 
     def products(self, values: Array, vectors: Array) -> Array:
-        """Return the products (T, 3n) of matrices with values (T, m) and vectors (T, 3n)."""
+        """Return for each t the product (3n,) of the symmetric matrix with lower-triangle values
+        (T, m) and a vector (T, 3n), (T, 3n).
+        """
         pairs = zip(values, vectors, strict=True)
         return np.stack([self.matrix(value) @ vector for value, vector in pairs])
 
@@ -121,9 +125,8 @@ class JointPattern:
         return JointPattern(union, tuple(union.positions_of(p.rows, p.columns) for p in patterns))
 
     def expand(self, values: Array) -> Array:
-        """Return values (T, m) of the first pattern as values of the union.
-
-        Unchanged if they are equal.
+        """Return values (T, m) of the first pattern as values (T, M) of the union, with zeros
+        elsewhere; the same array if both patterns are equal.
         """
         if not values.size or values.shape[1] == self.pattern.entry_count:
             return values

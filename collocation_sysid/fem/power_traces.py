@@ -107,14 +107,15 @@ class PowerTraces:
         opposite = _product(factor, lambda index: even(index) - odd(index))
         for doubling in range(DOUBLINGS):
             square = _exponent_partials(4**doubling * s**2, alpha)
-            excess, opposite = (
-                _doubled(excess, opposite, square),
-                _doubled(opposite, excess, square),
-            )
+            doubled_excess = _doubled(excess, opposite, square)
+            opposite = _doubled(opposite, excess, square)
+            excess = doubled_excess
         return cache(lambda index: excess(index) / 4)
 
     def _sum(self, parity: Parity, alpha: ca.SX) -> Partials:
-        """Return the sum C or D with its partial derivatives by Ī₁ − 3, Ī₂ − 3 and α."""
+        """Return a function from a `PartialIndex` to that partial derivative of the sum C ("even")
+        or D ("odd") by Ī₁ − 3, Ī₂ − 3 and α; results are cached.
+        """
         value_weights = _exponent_partials(_value_weights(parity, alpha), alpha)
         weights = _exponent_partials(_weights(parity, alpha), alpha)
 
@@ -167,13 +168,21 @@ def _nodes() -> Array:
 
 
 def _weights(parity: Parity, alpha: ca.SX) -> ca.SX:
-    """Return cosh(su) or sinh(su) at the nodes, and the weights of the series beyond them."""
+    """Return the weights (NODES + TAIL_TERMS,) of the sum of a parity, cosh(su) if even and
+    sinh(su) if odd, with s = α / 2^(DOUBLINGS + 1): values at the nodes, then those of the series
+    beyond them, see `_exponentials`.
+    """
     growing, decaying = _exponentials(alpha)
     return (growing + decaying) / 2 if parity == "even" else (growing - decaying) / 2
 
 
 def _value_weights(parity: Parity, alpha: ca.SX) -> ca.SX:
-    """Return the weights of a sum by parts: sinh(su)/s or (cosh(su) − 1)/s, and those beyond."""
+    """Return the weights (NODES + TAIL_TERMS,) of a sum after summation by parts: sinh(su)/s for
+    the even sum, (cosh(su) − 1)/s for the odd one, with s = α / 2^(DOUBLINGS + 1).
+
+    They are values at the nodes, then those of the series beyond them, see `_exponentials`.
+    Exponents near zero are replaced by a small one.
+    """
     s = alpha / 2 ** (DOUBLINGS + 1)
     safe_alpha = ca.if_else(
         ca.fabs(s) < SMALLEST_EXPONENT, SMALLEST_EXPONENT * 2 ** (DOUBLINGS + 1), alpha
@@ -188,7 +197,12 @@ def _value_weights(parity: Parity, alpha: ca.SX) -> ca.SX:
 
 
 def _exponentials(alpha: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return eˢᵘ and e⁻ˢᵘ at the nodes and summed beyond them for each term of the series."""
+    """Return e^(su) and e^(−su) for s = α / 2^(DOUBLINGS + 1), (NODES + TAIL_TERMS,) each.
+
+    The first NODES entries are the values at the nodes u > 0. The others are sums over all nodes
+    beyond the last: entry k contains the factor with which the kth term of the series of ln z,
+    which decays like e^(−ku), is weighted.
+    """
     ratio = ca.exp(SPACING / 2 ** (DOUBLINGS + 1) * alpha)
     powers = [ca.exp(SPACING / 2 ** (DOUBLINGS + 2) * alpha)]
     for _ in range(NODES):
@@ -218,16 +232,25 @@ def _integer_power_traces(first_excess: ca.SX, second_excess: ca.SX) -> ca.SX:
 
 
 def _doubled(excess: Partials, opposite: Partials, square: Partials) -> Partials:
-    """Return the scaled excess at twice the exponent, from those for s and −s, and s².
+    """Return the partial derivatives of the scaled excess (tr C̄^(2s) − 3)/(2s)².
 
-    Doubling of x = tr C̄ˢ − 3 and y = tr C̄⁻ˢ − 3 gives 6x + x² − 2y; excesses are divided by s².
+    With x = tr C̄ˢ − 3 and y = tr C̄⁻ˢ − 3 the excess at 2s is 6x + x² − 2y.
+
+    Parameters
+    ----------
+    excess, opposite : functions of a PartialIndex
+        Partial derivatives of x/s² and y/s².
+    square : function of a PartialIndex
+        Partial derivatives of s².
     """
     product = _product(square, _product(excess, excess))
     return cache(lambda index: (6 * excess(index) + product(index) - 2 * opposite(index)) / 4)
 
 
 def _product(first: Partials, second: Partials) -> Partials:
-    """Return the partial derivatives of a product by the rule of Leibniz."""
+    """Return the partial derivatives of a product by the rule of Leibniz, as a cached function of a
+    `PartialIndex`, from those of both factors.
+    """
 
     def partial(index: PartialIndex) -> ca.SX:
         """Return the partial derivative of the product with an index."""
@@ -248,7 +271,9 @@ def _index(orders: Sequence[int]) -> PartialIndex:
 
 
 def _exponent_partials(expression: ca.SX, alpha: ca.SX) -> Partials:
-    """Return the partial derivatives of an expression in the exponent alone."""
+    """Return the partial derivatives of an expression that depends on the exponent α alone, as a
+    cached function of a `PartialIndex`; derivatives by the invariants are zero.
+    """
 
     def partial(index: PartialIndex) -> ca.SX:
         """Return the partial derivative with an index; zero by the invariants."""

@@ -109,7 +109,12 @@ def refine_body(body: Body) -> Body:
 
 
 def _refined_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["stress_free"] | None:
-    """Return the rest-shape statement of a body, with the held nodes of the refined mesh."""
+    """Return the statement about the rest shape for the refined body: None if `body` has none,
+    "stress_free", or the scan conditions with the held nodes of the refined `mesh`.
+
+    A box or a ball selects nodes by position and stays as it is. Of the middle of an edge, both
+    ends must be held.
+    """
     if body.scan_conditions is None:
         return None if body.rest_shape is None else "stress_free"
     if isinstance(body.scan_conditions.nodes, (Box, Ball)):
@@ -121,9 +126,18 @@ def _refined_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["st
 
 
 def _refined_force(placed: LocatedForce, mesh: TetMesh, body: Body) -> NodeForce:
-    """Return a force for the refined mesh.
+    """Return a custom force for the refined body, at the corresponding nodes.
 
-    It acts in the middle of an edge if it does at both ends.
+    The middle of an edge is among them if both ends are.
+
+    Parameters
+    ----------
+    placed : LocatedForce
+        Force on the nodes or faces of `body`.
+    mesh : TetMesh
+        Refined mesh.
+    body : Body
+        Body before the refinement.
     """
     chosen = np.isin(np.arange(len(body.nodes_m)), placed.points.nodes)
     nodes = chosen[: len(body.mesh.points_m)]

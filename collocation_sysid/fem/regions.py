@@ -222,7 +222,23 @@ def _densities(
     density_kg_m3: float | None,
     mass_kg: float | None,
 ) -> list[float]:
-    """Return the density outside the regions, then that of each region."""
+    """Return the density outside the regions, then that of each region [kg/m³].
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    regions : sequence of Region
+        A region whose density is None has that of the rest.
+    claimed : sequence of arrays of int
+        Cells of each region.
+    density_kg_m3, mass_kg : float or None
+        Density of the rest, or mass of the complete body; exactly one of them is a number.
+
+    Raises
+    ------
+    InputError
+        If none or both are given, or a density is not positive.
+    """
     if (density_kg_m3 is None) == (mass_kg is None):
         raise InputError("give exactly one of density_kg_m3 and mass_kg")
     for region in regions:
@@ -281,7 +297,13 @@ def _cells_of_regions(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
 
 
 def _resolve_cells(mesh: TetMesh, cells: Selection | ArrayLike) -> Index:
-    """Return cell indices, ascending, from a selection, a mask or indices."""
+    """Return cell indices, ascending and unique, from a selection, a mask (E,) or indices.
+
+    Raises
+    ------
+    InputError
+        If the array is empty or of another kind, or an index is not that of a cell.
+    """
     if isinstance(cells, Selection):
         return cells.resolve_cells(mesh)
     array = np.asarray(cells)
@@ -378,7 +400,20 @@ class ConstantsModel:
         ]
 
     def used_names(self, known: Sequence[str]) -> set[str]:
-        """Return those of the given parameters' names on which θ depends."""
+        """Return the names of all parameters and constants from which θ is assembled.
+
+        Parameters
+        ----------
+        known : sequence of str
+            Names of the stated parameters. They decide which of the alternatives (moduli, shared
+            names, `mass_kg`) gives each constant of a part.
+
+        Returns
+        -------
+        set of str
+            The names among `known` that give constants of the parts, and always those of field
+            coefficients, contrasts, custom forces and coefficients of friction.
+        """
         used = {name for source in self.constant_sources(known) for name in source.names.values()}
         used.update(self.field_coefficient_names, self.contrast_deviations)
         further = (force.constants for force in self.forces)
@@ -386,8 +421,8 @@ class ConstantsModel:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names that a parameter may have: constants, moduli that replace them, and shared
-        names.
+        """All names that a parameter may have, without repetitions: constants of each part, moduli
+        in their place, both with and without the name of the region, and `mass_kg`.
         """
         names = []
         for part in self.parts:
@@ -398,6 +433,9 @@ class ConstantsModel:
 
     def assemble_theta(self, values: Mapping[str, Any]) -> list[Any]:
         """Return θ as a list from parameters by name: numbers, or CasADi expressions.
+
+        A coefficient of a field that is not among the values is 0, so that the field equals its
+        mean.
 
         Raises
         ------
@@ -432,7 +470,9 @@ class ConstantsModel:
         return np.array([float(value) for value in self.assemble_theta(values)])
 
     def lame(self, theta: Theta) -> dict[str, tuple[float, float]]:
-        """Return the small-strain (λ, μ) [Pa] of each part at θ, by the name of the part."""
+        """Return the small-strain (λ, μ) [Pa] of each part at θ (k,), by the name of the part (""
+        outside the regions). With memory they are the long-term moduli.
+        """
         by_part = {}
         for part, part_constants in zip(
             self.parts, self.split_theta(np.asarray(theta, dtype=float)), strict=True
@@ -488,12 +528,12 @@ class ConstantsModel:
         return [0, *np.cumsum([len(part.constants) for part in self.parts]).tolist()]
 
     def elastic_theta(self, constants: Mapping[str, float]) -> Array:
-        """Return θ from elastic constants, with all other constants zero.
+        """Return θ (k,) from elastic constants by name, with all other constants zero.
 
         Raises
         ------
         InputError
-            For a name that the model does not have, or one that is missing.
+            For a name that the model does not have, or an elastic constant that is missing.
         """
         for name in constants:
             if name not in self.parameter_names:

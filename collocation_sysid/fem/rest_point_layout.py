@@ -42,7 +42,12 @@ class RestPointLayout:
         return self.value_count * (1 + self.input_count + len(self.input_pairs))
 
     def expand(self, data: ca.SX, changes: ca.SX) -> ca.SX:
-        """Return the D values after changes (k,) of the inputs, to second order."""
+        """Return the D values of the stress-free shape after changes (k,) of the inputs, to second
+        order.
+
+        `data` contains column after column the D values, their k first derivatives, and their
+        second derivatives in the order of `input_pairs`.
+        """
         columns = ca.reshape(data, self.value_count, 1 + self.input_count + len(self.input_pairs))
         values = columns[:, 0]
         for i in range(self.input_count):

@@ -13,8 +13,7 @@ function theorem, with the residual r, ∂X/∂θ = −(∂r/∂X)⁻¹ ∂r/∂
 The kernels keep Y as the reference configuration of the computation. With G = ∂X/∂Y at a quadrature
 point, the deformation gradient of the material is F = (∂x/∂Y) G⁻¹ and the volume of the point V det
 G, see `RestPointLayout`. G and its derivatives by θ are data of the points, so that forces and all
-their
-derivatives are those of the complete model in every method.
+their derivatives are those of the complete model in every method.
 """
 
 from __future__ import annotations
@@ -258,9 +257,9 @@ def _part_forces(
         Constants of the material.
     material : Material
     averages : bool
-        Whether the element averages the dilatation.
+        Whether the element averages the dilatation, and with it the pressure.
     slopes : bool
-        Whether to compute derivatives.
+        Whether to compute derivatives; otherwise their arrays are empty.
     """
     count, points = geometry.shape[:2]
     shape_slopes = geometry[..., :-1].reshape(count, points, -1, 3)
@@ -336,7 +335,7 @@ class InverseEquilibrium:
     Parameters
     ----------
     body : Body
-        Body with a `scan_stiffness`. (`body` imports this module, hence no annotation.)
+        Body with `scan_conditions`. (`body` imports this module, hence no annotation.)
 
     Attributes
     ----------
@@ -428,15 +427,21 @@ class InverseEquilibrium:
         return self._data[key]
 
     def point_data_columns(self, part: int) -> Index:
-        """Return the columns (E, q, any) of each point in the data of a part, given by its
-        index.
+        """Return the columns (E, q, D (1 + k + pairs)) of each point in the data of a part, given
+        by its index.
         """
         count, points = self._parts[part][1].shape[:2]
         size = self.layout.count
         return np.arange(count * points * size).reshape(count, points, size)
 
     def weight_sensitivity(self, theta: ArrayLike) -> Array:
-        """Return the change (n, 3) of X for a relative change of gravity, to first order."""
+        """Return the change (n, 3) of X [m] per relative change of gravity, to first order.
+
+        Raises
+        ------
+        RestShapeError
+            If no stress-free shape is found at the constants θ, or its equations are singular.
+        """
         constants = np.asarray(theta, dtype=float)
         at = self._assemble_forces(self.solve(constants).positions_m, constants, slopes=True)
         factor = self._factorise(at.by_position)
@@ -445,8 +450,8 @@ class InverseEquilibrium:
         return self._newton_step(factor, self._weight_n(constants))
 
     def point_data_at(self, positions_m: Array) -> list[Array]:
-        """Return the data of the points for given X (n, 3), independent of θ: derivatives are
-        zero.
+        """Return for each part the data of its points if the stress-free positions X (n, 3) [m] are
+        given and do not depend on θ: all derivatives are zero.
         """
         others = self.layout.input_count + len(self.layout.input_pairs)
         return self._fields_at_points([positions_m, *[np.zeros_like(positions_m)] * others])
@@ -472,7 +477,16 @@ class InverseEquilibrium:
         return data
 
     def _volume_logarithms(self, values: Array, geometry: Array) -> Array:
-        """Return ρ with its derivatives (E, q, 1 + k + pairs, 1), from those of G (E, q, …, 9)."""
+        """Return the logarithm ρ of each point's volume ratio det G over the mean of its element,
+        with derivatives (E, q, 1 + k + pairs, 1).
+
+        Parameters
+        ----------
+        values : (E, q, 1 + k + pairs, 9)
+            G = ∂X/∂Y and its derivatives.
+        geometry : (E, q, 3·nodes + 1)
+            Shape gradients and volumes.
+        """
         layout = self.layout
         shares = geometry[..., -1] / geometry[..., -1].sum(axis=1)[:, None]
         matrices = values.reshape(*values.shape[:3], 3, 3)
@@ -502,7 +516,9 @@ class InverseEquilibrium:
         return (self._logarithm(determinants) - self._logarithm(mean))[..., None]
 
     def _logarithm(self, values: Array) -> Array:
-        """Return ln of a number with its derivatives (…, 1 + k + pairs)."""
+        """Return the logarithm of positive numbers with its derivatives, from numbers with their
+        first and second derivatives (…, 1 + k + pairs).
+        """
         k = self.layout.input_count
         logarithm = np.empty_like(values)
         logarithm[..., 0] = np.log(values[..., 0])
@@ -521,8 +537,13 @@ class InverseEquilibrium:
     # Newton's method ------------------------------------------------------------------------
 
     def _solve(self, theta: Array) -> RestShape:
-        """Return the stress-free shape at θ with derivatives, from the latest solution or from the
-        mesh.
+        """Return the stress-free shape at θ (k,) with derivatives, from the latest solution or, if
+        that fails, from the mesh.
+
+        Raises
+        ------
+        RestShapeError
+            If there is none near the mesh.
         """
         weight = self._weight_n(theta)
         start = self._predict(theta)
@@ -543,7 +564,9 @@ class InverseEquilibrium:
         return RestShape(x, by_input.reshape(-1, *self.points_m.shape))
 
     def _predict(self, theta: Array) -> Array | None:
-        """Return X at θ to first order from the latest solution; None if θ differs too much."""
+        """Return X (n, 3) [m] at θ to first order from the latest solution; None if there is none,
+        θ differs too much, or an element would be nearly inverted.
+        """
         if not self._shapes:
             return None
         key, shape = next(reversed(self._shapes.items()))
@@ -586,9 +609,8 @@ class InverseEquilibrium:
         return mass_kg * np.tile(self.gravity_m_s2, len(self.points_m))
 
     def _newton(self, start: Array, theta: Array, weight_n: Array) -> Array | None:
-        """Return X at a given weight, from `start` (n, 3).
-
-        None if Newton's method does not converge.
+        """Return X (n, 3) [m] at a given weight (3n,) [N], from `start` (n, 3); None if Newton's
+        method does not converge.
 
         A step is accepted if the next one, with the same factors, is shorter (Deuflhard's natural
         monotonicity test), and no element is nearly inverted.
@@ -622,7 +644,9 @@ class InverseEquilibrium:
         return None
 
     def _newton_step(self, factor: Any, residual_n: Array) -> Array:
-        """Return the Newton step (n, 3) of a residual, by factors of ∂r/∂X."""
+        """Return the Newton step −(∂r/∂X)⁻¹ r (n, 3) [m] of a residual r (3n,) [N], zero at held
+        nodes; `factor` solves with the factors of ∂r/∂X at the free dofs.
+        """
         step = np.zeros(self.points_m.size)
         step[self.free] = -factor.solve(residual_n[self.free])
         return step.reshape(self.points_m.shape)
@@ -636,7 +660,9 @@ class InverseEquilibrium:
             return None
 
     def _is_admissible(self, positions_m: Array) -> bool:
-        """Return whether no element of the stress-free shape is inverted, or nearly so."""
+        """Return whether every element of the stress-free shape (n, 3) has at least the smallest
+        allowed ratio of its volume in the mesh, so that none is inverted.
+        """
         for cells, geometry in self._parts:
             slopes = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3)
             gradients = np.einsum("ean,eqai->eqni", positions_m[cells], slopes)
@@ -645,8 +671,8 @@ class InverseEquilibrium:
         return True
 
     def _assemble_forces(self, positions_m: Array, theta: Array, slopes: bool) -> _AssembledForces:
-        """Return the elastic forces at the mesh for X `positions_m` (n, 3), with derivatives if
-        `slopes`.
+        """Return the elastic forces at the mesh if the stress-free positions X are `positions_m`
+        (n, 3), with derivatives by X and θ if `slopes`, else with zeros in their place.
         """
         size = self.points_m.size
         force = np.zeros(size)
@@ -682,7 +708,9 @@ class InverseEquilibrium:
         return _AssembledForces(force, by_position, by_theta)
 
     def _failure_message(self, theta: Array, reached: float) -> str:
-        """Return the message for a solve that reached only a share of the weight."""
+        """Return the message for a solve at θ that reached only the fraction `reached` of the
+        weight.
+        """
         moduli = ", ".join(
             f"{name + ': ' if name else ''}λ {lam:.4g} Pa, μ {mu:.4g} Pa"
             for name, (lam, mu) in self.body.lame(theta).items()

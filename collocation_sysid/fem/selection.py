@@ -29,7 +29,14 @@ class _PositionSelection:
     """Base class of selections by position."""
 
     def resolve(self, nodes: ElementNodes) -> np.ndarray:
-        """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
+        """Return the selected nodes as sorted int64 indices into `nodes.points_m`, mid nodes
+        included.
+
+        Raises
+        ------
+        InputError
+            If no node is selected; the message names the nearest one.
+        """
         hint = self._nearest_hint(nodes.points_m)
         return _indices_or_error(
             self._contains(nodes.points_m), nodes.mesh, str(self), "nodes" + hint
@@ -146,7 +153,16 @@ class Face(_PositionSelection):
         require_among(self.name, get_args(FaceName), None, "face")
 
     def resolve(self, nodes: ElementNodes) -> np.ndarray:
-        """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
+        """Return the selected nodes as sorted int64 indices into `nodes.points_m`, mid nodes
+        included.
+
+        Sides do not include the nodes of the top and the bottom.
+
+        Raises
+        ------
+        InputError
+            If no node is selected.
+        """
         points_m = nodes.points_m
         mask = self._contains(points_m)
         if self.name.startswith("side"):
@@ -160,7 +176,9 @@ class Face(_PositionSelection):
         )
 
     def _contains(self, points_m: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the points in the plane through the outermost point."""
+        """Return the mask (n,) of the points in the plane through the outermost point, within a
+        tolerance relative to the diagonal of the points (n, 3).
+        """
         axis, sign = {"top": (2, -1), "bottom": (2, 1), "side_x": (0, 1), "side_y": (1, 1)}[
             self.name
         ]
@@ -193,7 +211,15 @@ class Indices:
         object.__setattr__(self, "indices", tuple(indices.tolist()))
 
     def resolve(self, nodes: ElementNodes) -> np.ndarray:
-        """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
+        """Return the selected nodes as sorted int64 indices into `nodes.points_m`; a mid node is
+        selected if both ends of its edge are.
+
+        Raises
+        ------
+        InputError
+            If there is no index, or one is not that of a node of the file, or that of a node that
+            is not the corner of an element.
+        """
         mesh = nodes.mesh
         requested = np.unique(np.array(self.indices, dtype=np.int64))
         outside = requested[(requested < 0) | (requested >= mesh.file_node_count)]
@@ -213,7 +239,13 @@ class Indices:
         return _indices_or_error(chosen, mesh, "an empty list of indices")
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
-        """Return the indices of the selected cells, sorted."""
+        """Return the indices of the selected cells, sorted.
+
+        Raises
+        ------
+        InputError
+            If an index is not that of a cell, or no cell is selected.
+        """
         count = len(mesh.tetrahedra)
         outside = [index for index in self.indices if not 0 <= index < count]
         if outside:
@@ -225,7 +257,14 @@ class Indices:
         return _indices_or_error(chosen, mesh, "an empty list of indices", OF_CELLS)
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
-        """Return the rows of `mesh.surface` whose corners are all selected."""
+        """Return the rows of `mesh.surface` whose corners are all selected, sorted.
+
+        Raises
+        ------
+        InputError
+            If an index is not that of a node, or no face of the boundary has all its corners
+            selected.
+        """
         nodes = self.resolve(ElementNodes.corners(mesh))
         chosen = np.isin(np.arange(len(mesh.points_m)), nodes)
         return _select_faces(chosen, mesh, "the list of indices")
@@ -248,13 +287,28 @@ class Named:
     name: str
 
     def resolve(self, nodes: ElementNodes) -> np.ndarray:
-        """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
+        """Return the selected nodes as sorted int64 indices into `nodes.points_m`; a mid node is
+        selected if both ends of its edge are.
+
+        Raises
+        ------
+        InputError
+            If the mesh has no point array of this name, its values are not booleans or 0 and 1, or
+            none is true.
+        """
         what = f'point array "{self.name}"'
         mask = self._mask(nodes.mesh.point_arrays, len(nodes.mesh.points_m), what)
         return _indices_or_error(nodes.with_mid_nodes(mask), nodes.mesh, what)
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
-        """Return the indices of the selected cells, sorted."""
+        """Return the indices of the cells whose value in the cell array is 1, sorted.
+
+        Raises
+        ------
+        InputError
+            If the mesh has no cell array of this name, its values are not booleans or 0 and 1, or
+            none is true.
+        """
         what = f'cell array "{self.name}"'
         mask = self._mask(mesh.cell_arrays, len(mesh.tetrahedra), what)
         return _indices_or_error(mask, mesh, what, OF_CELLS)
@@ -263,6 +317,12 @@ class Named:
         """Return the selected rows of `mesh.surface`, sorted.
 
         They are the triangles of a face set, or those whose corners are all in a point array.
+
+        Raises
+        ------
+        InputError
+            If the mesh has neither of this name, no face is selected, or a face is not on the
+            boundary.
         """
         if self.name not in mesh.face_sets:
             what = f'point array "{self.name}"'
@@ -320,9 +380,8 @@ Selection = Box | Ball | Face | Indices | Named
 
 
 def rows_of_faces(faces: np.ndarray, surface: np.ndarray) -> np.ndarray:
-    """Return the rows of the surface (F, 3) that equal faces (k, 3) in any orientation.
-
-    −1 for none.
+    """Return for each of the faces (k, 3) the row of the surface (F, 3) with the same three nodes
+    in any order, (k,); −1 if there is none.
     """
     row_of_face = {tuple(face): row for row, face in enumerate(np.sort(surface, axis=1).tolist())}
     sorted_faces = np.sort(faces, axis=1).tolist()
@@ -330,7 +389,13 @@ def rows_of_faces(faces: np.ndarray, surface: np.ndarray) -> np.ndarray:
 
 
 def _select_faces(chosen_nodes: np.ndarray, mesh: TetMesh, what: str) -> np.ndarray:
-    """Return the boundary faces whose corners are all selected, or raise an `InputError`."""
+    """Return the rows of `mesh.surface` whose corners are all in the mask `chosen_nodes` (n,).
+
+    Raises
+    ------
+    InputError
+        If there is none; the message names the selection by `what`.
+    """
     mask = np.asarray(chosen_nodes[mesh.surface].all(axis=1))
     return _indices_or_error(
         mask, mesh, what, missed="holds no face of the boundary with all its corners"
@@ -360,7 +425,9 @@ def _indices_or_error(
 
 
 def _describe_bounds(bounds_m: np.ndarray) -> str:
-    """Return the bounds of a body as text."""
+    """Return the bounds of a body as text, from a row of three lowest and a row of three highest
+    coordinates (2, 3) [m].
+    """
     axes = zip("xyz", *bounds_m, strict=True)
     return ", ".join(f"{axis} from {low:.4g} to {high:.4g} m" for axis, low, high in axes)
 
@@ -376,7 +443,14 @@ def _is_number(value: object) -> bool:
 
 
 def _vector(values: Iterable[float], what: str) -> tuple[float, float, float]:
-    """Return three numbers as floats, or raise an `InputError` that begins with `what`."""
+    """Return three numbers as a tuple of floats.
+
+    Raises
+    ------
+    InputError
+        If `values` is not a sequence of three numbers, or one of them is NaN; infinite ones are
+        allowed. The message begins with `what`.
+    """
     components = (
         list(values) if isinstance(values, Iterable) and not isinstance(values, str) else []
     )

@@ -97,7 +97,9 @@ class PolylineLength:
         return nodal.reshape(-1, len(x), 3).transpose(1, 0, 2).reshape(len(x), -1)
 
     def hessian(self, x: Array) -> Array:
-        """Return ∂²L/∂x² (T, entries) on `couplings`, at positions (T, 3n)."""
+        """Return ∂²L/∂x² [1/m] at positions (T, 3n), as values (T, entries) on the pattern
+        `couplings`.
+        """
         e, length = _directions_and_lengths(self._vectors(x))
         across = np.eye(3) - e[..., :, None] * e[..., None, :]
         return self._assemble(across / length[..., None])

@@ -54,8 +54,8 @@ class Field:
     Parameters
     ----------
     parameter : str
-        Constant of the material or its damping law; young_pa stands for all moduli of a material;
-        density_kg_m3.
+        Constant that varies: one of the material or of its damping law, young_pa for all moduli of
+        a material together, or density_kg_m3.
     length_m : float or list
         Correlation length: places at this distance have the correlation 1/e. Of several lengths the
         most likely one is used.
@@ -170,7 +170,8 @@ class Laplacian:
         return 1 / (1 / length_m**2 + self.values)
 
     def variance_share(self, length_m: float) -> float:
-        """Return the share of the prior variance of these eigenvectors, without the constant one.
+        """Return the share of a field's prior variance that these eigenvectors represent at a
+        correlation length [m]; the constant eigenvector does not count.
 
         The trace that this needs is estimated with `PROBES` random sign vectors of a fixed seed.
         """
@@ -297,7 +298,9 @@ class FieldModes:
 
     @cached_property
     def shapes(self) -> Array:
-        """Shapes φ (E, m) in the cells."""
+        """Shapes φ (E, m), one column for each coefficient, in the cells of the part, scaled to the
+        prior standard deviation.
+        """
         unscaled = self.laplacian.weights(self.length_m)[:, None] * self.laplacian.vectors
         deviation = self.field.deviation * np.sqrt(self.variance_share)
         return (deviation * unscaled / np.linalg.norm(unscaled, axis=0)).T

@@ -55,7 +55,7 @@ def _stress_derivative(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _stress_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return (∂S/∂x)ᵀ σ, with the weights σ as data of the points."""
+    """Return (∂S/∂x)ᵀ σ of a point (9,), with the weights σ (6,) as its internal variables."""
     return point.gradient(
         ca.dot(point.internal_variables, second_piola(point, law)), point.gradients["x"]
     )
@@ -96,7 +96,7 @@ KERNELS: dict[str, tuple[Expression, tuple[str, ...], int, Contraction]] = {
 
 
 def stress_kernel(name: str, element: Element, law: PointLaw) -> ElementKernel:
-    """Return the kernel of a line of `KERNELS` for an element and a law."""
+    """Return the kernel that the line `name` of `KERNELS` states, for an element and a law."""
     expression, fields, has_internal_variables, contraction = KERNELS[name]
     point = quadrature_point(element, law, *fields, internal_variable_count=has_internal_variables)
     piece = expression(point, law)
@@ -108,7 +108,7 @@ def stress_kernel(name: str, element: Element, law: PointLaw) -> ElementKernel:
 
 @dataclass(frozen=True, eq=False)
 class JacobianEntries:
-    """Row and column of each entry of the derivatives `stress_jacobian` and `force_slopes`.
+    """Row and column of each entry of `stress_jacobian` and `memory_force_jacobian`.
 
     Attributes
     ----------
@@ -142,7 +142,9 @@ class StressEvaluator:
         return self._evaluate_at_points("stress", [x], theta)
 
     def stress_theta_derivatives(self, x: Array, theta: Array, theta_q: Array) -> Array:
-        """Return ∂S/∂θ θ_q (T, q, width), for directions θ_q (k, q)."""
+        """Return the derivatives of S along directions in θ, ∂S/∂θ θ_q (T, q, width), at positions
+        x (T, 3n) and θ (k,), for q directions θ_q (k, q).
+        """
         body = self.body
         derivatives = np.zeros((len(x), theta_q.shape[1], self.width))
         for number, part in enumerate(body.parts):
@@ -208,7 +210,9 @@ class StressEvaluator:
         return self._slopes("force_slope", x, theta)
 
     def _slopes(self, name: str, x: Array, theta: Array) -> Array:
-        """Return the entries (T, K) of a derivative."""
+        """Return the entries (T, K) of a derivative, given by the name of its kernel, at
+        `jacobian_entries`.
+        """
         out = np.zeros((len(x), len(self.jacobian_entries.points)))
         return self._evaluate_all_parts(name, [x], theta, out)
 
@@ -289,7 +293,9 @@ class StressEvaluator:
         )
 
     def _batch(self, name: str, number: int) -> KernelBatch:
-        """Return the batch of a kernel and part, in which every point is an element."""
+        """Return the batch of a kernel for a part, given by its index, in which every quadrature
+        point is an element of its own.
+        """
         body = self.body
         part = body.parts[number]
         places = body.memory.part_columns(number)
@@ -302,8 +308,8 @@ class StressEvaluator:
             # 3n for each of what the points carry, part after part.
             per_number = dofs_of(cells).shape[1]
             length = len(self.jacobian_entries.points)
-            point_numbers = np.arange(per_number * places.size).reshape(len(cells), -1)
-            destinations = per_number * places[0, 0, 0] + point_numbers
+            point_offsets = np.arange(per_number * places.size).reshape(len(cells), -1)
+            destinations = per_number * places[0, 0, 0] + point_offsets
         elif "nodes" in kernel.contractions.values():
             destinations = dofs_of(cells)
             length = body.pattern.size

@@ -21,12 +21,13 @@ _MOST_ELEMENTS = 1_000_000
 
 
 def box_of_edge(size_m: ArrayLike, edge_length_m: float) -> TetMesh:
-    """Mesh a box with a corner at the origin, with edges of about this length.
+    """Mesh a box of size (3,) [m] with a corner at the origin, with a whole number of cells along
+    each axis whose edges are about `edge_length_m` long.
 
     Raises
     ------
     InputError
-        If this takes more than a million elements.
+        For sizes or an edge length that are not positive, or more than a million elements.
     """
     divisions = _divisions(np.asarray(size_m, dtype=float), edge_length_m)
     _require_element_limit(6 * float(np.prod(divisions)))

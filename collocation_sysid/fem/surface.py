@@ -95,8 +95,8 @@ def tetrahedralize_surface(
 
 
 def merge_coincident(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merge vertices that coincide in single precision, and drop triangles that become
-    degenerate.
+    """Return vertices and triangles with vertices merged that coincide in single precision (10⁻⁶ of
+    the diagonal), and without the triangles that become degenerate.
     """
     tolerance = 1e-6 * np.linalg.norm(np.ptp(points, axis=0))
     pairs = KDTree(points).query_pairs(tolerance, output_type="ndarray")
@@ -177,7 +177,13 @@ def _pytetwild_version() -> str:
 def _run_ftetwild(
     points: np.ndarray, triangles: np.ndarray, edge_length_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and tetrahedra of fTetWild, run in a separate process."""
+    """Return nodes (n, 3) [m] and tetrahedra (E, 4) of fTetWild, run in a separate process.
+
+    Raises
+    ------
+    InputError
+        If it fails or is not installed.
+    """
     diagonal = np.linalg.norm(np.ptp(points, axis=0))
     lengths = (ASKED_LENGTH * edge_length_m, TOLERANCE * edge_length_m / diagonal)
     words = [repr(float(length)) for length in lengths]

@@ -150,7 +150,9 @@ class TwoPhaseModes(FieldModes):
         return (CONTRAST,)
 
     def split_in_eight(self) -> TwoPhaseModes:
-        """Return this field on a mesh whose cells are split into eight."""
+        """Return this field on a mesh whose cells are split into eight; phases and samples are
+        those of the cell before.
+        """
         finer = super().split_in_eight()
         assert isinstance(finer, TwoPhaseModes)
         samples = self.samples
@@ -167,7 +169,9 @@ class TwoPhaseModes(FieldModes):
         return self.phase[:, None] / coefficients[0]
 
     def weighted_hessian(self, coefficients: Array, weights: Array) -> Array:
-        """Return Σ weights (T, E) · ∂² of `logarithms` by the contrast, (T, 1, 1)."""
+        """Return the second derivative (T, 1, 1) of Σ_e weights[t, e] ln c_e by the contrast, the
+        only coefficient, for weights (T, E).
+        """
         return -(weights @ self.phase)[:, None, None] / coefficients[0] ** 2
 
 

@@ -1,8 +1,7 @@
 """CasADi callbacks that evaluate the NLP's functions and observe the iterations of a solver.
 
 Use `NlpFunctions` for functions with derivatives and `IterationMonitor` for the history; `nlpsol`
-combines
-them.
+combines them.
 """
 
 from __future__ import annotations
@@ -89,7 +88,12 @@ class TimedFunction(ca.Callback):
         return True
 
     def eval_buffer(self, arguments, results) -> int:
-        """Evaluate the function; return 0, or 1 if it fails (CasADi's interface)."""
+        """Evaluate the function and write its outputs to `results`, in place; return 0, or 1 if it
+        fails (CasADi's interface).
+
+        Exceptions are stored for the caller of the solver instead of being raised, except where no
+        stress-free shape exists: that counts as a failed evaluation alone.
+        """
         began = time.perf_counter()
         self.calls += 1
         if self._errors:
@@ -172,7 +176,10 @@ class NlpFunctions:
         return sum(function.calls for function in self._functions)
 
     def function(self, name: str, *outputs: str) -> TimedFunction:
-        """Return a new callback.
+        """Return a new callback, and keep it for `seconds` and `calls`.
+
+        Its inputs are z and p, and also w and y if an output is of the Lagrangian. For "grad_l"
+        alone it is a `LagrangianGradient`, which has a directional derivative.
 
         Parameters
         ----------
@@ -183,7 +190,9 @@ class NlpFunctions:
         """
 
         def evaluate(inputs: list[Array], buffers: list[Array | None]) -> None:
-            """Evaluate the requested outputs, which are those with memory."""
+            """Evaluate those outputs that are requested: their buffers are not None, and are
+            overwritten.
+            """
             requests = zip(outputs, buffers, strict=True)
             self._evaluate(inputs, {output: b for output, b in requests if b is not None})
 
@@ -198,7 +207,9 @@ class NlpFunctions:
         return made
 
     def _evaluate(self, inputs: list[Array], outputs: dict[str, Array]) -> None:
-        """Write the requested outputs, arrays by name, at the inputs."""
+        """Write the requested outputs at the inputs to `outputs`, arrays by name, in place; the
+        first input is z.
+        """
         collocation = self.collocation
         z = inputs[0]
         if "f" in outputs:
@@ -223,7 +234,9 @@ class NlpFunctions:
             outputs["hess"][:] = self._upper_triangle(z, weight, multipliers)[self._full[1]]
 
     def _forward(self, inputs: list[Array], outputs: list[Array | None]) -> None:
-        """Write the directional derivative of grad_l; the inputs are in CasADi's order."""
+        """Write the directional derivative of the Lagrangian's gradient to the only output, in
+        place, unless that is None; the inputs are in CasADi's order.
+        """
         z, _, weight, multipliers, _, by_z, _, by_weight, by_multipliers = inputs
         (product,) = outputs
         if product is None:
@@ -240,13 +253,17 @@ class NlpFunctions:
             product += self.collocation.jacobian(z).T @ by_multipliers
 
     def _upper_triangle(self, z: Array, weight: float, multipliers: Array) -> Array:
-        """Return the values of the upper triangle of the Hessian."""
+        """Return the values of the upper triangle of the Hessian at z, in the order of
+        `hessian_structure`.
+        """
         values = np.empty(len(self.collocation.hessian_structure[1]))
         self._upper_values(z, weight, multipliers, values)
         return values
 
     def _weights(self, weight: Array, multipliers: Array) -> tuple[float, Array]:
-        """Return w and y; CasADi passes empty arrays for zeros."""
+        """Return the weight w of the objective and the multipliers y (constraints,), from arrays
+        that CasADi leaves empty for zeros.
+        """
         if not len(multipliers):
             multipliers = np.zeros(self.collocation.constraint_count)
         return float(weight[0]) if len(weight) else 0.0, multipliers
@@ -349,8 +366,10 @@ class IterationMonitor(ca.Callback):
         return ca.Sparsity.dense(sizes.get(ca.nlpsol_out(i), 0), 1)
 
     def eval(self, arguments):
-        """Record an iteration; return [1] if the solver should stop, else [0] (CasADi's
-        interface).
+        """Record an iteration; return [1] if the solver should stop, else [0] (CasADi's interface).
+
+        It should stop on request, at the limit of time, and after an exception, which is stored in
+        `errors` instead of being raised.
         """
         began = time.perf_counter()
         if self.errors:
@@ -363,7 +382,11 @@ class IterationMonitor(ca.Callback):
         return [1 if self.stop or self.recorder.is_late or self.errors else 0]
 
     def _record(self, arguments) -> None:
-        """Update the best iterate and add an entry to the history."""
+        """Add an entry to the history, and store the iterate if it is the best.
+
+        The best has the smallest sum of the objective and the largest violation of a constraint.
+        `arguments` are the outputs of `nlpsol` in CasADi's order.
+        """
         z, value, rows, _, multipliers, *_ = (argument.full().ravel() for argument in arguments)
         # Objective and constraints are both of order one.
         merit = float(value[0] + np.abs(rows).max(initial=0.0))

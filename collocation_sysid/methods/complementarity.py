@@ -3,8 +3,7 @@
 The product of pressure and gap is decreased in a few solves, each from the previous solution; the
 first starts from the solution with the contact energy. Only faces that come within an edge length
 of an obstacle in that solution have pressures. Use `solve_complementarity` after a solve with the
-contact
-energy.
+contact energy.
 """
 
 from __future__ import annotations
@@ -97,7 +96,8 @@ def reachable_obstacles(experiment: Experiment, x: Array) -> list[Obstacle]:
     Returns
     -------
     list of Obstacle
-        One per obstacle; unchanged if no face comes within `REACH` edges.
+        One per obstacle, with the faces that come within `REACH` edges of it; unchanged if none
+        does.
     """
     obstacles = []
     mesh = experiment.body.mesh

@@ -2,10 +2,9 @@
 
 Where the pose of the body in its grasps is estimated, the positions of grasped nodes follow from φ.
 `CondensedCollocation` removes these variables and the constraints that prescribe them; derivatives
-with
-respect to them are added to the columns of φ by the chain rule. The optimum is that of the complete
-program, and so are the multipliers: those of the removed constraints balance the gradient with
-respect to the removed variables.
+with respect to them are added to the columns of φ by the chain rule. The optimum is that of the
+complete program, and so are the multipliers: those of the removed constraints balance the gradient
+with respect to the removed variables.
 
 An estimated clock interpolates between samples, so that the loss couples more time steps than the
 equations of motion do. The Hessian omits these entries: summed over a recording, products of slopes
@@ -33,8 +32,8 @@ from ..recording.nuisance import TIME
 
 
 def condense(complete: Collocation) -> Collocation:
-    """Return the program without variables that follow from φ; itself if grasps and clocks
-    are known.
+    """Return the program without the grasped positions that follow from φ; the same program if no
+    grasp and no clock is estimated.
     """
     if not any(
         s.nuisance.affects_grasps or len(s.nuisance.clock_indices) for s in complete.transcriptions
@@ -87,7 +86,9 @@ class EliminatedDofs:
 
     @classmethod
     def from_segment(cls, transcription: Transcription, complete: Collocation) -> EliminatedDofs:
-        """Return the dofs that are prescribed by constraints."""
+        """Return the grasped dofs of an experiment whose positions follow from φ: those that
+        constraints of the `complete` program prescribe.
+        """
         rows = np.flatnonzero(transcription.is_grasp_constraint)
         time, place = np.divmod(rows, transcription.constraints_per_time)
         dofs = (
@@ -103,7 +104,9 @@ class EliminatedDofs:
         )
 
     def evaluate(self, phi: Array) -> tuple[Array, Array]:
-        """Return the scaled positions (h,) and their derivatives (h, k) at φ of the experiment."""
+        """Return the scaled positions (h,) of the eliminated dofs, and their derivatives (h, k) by
+        the φ of the motion, at φ of the experiment.
+        """
         segment = self.segment
         prescribed = self.segment.prescribed_motion.evaluate_at(phi)
         time, dof = np.divmod(self.variables - segment.offsets.position, segment.dof_count)
@@ -163,8 +166,8 @@ class EliminatedColumns:
         )
 
     def times(self, values: Array, slopes: Array) -> Array:
-        """Return the product (r, k) of the columns with slopes (h, k), from all values of
-        the matrix.
+        """Return the product (r, k) of these columns with `slopes` (h, k), from all values of the
+        matrix.
         """
         shape = (len(self.rows), len(slopes))
         return sp.csr_array((values[self.entries], (self.row, self.column)), shape=shape) @ slopes
@@ -269,12 +272,12 @@ class CondensedCollocation(Collocation):
 
     @property
     def variable_count(self) -> int:
-        """Length of z."""
+        """Number of variables z that remain."""
         return len(self._remaining[0])
 
     @property
     def constraint_count(self) -> int:
-        """Length of g."""
+        """Number of constraints g that remain."""
         return len(self._remaining[1])
 
     @property
@@ -319,7 +322,8 @@ class CondensedCollocation(Collocation):
         return variables
 
     def complete_multipliers(self, z: Array, loss_weight: float, multipliers: Array) -> Array:
-        """Return the multipliers of all constraints of the complete program.
+        """Return the multipliers of all constraints of the complete program; those of eliminated
+        constraints make the Lagrangian stationary in the eliminated positions.
 
         Parameters
         ----------
@@ -342,8 +346,8 @@ class CondensedCollocation(Collocation):
         return complete
 
     def _prescribed(self, z: Array) -> Iterator[tuple[Array, Array]]:
-        """Return positions and derivatives of the eliminated dofs of each experiment, see
-        `EliminatedDofs.evaluate`.
+        """Return an iterator of positions and derivatives of the eliminated dofs of each experiment
+        at z, see `EliminatedDofs.evaluate`.
         """
         p = self.parameters_from(z)
         return (each.evaluate(p[each.segment.nuisance_indices.indices]) for each in self.eliminated)
@@ -369,7 +373,7 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def _jacobian(self) -> CondensedPattern:
-        """Pattern of ∂g/∂z."""
+        """Pattern of ∂g/∂z, and how its values follow from those of the complete program."""
         of_variable, of_row = self._condensed_indices
         rows, columns = _entries(self.complete.jacobian_structure)
         remaining = np.flatnonzero(of_row[rows] >= 0)
@@ -397,7 +401,8 @@ class CondensedCollocation(Collocation):
         return self._jacobian.structure
 
     def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
-        """Return g and the values of ∂g/∂z from one evaluation of the elements.
+        """Return the constraints g (constraints,) and the values of ∂g/∂z, including the dependence
+        through the eliminated positions, from one evaluation of the elements.
 
         Parameters
         ----------
@@ -418,7 +423,9 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def _hessian(self) -> CondensedPattern:
-        """Pattern of the upper triangle of the Hessian."""
+        """Pattern of the upper triangle of the Hessian, and how its values follow from those of the
+        complete program.
+        """
         number, _ = self._condensed_indices
         rows, columns = _entries(self.complete.hessian_structure)
         are_remaining = (number[rows] >= 0) & (number[columns] >= 0)
@@ -440,8 +447,8 @@ class CondensedCollocation(Collocation):
         return CondensedPattern.from_pairs((size, size), remaining, pairs, through)
 
     def _is_loss_coupling(self, rows: Index, columns: Index) -> NDArray[np.bool_]:
-        """Return a mask (entries,) of positions that are coupled by the loss, but by no
-        equation of motion.
+        """Return a mask (entries,) of those entries of the complete Hessian, by rows and columns,
+        that couple positions at times so distant that no equation of motion contains both.
         """
         mask = np.zeros(len(rows), dtype=bool)
         for segment in self.transcriptions:
@@ -509,8 +516,18 @@ class CondensedCollocation(Collocation):
         return values
 
     def _complete_hessian(self, z: Array, loss_weight: float, multipliers: Array | None) -> Array:
-        """Return the complete program's values, with the Gauss–Newton part at the nearest
-        whole sample.
+        """Return the values of the complete program's Hessian, with its Gauss–Newton part evaluated
+        at clocks rounded to whole samples and no other clock errors.
+
+        There each residual depends on few positions. The part with the multipliers is that at z.
+
+        Parameters
+        ----------
+        z : (complete variables,) array
+        loss_weight : float
+            Weight of the objective.
+        multipliers : (complete constraints,) array or None
+            None for the Gauss–Newton part alone.
         """
         nearest = z.copy()
         p = self.complete.parameters_from(z)
@@ -533,6 +550,8 @@ class CondensedCollocation(Collocation):
 
 
 def _entries(structure: tuple[Index, Index]) -> tuple[Index, Index]:
-    """Return the row and the column of each entry of a matrix by compressed columns."""
+    """Return the row and the column of each entry of a matrix by compressed columns, whose
+    structure is (indptr, rows).
+    """
     indptr, rows = structure
     return rows, np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))

@@ -45,7 +45,7 @@ STAGES: dict[str, type] = {kind.name: kind for kind in _ONE_HORIZON}
 
 @dataclass(frozen=True)
 class Continuation(Options):
-    """Another method on growing parts of every recording.
+    """Continuation over the horizon: another method on growing parts of every recording.
 
     Attributes
     ----------
@@ -108,7 +108,8 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
     experiment : Experiment
         Experiment.
     count : int
-        Number of samples; it is increased to the first sample with a marker, or with a depth image.
+        Number of samples; it is increased to three, and to the first sample with a marker or with a
+        depth image.
     """
     markers = experiment.markers
     stop = min(len(experiment.t_s), max(count, markers.first_visible_sample + 1, 3))
@@ -119,7 +120,9 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
 
 
 def first_share(collocation: Collocation, share: float) -> Collocation:
-    """Return the problem with the first share of every experiment's samples."""
+    """Return the problem with the first share, from 0 to 1, of every fitted experiment's samples;
+    validation recordings are left out.
+    """
     fitted = [segment.experiment for segment in collocation.transcriptions]
     shorter = [first_samples(e, samples_in_share(len(e.t_s), share)) for e in fitted]
     return replace(collocation, experiments=shorter)
@@ -148,7 +151,10 @@ class _ContinuationState:
         self.iterations = self.evaluations = 0
 
     def solve(self, share: float) -> bool:
-        """Solve the first share of the samples; return whether to continue."""
+        """Solve the first share of the samples, starting from the last solution, and store the
+        result; return whether to continue with a larger share: unless the solve was interrupted or
+        refused.
+        """
         recorder = self.recorder
         part = recorder.collocation if share == 1 else first_share(recorder.collocation, share)
         start = None if self.known is None else _continue_variables(part, *self.known)
@@ -187,7 +193,9 @@ class _ContinuationState:
         )
 
     def _add(self, solution: Solution, share: float) -> None:
-        """Store the solution of a part, and add its counts, times and a note."""
+        """Store the solution of a part as the last one and its positions as known, and add its
+        counts, its times and a note, in place; `share` is that of the samples.
+        """
         self.last = solution
         part = solution.collocation
         self.known = part.unpack(solution.z)
@@ -204,7 +212,8 @@ class _ContinuationState:
 
 
 def _continue_variables(collocation: Collocation, p: Array, positions: list[Array]) -> Array:
-    """Return variables z from the first rows of positions.
+    """Return variables z from parameters p (np,) and the first rows of positions [m] of each
+    experiment.
 
     The missing rows are simulated or, if that fails, those of a rigid motion with the grasp.
     """

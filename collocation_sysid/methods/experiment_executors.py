@@ -82,19 +82,19 @@ class LocalExecutor:
         self.threads = threads
 
     def store_segments(self, collocation: Collocation) -> list[Any]:
-        """See `ExperimentExecutor`."""
+        """Return the transcriptions themselves, which stay in this process."""
         return list(collocation.transcriptions)
 
     def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
-        """See `ExperimentExecutor`."""
+        """Apply a function to every experiment in parallel, and return the results themselves."""
         return map_experiments(lambda row: run(*row), [*zip(*columns, strict=True)], self.threads)
 
     def fetch(self, stored: Sequence[Any]) -> list[Any]:
-        """See `ExperimentExecutor`."""
+        """Return the stored values unchanged."""
         return list(stored)
 
     def notes(self) -> list[str]:
-        """See `ExperimentExecutor`."""
+        """Return no remarks: threads cannot be lost."""
         return []
 
 
@@ -131,7 +131,7 @@ class DaskExecutor:
             ]
 
     def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
-        """See `ExperimentExecutor`."""
+        """Apply a function to every experiment on its worker, and return futures of the results."""
         rows = zip(self._homes, *columns, strict=True)
         with self._end_search_if_disconnected():
             return [self._submit(home, run, *row) for home, *row in rows]
@@ -141,7 +141,7 @@ class DaskExecutor:
 
         Raises
         ------
-        Ended
+        SearchEnded
             If the scheduler or all workers are lost, or an experiment terminates every worker that
             processes it.
         """
@@ -149,7 +149,9 @@ class DaskExecutor:
             return [self._result(future) for future in stored]
 
     def notes(self) -> list[str]:
-        """See `ExperimentExecutor`."""
+        """Return a note for the user if workers were lost during the solve, as a list; else
+        empty.
+        """
         with self._end_search_if_disconnected():
             failed_workers = self._first - self.client.nthreads().keys()
         note = f"{len(failed_workers)} of {len(self._first)} workers were lost during the solve: "
@@ -247,6 +249,18 @@ def _assign_workers(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
     """Return the worker address of each experiment.
 
     The experiment with the highest cost is assigned first, each to the thread with the least work.
+
+    Parameters
+    ----------
+    costs : sequence of int
+        Cost of each experiment.
+    threads : dict of str to int
+        Number of threads by worker address.
+
+    Raises
+    ------
+    InputError
+        If there are no workers.
     """
     _require_workers(threads)
     threads_of_workers = [(address, k) for address, count in threads.items() for k in range(count)]
@@ -260,8 +274,12 @@ def _assign_workers(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
 
 
 def _require_package(client: Any) -> set[str]:
-    """Return the addresses of the workers; raise `InputError` for those without this
-    package version.
+    """Return the addresses of the workers.
+
+    Raises
+    ------
+    InputError
+        If there are none, they do not answer, or one has another version of this package or none.
     """
     own_version = version("collocation-sysid")
     try:

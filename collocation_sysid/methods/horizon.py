@@ -1,8 +1,7 @@
 """Least-squares problem on the first rows of every experiment, linearised by sweeps.
 
 `Horizon` distributes the work on the experiments to `ExperimentExecutor` and joins the results to
-an
-`Iterate`. It is used by the reduced-space method and by shooting.
+an `Iterate`. It is used by the reduced-space method and by shooting.
 """
 
 from __future__ import annotations
@@ -91,7 +90,7 @@ class Horizon:
     """The problem on the first rows of every experiment.
 
     Arguments named `x` are lists with one entry per experiment, stored by the workers, of any kind
-    that `trajectory.trajectory_positions` accepts.
+    that `trajectory_sweeps.trajectory_positions` accepts.
 
     Parameters
     ----------
@@ -186,14 +185,15 @@ class Horizon:
 
     @one_blas_thread()
     def _run(self, p: Array, run: Callable[..., SweepResult], *columns: Sequence[Any]) -> Iterate:
-        """Run a function of `trajectory` for every experiment and join the results to an iterate.
+        """Run a function of `trajectory_sweeps` for every experiment, and return the iterate of the
+        joined results.
 
         Parameters
         ----------
         p : (np,) array
             All parameters (q, φ).
         run : callable
-            Function of (solver, segment, huber, p of the experiment, entries of the columns).
+            Function of (solver, transcription, huber, p of the experiment, entries of the columns).
         columns : sequence
             Further arguments, one entry per experiment each.
         """
@@ -239,7 +239,7 @@ class Horizon:
 
         Returns
         -------
-        tuple of list of Reached and SimulationError or None
+        tuple of list of SimulationResult and SimulationError or None
             Trajectories, stored by the workers, and the first failure; None if all are complete.
         """
         known = trajectories or self._repeat(None)
@@ -256,13 +256,17 @@ class Horizon:
         return results, failures[0] if failures else None
 
     def extrapolate(self, iterate: Iterate, step: Array) -> list[Any]:
-        """Return the positions, stored by the workers, after a step (np,) of the parameters."""
+        """Return the positions of each experiment, stored by the workers, after the feasibility
+        step of the iterate and a step (np,) of the parameters, to first order.
+        """
         return self.workers.map_experiments(
             extrapolate, self.segments, iterate.trajectories, self._by_experiment(step)
         )
 
     def fit_summaries(self, p: Array, trajectories: Sequence[Any]) -> list[FitSummary]:
-        """Return the fit of trajectories x at parameters p, without a sweep."""
+        """Return the fit of trajectories, as the workers store them, at parameters p (np,), without
+        a sweep; one summary for each experiment.
+        """
         summaries = self.workers.map_experiments(
             fit_summary, self.segments, self._by_experiment(p), trajectories
         )

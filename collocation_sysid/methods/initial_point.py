@@ -58,6 +58,9 @@ def compute_initial_point(
 ) -> InitialPoint:
     """Compute an initial point by reduced space, and add every iteration to the recorder.
 
+    Whether it can be used and whether it is near the optimum are attributes of the result; a failed
+    search is no error.
+
     Parameters
     ----------
     recorder : Recorder
@@ -131,7 +134,7 @@ def adjoint_multipliers(
 
     Returns
     -------
-    Multipliers or None
+    InitialMultipliers or None
         None if the equations of a time step are singular or a multiplier is not finite.
     """
     try:

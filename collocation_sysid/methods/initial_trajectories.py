@@ -1,10 +1,8 @@
 """Initial trajectories: simulations at given parameters, as far as they succeed.
 
 Use `initial_variables` for a method that needs variables at the guess, and `simulate_trajectories`
-for
-simulations at any parameters. Where a simulation fails, `complete_variables` appends the initial
-shape moved
-rigidly with the grasp.
+for simulations at any parameters. Where a simulation fails, `complete_variables` appends the
+initial shape moved rigidly with the grasp.
 """
 
 from __future__ import annotations
@@ -51,8 +49,8 @@ def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
     """Return variables z (variables,) at the guess, and notes for the user.
 
     Each experiment is simulated at the guess with the collocation scheme. If that fails, the
-    initial shape is moved rigidly with the grasp and a note is added: collocation needs no feasible
-    start.
+    initial shape is moved rigidly with the grasp instead and a note is added, because collocation
+    needs no feasible start.
     """
     p = collocation.guess_p
     positions = []
@@ -112,7 +110,9 @@ def simulate_trajectories(
     parts = collocation.iterates_at(p, known_rows or _empty_trajectories(collocation))
 
     def simulate_one(k: int) -> tuple[Array, SimulationError | None]:
-        """Simulate experiment number k, from 0."""
+        """Simulate experiment number k, from 0; return its trajectory as far as it succeeded, and
+        the failure or None.
+        """
         count = parts[k].segment.grid_times if rows is None else rows[k]
         own_guess = None if guess is None else guess[k]
         return continue_trajectory(parts[k], count, options, stopwatch, own_guess)

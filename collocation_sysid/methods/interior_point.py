@@ -90,7 +90,7 @@ NO_DAMPING = 1e-2
 
 @dataclass(frozen=True)
 class InteriorPoint(Options):
-    """Interior point, by IPOPT.
+    """Interior-point method (IPOPT) for parameters and trajectories together.
 
     Attributes
     ----------
@@ -144,12 +144,12 @@ class InteriorPoint(Options):
     ipopt: Mapping[str, IpoptValue] = field(default_factory=dict)
 
     def require(self, experiments: Iterable[Experiment]) -> None:
-        """Raise `InputError` if an obstacle has friction and contact is a complementarity.
+        """Check that the method can solve the experiments.
 
         Raises
         ------
         InputError
-            Names the experiment and the obstacle.
+            If contact is a complementarity and an obstacle has friction; the message names both.
         """
         if self.contact == "complementarity":
             for each in experiments:
@@ -180,8 +180,16 @@ class InteriorPoint(Options):
     def _solve(
         self, collocation: Collocation, watch: Watch | None, start: Array | None
     ) -> Solution:
-        """Return the solution with the contact law of each obstacle, without the
-        complementarity solves.
+        """Return the solution with the contact law of each obstacle, without the complementarity
+        solves.
+
+        Parameters
+        ----------
+        collocation : Collocation
+        watch : callable or None
+            Called with each entry of the history.
+        start : (variables,) array or None
+            Initial variables; None for those of the options.
         """
         recorder = Recorder(self.name, collocation, watch)
         if self.initial == "simulation":
@@ -351,8 +359,8 @@ class _DampedHessian:
             values[self._of_q] += weight * self._damping * largest
 
     def _ends_warm_up(self, p: Array) -> bool:
-        """Return whether the step to p was short, and not because of damping; update the
-        damping.
+        """Return whether the step to p (np,) was short, and not because of damping; p is stored and
+        the damping adapted to the length of the step.
         """
         steps = np.abs(p - self._last_p) / self.collocation.reach_p
         self._last_p = p

@@ -3,8 +3,7 @@
 The Hessian of ‖r‖² is 2 (SᵀS + B) with S = ∂r/∂p and B = Σ r_i ∇²r_i, which is small if the
 residuals are small. If they are not, as with measurement noise, Gauss–Newton converges slowly.
 `secant_update` approximates B from the steps by the update of Dennis, Gay and Welsch (NL2SOL,
-1981),
-which converges superlinearly at no cost; `exact_curvature` computes B from the Lagrangian.
+1981), which converges superlinearly at no cost; `exact_curvature` computes B from the Lagrangian.
 """
 
 from __future__ import annotations
@@ -25,7 +24,10 @@ LARGEST_SHARE = 0.9
 
 
 def secant_update(curvature: Array, previous: Iterate, after: Iterate) -> Array:
-    """Return B (np, np) after an accepted step, by the update of Dennis, Gay and Welsch.
+    """Return B (np, np) after an accepted step, by the update of Dennis, Gay and Welsch; B itself
+    if the score does not increase along the step.
+
+    B is what Gauss–Newton neglects of the Hessian.
 
     Parameters
     ----------
@@ -83,7 +85,7 @@ def with_curvature(fit: SquareRootInformation, curvature: Array) -> SquareRootIn
 
 
 def require_second_derivatives(collocation: Collocation) -> None:
-    """Raise `InputError` if the problem has no exact second derivatives.
+    """Check that the problem has exact second derivatives.
 
     Raises
     ------
@@ -137,8 +139,8 @@ def exact_curvature(
 
 
 def _tangent_direction(collocation: Collocation, iterate: Iterate, k: int) -> Array:
-    """Return the change of all variables per unit of parameter k (an index), along the
-    equations of motion.
+    """Return the change (variables,) of all variables per unit of the parameter with index k, along
+    the equations of motion; other parameters do not change.
     """
     unit = np.eye(len(iterate.p))[k]
     position_changes = [

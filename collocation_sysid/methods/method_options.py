@@ -1,8 +1,7 @@
 """Construction of methods from options by name, and shares of recordings.
 
 Use `method_from_options` to make a method from a table of the problem file. `Shares` is the type of
-options that
-list growing first parts of every recording, which are solved one after another.
+options that list growing first parts of every recording, which are solved one after another.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ FEWEST = 8
 
 
 def samples_in_share(count: int, share: float) -> int:
-    """Return the number of samples in a share of `count` samples, at least `FEWEST_SAMPLES` if
+    """Return the number of samples in a share of `count` samples, at least `FEWEST` if
     there are as many.
     """
     return min(count, max(FEWEST, round(share * count)))

@@ -17,7 +17,7 @@ import numpy as np
 from ..array_types import Array
 from ..errors import InputError
 from ..program.collocation import Collocation, convert_variables
-from ..signal_handling import LEFT_BEHIND, raises_interrupt
+from ..signal_handling import ABANDONED_THREAD, raises_interrupt
 from .callbacks import HessianValues, IterationMonitor, NlpFunctions
 from .condensed_program import complete_multipliers
 from .initial_point import InitialMultipliers
@@ -160,6 +160,19 @@ def _run(
 ) -> tuple[Array, Array, str, int]:
     """Run a solver, on a thread of its own if this is the main thread.
 
+    Parameters
+    ----------
+    solver : ca.Function
+        Solver of CasADi's `nlpsol`.
+    bounds : ((variables,) array, (variables,) array)
+        Lower and upper bounds of the variables.
+    start : (variables,) array
+        Initial variables.
+    monitor : IterationMonitor
+        Can stop the solver; receives its errors.
+    multipliers : InitialMultipliers or None
+        Initial multipliers; None for those of the solver.
+
     Returns
     -------
     tuple
@@ -197,6 +210,9 @@ def _run(
 def _run_on_thread(search: Callable[[], None], monitor: IterationMonitor) -> None:
     """Run a search on a thread, so that the main thread can handle signals during long
     factorisations.
+
+    After a request to stop, the search is abandoned if it does not end within `GRACE_S`: the thread
+    goes on, and `monitor.errors` receives an entry.
     """
     thread = threading.Thread(target=copy_context().run, args=(search,), daemon=True)
     with _interruptible(monitor):
@@ -208,7 +224,7 @@ def _run_on_thread(search: Callable[[], None], monitor: IterationMonitor) -> Non
                 remaining_s -= LOOK_EVERY_S if monitor.stop else 0.0
         finally:
             if thread.is_alive():
-                thread.name = LEFT_BEHIND
+                thread.name = ABANDONED_THREAD
                 monitor.errors.append(_SolverAbandoned())
 
 

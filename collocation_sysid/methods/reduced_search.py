@@ -207,9 +207,9 @@ class ReducedSearch:
         return status, status.sentence
 
     def _solve_from_start(self) -> Status | None:
-        """Solve the complete problem from the given positions.
+        """Return the status of a solve of the complete problem from the given trajectories.
 
-        Return None if there are none or the sweep fails; then the positions are discarded.
+        None if there are none or the sweep fails; the trajectories are then discarded.
         """
         if self.trajectories is None:
             return None
@@ -221,7 +221,9 @@ class ReducedSearch:
             return None
 
     def _solve_horizons(self) -> Status:
-        """Solve one horizon after the other, and return the last status."""
+        """Solve one horizon after the other, up to the complete problem or a limit of iterations,
+        and return the last status.
+        """
         status = Status.CONVERGED
         for share in self.options.ladder:
             last = share == self.options.ladder[-1]
@@ -237,8 +239,8 @@ class ReducedSearch:
         return status
 
     def _horizon(self, rows: list[int], last: bool) -> Horizon:
-        """Return the problem on the first rows of each experiment, with a prior unless it
-        is the last.
+        """Return the problem on the given numbers of first rows of each experiment; unless it is
+        the last horizon, with the prior of the options.
         """
         prior = None if last else self.options.rung_prior
         watch = self.recorder.stopwatch
@@ -286,6 +288,10 @@ class ReducedSearch:
 
     def _minimise(self, horizon: Horizon, is_last: bool) -> Status:
         """Take Gauss–Newton steps on one horizon until convergence, and return the status.
+
+        Accepted steps change the parameters, trajectories and trust region of this object; they
+        need trajectories of the horizon. The status is that of convergence, of the iteration limit,
+        or `STALLED` if steps become tiny without a decrease.
 
         Parameters
         ----------
@@ -349,8 +355,8 @@ class ReducedSearch:
                 point = self._make_feasible(horizon, point)
 
     def _update_curvature(self, curvature: Array, previous: Iterate, after: Iterate) -> Array:
-        """Return what Gauss–Newton neglects of the Hessian (np, np) at `after`,
-        approximated or exact.
+        """Return the part of the Hessian (np, np) at `after` that Gauss–Newton neglects: exact, or
+        by a secant update of `curvature` from the point `previous`, as the options state.
         """
         if self.options.hessian == "exact":
             return exact_curvature(self.collocation, after, self.recorder.stopwatch)
@@ -361,7 +367,9 @@ class ReducedSearch:
         return float(np.abs(step / self.reach).max(initial=0.0))
 
     def _next_step(self, point: Iterate, curvature: Array) -> Array:
-        """Return the step (np,) that minimises the model within bounds and trust region."""
+        """Return the step (np,) from `point` that minimises the model, with the neglected curvature
+        (np, np) added, within bounds and trust region.
+        """
         low = np.maximum(self.lower - point.p, -self.trust * self.reach)
         high = np.minimum(self.upper - point.p, self.trust * self.reach)
         # Rounding may leave a parameter on its bound by a hair.
@@ -370,7 +378,9 @@ class ReducedSearch:
         return with_curvature(point.fit, curvature).minimiser(low, high)
 
     def _try(self, horizon: Horizon, point: Iterate, step: Array) -> Iterate | None:
-        """Sweep after a step from `point`; None if that fails or is not finite."""
+        """Return the point after a step (np,) of the parameters from `point`, clipped to the
+        bounds, by one sweep; None if that fails or is not finite.
+        """
         self.sweeps += 1
         p = np.clip(point.p + step, self.lower, self.upper)
         try:
@@ -380,7 +390,20 @@ class ReducedSearch:
         return trial if trial.is_finite else None
 
     def _judge(self, point: Iterate, step: Array, trial: Iterate) -> bool:
-        """Return whether a trial is accepted, and adapt the trust region if it is."""
+        """Return whether a trial is accepted.
+
+        It must decrease the loss by a share of what the model predicts, and violate the equations
+        of motion little. For an accepted trial the trust region is enlarged or reduced, in place.
+
+        Parameters
+        ----------
+        point : Iterate
+            Best point so far.
+        step : (np,) array
+            Step of the parameters.
+        trial : Iterate
+            Point after the step.
+        """
         predicted = point.loss - point.predicted_loss(step)
         actual = point.loss - trial.loss
         if trial.feasibility_m > max(
@@ -399,7 +422,7 @@ class ReducedSearch:
 
     def _make_feasible(self, horizon: Horizon, point: Iterate) -> Iterate:
         """Return the point after its feasibility step or, if that does not converge, with a
-        simulation.
+        simulated trajectory; the result is accepted as the best so far.
 
         The loss of the projected trajectory is then accurate to a higher order, so that trials are
         no longer compared with a loss that is too low.
@@ -410,7 +433,12 @@ class ReducedSearch:
         return self._accept(horizon, refined)
 
     def _resimulated(self, horizon: Horizon, point: Iterate) -> Iterate:
-        """Return the point with a simulated trajectory, or unchanged if the simulation fails."""
+        """Return the point with a simulated trajectory in place of its own, accepted as the best so
+        far by `_accept`; the point itself, with nothing accepted, if the simulation or its sweep
+        fails.
+
+        It counts as one sweep.
+        """
         self.sweeps += 1
         x, failure = horizon.simulate(point.p, guess=point)
         if failure is not None:
@@ -433,8 +461,11 @@ class ReducedSearch:
     # Where recordings are read ----------------------------------------------------------------
 
     def _associate_initially(self, horizon: Horizon, is_first: bool) -> None:
-        """Associate markers and cameras of unknown position, from the first rows of the
-        trajectories.
+        """Associate markers and cameras of unknown position with the first rows of the
+        trajectories, and replace the collocation of the search and the horizon.
+
+        Nothing happens after the first time, unless the trajectories were then too short for the
+        cameras; nor if all positions are known.
 
         Parameters
         ----------
@@ -454,8 +485,8 @@ class ReducedSearch:
                 )
 
     def _set_collocation(self, horizon: Horizon, collocation: Collocation, p: Array) -> None:
-        """Use another collocation of the same problem in the search, the recorder and the
-        horizon.
+        """Use another collocation of the same problem, and its parameters p (np,), in the search,
+        the recorder and the horizon, in place.
         """
         self.collocation = self.recorder.collocation = collocation
         horizon.set_collocation(collocation)
@@ -463,10 +494,8 @@ class ReducedSearch:
         self.p = p
 
     def _reassociate(self, horizon: Horizon, point: Iterate) -> Iterate:
-        """Return the point with measurements associated at its estimates; unchanged if they are the
-        same.
-
-        The association is not updated after `REREADINGS` updates.
+        """Return the point with measurements associated at its estimates, and use that collocation
+        from now on; the point itself if nothing changes, or after `REREADINGS` updates.
         """
         trial, collocation, after = self.camera_trial
         is_camera_trial = trial is point
@@ -486,7 +515,8 @@ class ReducedSearch:
         """Return whether a trial is still acceptable with depth points associated at its estimates.
 
         A depth point may then belong to another part of the surface, or to none. True without depth
-        cameras; false if the association may not be updated any more.
+        cameras; false if the association may not be updated any more. The collocation is as before
+        afterwards; the association at the trial is stored for `_reassociate`.
         """
         before = self.collocation
         if not self.has_depth_cameras:
@@ -507,7 +537,9 @@ class ReducedSearch:
         )
 
     def _accept(self, horizon: Horizon, point: Iterate) -> Iterate:
-        """Make a point the best so far, associate its measurements, record it, and return it."""
+        """Make a point the best so far: associate its measurements with its estimates, store and
+        record it, and return it as associated.
+        """
         self.point = point = self._reassociate(horizon, point)
         self.indefinite_steps = sum(report.indefinite_steps for report in point.reports)
         summaries = [report.fit_summary for report in point.reports]
@@ -515,7 +547,18 @@ class ReducedSearch:
         return point
 
     def _record(self, p: Array, x: list[Any], loss: float, summaries: list[FitSummary]) -> None:
-        """Store parameters and trajectories as the best so far, and add them to the history."""
+        """Store parameters and trajectories as the best so far, and add an entry to the history.
+
+        Parameters
+        ----------
+        p : (np,) array
+        x : list
+            Trajectories, as the workers store them.
+        loss : float
+            Loss with priors.
+        summaries : list of FitSummary
+            Fit of each experiment.
+        """
         self.p = p
         self.trajectories = x
         squares_m2 = sum(each.squares_m2 for each in summaries)

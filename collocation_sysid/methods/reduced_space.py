@@ -19,7 +19,7 @@ quarter, half and all of the recording) extend the convergence to cases where on
 simulated at the guess. If even one horizon cannot be simulated completely, its first rows are
 solved before the others.
 
-Use it by default: it needs the least memory and time. Its search is in `minimise`.
+Use it by default: it needs the least memory and time. Its search is in `reduced_search`.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ MISFIT = 3.0
 
 @dataclass(frozen=True)
 class ReducedSpace(SearchOptions):
-    """Gauss–Newton steps of the parameters, with the trajectories that the dynamics give them."""
+    """Gauss–Newton method for the parameters; the equations of motion give the trajectories."""
 
     name: ClassVar[str] = "reduced-space"
 
@@ -122,8 +122,8 @@ def memory_mb(collocation: Collocation) -> float:
 
 
 def _main_measurement(collocation: Collocation) -> tuple[str, str]:
-    """Return the kind of measurement that dominates, in words, and the key that states its
-    noise.
+    """Return the kind of measurement that dominates, as plural text, and the key that states its
+    noise: markers, else depth cameras, else wrenches, else custom sensors.
     """
     experiments = [segment.experiment for segment in collocation.transcriptions]
     if any(each.markers.sample_count for each in experiments):
@@ -136,7 +136,8 @@ def _main_measurement(collocation: Collocation) -> tuple[str, str]:
 
 
 def _notes(collocation: Collocation, indefinite_steps: int, z: Array, status: Status) -> list[str]:
-    """Return notes for the user on the answer.
+    """Return notes for the user on the answer: on time steps whose matrix is indefinite, and on
+    residuals that are much larger than the noise.
 
     Parameters
     ----------
@@ -147,7 +148,7 @@ def _notes(collocation: Collocation, indefinite_steps: int, z: Array, status: St
     z : (variables,) array
         Final variables.
     status : Status
-        Status of the search.
+        Status of the search; residuals are judged only at a minimum.
     """
     notes = []
     if indefinite_steps:

@@ -216,7 +216,10 @@ class Solution:
         return self
 
     def after(self, first: Solution, why: str) -> Solution:
-        """Return a copy that also counts a previous solve: its iterations, history, time and notes.
+        """Return a copy that also counts a previous solve.
+
+        Iterations, evaluations and times are added; the history follows that of the first solve,
+        with its numbers and times continued; `scan` is that of the first solve.
 
         Parameters
         ----------
@@ -310,7 +313,9 @@ class Solution:
         raise InputError(f"{which}; expected one of {expected or '(none)'}{hint_at(name, known)}")
 
     def part_of(self, experiment: str) -> ExperimentIterate | None:
-        """Return one experiment at the solution, by name; None if it was not fitted."""
+        """Return the iterate of one experiment at the solution, by the experiment's name; None if
+        it was not fitted.
+        """
         named = {part.segment.experiment.name: part for part in self.parts}
         return named.get(experiment)
 
@@ -342,7 +347,8 @@ class Solution:
 
     @cached_property
     def wrench_rms(self) -> dict[str, tuple[float | None, float | None]]:
-        """RMS residuals of force [N] and torque [N m] by experiment name, see `wrench_rms`.
+        """RMS residuals of force [N] and torque [N m] by experiment name, None for one that is not
+        measured, see the function `wrench_rms`.
 
         Only experiments with wrench sensors are included.
         """
@@ -375,7 +381,9 @@ class Solution:
 
     @cached_property
     def rms_by_experiment_m(self) -> dict[str, float]:
-        """Root mean square distance of markers from their measurements [m], by experiment name."""
+        """Root mean square distance of markers from their measurements [m], by experiment name; 0
+        without samples.
+        """
         rms_by_experiment = {}
         for segment, readings in zip(self.collocation.transcriptions, self.readings_m, strict=True):
             markers = segment.experiment.markers
@@ -443,7 +451,8 @@ def custom_sensor_rms(experiment: Experiment, predicted: Mapping[str, Array]) ->
     experiment : Experiment
         Experiment with the measured values.
     predicted : mapping of str to (S, m) array
-        Predicted values by sensor name; NaN entries are ignored.
+        Predicted values by sensor name. Samples that are NaN, predicted or measured, are ignored; a
+        sensor without any other has the value NaN.
     """
     residuals = ((g.name, predicted[g.name] - g.measured_values) for g in experiment.readings)
     return {name: float(np.sqrt(np.nanmean(each**2))) for name, each in residuals}
@@ -542,9 +551,10 @@ def constraint_multipliers(
 
 
 def _set_grasp_multipliers(collocation: Collocation, z: Array, multipliers: Array) -> None:
-    """Set the multipliers of prescribed displacements to minus the remaining gradient, in place.
+    """Set the multipliers (constraints,) of prescribed displacements to minus the remaining
+    gradient of the Lagrangian, in place.
 
-    Their constraints have unit Jacobian rows.
+    The constraints of prescribed displacements have unit Jacobian rows.
     """
     slope = collocation.gradient(z) + collocation.jacobian_vjp(z, multipliers)
     for part in collocation.iterates(slope):

@@ -78,7 +78,7 @@ class Recorder:
 
     @property
     def elapsed_s(self) -> float:
-        """Time since construction [s]."""
+        """Wall-clock time since the recorder was made [s]."""
         return time.perf_counter() - self.start_s
 
     @property
@@ -149,7 +149,7 @@ class Recorder:
         self.add(line)
 
     def add(self, line: Iteration) -> None:
-        """Add an entry to the history and pass it to `watch`.
+        """Add an entry to the history and pass it to `watch`, unless that is None.
 
         Coefficients of spatially varying parameters are removed from the entry, because there are
         many.
@@ -182,7 +182,7 @@ class Recorder:
         z : (variables,) array
             Final variables.
         multipliers : (constraints,) array or None
-            Multipliers of the method; None if it has none.
+            Multipliers of the method; None if it has none, and then also in the solution.
         iterations : int
             Iterations of the method.
         evaluations : int

@@ -8,8 +8,7 @@ simulation fails. So the best start is found by cheap simulations, and the searc
 where simulations succeed.
 
 The same scan is used if a guess cannot be simulated, or fits worse than a rigid body. Use
-`start_problem`
-before a method is called.
+`start_problem` before a method is called.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ SOFT_PA = 1e4
 # Tolerance of simulations that are only compared.
 LOOSE = NewtonOptions(tolerance=1e-4)
 # Number of failures in a row that end the scan.
-LOST_MARKERS = 2
+CONSECUTIVE_FAILURES = 2
 # Misfit over the best one that counts as a failure.
 WORSE = 3.0
 # The scan continues beyond an end as long as the misfit decreases by this share.
@@ -100,7 +99,9 @@ class Scan:
 
     @property
     def sentence(self) -> str:
-        """Summary of the scan for the user."""
+        """Summary of the scan for the user: its reason, the best modulus, the number of moduli and
+        the time.
+        """
         return (
             f"{self.reason}: started from E = {self.young_pa[self.best]:.3g} Pa after a scan of "
             f"{len(self.young_pa)} stiffnesses in {self.time_s:.2g} s"
@@ -238,7 +239,11 @@ def scan_stiffness(
 
 
 def _other_starts(misfit: Array, best: int) -> tuple[int, ...]:
-    """Return indices of the next best starts, see `Scan.others`.
+    """Return the indices of moduli other than the best that may lead to a better solution, in
+    ascending order of the misfit.
+
+    They are the neighbours of the best and other minima of the misfit, unless their misfit is much
+    larger; at most `MORE_STARTS`.
 
     Parameters
     ----------
@@ -261,7 +266,7 @@ def _other_starts(misfit: Array, best: int) -> tuple[int, ...]:
 
 def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
     """Return parameters in which missing guesses are replaced by typical values at a Young's
-    modulus [Pa].
+    modulus [Pa], within their bounds.
 
     Parameters with a prior get its mean instead. Fixed parameters and those with a guess are kept.
     """
@@ -289,8 +294,8 @@ def typical_constants(parameters: Parameters) -> dict[str, float]:
 
 
 def _ranked_moduli(young_pa: Array, misfit: Array) -> list[float]:
-    """Return the moduli that could be simulated: the best, followed by stiffer ones; empty
-    if none could.
+    """Return the moduli [Pa] that could be simulated, from the best on to stiffer ones; empty if
+    none could. The moduli ascend; a misfit is NaN where the simulation failed.
     """
     if np.isnan(misfit).all():
         return []
@@ -299,8 +304,8 @@ def _ranked_moduli(young_pa: Array, misfit: Array) -> list[float]:
 
 
 def _with_units(parameters: Parameters, young_pa: float) -> Parameters:
-    """Return the parameters with a unit for linear ones without: a tenth of Young's modulus
-    [Pa].
+    """Return the parameters with a unit for those linear ones that have none, a tenth of Young's
+    modulus [Pa].
     """
     unit = young_pa / 10
     return Parameters(
@@ -315,8 +320,8 @@ def _has_free_modulus(collocation: Collocation) -> bool:
 
 
 def without_guesses(collocation: Collocation) -> Collocation:
-    """Return the problem without the guesses of free parameters that a prior or a typical
-    value can replace.
+    """Return the problem without the guesses of those free parameters that have a prior or a
+    typical value, which can replace the guess.
     """
 
     def without_guess(item: Parameter) -> Parameter:
@@ -330,9 +335,17 @@ def without_guesses(collocation: Collocation) -> Collocation:
 
 
 def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> float:
-    """Return the root mean square of all residuals, in standard deviations, on the first rows.
+    """Return the root mean square of all residuals on the first rows, in standard deviations.
 
     Markers of unknown position are associated with the body at the first samples.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    p : (np,) array
+        Parameters.
+    positions : sequence of (rows, 3n) array
+        First rows of each trajectory [m].
     """
     collocation, p = collocation.place_unknown_markers(p, positions)
     parts = collocation.iterates_at(p, positions)
@@ -374,8 +387,8 @@ def _residuals(iterate: ExperimentIterate) -> Array:
 
 
 def _compared_samples(transcription: Transcription) -> int:
-    """Return the number of first samples that are compared, with at least one of each
-    measurement.
+    """Return the number of first samples of an experiment that are compared: a share of the
+    recording, and at least one sample of each measurement.
     """
     t_s = transcription.experiment.t_s
     first_samples = [transcription.experiment.markers.first_visible_sample]
@@ -422,7 +435,10 @@ class _TrialSimulation:
         return _misfit(self.collocation, self.collocation.guess_p, positions)
 
     def evaluate_guess(self, is_complete: bool) -> tuple[float, SimulationError | None]:
-        """Return the misfit of the guess and None, or NaN and the failure of its simulation."""
+        """Return the misfit of the guess and None, or NaN and the failure of its simulation. With
+        `is_complete` the complete recordings are simulated; the misfit is always that of their
+        first part.
+        """
         p = self.collocation.guess_p
         positions, failure = self._simulate(p, None, self.all_rows if is_complete else self.rows)
         if failure is not None:
@@ -432,15 +448,15 @@ class _TrialSimulation:
     def evaluate_at(
         self, young_pa: float, guess: list[Array] | None
     ) -> tuple[float, list[Array] | None]:
-        """Return misfit and trajectories at a Young's modulus [Pa]; NaN and None if the simulation
-        fails.
+        """Return misfit and trajectories at a Young's modulus; NaN and None if the simulation
+        fails, whose error is then stored in `failure`.
 
         Parameters
         ----------
         young_pa : float
             Young's modulus [Pa].
         guess : list of (N, 3n) array or None
-            Trajectories at another modulus, near which equilibria are searched.
+            Trajectories at another modulus, near which equilibria are searched; None without.
         """
         p = self._p(young_pa)
         positions, failure = self._simulate(p, guess, self.rows)
@@ -450,7 +466,9 @@ class _TrialSimulation:
         return self._evaluate(p, positions), positions
 
     def is_simulable(self, young_pa: float) -> bool:
-        """Return whether the complete recordings can be simulated at a Young's modulus [Pa]."""
+        """Return whether the complete recordings can be simulated at a Young's modulus [Pa]; if
+        not, the error is stored in `failure`.
+        """
         _, failure = self._simulate(self._p(young_pa), None, self.all_rows)
         self.failure = failure or self.failure
         return failure is None
@@ -462,7 +480,9 @@ class _TrialSimulation:
         return tuple(self._p(young_pa).tolist())
 
     def _p(self, young_pa: float) -> Array:
-        """Return the parameters p (np,) at a Young's modulus [Pa]."""
+        """Return the parameters p (np,) with missing guesses replaced by typical values at a
+        Young's modulus [Pa], and φ zero.
+        """
         q = typical_parameters(self.collocation.parameters, young_pa).guess_q
         return np.concatenate([q, np.zeros(self.collocation.nphi)])
 
@@ -475,8 +495,10 @@ class _TrialSimulation:
     def _simulate(
         self, p: Array, warm: list[Array] | None, rows: Sequence[int]
     ) -> tuple[list[Array], SimulationError | None]:
-        """Return trajectories of so many rows at p, and the first failure, see
-        `simulate_trajectories`.
+        """Return trajectories of the given numbers of rows at p (np,), and the first failure or
+        None, see `simulate_trajectories`.
+
+        Equilibria are searched near the trajectories `warm`; None for no guess.
         """
         return simulate_trajectories(self.collocation, p, None, rows, LOOSE, guess=warm)
 
@@ -501,9 +523,10 @@ class _ScanState:
         self.is_ended_early = False
 
     def try_sequence(self, young_pa: Sequence[float]) -> None:
-        """Try Young's moduli in the given order [Pa] until several in a row fail or fit badly.
+        """Try Young's moduli in the given order [Pa] until several in a row fail or fit badly; then
+        `is_ended_early` is set.
 
-        Moduli that give the same parameters are tried once.
+        Of neighbours that give the same parameters only one is tried.
         """
         failures = 0
         first, *others = ([*same] for _, same in groupby(young_pa, self.trial.parameter_key))
@@ -512,12 +535,13 @@ class _ScanState:
             finite_misfits = [m for m in self.misfits.values() if np.isfinite(m)]
             is_failure = bool(finite_misfits) and not misfit <= WORSE * min(finite_misfits)
             failures = failures + 1 if is_failure else 0
-            if failures == LOST_MARKERS:
+            if failures == CONSECUTIVE_FAILURES:
                 self.is_ended_early = True
                 return
 
     def extend_range(self, young_pa: float, factor: float) -> None:
-        """Try moduli beyond an end of the range, as long as the misfit decreases.
+        """Try moduli beyond an end of the range, as long as the misfit decreases, within
+        `LIMITS_PA`; their misfits are stored.
 
         Parameters
         ----------
@@ -549,7 +573,9 @@ class _ScanState:
         return best == (min(self.misfits) if softest else max(self.misfits))
 
     def _try(self, young_pa: float) -> float:
-        """Simulate at a modulus, store the misfit, and return it."""
+        """Simulate at a Young's modulus [Pa], store its misfit and trajectories, and return the
+        misfit; NaN if the simulation fails.
+        """
         misfit, warm = self.trial.evaluate_at(young_pa, self.last_trajectories)
         self.last_trajectories = warm or self.last_trajectories
         self.misfits[young_pa] = misfit

@@ -2,8 +2,7 @@
 
 These functions run where the experiment is stored, in this process or on a worker of a cluster. A
 `SweepResult` is stored there because its size grows with the number of time steps; the search needs
-only
-its `SweepReport`, whose size does not. Parameters p are the (q, φ) of the experiment alone.
+only its `SweepReport`, whose size does not. Parameters p are the (q, φ) of the experiment alone.
 """
 
 from __future__ import annotations
@@ -208,9 +207,8 @@ def sweep_after_step(
     """Return the result of one sweep after a step of the parameters to p.
 
     The positions are those of `previous` extrapolated along the sensitivities. Static experiments
-    are
-    first solved for the equilibrium if one is near: a linear extrapolation stretches slender bodies
-    that rotate much, so that its loss would be meaningless.
+    are first solved for the equilibrium if one is near: a linear extrapolation stretches slender
+    bodies that rotate much, so that its loss would be meaningless.
 
     Parameters
     ----------
@@ -281,8 +279,8 @@ def reassociate(
 
 
 def extrapolate(transcription: Transcription, sweep_result: SweepResult, step: Array) -> Array:
-    """Return positions (rows, 3n) [m] after the feasibility step and a step (k,) of the
-    parameters.
+    """Return positions (rows, 3n) [m] after the feasibility step of a sweep and a step (k,) of the
+    experiment's parameters, to first order.
     """
     return (
         sweep_result.x
@@ -299,6 +297,8 @@ def simulate_rows(
     guess: SweepResult | None,
 ) -> SimulationResult:
     """Simulate the rows of the solver at parameters p, as far as the simulation succeeds.
+
+    A failure is part of the result. The stopwatch of the solver is read and reset.
 
     Parameters
     ----------
@@ -328,8 +328,8 @@ def simulate_rows(
 
 
 def fit_summary(transcription: Transcription, p: Array, x: Array) -> FitSummary:
-    """Return the fit of positions x (rows, 3n) [m] at parameters p, with residuals computed
-    from them.
+    """Return the fit of positions x (rows, 3n) [m] at the experiment's parameters p (k,), with
+    residuals of the equations of motion evaluated at x.
     """
     part = _iterate(transcription, p, x)
     return FitSummary.from_iterate(part, x, float(np.abs(part.residual_n).max()))
@@ -347,18 +347,20 @@ def _sweep_result(
     previous: SweepResult | None,
     times_s: tuple[float, float, float],
 ) -> SweepResult:
-    """Return the sweep result: measurement residuals and slopes after the feasibility step.
+    """Return the sweep result: measurement residuals and slopes after the feasibility step, as
+    least squares with Huber's loss.
 
     Parameters
     ----------
     iterate : ExperimentIterate
         Experiment at the parameters and positions of the sweep.
     huber : float or None
-        See `sweep`.
+        Not used: each measurement residual has a threshold of its own.
     tangent : Tangent
         Feasibility step and sensitivities.
     previous : SweepResult or None
-        Previous trajectory; None for none.
+        Previous trajectory; for None the change of positions and `previous_slopes_residual` are
+        zero.
     times_s : tuple of three floats
         Times for `Stopwatch.add` [s].
     """

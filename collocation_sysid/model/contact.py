@@ -1,9 +1,8 @@
 """Contact pressure and friction between a deformable body and rigid obstacles.
 
 Use `contact_terms` to get the contact terms of an experiment. At points of the surface with
-undeformed
-areas A and the gap g(x, X) to an obstacle whose frame has the pose X, the contact energy Ψ, the
-normal force N and the dissipation potential of friction D are
+undeformed areas A and the gap g(x, X) to an obstacle whose frame has the pose X, the contact energy
+Ψ, the normal force N and the dissipation potential of friction D are
 
     Ψ = Σ A κ/(3δ) (⟨δ − g⟩³ − ⟨−g⟩³),    N = A κ/δ (⟨δ − g⟩² − ⟨−g⟩²),
     D = Σ μ N (√(|v_t|² + ε²) − ε),
@@ -138,8 +137,8 @@ class ContactLaw:
 
     @cached_property
     def constant_columns(self) -> Index:
-        """Indices (c,) in θ of the elastic constants on which κ depends, then of the friction
-        coefficient.
+        """Indices (c,) in θ of the constants on which the force depends: the elastic ones that
+        determine κ, unless it is stated, then the friction coefficient if it is a parameter.
         """
         part = self.surface.part
         columns = []
@@ -170,7 +169,9 @@ class ContactLaw:
         return stiffness * self.data[3]
 
     def friction_coefficient(self, constants: ca.SX) -> ca.SX:
-        """Return the friction coefficient μ, stated or from the constants (c,)."""
+        """Return the friction coefficient μ: the stated number, or the last of the law's constants
+        (c,).
+        """
         coefficient = self.obstacle.friction
         return constants[-1] if isinstance(coefficient, str) else ca.SX(coefficient)
 
@@ -211,7 +212,8 @@ class ContactLaw:
     def scaled_pressure(self, gap: ca.SX, data: ca.SX) -> ca.SX:
         """Return b, the pressure divided by κ [m], at a gap.
 
-        With relaxed contact b is r δ² / g, limited to `LARGEST_SCALED_PRESSURE` widths.
+        With relaxed contact b is r δ² / g, limited to `LARGEST_SCALED_PRESSURE` widths δ; otherwise
+        it is (⟨δ − g⟩² − ⟨−g⟩²) / δ.
 
         Parameters
         ----------
@@ -228,8 +230,8 @@ class ContactLaw:
         return data[1] / ca.fmax(gap, data[1] / (LARGEST_SCALED_PRESSURE * width_m))
 
     def mean_scaled_pressure(self, gaps: tuple[ca.SX, ca.SX], data: ca.SX) -> ca.SX:
-        """Return the mean of b while the gap changes linearly from the first to the second
-        value.
+        """Return the mean of b [m] over a step in which the gap changes linearly between two values
+        [m]; `data` (5,) are those of the point.
         """
         width_m = data[2]
         reach = mean_square(*(width_m - gap for gap in gaps))
@@ -315,7 +317,18 @@ class ContactLaw:
         )
 
     def _complementarity_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the forces at given b, followed by b + g − √((b − g)² + 4 r δ²)."""
+        """Return the contact forces (12,) on y and the residual b + g − √((b − g)² + 4 r δ²),
+        stacked (13,).
+
+        The residual vanishes where b and the gap g are positive and b g = r δ².
+
+        Parameters
+        ----------
+        u : SX
+            Stacked inputs of `force_expression`, then the scaled pressure b [m].
+        data : (5,) SX
+            Data of the point, see `data`; entry 1 is r δ².
+        """
         inputs, b = ca.vertsplit(u, [0, u.numel() - 1, u.numel()])
         gap = self.gap_at(self.to_obstacle_frame(inputs[: 3 * VECTORS_PER_POINT])[0])
         residual = b + gap - ca.sqrt((b - gap) ** 2 + 4 * data[1])
@@ -353,8 +366,18 @@ class ContactLaw:
     def _normal(
         self, u: ca.SX, data: ca.SX, pressing: ca.SX | None
     ) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-        """Return the point in obstacle axes, these axes, the gradient of the gap there and the
-        force N.
+        """Return the point in obstacle axes (3,), these axes (3, 3), the gradient of the gap there
+        (3,), in obstacle axes, and the normal force N.
+
+        Parameters
+        ----------
+        u : SX
+            Stacked (y, ẏ, c), or (y, c) if the force does not depend on velocities.
+        data : (5,) SX
+            Data of the point, see `data`.
+        pressing : SX or None
+            Given scaled pressure b; None for that of the gap, averaged over the step if
+            `is_averaged`.
         """
         place, axes = self.to_obstacle_frame(u[: 3 * VECTORS_PER_POINT])
         symbol = ca.SX.sym("place", 3)
@@ -375,7 +398,9 @@ class ContactLaw:
         )
 
     def _end_gaps(self, u: ca.SX, half_s: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Return the gaps at both ends of a step, half a step before and after ξ."""
+        """Return the gaps [m] at both ends of a step: `half_s` [s] before and after the state in u,
+        with constant velocities.
+        """
         y = u[: 3 * VECTORS_PER_POINT]
         v = u[3 * VECTORS_PER_POINT : 6 * VECTORS_PER_POINT]
         before, after = (
@@ -557,7 +582,9 @@ class Contact(Pointwise):
         return chosen, y[..., chosen]
 
     def _least_gaps(self, states: States, y: Array) -> Array:
-        """Return the gaps (T, i) at y; if averaged over a step, the smaller one of its two ends."""
+        """Return the gaps (T, i) [m] of points y (12, T, i); for a pressure that is averaged over a
+        step the smaller one of the gaps at its ends.
+        """
         half_s = self.step_s / 2
         if not half_s:
             return self.law_of_contact.gaps(y)
@@ -567,8 +594,8 @@ class Contact(Pointwise):
         )
 
     def deepest_point(self, x: Array) -> tuple[float, Array]:
-        """Return the depth δ − g of the deepest point at positions x (3n,) [m], and the normal (3,)
-        there.
+        """Return the depth δ − g [m] of the deepest point at positions x (3n,) [m], and the
+        gradient of its gap (3,), the obstacle's outward normal.
 
         The depth is negative if no point has a pressure.
         """
@@ -640,7 +667,9 @@ def contact_law(
 
 
 def mean_square(first: ca.SX, second: ca.SX) -> ca.SX:
-    """Return the mean ∫₀¹ ⟨a + s (b − a)⟩² ds of ⟨·⟩² from a to b, without cancellation."""
+    """Return the mean ∫₀¹ ⟨a + s (b − a)⟩² ds between two numbers a = `first` and b = `second`,
+    without cancellation; ⟨·⟩ is the positive part.
+    """
     high = ca.fmax(first, second)
     low = ca.fmin(first, second)
     both = (high**2 + high * low + low**2) / 3

@@ -10,8 +10,8 @@ so that with G = ∂F/∂ξ and C = ∂F/∂ν at evaluation t (see `schemes`)
     −∂c_t/∂x_t = s_0 M − w_0 (p_0 G + q_0 C).
 
 Use `Dynamics.from_experiment` to discretise an experiment, `Dynamics.residual` and
-`Dynamics.linearise` to
-evaluate all rows, and `StencilRow` for time-marching methods that need the coefficients of one row.
+`Dynamics.linearise` to evaluate all rows, and `StencilRow` for time-marching methods that need the
+coefficients of one row.
 """
 
 from __future__ import annotations
@@ -122,6 +122,8 @@ class Dynamics:
     ) -> Dynamics:
         """Discretise an experiment in time.
 
+        The constants of the body are NaN until `with_theta` or `with_inputs` sets them.
+
         Parameters
         ----------
         experiment : Experiment
@@ -181,8 +183,8 @@ class Dynamics:
         return replace(self, forces=forces, mass=_row_masses(self.tables, forces.mass))
 
     def rows_to_evaluations(self, row_values: Array) -> Array:
-        """Apply the transpose of `row_values`: distribute row quantities (N, …) to the
-        evaluations.
+        """Return quantities of the rows (N, …), distributed to the evaluations by the transpose of
+        the weighted mean that gives a row's value.
         """
         total = self.tables.w.sum(axis=1).reshape((-1,) + (1,) * (row_values.ndim - 1))
         shares = row_values / np.where(total == 0, 1.0, total)
@@ -261,9 +263,9 @@ class Dynamics:
 
     @property
     def interval_to_next_s(self) -> Array:
-        """Time from each evaluation to the next (N,).
+        """Time [s] from each evaluation to the next (N,).
 
-        The last entry is one step, or 1 s if static.
+        The last entry is one step; in a static experiment 1 s.
         """
         if self.is_static:
             return np.append(np.diff(self.t_s), 1.0)
@@ -303,14 +305,15 @@ class Dynamics:
     def contact_with_pressures(
         self, x: Array, scaled_pressures: Mapping[int, Array]
     ) -> tuple[AnyHistory, ...]:
-        """Return contact forces at given pressures b, in the form of histories.
+        """Return contact forces at given pressures b, one object with the interface of
+        `ForceHistory` for each entry.
 
         Parameters
         ----------
         x : (N, 3n)
             Positions [m].
         scaled_pressures : mapping
-            Scaled contact pressure b (1, N, points) by the index of the force in
+            Scaled contact pressure b (1, N, points) [m] by the index of the force in
             `Forces.external_terms`.
         """
         states = self.all_evaluation_states(x)
@@ -357,7 +360,9 @@ class Dynamics:
         return _combine(table, rows)
 
     def combine_transposed(self, table: Array, rows: Array) -> Array:
-        """Return Σ_i table[k + i, i] rows[k + i] for every k: the transpose of `combine`."""
+        """Return Σ_i table[k + i, i] rows[k + i] for every k (N, …), from coefficients (N, lags)
+        and `rows` (N, …): the transpose of `combine`. Terms after the end are omitted.
+        """
         result = np.zeros_like(rows)
         shape = (-1,) + (1,) * (rows.ndim - 1)
         for lag in range(min(table.shape[1], len(rows))):
@@ -386,8 +391,13 @@ class Dynamics:
     def force(self, x: Array, histories: Sequence[AnyHistory] = ()) -> Array:
         """Return the forces F (N − first_row, 3n) [N] at the evaluation states of x (N, 3n).
 
-        `histories_of_trajectory` are the internal variables of the motion; computed from x where
-        the sequence is empty.
+        Parameters
+        ----------
+        x : (N, 3n)
+            Positions [m].
+        histories : sequence of histories
+            Internal variables of the motion, see `histories`; computed from x where the sequence is
+            empty.
         """
         return self.forces_with_histories(histories or self.histories(x)).total(
             *self.evaluation_states(x)
@@ -395,6 +405,8 @@ class Dynamics:
 
     def assemble_residual(self, x: Array, force: Array) -> Array:
         """Return the residuals c (N, 3n) [N] from forces that have been evaluated.
+
+        Forces on temporarily prescribed dofs and those before `first_row` count as zero.
 
         Parameters
         ----------
@@ -420,7 +432,9 @@ class Dynamics:
         return rows
 
     def acceleration(self, x: Array) -> Array:
-        """Return the acceleration in every row (N, 3n) [m/s²] of positions x (N, 3n)."""
+        """Return the acceleration in every row (N, 3n) [m/s²] of positions x (N, 3n) [m]; zero in
+        rows before `first_row` and in static experiments.
+        """
         acceleration = self.combine(self.tables.s, x) / self.step_s**2
         acceleration += np.outer(self.tables.r / self.step_s, self.start_velocity_m_s)
         return acceleration
@@ -471,7 +485,9 @@ class Dynamics:
 
 
 def _combine(table: Array, rows: Array) -> Array:
-    """Return Σ_i table[t, i] rows[t − i] for every t; terms before the start are omitted."""
+    """Return Σ_i table[t, i] rows[t − i] for every t (N, …), from coefficients (N, lags) and `rows`
+    (N, …); terms before the start are omitted.
+    """
     result = np.zeros_like(rows)
     shape = (-1,) + (1,) * (rows.ndim - 1)
     for lag in range(min(table.shape[1], len(rows))):
@@ -489,9 +505,10 @@ def _row_masses(tables: StencilTables, at_evaluations: DofMasses) -> DofMasses:
 def _evaluation_mean(tables: StencilTables, at_evaluations: Array) -> Array:
     # Weighted like the forces, so that gravity alone accelerates all masses equally, also a load
     # that is joining.
-    """Return the mean over the evaluations of each row (N, …), weighted like the forces.
+    """Return the mean over the evaluations of each row (N, …), weighted like the forces, of
+    quantities (N, …) at the evaluations.
 
-    A row without forces keeps the value at its evaluation.
+    A row without forces has the value at its evaluation.
     """
     if (at_evaluations == at_evaluations[:1]).all():
         return at_evaluations
@@ -537,7 +554,7 @@ class StencilRow:
 
     @cached_property
     def nonzero_lags(self) -> list[int]:
-        """Lags from 1 on whose positions the evaluation of the force depends on."""
+        """Lags i ≥ 1 for which the force of this row depends on x_{t−i}."""
         return [i for i in range(1, len(self.p)) if self.p[i] or self.q[i]]
 
     def block(self, by_position: Array, by_velocity: Array, pattern: SymmetricPattern) -> Array:
@@ -566,7 +583,9 @@ class StencilRow:
         return -self.w[0] * self.skew(0, by_position_skew, by_velocity_skew)
 
     def skew(self, lag: int, by_position_skew: Array, by_velocity_skew: Array) -> Array:
-        """Return the skew part of p G + q C at a lag, (m,) or (0,)."""
+        """Return the skew part (m,) of p G + q C at a lag, from those of G (m,) and C (m,); that of
+        C may be empty, which stands for zero.
+        """
         skew_part = self.p[lag] * by_position_skew
         return skew_part + self.q[lag] * by_velocity_skew if by_velocity_skew.size else skew_part
 

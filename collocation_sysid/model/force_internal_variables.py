@@ -1,6 +1,6 @@
 """Internal variables of one force along a motion, with derivatives forward and backward in time.
 
-See `custom_force_terms` for the law of a force with internal variables h. At evaluation k, with the
+See `point_forces` for the law of a force with internal variables h. At evaluation k, with the
 previous variables b = h_{k−1}, columns of derivatives follow by the chain rule,
 
     dF_k ∋ ∂F/∂b db,   dh_k = ∂h/∂b db + ∂h/∂y dy_k + ∂h/∂ẏ dẏ_k + ∂h/∂c dc_k,
@@ -10,8 +10,8 @@ and backward in time, with weights λ_k of the forces and μ_k of h_k,
     μ_{k−1} = (∂h/∂b)ᵀ μ_k + (∂F/∂b)ᵀ λ_k,   y_k gets (∂h/∂y)ᵀ μ_k, and ẏ_k likewise.
 
 `ForceHistory` holds all evaluations; `ForceForwardColumns` propagates columns forward,
-`ForceAdjoint` propagates
-weights backward. `ForcePreviousState` is the state at one time, for time-marching methods.
+`ForceAdjoint` propagates weights backward. `ForcePreviousState` is the state at one time, for
+time-marching methods.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class ForceHistory:
         )
 
     def _states(self, rows: slice) -> States:
-        """Return the states of some evaluations, as the force uses them."""
+        """Return the states of the evaluations `rows`, with the velocities that the force uses."""
         term = self.forces.pointwise_term(self.number)[0]
         return self.forces.states_of_terms(self.xi[rows], self.nu[rows])(term)
 
@@ -129,8 +129,8 @@ class ForceHistory:
         return self._without_static_velocity(self.term_at(rows).derivatives(self._states(rows)))
 
     def _without_static_velocity(self, parts: LawDerivatives) -> LawDerivatives:
-        """Return the derivatives, with those by ẏ zero if the force gets no velocities
-        (statics).
+        """Return the derivatives; those by ẏ are zero if the force gets no velocities, in a static
+        experiment without friction.
         """
         term = self.forces.pointwise_term(self.number)[0]
         rests = self.forces.is_static and not term.uses_increments
@@ -174,7 +174,17 @@ class ForceHistory:
     def forward_columns(
         self, by_p: Callable[[int], Array], done: int = 0, known: Array | None = None
     ) -> ForceForwardColumns:
-        """Return an iterator of the columns db forward in time, see `ForceForwardColumns`."""
+        """Return an iterator of the columns db forward in time, see `ForceForwardColumns`.
+
+        Parameters
+        ----------
+        by_p : callable
+            Derivatives (U, columns) of the inputs at the evaluation with a given index.
+        done : int
+            Number of evaluations that have been passed already.
+        known : array, optional
+            Columns after those evaluations; 0 by default.
+        """
         return ForceForwardColumns(self, by_p, done, known)
 
     def adjoint(self) -> ForceAdjoint:
@@ -225,14 +235,24 @@ class ForcePreviousState:
 
     @classmethod
     def from_state(cls, forces: Forces, number: int, x: Array, v: Array) -> ForcePreviousState:
-        """Return the internal variables after the state (x, v), (3n,) each, with the forces
-        there.
+        """Return the internal variables h after an evaluation at (x, v), (3n,) each.
+
+        Parameters
+        ----------
+        forces : Forces
+            Forces at the time, with the internal variables before it.
+        number : int
+            Index of the force in `external_terms`.
+        x, v : (3n,)
+            Position [m] and velocity [m/s].
         """
         term = forces.pointwise_term(number)[0]
         return cls(number, term, term.internal_variables(forces.states_of_terms(x, v)(term)))
 
     def insert_at_same_time(self, forces: Forces) -> Forces:
-        """Return forces in the same state, with the internal variables before it."""
+        """Return forces in the same state, with the internal variables before it inserted;
+        unchanged if there are none.
+        """
         previous = self.term.previous_state
         if previous is None:
             return forces
@@ -241,8 +261,8 @@ class ForcePreviousState:
         )
 
     def insert_after_interval(self, forces: Forces, interval_s: float) -> Forces:
-        """Return forces in a state one interval later, with the internal variables `after`
-        inserted.
+        """Return forces in a state one interval [s] later, with the internal variables after this
+        evaluation inserted as the previous ones.
         """
         previous = PreviousState(self.after, np.array([interval_s]))
         return forces.with_term(
@@ -285,7 +305,9 @@ class _DerivativeIterator:
         self._parts = LawDerivatives(*np.zeros((4, 0)))
 
     def derivatives(self) -> tuple[LawDerivatives, LawDerivatives]:
-        """Return ∂F (d, …, I) and ∂h (n, …, I) at the next evaluation."""
+        """Return ∂F (d, …, I) and ∂h (n, …, I) of the I points at the next evaluation; the iterator
+        does not advance.
+        """
         chunk, k = divmod(self.next, CHUNK)
         d = self.points.dofs
         if chunk != self._chunk:

@@ -5,7 +5,7 @@ Derive a force from `ForceTerm`, or from `point_forces.Pointwise` if it acts poi
 pressure. A term is F(ξ, ν; u) at T times. Its inputs (see `inputs`) follow the constants θ of the
 body in u. Terms add their values and derivatives to shared arrays, on the sparsity pattern of all
 couplings and with one column for every input. The chain rule from inputs to parameters is applied
-in `setting`.
+in `equations_at_parameters`.
 """
 
 from __future__ import annotations
@@ -217,7 +217,9 @@ class Potential(ForceTerm):
     def add_derivatives(
         self, linearisation: Linearisation, places: AssemblyIndices, states: States
     ) -> None:
-        """Add the forces and their first derivatives to a linearisation, in place."""
+        """Add the forces and their first derivatives to a linearisation, in place, at the entries
+        and input columns `places`.
+        """
         gradient = self.scalar.gradient(states.xi)
         np.subtract(linearisation.force, self.amplitude * gradient, out=linearisation.force)
         linearisation.by_position[:, places.entries] -= self.amplitude * self.scalar.hessian(
@@ -228,7 +230,9 @@ class Potential(ForceTerm):
     def add_second_derivatives(
         self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
     ) -> None:
-        """Add the derivatives of weightsᵀ F to a curvature, in place."""
+        """Add the second derivatives of Σ weights · F, and its first ones by the inputs, to a
+        curvature, in place, at `places`; the weights are (T, 3n).
+        """
         xi = states.xi
         column = places.inputs.start
         third_derivatives = self.scalar.hessian_derivative(xi, weights)

@@ -1,11 +1,10 @@
 """All forces on a body at some times: F(ξ, ν; u) = f(ξ, ν; θ) + Σ terms.
 
 Use `Forces.from_experiment` for an experiment and `Forces.of_body_alone` for a body alone. The sum
-includes the internal
-forces f of materials and damping laws (see `fem.body`), the weight, tendons, pressures, contact,
-air drag and custom forces; no other module adds forces. Derivatives by the state are on the
-sparsity pattern of all couplings. Columns of derivatives by θ are followed by those by the other
-inputs u, in the order of the terms, see `inputs`.
+includes the internal forces f of materials and damping laws (see `fem.body`), the weight, tendons,
+pressures, contact, air drag and custom forces; no other module adds forces. Derivatives by the
+state are on the sparsity pattern of all couplings. Columns of derivatives by θ are followed by
+those by the other inputs u, in the order of the terms, see `inputs`.
 """
 
 from __future__ import annotations
@@ -151,7 +150,9 @@ class Forces:
         return self.weight.mass_derivatives(self._input_offsets[0])
 
     def with_inputs(self, u: Array) -> Forces:
-        """Return these forces at inputs u (T, U)."""
+        """Return these forces at inputs u (T, U): θ from the first time, then the inputs of each
+        term.
+        """
         forces = self.with_theta(u[0, : self._input_offsets[0]])
         if self._input_offsets[0] == self._input_offsets[-1]:
             return forces
@@ -164,14 +165,14 @@ class Forces:
         return replace(forces, weight=weight, external_terms=tuple(further))
 
     def at_times(self, rows: slice) -> Forces:
-        """Return these forces at some of the times."""
+        """Return these forces at some of the T times, given as a slice."""
         further = tuple(term.at_times(rows) for term in self.external_terms)
         return replace(self, weight=self.weight.at_times(rows), external_terms=further)
 
     def scaled(self, factor: float) -> Forces:
-        """Return these forces with all external ones multiplied by a factor.
+        """Return these forces with gravity, loads and other external forces multiplied by a factor.
 
-        Masses are unchanged.
+        Masses and internal forces are unchanged.
         """
         further = tuple(term.scaled(factor) for term in self.external_terms)
         return replace(self, weight=self.weight.scaled(factor), external_terms=further)
@@ -227,13 +228,17 @@ class Forces:
         return replace(self, external_terms=further, joint_pattern=pattern), touching
 
     def only_loads(self) -> Forces:
-        """Return weight and loads with internal forces, without all further terms."""
+        """Return these forces without the external terms besides weight and loads; internal forces
+        stay.
+        """
         return replace(
             self, external_terms=(), joint_pattern=JointPattern.from_patterns((self.body.pattern,))
         )
 
     def total(self, xi: Array, nu: Array) -> Array:
-        """Return the sum of all forces F (T, 3n) [N] at positions ξ and velocities ν."""
+        """Return the sum of all forces F (T, 3n) [N] at positions ξ (T, 3n) [m] and velocities ν
+        (T, 3n) [m/s].
+        """
         states_for = self.states_of_terms(xi, nu)
         total = self.body.force(
             xi, states_for(self.weight).nu, self.theta, self.mass.compact_tied_kg, self.memory_state
@@ -277,8 +282,8 @@ class Forces:
 
     @property
     def _has_external_derivatives(self) -> bool:
-        """Whether derivatives have more entries or columns than those of the body's internal
-        forces.
+        """Whether there are external terms, inputs besides θ, or couplings besides the mesh graph,
+        so that derivatives have more entries or columns than those of the body's internal forces.
         """
         more = (
             self._input_offsets[-1] > self._input_offsets[0]
@@ -362,10 +367,11 @@ class Forces:
         return self.body.curvature_width
 
     def states_of_terms(self, xi: Array, nu: Array) -> Callable[[ForceTerm], States]:
-        """Return a function that gives each term its states.
+        """Return a function that gives each term its states, from positions ξ and velocities ν, (T,
+        3n) or (3n,).
 
         In a static experiment only terms that use displacements since the previous sample
-        (`slides`) get a nonzero ν. The states of the weight are also those of the body.
+        (`uses_increments`) get a nonzero ν. The states of the weight are also those of the body.
         """
         size = self.body.pattern.size
         moving = States(xi.reshape(-1, size), nu.reshape(-1, size), self.theta)
@@ -374,7 +380,7 @@ class Forces:
 
     @cached_property
     def _terms_with_indices(self) -> list[tuple[ForceTerm, AssemblyIndices]]:
-        """Every external term with its columns and entries in the shared arrays."""
+        """Every term, the weight first, with its columns and entries in the shared arrays."""
         entries: Iterator[Index] = iter(self.joint_pattern.places[1:])
         nowhere: Index = np.zeros(0, dtype=np.int64)
         return [
@@ -390,7 +396,7 @@ class Forces:
         ]
 
     def pointwise_term(self, number: int) -> tuple[Pointwise, Index]:
-        """Return one of the further terms, and the columns of its constants among all inputs.
+        """Return an external term, and the indices of its constants among all inputs.
 
         Parameters
         ----------

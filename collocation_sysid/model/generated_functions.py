@@ -47,7 +47,15 @@ class GeneratedFunction:
         return self._evaluate_at_instances(self._value, u, data)[0][:, 0]
 
     def evaluate_with_jacobian(self, u: Array, data: Array) -> tuple[Array, Array]:
-        """Return the values y (m, …) and the derivatives ∂y/∂u (m, k, …)."""
+        """Return the values y (m, …) and the derivatives ∂y/∂u (m, k, …) at all instances.
+
+        Parameters
+        ----------
+        u : (k, …) or (k,)
+            Inputs; (k,) are the same at all instances.
+        data : (d, …)
+            Data, which are not differentiated; their axes after the first are the instances.
+        """
         value, slopes = self._evaluate_at_instances(self._slopes, u, data)
         return value[:, 0], slopes
 
@@ -134,8 +142,15 @@ class GeneratedFunction:
     ) -> list[Array]:
         """Return the outputs of a CasADi function at all instances, each (rows, columns, …).
 
-        Evaluators are created on the first call and kept. `others` are the data and, for the second
-        derivatives, the weights.
+        Evaluators are created on the first call and stored.
+
+        Parameters
+        ----------
+        function : Function
+        u : (k, …) or (k,)
+            Inputs; (k,) are the same at all instances.
+        *others : arrays (size, …)
+            Data and, for second derivatives, weights; the axes after the first are the instances.
         """
         shape = others[0].shape[1:]
         count = int(np.prod(shape))

@@ -69,7 +69,9 @@ class GraspConstraint:
         return prescribed_dofs(self.experiment.grasps)
 
     def evaluate_at(self, phi: Array) -> PrescribedDisplacements:
-        """Return the prescribed positions at nuisance parameters φ."""
+        """Return the prescribed positions at nuisance parameters φ (m,) of the experiment, with
+        derivatives by the φ of the motion; derivatives are zero while a dof is free.
+        """
         if not self.nuisance.affects_grasps:
             return self._constant_positions
         places, slopes = self.displaced_nodes(phi)
@@ -81,7 +83,10 @@ class GraspConstraint:
         return PrescribedDisplacements(self.dofs, positions, by_phi)
 
     def displaced_nodes(self, phi: Array) -> tuple[Array, Array]:
-        """Return H X (g, 3) of the node of each grasped dof, and its derivatives by φ (g, 3, m)."""
+        """Return for each grasped dof the place H X of its node (g, 3) [m], with the hand–eye
+        transform H, and its derivatives (g, 3, m) by the φ of the motion. Nodes of obstacles are
+        not displaced.
+        """
         places, by_own = self.nuisance.grasp_motion.evaluate_with_jacobian(
             self._phi_of_grasps(phi), self._points
         )
@@ -106,8 +111,8 @@ class GraspConstraint:
         return places, slopes
 
     def weighted_hessian(self, phi: Array, weights: Array) -> Array:
-        """Return Σ weights[t, g] ∂²position/∂φ² (m, m), for weights (N, g) that are zero while
-        free.
+        """Return Σ weights[t, g] ∂²position/∂φ² (m, m) by the φ of the motion, for weights (N, g)
+        that are zero while a dof is free.
         """
         point_weights = np.einsum("tgj,tg->gj", np.nan_to_num(self.pose_rows[0]), weights)
         node_weights = np.zeros_like(self._points.T)
@@ -143,6 +148,14 @@ class GraspConstraint:
                 columns = np.searchsorted(self.dofs, 3 * grasp.nodes + "xyz".index(axis))
                 column = np.flatnonzero(self.nuisance.motion_indices == place)
                 derivatives[np.ix_(rows, columns, column)] = self.nuisance.scales[place]
+            for place in self.nuisance.strain_zero_indices:
+                columns = np.searchsorted(self.dofs, grasp.prescribed_dofs)
+                column = np.flatnonzero(self.nuisance.motion_indices == place)
+                shifts_m = np.tile(self.nuisance.strain_shifts_m[number], len(grasp.nodes))
+                own_m = shifts_m.reshape(-1, 3)[:, grasp.axis_indices].ravel()
+                derivatives[np.ix_(rows, columns, column)] = (
+                    self.nuisance.scales[place] * own_m[None, :, None]
+                )
         half_interval_s = 0.5e-3 * self.experiment.timestep_s
         for columns, obstacle, row, _, place in self._obstacle_parameters:
             if row == OBSTACLE_TIME:
@@ -158,8 +171,8 @@ class GraspConstraint:
 
     @property
     def _obstacle_parameters(self) -> Iterator[tuple[Index, Obstacle, NuisanceRow, int, int]]:
-        """Nuisance parameters of obstacles: positions of the dofs, obstacle, row, axis and index in
-        φ.
+        """For each nuisance parameter of an obstacle, yield the positions of the obstacle's dofs in
+        `dofs`, the obstacle, the row, the axis and the index in φ.
         """
         for number, obstacle in enumerate(
             self.experiment.obstacles, len(self.experiment.body_grasps)
@@ -201,7 +214,9 @@ class GraspConstraint:
 
     @cached_property
     def pose_rows(self) -> tuple[Array, Array]:
-        """For each dof its row of U_t: rotation (N, g, 3) and shift (N, g) [m], NaN while free."""
+        """Row of the pose U_t for each of the g grasped dofs: rotation (N, g, 3) and shift (N, g)
+        [m], so that the position is rotation · H X + shift; NaN while the dof is free.
+        """
         rotations, shifts_m = (
             np.full((len(self.t_s), len(self.dofs), *s), np.nan) for s in ((3,), ())
         )

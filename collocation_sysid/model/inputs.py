@@ -1,11 +1,10 @@
 """Inputs u(p; t) by which parameters enter the equations of motion, with generated derivatives.
 
-The entries of u at each evaluation are, in this order: the constants θ of the body; gravity (3),
-if a nuisance parameter rotates it; the share of each load whose time is estimated; the amplitude of
+The entries of u at each evaluation are, in this order: the constants θ of the body; gravity (3), if
+a nuisance parameter rotates it; the share of each load whose time is estimated; the amplitude of
 each tendon and pressure. The parameters p are those that affect the motion: the shared coordinates
 q, then the nuisance parameters φ of `NuisanceMap.motion_indices`. Every force provides its
-derivatives by u
-(see `forces`); this module generates ∂u/∂p and Σ w ∂²u/∂p².
+derivatives by u (see `forces`); this module generates ∂u/∂p and Σ w ∂²u/∂p².
 """
 
 from __future__ import annotations
@@ -92,7 +91,7 @@ class Inputs:
         return np.broadcast_to(u, full_shape[:2]), np.broadcast_to(by_p, full_shape)
 
     def weighted_hessian(self, p: Array, weights: Array) -> Array:
-        """Return Σ_t weights[t] · ∂²u_t/∂p² (m, m) for weights (N, U)."""
+        """Return Σ_t weights[t] · ∂²u_t/∂p² (m, m) at parameters p (m,), for weights (N, U)."""
         hessian = np.zeros((self.parameter_count,) * 2)
         offset = 0
         for each, generated in zip(self.groups, self._functions, strict=True):
@@ -138,7 +137,9 @@ def inputs_from_experiment(
     ----------
     experiment : Experiment
     parameters : Parameters
+        Parameters of the problem; p begins with the free ones.
     nuisance : NuisanceMap
+        Nuisance parameters of the experiment; p ends with those of `motion_indices`.
     evaluated_s : (N,)
         Times at which forces are evaluated.
     """

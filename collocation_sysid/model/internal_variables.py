@@ -76,9 +76,19 @@ def insert_histories(forces: Forces, histories: Sequence[AnyHistory], rows: slic
 
 
 def start_states(forces: Forces, x: Array, v: Array, loaded_s: float) -> tuple[PreviousState, ...]:
-    """Return the internal variables in the start state: positions x and velocities v, (3n,) each.
+    """Return the internal variables in the start state: positions x [m] and velocities v [m/s],
+    (3n,) each.
 
     The memory comes first, then each force with internal variables, in the order of the forces.
+    Without any, the tuple is empty.
+
+    Parameters
+    ----------
+    forces : Forces
+        Forces at the start.
+    x, v : (3n,)
+    loaded_s : float
+        Time for which the body has been in its start shape; infinite if its memory has relaxed.
     """
     states: list[PreviousState] = [
         ForcePreviousState.from_state(forces, number, x, v)
@@ -110,5 +120,7 @@ def insert_previous_states(
 def advance_states(
     forces: Forces, previous_states: Sequence[PreviousState], x: Array, v: Array, interval_s: float
 ) -> tuple[PreviousState, ...]:
-    """Return the internal variables in a state (x, v), (3n,) each, one interval later."""
+    """Return the internal variables in a state (x, v), (3n,) each, `interval_s` [s] after that of
+    `previous_states`; `forces` are those at the later time.
+    """
     return tuple(each.advance(forces, x, v, interval_s) for each in previous_states)

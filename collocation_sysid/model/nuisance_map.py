@@ -16,7 +16,7 @@ A tension T acts on the body as max(0, f T − b), a pressure p as f p − b.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
 from typing import Any, NamedTuple, TypeVar, get_args
@@ -46,6 +46,7 @@ from ..recording.nuisance import (
     PLACE,
     POSE_TURN,
     PRESSURE_OFFSET,
+    STRAIN_ZERO,
     TARE,
     TENSION_OFFSET,
     TILT,
@@ -151,6 +152,9 @@ class NuisanceMap:
         Loads with an estimated time, in the order of their parameters.
     recorded_s : (float, float)
         First and last time of the recording.
+    strain_shifts_m : (G, 3)
+        Displacement of the node of each grasp per unit of strain [m]; empty unless the experiment
+        is a specimen without a mesh.
     """
 
     entries: tuple[NuisanceEntry, ...]
@@ -165,6 +169,7 @@ class NuisanceMap:
     declared_calibration: Array
     timed_loads: tuple[TimedLoad, ...]
     recorded_s: tuple[float, float]
+    strain_shifts_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod
     def from_experiment(cls, experiment: Experiment, pivot_m: Array | None = None) -> NuisanceMap:
@@ -207,14 +212,19 @@ class NuisanceMap:
             np.array([a.factor_and_offset for a in experiment.actuators]).reshape(-1, 2),
             tuple(timed for _, timed in _timed_loads(experiment)),
             (float(experiment.t_s[0]), float(experiment.t_s[-1])),
+            _strain_shifts_m(experiment),
         )
         for row in experiment.nuisance.own:
             nuisance_map._require_valid_expression(row)
         return nuisance_map
 
     def _require_valid_expression(self, row: NuisanceRow) -> None:
-        """Raise an `InputError` if a custom reading or clock cannot be evaluated and
-        differentiated.
+        """Check that the reading or clock of a custom kind can be evaluated and differentiated.
+
+        Raises
+        ------
+        InputError
+            If it cannot, or has the wrong shape.
         """
         y = ca.SX.sym("y", 3)
         t_s = ca.SX.sym("t_s")
@@ -242,8 +252,8 @@ class NuisanceMap:
         return len(self.names)
 
     def iterate_values(self, phi: Array) -> Iterator[tuple[NuisanceEntry, str, float]]:
-        """Yield entry, name and value with unit of each parameter, except for the places of
-        markers.
+        """Yield entry, name and value (in the entry's unit) of each parameter at φ, except for the
+        places of markers.
         """
         for entry, name, value in zip(self.entries, self.names, phi * self.scales, strict=True):
             if entry.row != PLACE:
@@ -277,9 +287,8 @@ class NuisanceMap:
         return self._indices_where(lambda e: "drives" in e.row.changes)
 
     def actuator_calibration_indices(self, number: int) -> tuple[int, int]:
-        """Return the indices in φ of factor and loss of an actuator.
-
-        −1 where they are not estimated.
+        """Return the indices in φ of factor and offset of the actuator with index `number`; −1 for
+        one that is not estimated.
         """
         indices = [-1, -1]
         for k in self.actuator_indices:
@@ -288,7 +297,9 @@ class NuisanceMap:
         return indices[0], indices[1]
 
     def actuator_calibration(self, phi: Array) -> Array:
-        """Return factor f and loss b (A, 2) of each tension and pressure at φ."""
+        """Return factor f and offset b (A, 2) of each tendon and pressure at φ, the stated ones
+        where they are not estimated.
+        """
         calibration = self.declared_calibration.copy()
         values = phi * self.scales
         for number in range(len(calibration)):
@@ -299,8 +310,8 @@ class NuisanceMap:
     # What markers read --------------------------------------------------------------------------
 
     def marker_indices(self, count: int) -> Index:
-        """Return the indices in φ (count, f) on which the measurement of each of `count` markers
-        depends.
+        """Return the indices in φ (count, f) of the parameters on which the measurement of each of
+        `count` markers depends: those of the marker, then those of all markers.
         """
         read = self._indices_where(lambda e: e.row.reading is not None or e.row.clock is not None)
         single = [k for k in read if self.entries[k].row.of == "marker"]
@@ -321,7 +332,7 @@ class NuisanceMap:
         Parameters
         ----------
         phi : SX
-            Parameters at the indices `indices_of_rows`.
+            Parameters at the indices `places`.
         places : array of int
             Indices in φ of the marker, a row of `marker_indices`.
         t_s : SX
@@ -339,7 +350,7 @@ class NuisanceMap:
         ----------
         y : (3,) SX
         phi : SX
-            Parameters at the indices `indices_of_rows`.
+            Parameters at the indices `places`.
         places : array of int
             Indices in φ of the marker, a row of `marker_indices`.
         t_s : SX
@@ -363,6 +374,11 @@ class NuisanceMap:
         """Return the indices in φ of the zeros of a grasp's displacement, axis by axis."""
         return self.indices_of_rows(ZERO, component=number)
 
+    @cached_property
+    def strain_zero_indices(self) -> Index:
+        """Indices in φ of the zero of the strain of a specimen; empty if it is not estimated."""
+        return self.indices_of_rows(STRAIN_ZERO)
+
     def obstacle_parameters(self, number: int) -> list[tuple[NuisanceRow, int, int]]:
         """Return row, axis and index in φ of every nuisance parameter of an obstacle.
 
@@ -376,7 +392,9 @@ class NuisanceMap:
         return [(entry.row, entry.axis, k) for entry, k in here]
 
     def with_grasps(self, grasps: Sequence[Grasp], phi: Array) -> tuple[Grasp, ...]:
-        """Return the grasps and obstacles at their poses at φ."""
+        """Return grasps and obstacles, in the order of the experiment's `grasps`, at their poses at
+        φ: with the hand–eye transform, delays and offsets.
+        """
         motion = self.grasp_motion_matrix(phi)
         return tuple(self._with_grasp(k, grasp, motion, phi) for k, grasp in enumerate(grasps))
 
@@ -404,6 +422,8 @@ class NuisanceMap:
         zero_m = np.zeros(3)
         for place in self.displacement_zero_indices(number):
             zero_m[self.entries[place].axis] = phi[place] * self.scales[place]
+        for place in self.strain_zero_indices:
+            zero_m += phi[place] * self.scales[place] * self.strain_shifts_m[number]
         return replace(grasp, poses=grasp.poses.after(motion).with_shift(zero_m))
 
     def bounds(self, samples: int) -> tuple[Array, Array]:
@@ -434,7 +454,9 @@ class NuisanceMap:
         return low, high
 
     def with_times(self, experiment: Experiment, phi: Array) -> Experiment:
-        """Return the experiment with its loads joining and leaving at the times estimated by φ."""
+        """Return the experiment with its loads joining and leaving at the times estimated by φ; the
+        experiment itself if none is estimated.
+        """
         if not self.timed_loads:
             return experiment
         late_s = (phi * self.scales)[self.indices_of_rows(JOINING)]
@@ -462,7 +484,9 @@ class NuisanceMap:
         return GeneratedFunction(self._displaced_point, len(self.grasp_indices), 3)
 
     def _displaced_point(self, phi: ca.SX, point: ca.SX) -> ca.SX:
-        """Return H X as an expression."""
+        """Return H X (3,) of a point X (3,) of the undeformed body [m], with the hand–eye transform
+        H, as an expression of the φ of `grasp_indices`.
+        """
         values = self.values_by_row(phi, self.grasp_indices)
         if GRASP_TURN in values:
             pivot = ca.DM(self.grasp_pivot_m)
@@ -472,7 +496,7 @@ class NuisanceMap:
         return point
 
     def grasp_motion_matrix(self, phi: Array) -> Array:
-        """Return H at φ as a 4×4 matrix [[R, p], [0, 1]]."""
+        """Return the hand–eye transform H at φ as a 4×4 matrix [[R, p], [0, 1]]; p in metres."""
         points = np.hstack([np.zeros((3, 1)), np.eye(3)])
         images = self.grasp_motion.evaluate(phi[self.grasp_indices], points)
         matrix = np.eye(4)
@@ -508,7 +532,7 @@ class NuisanceMap:
         Parameters
         ----------
         phi : SX
-            Parameters at the indices `indices_of_rows`.
+            Parameters at the indices `places`.
         places : array of int
             Indices in φ.
         """
@@ -519,8 +543,8 @@ class NuisanceMap:
         return {row: ca.vertcat(*each) for row, each in parts.items()}
 
     def _tilted_gravity(self, angles: ca.SX) -> ca.SX:
-        """Return gravity of the stated magnitude, tilted by two angles [rad] about the axes across
-        it.
+        """Return gravity (3,) of the stated magnitude, tilted by two angles (2,) [rad] about the
+        axes perpendicular to it; unchanged without gravity.
         """
         size = float(np.linalg.norm(self.gravity_m_s2))
         if size == 0:
@@ -530,6 +554,17 @@ class NuisanceMap:
         across = np.linalg.svd(down[None])[2][1:]
         tilted = down + ca.mtimes(ca.DM(across.T), angles)
         return ca.SX(size * tilted / ca.norm_2(tilted))
+
+
+def _strain_shifts_m(experiment: Experiment) -> Array:
+    """Return the displacement (G, 3) of the node of each grasp of a specimen per unit of strain
+    [m]; empty, (0, 3), if the experiment has a mesh.
+    """
+    if experiment.specimen is None:
+        return np.zeros((0, 3))
+    moving = experiment.specimen.displaced_nodes()
+    still = np.zeros(3), np.zeros(3)
+    return np.array([sum(moving.get(int(g.nodes[0]), still)) for g in experiment.body_grasps])
 
 
 def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
@@ -581,6 +616,14 @@ def _component_axes(
     """Return index, name, unit and prior deviation of each estimated axis of a component.
 
     The list is empty if the component is exact or the row does not apply to it.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    row : NuisanceRow
+        Kind of nuisance parameter.
+    number : int
+        Index of the component among those of the kind `row.of`: a marker, grasp, wrench, camera, …
     """
     sigma = experiment.nuisance.sigma(row)
     names = row.axes.split() or [""]

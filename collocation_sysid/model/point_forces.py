@@ -7,7 +7,7 @@ anchor of friction:
     (F, h)_k = L(y_k, ẏ_k, c_k, h_{k−1}; data_k),
 
 with the vectors y of the instance, their velocities ẏ and constants c. With h_{k−1} given, F and
-its derivatives are those of any other force; `force_history` treats h along a motion.
+its derivatives are those of any other force; `force_internal_variables` treats h along a motion.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class Pointwise(ForceTerm):
         self, previous_state: PreviousState, variable_weights: Array | None = None
     ) -> Self:
         """Return this force with given internal variables, and with weights of h in second
-        derivatives.
+        derivatives, which are zero for None.
         """
         return replace(self, previous_state=previous_state, variable_weights=variable_weights)  # type: ignore[type-var]
 
@@ -138,7 +138,7 @@ class Pointwise(ForceTerm):
         return since_s, (since_s == 0).astype(float)
 
     def _inputs_at(self, states: States) -> _LawInputs:
-        """Return the inputs and data of the law at states."""
+        """Return the inputs and data of the law at states, at those points that can act."""
         chosen, y = self.active_points(states)
         constants = self.constants(states)
         velocities = (
@@ -160,7 +160,9 @@ class Pointwise(ForceTerm):
         )
 
     def force(self, states: States) -> Array:
-        """Return the forces F (T, 3n) [N]."""
+        """Return the forces F (T, 3n) [N] on the nodes at states: the law's forces at the points,
+        multiplied by `factor`.
+        """
         at = self._inputs_at(states)
         value = self.law.evaluate(at.u, at.data)[at.y]
         return self.factor * self.points.assemble(value, at.chosen)
@@ -168,7 +170,9 @@ class Pointwise(ForceTerm):
     def add_derivatives(
         self, linearisation: Linearisation, places: AssemblyIndices, states: States
     ) -> None:
-        """Add the forces and their first derivatives to a linearisation, in place."""
+        """Add the forces and their first derivatives to a linearisation, in place, at the entries
+        and input columns `places`.
+        """
         evaluated = self._inputs_at(states)
         points = self.points
         value, slopes = self.law.evaluate_with_jacobian(evaluated.u, evaluated.data)
@@ -194,7 +198,9 @@ class Pointwise(ForceTerm):
     def add_second_derivatives(
         self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
     ) -> None:
-        """Add the derivatives of weightsᵀ F + Σ `variable_weights` · h to a curvature, in place."""
+        """Add the derivatives of Σ weights · F + Σ `variable_weights` · h to a curvature, in place,
+        at the entries and input columns `places`; the weights are (T, 3n).
+        """
         evaluated = self._inputs_at(states)
         points = self.points
         entries = places.entries
@@ -345,7 +351,9 @@ class _LawInputs:
         return slice(self.variables_offset, len(self.u))
 
     def split(self, values: Array, axis: int) -> LawDerivatives:
-        """Split values along one axis into the parts of u."""
+        """Return views of `values`, split along the axis of u into the parts y, ẏ, c and
+        h_{k−1}.
+        """
         return LawDerivatives(
             *np.split(
                 values,
@@ -434,7 +442,9 @@ class CustomForce(Pointwise):
         return self.placed.columns
 
     def data(self, chosen: Index | None) -> Array:
-        """Return the data of the law at all instances, as an `ForceContext` reads them."""
+        """Return the data (d, T, I) of the law at all instances, in the order in which a
+        `ForceContext` reads them; `chosen` is not used.
+        """
         data = np.empty((CONTEXT_SIZE, len(self.t_s), self.points.count))
         data[0] = self.t_s[:, None]
         data[1:-2] = self.placed.data[:, None]

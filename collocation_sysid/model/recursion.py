@@ -133,7 +133,7 @@ class RecursionTrajectory:
         return trajectory
 
     def _stacked_inputs(self, times: slice) -> Array:
-        """Return the stacked inputs (h_{k−1}, s_k, s_{k−1}, c) at consecutive times.
+        """Return the stacked inputs (h_{k−1}, s_k, s_{k−1}, c) at consecutive times, (size, T, I).
 
         At the start, h_{k−1} is zero and s_{k−1} is s_0.
         """

@@ -69,7 +69,7 @@ class Scheme:
     start: tuple[Stencil, ...]
 
     def stencil(self, row: int) -> Stencil:
-        """Return the stencil of a row.
+        """Return the stencil of a row, given by its index.
 
         Row 0, which exists where an experiment starts in equilibrium, has the stencil of statics.
         """

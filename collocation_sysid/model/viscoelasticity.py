@@ -17,10 +17,9 @@ and backward in time, with weights λ_k of the forces and μ_k of m_k,
     μ_{k−1} = d_k μ_k + (∂f_H/∂H)ᵀ λ_k,   ξ_k gets (∂S_k/∂ξ_k)ᵀ Σ a_k μ_k.
 
 `MemoryHistory` holds all evaluations; `MemoryForwardColumns` propagates columns forward,
-`MemoryAdjoint` propagates weights
-backward; `MemoryState` is the state at one time, for time marching. The recursion is one of
-`recursion`; since it is linear in m and S, all points of a branch share its coefficients, which
-avoids most of the cost of a generated recursion for each point.
+`MemoryAdjoint` propagates weights backward; `MemoryState` is the state at one time, for time
+marching. The recursion is one of `recursion`; since it is linear in m and S, all points of a branch
+share its coefficients, which avoids most of the cost of a generated recursion for each point.
 """
 
 from __future__ import annotations
@@ -60,7 +59,9 @@ def _stiffening_of_interval(u: ca.SX, spacing_s: ca.SX) -> ca.SX:
 
 
 def _stiffening(u: ca.SX, data: ca.SX) -> ca.SX:
-    """Return c of an evaluation; at the start c_0 of the load."""
+    """Return the coefficient c of an evaluation, with u = (g, τ); at the start the share g e^(−t/τ)
+    of a load that was applied a time t before. See `_overstress` for the data.
+    """
     since_s = data[0]
     began = data[1]
     at_once = u[0] * ca.exp(-since_s / u[1])
@@ -81,7 +82,9 @@ OVERSTRESS = Recursion(_overstress, 1, 1, 2, 3)
 
 
 def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
-    """Return the coefficients c, d and a of an evaluation."""
+    """Return the coefficients c, d and a of an evaluation, with u = (g, τ); see `_overstress` for
+    the data.
+    """
     return ca.vertcat(_stiffening(u, data), OVERSTRESS.linear_coefficients(u, data)[:2])
 
 
@@ -143,8 +146,8 @@ class FadingCoefficients:
         return cls(places, u, data, c, d, a, by)
 
     def jacobian_vector_product(self, theta_q: Array) -> tuple[Array, Array]:
-        """Return the derivatives (q, B, N) of d and of a in the directions `theta_q` (k, q) of
-        θ.
+        """Return the derivatives (q, B, N) of the coefficients d and a along the q directions
+        `theta_q` (k, q) of θ.
         """
         d_q, a_q = np.einsum("cjbn,jbq->cqbn", self.by[1:], theta_q[self.places])
         return d_q, a_q
@@ -218,7 +221,9 @@ class MemoryHistory:
         return self.body.memory
 
     def past_at(self, rows: slice) -> MemoryInput:
-        """Return the memory's contribution to the forces at some evaluations."""
+        """Return the memory's contribution to the forces at the evaluations `rows`: overstress of
+        earlier stresses, stiffening, and its derivatives.
+        """
         past = self.memory.relaxed(len(self.xi[rows]))
         fades = self.fading
         past.overstress[:] = self.memory.sum_over_branches(self.previous_variables[rows])
@@ -275,9 +280,8 @@ class MemoryHistory:
 
     @property
     def recursion_residuals(self) -> Array:
-        """Residuals m_k − d_k m_{k−1} − a_k S_k (N − 1, all branches).
-
-        Zero if m satisfies the recursion.
+        """Residuals m_k − d_k m_{k−1} − a_k S_k for k = 0 … N − 2 (N − 1, all branches) [Pa]; zero
+        if m satisfies the recursion.
         """
         d, a = (
             self.memory.repeat_over_points(each[:, :-1]) for each in (self.fading.d, self.fading.a)
@@ -306,8 +310,8 @@ class MemoryHistory:
         return np.stack([before, now, 0 * now, *self.fading.u])
 
     def stress_derivatives(self, theta_q: Array) -> Iterator[tuple[slice, Array]]:
-        """Yield ∂S/∂θ θ_q (T, q, width) of `EVALUATIONS_PER_CHUNK` evaluations at a time, with
-        their slice.
+        """Yield consecutive slices of at most `EVALUATIONS_PER_CHUNK` evaluations, each with the
+        derivatives ∂S/∂θ θ_q (T, q, width) there, for q directions θ_q (k, q) in θ.
         """
         for start in range(0, len(self.xi), EVALUATIONS_PER_CHUNK):
             rows = slice(start, start + EVALUATIONS_PER_CHUNK)
@@ -362,10 +366,8 @@ class MemoryHistory:
         """Add the second derivatives of Σ μ_k (d_k m_{k−1} + a_k S_k) that involve (g, τ).
 
         The derivatives are added in place to the N states of a `SecondDerivatives` that already has
-        those
-        of Σ σ_k S_k, see `with_variable_weights`. Mixed derivatives are those with ξ and with
-        elastic constants,
-        through S.
+        those of Σ σ_k S_k, see `with_variable_weights`. Mixed derivatives are those with ξ and with
+        elastic constants, through S.
 
         Parameters
         ----------
@@ -423,17 +425,21 @@ class MemoryState:
 
     @classmethod
     def at_start(cls, body: Body, x: Array, theta: Array, loaded_s: float) -> MemoryState:
-        """Return the memory in the start shape x (3n,), loaded for a time `loaded_s`."""
+        """Return the memory in the start shape x (3n,) [m], loaded for a time `loaded_s` [s];
+        infinite if the memory has relaxed.
+        """
         return MemoryHistory.from_states(body, x[None], theta, np.ones(1), loaded_s).final_state
 
     def insert_at_same_time(self, forces: Forces) -> Forces:
-        """Return forces in the same state, with the overstress Q inserted."""
+        """Return forces in the state of this memory, with its overstress Q inserted."""
         past = self.body.memory.relaxed(1)
         past.overstress[0] = self.body.memory.sum_over_branches(self.overstress)
         return replace(forces, memory_state=past)
 
     def insert_after_interval(self, forces: Forces, interval_s: float) -> Forces:
-        """Return forces in a state one interval later, with the memory inserted."""
+        """Return forces in a state one interval [s] later, with the memory inserted; self is
+        unchanged.
+        """
         past = self.body.memory.relaxed(1)
         previous, c = self._after_interval(interval_s)
         past.overstress[0] = self.body.memory.sum_over_branches(previous)
@@ -453,7 +459,9 @@ class MemoryState:
         return MemoryState(self.body, self.theta, stress, overstress)
 
     def _after_interval(self, interval_s: float) -> tuple[Array, Array]:
-        """Return e Q − c S of all branches, and c (B,), for an interval."""
+        """Return e Q − c S (all branches,) [Pa] of the overstress Q and the stress S, and the
+        coefficients c (B,), for an interval [s].
+        """
         memory = self.body.memory
         share, tau_s = self.theta[[(b.share, b.tau) for b in memory.branches]].T
         e, c = fading_coefficients(share, tau_s, interval_s)
@@ -515,7 +523,9 @@ class MemoryForwardColumns:
         self._d_own, self._a_own = fades.jacobian_vector_product(theta_q[:, self._own])
 
     def force_columns(self) -> Array:
-        """Return the contribution of the memory to dF at the next evaluation, (3n, columns)."""
+        """Return the contribution of the memory to dF at the next evaluation, (3n, columns); the
+        iterator does not advance.
+        """
         self._state[:] = self.history.xi[self.next]
         return self.stresses.memory_force(
             self._state, self.memory.sum_over_branches(self.columns), self.theta
@@ -557,8 +567,10 @@ class MemoryForwardColumns:
         self.next += 1
 
     def _elastic_stress_derivatives(self, k: int) -> Array:
-        """Return the derivatives of S at evaluation k by the columns that change elastic
-        constants.
+        """Return the derivatives (c, width) of S at evaluation k by the c columns that change
+        elastic constants; empty if none do.
+
+        Derivatives are computed for a chunk of evaluations and stored, so that k must not decrease.
         """
         if not len(self._moduli):
             return self._by_moduli

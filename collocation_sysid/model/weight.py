@@ -78,9 +78,10 @@ class DofMasses:
         return self.own_kg + self.added_kg + self.tied_kg[t]
 
     def _plus_tied(self, constant_kg: Array) -> Array:
-        """Return the sum of a constant mass (3n,) and the tied masses (T, 3n).
+        """Return the sum (T, 3n) of a constant mass (3n,) and the tied masses.
 
-        If the tied masses are constant views with stride 0, so is the result.
+        If the tied masses are the same at all times, stored as a view with stride 0, so is the
+        result.
         """
         if len(self.tied_kg) and self.tied_kg.strides[0] == 0:
             return np.broadcast_to(constant_kg + self.tied_kg[0], self.tied_kg.shape)
@@ -158,7 +159,8 @@ class Weight(ForceTerm):
     def with_load_inputs(
         self, has_gravity_input: bool, loads: Sequence[PointMass | Force], t_s: Array
     ) -> Weight:
-        """Return this weight with gravity and the shares of some loads as inputs.
+        """Return this weight with gravity and the shares of some loads as inputs; other loads stay
+        as they are.
 
         Parameters
         ----------
@@ -167,7 +169,7 @@ class Weight(ForceTerm):
         loads : sequence of PointMass or Force
             Loads whose shares are inputs.
         t_s : (T,)
-            Times of the evaluations.
+            Times of the evaluations [s].
         """
         kg, newtons, share = _no_loads(self.applied_n, len(loads))
         for k, load in enumerate(loads):
@@ -186,7 +188,9 @@ class Weight(ForceTerm):
         return 3 * self.has_gravity_input + len(self.joining_kg)
 
     def with_inputs(self, u: Array) -> Self:
-        """Return this weight at inputs u (T, size); gravity is taken from the first time."""
+        """Return this weight at inputs u (T, size): gravity from the first time if it is an input,
+        then the shares of the loads.
+        """
         if not self.size:
             return self
         weight = replace(self, gravity_m_s2=u[0, :3]) if self.has_gravity_input else self
@@ -200,7 +204,7 @@ class Weight(ForceTerm):
         return replace(weight, mass=mass, applied_n=applied_n, share=share)
 
     def at_times(self, rows: slice) -> Self:
-        """Return this weight at some of the times."""
+        """Return this weight at some of the T times, given as a slice."""
         return replace(
             self,
             mass=self.mass.at_times(rows),
@@ -221,7 +225,7 @@ class Weight(ForceTerm):
     def interpolate(self, other: Self, share: float) -> Self:
         """Return this weight with masses and loads interpolated linearly to those of another time.
 
-        Gravity stays that of this time.
+        Gravity stays that of this time. `share` is 0 for this time and 1 for the other.
         """
 
         def between(a: Array, b: Array) -> Array:
@@ -268,7 +272,9 @@ class Weight(ForceTerm):
     def add_derivatives(
         self, linearisation: Linearisation, places: AssemblyIndices, states: States
     ) -> None:
-        """Add the forces and their first derivatives to a linearisation, in place."""
+        """Add the forces and their first derivatives to a linearisation, in place, at the input
+        columns `places`; the states are not used.
+        """
         np.add(linearisation.force, self.external_n, out=linearisation.force)
         for density, slope in self.body.mass_derivatives.items():
             linearisation.by_theta[:, :, density] += slope * self.gravity
@@ -284,7 +290,9 @@ class Weight(ForceTerm):
     def add_second_derivatives(
         self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
     ) -> None:
-        """Add the derivatives of weightsᵀ F to a curvature, in place."""
+        """Add the derivatives of Σ weights · F, for weights (T, 3n), to a curvature, in place, at
+        the input columns `places`; the states are not used.
+        """
         for density, slope in self.body.mass_derivatives.items():
             curvature.theta[:, density] += weights @ (slope * self.gravity)
         first_column = places.inputs.start
@@ -325,7 +333,8 @@ def _own_kg(body: Body) -> Array:
 
 
 def _no_loads(rows: Array, count: int = 0) -> tuple[Array, Array, Array]:
-    """Return zero arrays for `joining_kg`, `joining_n` and `share` of `count` loads.
+    """Return zero arrays for `joining_kg` (count, 3n), `joining_n` (count, T, 3n) and `share` (T,
+    count) of `count` loads.
 
     Parameters
     ----------

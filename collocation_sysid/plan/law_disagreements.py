@@ -52,7 +52,7 @@ class Disagreement:
 
     @property
     def sentence(self) -> str:
-        """Explanation for the user."""
+        """Range of the constant over the laws, and what its interval includes, as a sentence."""
         low = min(self.values.values())
         high = max(self.values.values())
         symbol = symbol_of(self.name)

@@ -27,12 +27,15 @@ from typing import Any
 
 import numpy as np
 
+from ..array_types import Array
 from ..errors import InputError, SimulationError
 from ..methods.solution import Solution, pooled_wrench_rms
 from ..problem import Problem, RolloutOptions
 from ..program.simulation import with_markers
+from ..recording.custom_sensor import Gauge
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp
+from ..recording.specimen import STRESS_UNIT
 from ..runs.forward_simulation import ForwardSimulation, simulate_experiment
 from ..runs.solving import solve
 from ..statistics.autocorrelation import ErrorProcess, error_processes
@@ -276,8 +279,10 @@ def _prediction_text(row: Row) -> str:
 
 
 def display_unit(unit: str) -> tuple[float, str]:
-    """Return factor and unit for display: metres as millimetres, other units unchanged."""
-    return (1e3, "mm") if unit == "m" else (1.0, unit)
+    """Return factor and unit for display: metres as millimetres, pascals as kilopascals, other
+    units unchanged.
+    """
+    return {"m": (1e3, "mm"), STRESS_UNIT: (1e-3, "kPa")}.get(unit, (1.0, unit))
 
 
 def _log_ratio_between(chosen: Row, rival: Row) -> tuple[float, float]:
@@ -423,7 +428,11 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
     record: dict[str, Any] = {
         "status": solution.status.value,
         "converged": solution.status.converged,
-        "rms": {"m": solution.rms_m, "N": pooled_wrench_rms(solution)[0]},
+        "rms": {
+            "m": solution.rms_m,
+            "N": pooled_wrench_rms(solution)[0],
+            STRESS_UNIT: _pooled_stress_rms_pa(solution),
+        },
         "parameters": parameter_values(solution.collocation, solution.q),
         "free": [item.name for item in problem.parameters.free],
         "time_s": solution.timing.total,
@@ -482,7 +491,10 @@ def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
         tracks = np.where((chosen.t_s > start_s)[:, None, None], np.nan, chosen.markers.positions_m)
         grasps = tuple(_without_later_wrench(grasp, start_s) for grasp in chosen.grasps)
         depths = [each for d in chosen.depths if (each := d.until_time(start_s)) is not None]
-        remaining = replace(with_markers(chosen, tracks), grasps=grasps, depths=depths)
+        readings = [_without_later_values(gauge, start_s) for gauge in chosen.readings]
+        remaining = replace(
+            with_markers(chosen, tracks), grasps=grasps, depths=depths, readings=readings
+        )
     experiments = [remaining if e is chosen else e for e in problem.experiments]
     return replace(problem, experiments=experiments), start_s
 
@@ -496,21 +508,60 @@ def _without_later_wrench(grasp: Grasp, end_s: float) -> Grasp:
     return replace(grasp, wrench=replace(wrench, values=values))
 
 
+def _without_later_values(gauge: Gauge, end_s: float) -> Gauge:
+    """Return the custom sensor without measurements after a time [s]; itself if none would
+    remain.
+    """
+    values = np.where((gauge.sample_times_s > end_s)[:, None], np.nan, gauge.measured_values)
+    return replace(gauge, values=values) if np.isfinite(values).any() else gauge
+
+
+def _stress_residuals_pa(
+    experiment: Experiment, predicted: Mapping[str, Array]
+) -> tuple[Array, Array]:
+    """Return times (S,) and differences (S,) of predicted and measured stresses [Pa] of a specimen,
+    in the order of time; NaN where not measured.
+    """
+    stresses = [gauge for gauge in experiment.readings if gauge.unit == STRESS_UNIT]
+    t_s = np.concatenate([gauge.sample_times_s for gauge in stresses])
+    differences = [predicted[gauge.name] - gauge.measured_values for gauge in stresses]
+    order = np.argsort(t_s, kind="stable")
+    return t_s[order], np.concatenate(differences)[order, 0]
+
+
+def _pooled_stress_rms_pa(solution: Solution) -> float | None:
+    """Return the RMS residual of the stresses of all fitted specimens [Pa]; None without any."""
+    residuals = [
+        _stress_residuals_pa(segment.experiment, solution.readings[segment.experiment.name])[1]
+        for segment in solution.collocation.transcriptions
+        if segment.experiment.specimen is not None
+    ]
+    if not residuals:
+        return None
+    return float(np.sqrt(np.nanmean(np.concatenate(residuals) ** 2)))
+
+
 def _prediction_error(
     experiment: Experiment, rollout: ForwardSimulation, start_s: float
 ) -> dict[str, Any]:
     """Return RMS, number of samples and sums of squares by block, of held-out measurements against
     a simulation.
 
-    The measurements are markers [m] or, without any, forces [N] on the complete specimen; `unit`
-    says which. Samples up to `start_s` are ignored; the RMS is None without samples.
+    The measurements are markers [m] or, without any, forces [N] on the complete specimen, or
+    stresses [Pa] of a specimen without a mesh; `unit` says which. Samples up to `start_s` are
+    ignored; the RMS is None without samples.
     """
     markers = experiment.markers
     unit = "m"
     t_s = experiment.t_s
     residuals = rollout.trajectory.markers_m - markers.positions_m
     is_counted = markers.is_present
-    if not markers.sample_count:
+    if experiment.specimen is not None:
+        t_s, stresses_pa = _stress_residuals_pa(experiment, rollout.readings)
+        unit = STRESS_UNIT
+        residuals = stresses_pa[:, None, None]
+        is_counted = np.isfinite(residuals[:, :, 0])
+    elif not markers.sample_count:
         t_s = np.concatenate([sensor.t_s for sensor in experiment.wrenches])
         pairs = zip(rollout.wrenches, experiment.wrenches, strict=True)
         residuals = np.concatenate(

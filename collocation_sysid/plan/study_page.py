@@ -17,6 +17,7 @@ from ..serialisation import as_json
 from .law_disagreements import law_table
 from .model_choice import advice, display_unit, law_disagreements, model_notes, model_rows
 from .run_execution import Record, RunStore
+from .study_kinds import METHOD_STUDY, MODEL_STUDY
 from .study_planning import PlannedRun, shortened_keys
 from .study_plots import comparison_plots, sweep_plots
 from .study_rows import (
@@ -56,7 +57,7 @@ class StudyReport:
     ----------
     title : str
         Title.
-    kind : {"compare", "sweep", "models"}
+    kind : {METHOD_STUDY, MODEL_STUDY, SWEEP_STUDY}
         Kind of study.
     planned : tuple of PlannedRun
         Runs of the study.
@@ -75,16 +76,16 @@ class StudyReport:
     @property
     def rows(self) -> list[Row]:
         """One row for each planned run, or for each model."""
-        if self.kind == "models":
+        if self.kind == MODEL_STUDY:
             return model_rows(self.planned, self.records)
         return [run_row(run, self.records.get(run.key), self.yardstick) for run in self.planned]
 
     @property
     def views(self) -> list[Table]:
         """Tables for the terminal, each within 80 columns."""
-        if self.kind == "compare":
+        if self.kind == METHOD_STUDY:
             return comparison_views(method_rows(self.rows))
-        if self.kind == "models":
+        if self.kind == MODEL_STUDY:
             disagreements = law_disagreements(self.rows)
             return [*model_views(self.rows), *([law_table(disagreements)] if disagreements else [])]
         return sweep_views(self.rows, list(self.planned[0].varied_values))
@@ -92,9 +93,9 @@ class StudyReport:
     @property
     def headline(self) -> list[str]:
         """Result of the study in a few sentences."""
-        if self.kind == "models":
+        if self.kind == MODEL_STUDY:
             return [advice(self.rows)]
-        if self.kind == "compare":
+        if self.kind == METHOD_STUDY:
             return [_method_sentence(row) for row in method_rows(self.rows)]
         return sweep_sentences(self.rows)
 
@@ -102,7 +103,7 @@ class StudyReport:
     def tables(self) -> list[Table]:
         """Tables for pages: headings in words, and the runs of a comparison."""
         views = [replace(view, heads=tuple(map(_in_words, view.heads))) for view in self.views]
-        return [*views, run_view(self.rows)] if self.kind == "compare" else views
+        return [*views, run_view(self.rows)] if self.kind == METHOD_STUDY else views
 
     @property
     def failures(self) -> list[str]:
@@ -119,10 +120,10 @@ class StudyReport:
         """Notes that explain the tables."""
         missing = len(self.planned) - len(self.records)
         notes = [f"{missing} of {len(self.planned)} runs remain to be done."] if missing else []
-        if self.kind == "models":
+        if self.kind == MODEL_STUDY:
             return [*model_notes(self.rows), *notes]
         return [
-            *((self.yardstick.sentence, MEDIANS_NOTE) if self.kind == "compare" else ()),
+            *((self.yardstick.sentence, MEDIANS_NOTE) if self.kind == METHOD_STUDY else ()),
             *notes,
         ]
 
@@ -146,7 +147,7 @@ def load_report(
 def study_tables(report: StudyReport, folder: Path) -> list[Shown]:
     """Return the tables of a study within 80 columns, and its failures."""
     # What no line of the tables says.
-    parts: list[Shown] = [*report.headline, ""] if report.kind == "models" else []
+    parts: list[Shown] = [*report.headline, ""] if report.kind == MODEL_STUDY else []
     for table in report.views:
         parts += [table, ""]
     failures = report.failures
@@ -178,13 +179,13 @@ def write_report(report: StudyReport, folder: Path) -> None:
     """Write ``runs.csv``, ``summary.csv``, ``summary.json``, ``summary.md`` and the plots."""
     rows = report.rows
     write_text_file(folder / "runs.csv", as_csv(rows))
-    if report.kind == "compare":
+    if report.kind == METHOD_STUDY:
         write_text_file(folder / "summary.csv", as_csv(method_rows(rows)))
     write_text_file(folder / "summary.json", as_json(report_json(report)) + "\n")
     write_text_file(folder / "summary.md", as_markdown([report_section(report)]))
-    if report.kind == "models":
+    if report.kind == MODEL_STUDY:
         figures = {}
-    elif report.kind == "compare":
+    elif report.kind == METHOD_STUDY:
         figures = comparison_plots(rows, report.records, report.yardstick)
     else:
         figures = sweep_plots(rows, list(report.planned[0].varied_values))
@@ -208,13 +209,13 @@ def report_json(report: StudyReport) -> dict[str, Any]:
         "tables": report.tables,
         "failures": report.failures,
     }
-    if report.kind == "compare":
+    if report.kind == METHOD_STUDY:
         content |= {
             "truth": dict(report.yardstick.truth) or None,
             "within": report.yardstick.within,
             "methods": method_rows(rows),
         }
-    elif report.kind == "models":
+    elif report.kind == MODEL_STUDY:
         content |= {"advice": advice(rows), "laws": law_disagreements(rows)}
     else:
         content["varied_values"] = list(first.varied_values)

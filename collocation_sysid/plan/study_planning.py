@@ -277,7 +277,8 @@ def plan_models(
         wrenches.
     """
     for each in problem.experiments:
-        if not (each.validation or each.markers.sample_count or each.wrenches):
+        is_compared = each.markers.sample_count or each.wrenches or each.specimen is not None
+        if not (each.validation or is_compared):
             raise InputError(
                 f"'{each.name}' has neither markers nor a measured wrench; expected one of these, "
                 "because models are compared by their predictions of these, not of depth images "

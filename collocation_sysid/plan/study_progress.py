@@ -105,7 +105,7 @@ class DesignProgress(Watched):
         )
 
     def show_activity(self, what: str) -> None:
-        """Show the present activity."""
+        """Show `what` is being computed, such as a stage of the design."""
         self.update(Text(f"{what} (Ctrl-C stops and keeps the best)", style="dim"), what)
 
 

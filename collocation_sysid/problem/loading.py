@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from ..declarations import keys_of, tables_of
-from ..errors import InputError
+from ..errors import InputError, located
 from ..fem.body import Body
-from ..fem.constants import FRICTION, Constant, constant_named
+from ..fem.constants import FRICTION, GAMMA_M, GAMMA_R, Constant, constant_named
 from ..fem.mesh import TetMesh
 from ..fem.regions import Region
 from ..fem.rest_shape import UnderGravity
@@ -23,8 +23,11 @@ from ..fem.structured import (
     cylinder_of_edge,
 )
 from ..model.parameters import Parameters, Tied, Unknown
-from ..recording import Experiment
+from ..recording import Experiment, Specimen
+from ..recording.homogeneous_deformation import DEFORMATIONS
 from ..recording.node_selection import selection_from_section
+from ..recording.specimen import cell_body
+from ..recording.specimen_checks import require_equal_units
 from ..schema_tables import Section, declared_in
 from ..statistics.plausibility import SIZES_M, size_and_density_hypotheses
 from .code_loader import CodeLoader, existing_file
@@ -34,6 +37,8 @@ from .problem_reading import read_problem_file
 from .problem_size import Say, Size, announce_reading, require_feasible
 from .recording_reader import RecordingReader
 from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
+from .specimen_reader import SpecimenReader
+from .specimen_schema import SpecimenSection
 
 # The key of `Experiment` that stands in a table of its own, of all experiments.
 AIR_KEY = "air_density_kg_m3"
@@ -61,26 +66,16 @@ def problem_arguments(
     code = CodeLoader(folder, allow_code)
     if say is not None:
         announce_reading({*_named_files(file, folder)}, say)
+    size = None
+    mesh_warnings: list[str] = []
     with _locate_in_table(path, "object"):
-        with _lengths_checked(file.object):
-            generated = _generated_counts(file.object)
-            if generated:
-                corners, elements = generated
-                size = _smallest_size(
-                    file, corners=corners, elements=elements, simulation=simulation
-                )
-                require_feasible(replace(size, substeps=1), say)
-            mesh = _load_mesh(file.object, folder)
-        size = _smallest_size(
-            file,
-            corners=len(mesh.points_m),
-            elements=len(mesh.tetrahedra),
-            simulation=simulation,
-        )
-        require_feasible(replace(size, substeps=1), None if generated else say)
-        body = _load_body(with_guessed_densities(file.object, unknowns), mesh, code)
-        body = body.with_free_densities(body.parts_with_free_density(unknowns))
-        mesh_warnings = [oddity.message for oddity in size_and_density_hypotheses(body)]
+        cells = SpecimenCells(file.object, code)
+        if file.recordings:
+            body, size = _load_object(file, folder, code, simulation, say)
+            mesh_warnings = [oddity.message for oddity in size_and_density_hypotheses(body)]
+        else:
+            body = cells.body_for(file.specimens[0].test)
+            unknowns = cells.with_undamped(unknowns)
     with _locate_in_table(path, "parameters"):
         body_with_friction = body.with_frames(0, frictions=_frictions(file))
         sections = with_declared_densities(unknowns, body_with_friction)
@@ -90,7 +85,17 @@ def problem_arguments(
         parameters.require_constants_of([body_with_friction])
     experiments = []
     notes = []
+    specimens: dict[str, Specimen] = {}
     for section in file.experiment:
+        if isinstance(section, SpecimenSection):
+            specimen_reader = SpecimenReader(
+                section, folder, cells.body_for(section.test), simulation=simulation
+            )
+            with _locate_in_table(path, f"experiment '{section.name}'"):
+                specimens[section.name], experiment = specimen_reader.read()
+            experiments.append(experiment)
+            notes += specimen_reader.notes
+            continue
         reader = RecordingReader(
             section,
             folder,
@@ -105,6 +110,8 @@ def problem_arguments(
         with _locate_in_table(path, f"experiment '{section.name}'", mesh_warnings):
             experiments.append(reader.read())
         notes += reader.notes
+    with located(path):
+        require_equal_units(specimens)
     return {
         "experiments": experiments,
         "parameters": parameters,
@@ -118,6 +125,70 @@ def problem_arguments(
         "notes": notes,
         "origin": Origin(path, text, _named_files(file, folder)),
     }
+
+
+def _load_object(
+    file: ProblemFile, folder: Path, code: CodeLoader, simulation: bool, say: Say | None
+) -> tuple[Body, Size]:
+    """Return the body of the recordings, and the size of the problem with one sample."""
+    with _lengths_checked(file.object):
+        generated = _generated_counts(file.object)
+        if generated:
+            corners, elements = generated
+            size = _smallest_size(file, corners=corners, elements=elements, simulation=simulation)
+            require_feasible(replace(size, substeps=1), say)
+        mesh = _load_mesh(file.object, folder)
+    size = _smallest_size(
+        file,
+        corners=len(mesh.points_m),
+        elements=len(mesh.tetrahedra),
+        simulation=simulation,
+    )
+    require_feasible(replace(size, substeps=1), None if generated else say)
+    body = _load_body(with_guessed_densities(file.object, file.parameters), mesh, code)
+    return body.with_free_densities(body.parts_with_free_density(file.parameters)), size
+
+
+class SpecimenCells:
+    """Homogeneous cells of specimens of the object's material, each made once.
+
+    Parameters
+    ----------
+    section : ObjectSection
+        Table of the object.
+    code : CodeLoader
+        Loader of Python files.
+    """
+
+    def __init__(self, section: ObjectSection, code: CodeLoader) -> None:
+        self._section = section
+        self._code = code
+        self._bodies: dict[bool, Body] = {}
+
+    def body_for(self, test: str) -> Body:
+        """Return the cell of a kind of test, one of `homogeneous_deformation.TESTS`."""
+        has_inner_node = DEFORMATIONS[test].needs_inner_node
+        if has_inner_node not in self._bodies:
+            law = self._section.material
+            is_code = isinstance(law, CodeSection)
+            material = self._code.material(law, "material") if is_code else law
+            self._bodies[has_inner_node] = cell_body(
+                test,
+                material,
+                prony=tuple(b.name for b in self._section.prony if b.region is None),
+                damping=self._section.damping,
+            )
+        return self._bodies[has_inner_node]
+
+    def with_undamped(
+        self, parameters: Mapping[str, ParameterSection | float]
+    ) -> Mapping[str, ParameterSection | float]:
+        """Return parameters with zero for damping constants that are not given, on which no
+        equilibrium depends.
+        """
+        constants = next(iter(self._bodies.values())).constants.values()
+        damping = {c.name: 0.0 for c in constants if c in (GAMMA_R, GAMMA_M)}
+        return {**parameters, **{n: v for n, v in damping.items() if n not in parameters}}
 
 
 def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
@@ -158,7 +229,8 @@ def _smallest_size(file: ProblemFile, corners: int, elements: int, *, simulation
 def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     """Return the data files that a problem names, whether or not they exist."""
     names = [file.object.mesh, file.object.surface]
-    for section in file.experiment:
+    names += [section.file for section in file.specimens]
+    for section in file.recordings:
         names += [section.markers.file, *(each.file for each in (*section.reading, *section.depth))]
         for grasp in section.moved_sections:
             displacement_file = section.file_of(grasp.displacement)
@@ -281,7 +353,7 @@ def _rest_shape(section: ObjectSection) -> UnderGravity | Literal["stress_free"]
 
 def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
     """Return the friction parameters that obstacles name, each once."""
-    declared = (each.friction for section in file.experiment for each in section.obstacle)
+    declared = (each.friction for section in file.recordings for each in section.obstacle)
     named = (one for one in declared if isinstance(one, str) and one.endswith(FRICTION.name))
     return tuple(dict.fromkeys(map(constant_named, named)))
 

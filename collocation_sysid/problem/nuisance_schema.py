@@ -49,7 +49,7 @@ class CustomNuisanceSection(Scoped):
     file : str
         Python file; it is run, which needs --allow-code.
     row : str
-        Name of the NuisanceRow in it.
+        Name of the NuisanceRow in the file.
     """
 
     file: Text

@@ -72,7 +72,7 @@ class Size:
 
     @property
     def timesteps(self) -> int:
-        """Timesteps of the recording."""
+        """Number of time steps: samples times steps per sample."""
         return self.samples * self.substeps
 
     def memory_mb(self) -> float:

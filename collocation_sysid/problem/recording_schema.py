@@ -35,12 +35,12 @@ class TableSection(Section):
     file : str, optional
         A table of columns with units; the experiment's file by default.
     columns : mapping of name to str
-        Column of the file by quantity, where its name is not recognised; with a unit behind, "Load
-        (N)", that the file does not state.
+        Column of the file for each quantity whose column is not recognised by its name. A unit that
+        the file does not state is added to the name, as in "Load (N)".
     axis : {"x", "y", "z"}
         Axis of the world along which a machine measures.
     sign : {1, -1}
-        -1 where the file's positive values are against the axis, as compression.
+        1, or -1 if positive values in the file point against the axis, as those of a compression.
     """
 
     file: Text | None = None
@@ -63,8 +63,8 @@ class DisplacementSection(TableSection):
     Attributes
     ----------
     length_m : float or "body", optional
-        Undeformed length that an engineering strain multiplies; or "body", that of the body along
-        the axis.
+        Undeformed length by which an engineering strain is multiplied [m]; "body" is the length of
+        the body along the axis.
     """
 
     length_m: Annotated[Literal["body"] | Positive, ByForm(str)] | None = None
@@ -79,10 +79,11 @@ class WrenchSection(section_of(Wrench, "WrenchSection", TableSection)):
     Attributes
     ----------
     area_m2 : float, optional
-        Undeformed area that an engineering stress multiplies.
+        Undeformed area by which an engineering stress is multiplied [m²].
     symmetry : int
-        The mesh is one of so many equal parts of what was measured, 4 for a quarter: forces and
-        sigmas are divided by it, and results are reported for the whole.
+        Number of equal parts of the measured specimen of which the mesh is one, such as 4 for a
+        quarter: forces and sigmas are divided by this number, and results are reported for the
+        whole specimen.
     """
 
     area_m2: Positive | None = None
@@ -108,24 +109,24 @@ class MovedSection(Section):
     Attributes
     ----------
     poses : str, optional
-        Poses, CSV or .npz; held where they are without poses or markers.
+        File of poses (CSV or .npz). Without poses, displacement and markers there is no motion.
     displacement : Displacement, optional
-        A file with t_s and any of x_m, y_m, z_m, or a table of file, columns, axis, sign: shifts
-        from the undeformed place, as of a crosshead, in place of poses.
+        Translations from the undeformed position, as of a crosshead, instead of poses: a file with
+        t_s and any of x_m, y_m, z_m, or a table of file, columns, axis and sign.
     quaternion : {"xyzw", "wxyz"}, optional
-        Order of a quaternion whose columns in poses do not name it.
+        Order of the quaternion's components, if the columns of the poses do not name them.
     length_unit : {"m", "cm", "mm", "in"}, optional
-        Unit of the positions in poses, where they do not state it.
+        Unit of the positions, if the file of poses does not state it.
     markers : mapping of name to (3,) array, optional
-        Place [x, y, z] on the undeformed body for each marker that is tied to the gripper, by name;
-        poses are fitted to their tracks.
+        Position [x, y, z] in the frame of the undeformed body of each marker on the gripper or
+        obstacle, by name; the poses are fitted to the tracks of these markers.
     weights : mapping of name to float
-        Weight in that fit by marker name, 1 by default.
+        Weight of each of these markers in the fit of the poses, by name; 1 by default.
     max_residual_m : float, optional
-        Residual of that fit above which a frame is reported.
+        Residual of the fit of the poses above which a frame is reported [m].
     gripper_to_body : TransformSection, optional
-        Place of the undeformed body in the frame that poses tell of, G in x = U(t) G X: position_m,
-        quaternion_xyzw.
+        Pose G of the undeformed body in the frame whose poses U(t) were measured, x = U(t) G X:
+        position_m, quaternion_xyzw.
     interpolation : {"smooth", "linear", "hold"}
         Motion between the samples of poses.
     """
@@ -214,30 +215,30 @@ class MarkersSection(section_of(Markers, "MarkersSection")):
         Marker tracks: C3D, TRC, Qualisys TSV, Motive CSV or plain CSV; only `simulate` can do
         without.
     sigma_m : Sigma
-        Standard deviation of a coordinate, for all or by marker name.
+        Standard deviation of the noise of each coordinate [m], for all markers or by marker name.
     names : list of str, optional
         List of the names of markers to use; all by default.
     labels : mapping of name to str
-        Name here for a label in the file, by label.
+        Marker name for each label in the file, by label.
     weights : mapping of name to float
         Weight in the loss by marker name, 1 by default; 0 leaves the marker out.
     length_unit : {"m", "cm", "mm", "in"}, optional
-        Unit of the coordinates, where the file does not state it.
+        Unit of the coordinates, if the file does not state it.
     rate_hz : float, optional
-        Frame rate, where the file states neither it nor times.
+        Frame rate [Hz], if the file states neither it nor times.
     template_m : mapping of name to (3,) array, optional
-        Place [x, y, z] in the body's frame for at least three markers, by name; all tracks are
-        moved rigidly so that these fit.
+        Position [x, y, z] in the body's frame of at least three markers, by name; all tracks are
+        moved by the rigid motion that fits these markers to their positions.
     template_window_s : list, optional
         First and last time [start, end] to average for the template.
     max_template_residual_m : float, optional
-        Farthest a marker may be from its place in the template.
+        Largest allowed distance of a marker from its position in the template [m].
     reference_m : mapping of name to (3,) array
-        Place [x, y, z] on the undeformed body for each marker, by name; the others' places are
-        estimated.
+        Position [x, y, z] of each marker on the undeformed body, by name; those of other markers
+        are estimated.
     reference_sigma_m : ReferenceSigma, optional
-        Standard deviation of the places in reference_m, for all or by marker name; 0 for exact
-        ones. That of nuisance.marker_offsets by default.
+        Standard deviation of the positions in reference_m, for all or by marker name; 0 for exact
+        positions. That of nuisance.marker_offsets by default.
     """
 
     file: Text | None = None
@@ -340,7 +341,8 @@ class DepthSection(section_of(Depth, "DepthSection", NamedSection)):
     camera : DepthCameraSection
         Pose and projection of the camera.
     t_s : list of float, optional
-        Times, where the file does not contain them; of one image that of the first sample.
+        Times [s], if the file does not contain them; a single image is assigned to the first sample
+        by default.
     count_m : float, optional
         Depth of one count of an image, 0.001 by default.
     length_unit : {"m", "cm", "mm", "in"}
@@ -366,7 +368,7 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
     grasp : Grasps
         A table of nodes and poses, or a list of them.
     obstacle : list of ObstacleSection
-        [[experiment.obstacle]] tables: what the body may touch.
+        [[experiment.obstacle]] tables: rigid solids that the body may touch.
     markers : MarkersSection
         Tracked points; none are needed where the wrench of a grasp is measured.
     window_s : list, optional

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
+from ..errors import InputError
 from ..fem.elements import ELEMENTS
 from ..fem.materials import DAMPINGS, MATERIALS
 from ..fem.spatial_field import Field as MaterialField
@@ -27,6 +28,7 @@ from ..validated_types import Count, Finite, Flag, NotNegative, Positive, Text
 from .problem_options import RolloutOptions, UncertaintyOptions
 from .recording_schema import ExperimentSection
 from .solver_schema import SolverSection
+from .specimen_schema import SpecimenSection
 
 MaterialName = Annotated[str, Among(tuple(MATERIALS))]
 DampingName = Annotated[str, Among(tuple(DAMPINGS))]
@@ -48,7 +50,7 @@ class CodeSection(Section):
     file : str
         Python file; it is run, which needs --allow-code.
     function : str
-        Name of the energy function in it.
+        Name of the energy function in the file.
     """
 
     file: Text
@@ -61,11 +63,12 @@ class NodeForceSection(CodeSection):
     Attributes
     ----------
     function : str
-        Name of the function of the force in it.
+        Name of the force function in the file.
     nodes : ElementNodes, optional
         Selection of nodes; all by default.
     on : str
-        What it acts on: these nodes, or faces of the surface that have all of theirs among them.
+        "nodes": the force acts on the selected nodes. "faces": it acts on the faces of the surface
+        all of whose nodes are selected.
     carries : int
         Number of internal variables of each node or face from step to step: the function gets them
         after v, and returns the force and those for the next step.
@@ -85,7 +88,7 @@ class RegionSection(Section):
     Attributes
     ----------
     name : str
-        Letters, digits, - and _.
+        Name, made of letters, digits, - and _.
     cells : ElementNodes
         Selection of cells, by their centres: a table of box_m, ball_m or indices, or the name of a
         cell array or of a physical group.
@@ -107,9 +110,9 @@ class PronySection(Section):
     Attributes
     ----------
     name : str
-        Letters, digits, - and _.
+        Name, made of letters, digits, - and _.
     region : str, optional
-        Region that it belongs to; all without their own by default.
+        Region with this branch; by default all regions that have no branches of their own.
     """
 
     name: Annotated[str, Field(pattern="^[A-Za-z0-9_-]+$")]
@@ -145,6 +148,10 @@ class ScanSection(Section):
     gravity_m_s2: Vector = (0.0, 0.0, -9.81)
 
 
+# Keys of the object that state its shape.
+SHAPES = ("mesh", "surface", "cylinder", "box_m")
+
+
 class ObjectSection(Section):
     """The soft object: its mesh, surface or shape, mass and material.
 
@@ -159,32 +166,34 @@ class ObjectSection(Section):
     box_m : list, optional
         Lengths [x, y, z] of a box to mesh, with a corner at the origin.
     edge_length_m : float, optional
-        Edge length wanted of the mesh of a surface, cylinder or box.
+        Target edge length of the mesh of a surface, cylinder or box [m].
     length_unit : {"m", "cm", "mm", "in"}
         Unit of the coordinates in the file.
     mass_kg : float, optional
-        Weighed mass of the whole object; or a parameter, then it may be left out.
+        Weighed mass of the whole object [kg]. Left out if density_kg_m3 is stated here or is a
+        parameter.
     density_kg_m3 : float, optional
-        Uniform density instead of a mass; likewise.
+        Uniform density [kg/m³], instead of the mass.
     material : Material
         A material's name, or a table of file and function.
     damping : DampingName
-        Law of γ_r: kelvin-voigt, a viscous fluid in the current shape; material, viscous in the
-        rate of the Green strain, as in MuJoCo; rayleigh, the paper's, also damps rotation.
+        Law of the damping γ_r. "kelvin-voigt": a viscous stress in the current shape. "material": a
+        viscous stress by the rate of the Green strain, as in MuJoCo. "rayleigh": the law of the
+        paper, which also damps rigid rotation.
     region : list of RegionSection
-        [[object.region]] tables: cells that differ.
+        [[object.region]] tables: parts of the body with other properties.
     prony : list of PronySection
         [[object.prony]] tables: a material with memory, branch by branch.
     force : list of NodeForceSection
-        [[object.force]] tables: forces of the user's own on the nodes.
+        [[object.force]] tables: custom forces on the nodes.
     field : FieldSection, optional
-        A constant that differs from place to place: parameter, length_m, modes, amplitude.
+        A constant that varies in space: parameter, length_m, modes, amplitude.
     rest_shape : {"stress_free", "under_gravity"}, optional
         Whether the mesh is free of stress, or the shape in which the object hung or stood under its
         own weight while it was scanned; not known by default, which widens the intervals of a mesh
         from a file.
     scan : ScanSection, optional
-        Pose and held nodes of the scan: gravity_m_s2, nodes.
+        Gravity and held nodes during the scan: gravity_m_s2, nodes.
     evaluator : {"auto", "simd", "casadi"}
         How element kernels are evaluated.
     """
@@ -208,11 +217,17 @@ class ObjectSection(Section):
     scan: ScanSection | None = None
     evaluator: Literal["auto", "simd", "casadi"] = "auto"
 
+    @property
+    def has_shape(self) -> bool:
+        """Whether the table states a mesh, a surface or a shape."""
+        return bool(used_keys(self, *SHAPES)) or self.edge_length_m is not None
+
     @model_validator(mode="after")
     def _require_consistent(self) -> ObjectSection:
         """Raise `ValueError` for keys that exclude or require each other."""
-        require_one(self, "mesh", "surface", "cylinder", "box_m")
-        if (self.mesh is None) != (self.edge_length_m is not None):
+        if self.has_shape:
+            require_one(self, *SHAPES)
+        if self.has_shape and (self.mesh is None) != (self.edge_length_m is not None):
             raise ValueError(
                 "edge_length_m is used only with surface, cylinder or box_m; expected one of "
                 "these, or no edge_length_m"
@@ -269,7 +284,7 @@ class ParameterSection(section_of(Unknown, "ParameterSection")):
     tied_to : str, optional
         Parameter that this one is a multiple of.
     ratio : float, optional
-        The multiple, 1 by default.
+        Ratio of this parameter to that of `tied_to`, 1 by default.
     """
 
     fixed: Finite | None = None
@@ -330,8 +345,8 @@ class TranscriptionSection(Section):
     Attributes
     ----------
     substeps : str
-        Grid steps between samples; auto: as many, up to 8, as move no parameter by more than half a
-        standard error.
+        Number of time steps between samples. "auto": one, or more (up to 8) if one step would
+        change a parameter by more than half a standard error.
     explicit_grasps : bool
         Grasped nodes as constraint rows (the paper's c^g) instead of bounds.
     """
@@ -357,24 +372,43 @@ class EnvironmentSection(Section):
     air_density_kg_m3: AirDensity = Field(default_factory=usual_air_density)
 
 
+def _kind_tag(value: Any) -> str:
+    """Return the tag of an experiment's table, which messages omit."""
+    kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
+    return SPECIMEN_TAG if kind == "specimen" else "<recording>"
+
+
+# Tag of the tables of specimens in the locations of validation errors.
+SPECIMEN_TAG = "<specimen>"
+if TYPE_CHECKING:
+    AnyExperimentSection = ExperimentSection | SpecimenSection
+else:
+    AnyExperimentSection = Annotated[
+        Annotated[ExperimentSection, Tag("<recording>")]
+        | Annotated[SpecimenSection, Tag(SPECIMEN_TAG)],
+        Discriminator(_kind_tag),
+    ]
+
+
 class ProblemFile(Section):
     """A problem file (TOML).
 
     Attributes
     ----------
     parameters : Parameters
-        Names of the model's constants: each {} or a guess to estimate it, a value, or a tie.
+        Constants of the model by name: {} or a guess for a constant to estimate, a number for a
+        known one, or a tie to another constant.
     experiment_defaults : mapping of name to Any
-        Keys that every [[experiment]] has which does not give them itself.
-    experiment : list of ExperimentSection
-        At least one [[experiment]] table, one for each recording.
+        Default keys of every [[experiment]] table; specimens get only the keys that they have.
+    experiment : list of ExperimentSection or SpecimenSection
+        At least one [[experiment]] table, one for each recording or specimen.
     """
 
     title: str = ""
     object: ObjectSection
     parameters: Parameters
     experiment_defaults: dict[str, Any] = Field(default_factory=dict)
-    experiment: list[ExperimentSection] = Field(min_length=1)
+    experiment: list[AnyExperimentSection] = Field(min_length=1)
     environment: EnvironmentSection = Field(default_factory=EnvironmentSection)
     transcription: TranscriptionSection = TranscriptionSection()
     solver: SolverSection = Field(default_factory=SolverSection)
@@ -384,8 +418,37 @@ class ProblemFile(Section):
     @model_validator(mode="before")
     @classmethod
     def _merge_defaults(cls, content: Any) -> Any:
-        """Insert [experiment_defaults] before validation."""
+        """Insert [experiment_defaults] into each experiment before the file is validated."""
         return with_experiment_defaults(content)
+
+    @model_validator(mode="after")
+    def _require_shape(self) -> ProblemFile:
+        """Raise an `InputError` if a recording has no mesh, or regions have none."""
+        if self.object.has_shape:
+            return self
+        if self.recordings:
+            raise InputError(
+                f"found no {' or '.join(SHAPES)}; expected exactly one of {', '.join(SHAPES)}",
+                where="object",
+            )
+        for key in ("region", "field", "force", "scan"):
+            if getattr(self.object, key):
+                raise InputError(
+                    f"found {key} in a problem of specimens without a mesh, which are homogeneous; "
+                    f"expected no {key}, or a mesh and a recording of it",
+                    where=f"object.{key}",
+                )
+        return self
+
+    @property
+    def recordings(self) -> list[ExperimentSection]:
+        """Experiments with the object's mesh."""
+        return [each for each in self.experiment if isinstance(each, ExperimentSection)]
+
+    @property
+    def specimens(self) -> list[SpecimenSection]:
+        """Material tests without a mesh."""
+        return [each for each in self.experiment if isinstance(each, SpecimenSection)]
 
 
 def with_experiment_defaults(content: Any) -> Any:
@@ -397,6 +460,16 @@ def with_experiment_defaults(content: Any) -> Any:
     if not (isinstance(shared, dict) and isinstance(experiments, list)):
         return content
     completed_tables = [
-        shared | table if isinstance(table, dict) else table for table in experiments
+        _known_defaults(shared, table) | table if isinstance(table, dict) else table
+        for table in experiments
     ]
     return content | {"experiment": completed_tables}
+
+
+def _known_defaults(shared: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
+    """Return the defaults of an experiment: all, or of a specimen beside recordings those that
+    specimens know.
+    """
+    if table.get("kind") != "specimen" or shared.get("kind") == "specimen":
+        return shared
+    return {key: value for key, value in shared.items() if key in SpecimenSection.model_fields}

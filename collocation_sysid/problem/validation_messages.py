@@ -12,7 +12,8 @@ from pydantic.fields import FieldInfo
 
 from ..errors import InputError, excerpt, hint_at
 from ..validated_types import expected as wanted
-from .schema import ProblemFile, with_experiment_defaults
+from .schema import SPECIMEN_TAG, ProblemFile, with_experiment_defaults
+from .specimen_schema import SpecimenSection
 
 Part = str | int
 Fault = Mapping[str, Any]
@@ -70,6 +71,8 @@ def _fault_message(fault: Fault, content: dict[str, Any], root: type[BaseModel])
     if kind == "extra_forbidden":
         table, _ = _schema_field(key[:-1], root)
         inside = _table_model(table.annotation) if table else None
+        if SPECIMEN_TAG in fault["loc"] and inside is not None and len(key) == 3:
+            inside = SpecimenSection
         known = list((inside or root).model_fields)
         hint = hint_at(str(key[-1]), known)
         return f"unknown key{hint or '; expected one of ' + ', '.join(known)}"
@@ -156,6 +159,9 @@ def _schema_field(key: Sequence[Part], root: type[BaseModel]) -> tuple[FieldInfo
         if field is not None and get_origin(field.annotation) is dict and not named:
             named = True  # a name of the user's, such as a parameter's
             continue
+        if field is not None and model is not None and part not in model.model_fields:
+            others = _table_models(field.annotation)
+            model = next((each for each in others if part in each.model_fields), None)
         if model is None or part not in model.model_fields:
             break
         field = model.model_fields[part]
@@ -166,14 +172,20 @@ def _schema_field(key: Sequence[Part], root: type[BaseModel]) -> tuple[FieldInfo
 
 
 def _table_model(annotation: Any) -> type[BaseModel] | None:
-    """Return the model of a field that is a table or a list of tables; None for other fields."""
+    """Return the first model of a field that is a table or a list of tables; None for other
+    fields.
+    """
+    return next(iter(_table_models(annotation)), None)
+
+
+def _table_models(annotation: Any) -> list[type[BaseModel]]:
+    """Return the models of a field that is a table or a list of tables; several if tables differ
+    by kind.
+    """
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for argument in getattr(annotation, "__args__", ()):
-        model = _table_model(argument)
-        if model is not None:
-            return model
-    return None
+        return [annotation]
+    arguments = getattr(annotation, "__args__", ())
+    return [model for argument in arguments for model in _table_models(argument)]
 
 
 def shortened(value: Any) -> str:

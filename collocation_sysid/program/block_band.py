@@ -214,7 +214,9 @@ class _ColumnBlock:
 
     @classmethod
     def from_blocks(cls, columns: int, blocks: Sequence[BandBlock], top: int) -> _ColumnBlock:
-        """Build the structure of a column block of `columns` columns."""
+        """Return the structure of a column block of `columns` columns: `top` dense rows, then the
+        blocks.
+        """
         top_rows = np.tile(np.arange(top), columns)
         top_columns = np.repeat(np.arange(columns), top)
         rows = np.concatenate([top_rows, *(b.rows for b in blocks)])
@@ -253,8 +255,13 @@ class _ColumnBlock:
         return self.sorted_positions[first : first + len(self.blocks[block].rows)]
 
     def locate(self, offset: int, rows: Index, columns: Index) -> Index:
-        """Return the positions in the column block of given entries of the block at
-        `offset`; raise IndexError for others.
+        """Return the positions in the column block of entries (rows, columns) of the block at a row
+        offset.
+
+        Raises
+        ------
+        IndexError
+            For entries that the block does not have.
         """
         k = [b.offset for b in self.blocks].index(offset)
         block = self.blocks[k]
@@ -297,7 +304,19 @@ class CombinePlan:
 
 
 def _make_plan(kinds: Sequence[_ColumnBlock], starts: Index, count: int, adds: bool) -> CombinePlan:
-    """Return the tasks that fill the column blocks."""
+    """Return the tasks that fill the column blocks.
+
+    Parameters
+    ----------
+    kinds : sequence of _ColumnBlock
+        Structure of each column block.
+    starts : array of int
+        First value of each column block.
+    count : int
+        Number of rows of the coefficients.
+    adds : bool
+        Whether values are added to those present, instead of replacing them.
+    """
     targets = []
     sources = []
     maps = {}

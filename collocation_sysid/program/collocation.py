@@ -16,8 +16,7 @@ x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axi
 
 Lifted variables (history variables, reaction forces, wrenches, contact pressures) are eliminated by
 default; with `Collocation.has_lifted_variables` they follow at the end of z, and their equations at
-the end of
-g.
+the end of g.
 
 Constraints g, in this order:
 
@@ -124,13 +123,12 @@ class Collocation:
     has_grasp_constraints : bool, default False
         If true, prescribed displacements are constraints instead of bounds.
     huber : float, optional
-        Threshold of Huber's loss in standard deviations, see `ResidualExpression`; None means a
-        quadratic
-        loss.
+        Threshold of Huber's loss in standard deviations, see `measurement_residual`; None means a
+        quadratic loss.
     associations : mapping of experiment name to MarkerAssociation
         Elements, clock samples and correspondences of the measurements. Experiments that are
-        missing, or whose chart belongs to another body or other priors, get the chart of the stated
-        places.
+        missing, or whose association belongs to another body or other priors, get that of the
+        stated places.
     has_lifted_variables : bool, default False
         If true, keep history variables, measured wrenches and contact pressures as variables with
         constraints (lifted variables, see `lifted`), so that the exact matrices are sparse. If
@@ -167,7 +165,9 @@ class Collocation:
 
     @cached_property
     def transcriptions(self) -> tuple[Transcription, ...]:
-        """Transcriptions of the experiments that are fitted."""
+        """Transcriptions of the experiments that are fitted, in their order; validation recordings
+        have none.
+        """
         fitted = [each for each in self.experiments if not each.validation]
         segments = list[Transcription]()
         for experiment, local in zip(fitted, nuisance_indices(fitted, self.nq), strict=True):
@@ -287,7 +287,9 @@ class Collocation:
         return np.concatenate([self._pack_without_lifted(p, positions), *lifted])
 
     def _pack_without_lifted(self, p: Array, positions: Sequence[Array]) -> Array:
-        """Return z without lifted variables."""
+        """Return z without lifted variables from p (nq + nphi,) and the positions (N, 3n) [m] of
+        each experiment: q, scaled positions, φ.
+        """
         pairs = zip(self.transcriptions, positions, strict=True)
         scaled = [np.ravel(x) / segment.length_m for segment, x in pairs]
         return np.concatenate([p[: self.nq], *scaled, p[self.nq :]])
@@ -329,7 +331,8 @@ class Collocation:
         return min(segment.body.threads for segment in self.transcriptions)
 
     def iterates_at(self, p: Array, positions: Sequence[Array]) -> list[ExperimentIterate]:
-        """Return every experiment at parameters p and positions (N, 3n) [m], or their first rows.
+        """Return every experiment at parameters p (nq + nphi,) and positions (N, 3n) [m], or their
+        first rows.
 
         Lifted quantities follow from positions and parameters.
         """
@@ -365,7 +368,7 @@ class Collocation:
 
     @property
     def parameter_bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of p."""
+        """Lower and upper bounds of p, (nq + nphi,) each; infinite for most φ."""
         lower, upper = self.parameters.bounds_q
         low, high = (np.full(self.nphi, bound) for bound in (-np.inf, np.inf))
         for segment in self.transcriptions:
@@ -380,7 +383,7 @@ class Collocation:
     def follow_estimates(
         self, p: Array, positions: Sequence[Array] = ()
     ) -> tuple[Collocation, Array]:
-        """Update the charts where the estimates p have left them.
+        """Update the associations where the estimates p have left them.
 
         Parameters
         ----------
@@ -393,7 +396,7 @@ class Collocation:
         Returns
         -------
         (Collocation, array)
-            The program with the new charts, which is self if no chart has changed, and p in it.
+            The program with the new associations, which is self if none has changed, and p in it.
         """
         rows = positions or [np.zeros((0, segment.dof_count)) for segment in self.transcriptions]
         pairs = zip(self.transcriptions, rows, strict=True)
@@ -423,7 +426,7 @@ class Collocation:
         Returns
         -------
         (Collocation, array)
-            The program with the new charts, which is self if everything is stated, and p in it.
+            The program with the new associations, which is self if all is stated, and p in it.
         """
         if not any(segment.rows_to_place for segment in self.transcriptions):
             return self, p
@@ -436,8 +439,8 @@ class Collocation:
         )
 
     def with_marker_places(self, places_m: Sequence[Array]) -> Collocation:
-        """Return the program with charts about given marker places, (M, 3) for each
-        experiment [m].
+        """Return the program with associations about given marker places (M, 3) [m] for each
+        experiment.
         """
         charts = [
             s.association.centred_at(m) for s, m in zip(self.transcriptions, places_m, strict=True)
@@ -448,7 +451,9 @@ class Collocation:
     def _with_associations(
         self, charts: Sequence[MarkerAssociation], p: Array, phis: Sequence[Array]
     ) -> tuple[Collocation, Array]:
-        """Return the program with other charts, and p with the φ of each experiment in them."""
+        """Return the program with another association of each experiment, and p (nq + nphi,) with
+        the φ of each experiment in `phis`, which refer to these associations.
+        """
         other = copy(self)
         updated = self._combine_parameters(p[: self.nq], phis)
         segments = _with_shared_associations(self.transcriptions, charts)
@@ -460,14 +465,14 @@ class Collocation:
 
     @property
     def guess_p(self) -> Array:
-        """Guess of p: that of q, and φ at the centres of the charts."""
+        """Guess of p: that of q, and φ at the centres of the associations."""
         return self._combine_parameters(
             self.parameters.guess_q, [s.guess_phi for s in self.transcriptions]
         )
 
     def _combine_parameters(self, q: Array, phis: Sequence[Array]) -> Array:
-        """Return p from q and the φ of each experiment; shared entries are those of the
-        first experiment.
+        """Return p (nq + nphi,) from q (nq,) and the φ of each experiment; shared entries are those
+        of the first experiment.
         """
         p = np.concatenate([q, np.zeros(self.nphi)])
         for segment, phi in reversed([*zip(self.transcriptions, phis, strict=True)]):
@@ -496,13 +501,13 @@ class Collocation:
     # Objective --------------------------------------------------------------------------------
 
     def objective(self, z: Array) -> float:
-        """Return the objective: loss and priors, divided by the number of measurements."""
+        """Return the objective at z: loss and priors, divided by the number of measurements."""
         residuals, _ = self.prior_residuals(self.parameters_from(z))
         loss = sum(part.loss for part in self.iterates(z))
         return self.loss_scale * float(residuals @ residuals + loss)
 
     def gradient(self, z: Array) -> Array:
-        """Return the gradient of the objective by z."""
+        """Return the gradient (variables,) of the objective by z."""
         parts = self.iterates(z)
         residuals, slopes = self.prior_residuals(self.parameters_from(z))
         by_p = 2 * residuals * slopes
@@ -517,7 +522,9 @@ class Collocation:
     # Constraints ------------------------------------------------------------------------------
 
     def constraint_values(self, z: Array) -> Array:
-        """Return the scaled constraints g."""
+        """Return the scaled constraints g (constraints,) at z: equations of motion, grasps, and
+        equations of lifted variables.
+        """
         parts = self.iterates(z)
         rows = [
             part.segment.constraint_values(part.x, part.equations, part.histories) for part in parts
@@ -612,8 +619,8 @@ class Collocation:
         )
 
     def jacobian_vjp(self, z: Array, multipliers: Array) -> Array:
-        """Return the vector–Jacobian product (∂g/∂z)ᵀ multipliers, including eliminated
-        history variables.
+        """Return the vector–Jacobian product (∂g/∂z)ᵀ multipliers (variables,), including the
+        dependence through eliminated history variables.
         """
         slope = self.jacobian(z).T @ multipliers
         for part in self.iterates(z) if self.has_eliminated_histories else ():
@@ -740,11 +747,11 @@ class Collocation:
         return values
 
     def kkt_residual(self, z: Array, multipliers: Array) -> float:
-        """Return the largest violation of the first-order optimality conditions, in the scaling of
-        the program.
+        """Return the largest violation of the first-order optimality conditions at z, in the
+        scaling of the program.
 
-        Stationarity of objective + multipliers · g in every variable that is not prescribed (at a
-        bound, the gradient may point outwards), and feasibility.
+        The conditions are stationarity of objective + multipliers · g in every variable that is not
+        prescribed (at a bound, the gradient may point outwards), and feasibility.
         """
         rows = self.constraint_values(z)
         slope = self.gradient(z) + self.jacobian_vjp(z, multipliers)
@@ -776,7 +783,9 @@ class Collocation:
         return [part.residual_n for part in self.iterates(z)]
 
     def largest_force_n(self, z: Array) -> float:
-        """Return the largest internal or external force on a dof [N], as a scale for violations."""
+        """Return the largest force on a dof [N] at z, internal or external and without inertia, as
+        a scale for violations.
+        """
         largest = 0.0
         for part in self.iterates(z):
             dynamics = part.equations.dynamics
@@ -788,7 +797,9 @@ class Collocation:
         return largest
 
     def largest_violations(self, z: Array, count: int = 5) -> list[Violation]:
-        """Return the `count` largest residuals of the equations of motion, in descending order."""
+        """Return the `count` largest residuals of the equations of motion at z, of all experiments,
+        in descending order.
+        """
         violations = []
         for part in self.iterates(z):
             segment = part.segment
@@ -826,8 +837,8 @@ class Collocation:
 def _with_shared_associations(
     transcriptions: Sequence[Transcription], charts: Sequence[MarkerAssociation]
 ) -> tuple[Transcription, ...]:
-    """Return the segments with the given charts, made equal where nuisance parameters are
-    shared.
+    """Return the transcriptions with the given associations, made equal where nuisance parameters
+    are shared.
     """
     parts = zip(transcriptions, charts, strict=True)
     same = shared_charts((s.nuisance_indices, s.nuisance, chart) for s, chart in parts)

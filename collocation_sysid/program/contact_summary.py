@@ -114,8 +114,8 @@ class FrictionSummary:
 def friction_summaries(
     experiment: Experiment, dynamics: Dynamics, x: Array
 ) -> dict[str, FrictionSummary]:
-    """Return the friction with each obstacle that has friction, by name, along positions x
-    (T, 3n).
+    """Return the friction with each obstacle that has friction, by the name of the obstacle, along
+    positions x (T, 3n) [m]; empty without friction.
     """
     xi, nu = dynamics.evaluation_states(x)
     summaries = {}
@@ -137,14 +137,16 @@ def friction_summaries(
 
 
 def contact_summaries_of_parts(iterates: Iterable[ExperimentIterate]) -> Iterator[ContactSummary]:
-    """Iterate over the contact summaries of several experiments."""
+    """Yield the contact summaries of each obstacle of each experiment, at the positions of its
+    iterate.
+    """
     for part in iterates:
         t_s = part.equations.dynamics.t_s[: len(part.x)]
         yield from contact_summaries(part.segment.experiment, part.x, t_s)
 
 
 def contact_summaries(experiment: Experiment, x: Array, t_s: Array) -> Iterator[ContactSummary]:
-    """Iterate over the contact summaries of each obstacle for positions x (T, 3n) at times (T,)."""
+    """Yield the contact summary of each obstacle for positions x (T, 3n) [m] at times (T,) [s]."""
     for contact, obstacle in zip(contact_terms(experiment), experiment.obstacles, strict=True):
         law = contact.law_of_contact
         smallest_gap_m = np.inf

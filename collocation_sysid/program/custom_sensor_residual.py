@@ -132,8 +132,8 @@ class CustomSensorResidual(MeasurementResidual):
         return RowStencil(places, data.T[..., None])
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
-        """Return the stencil of those first samples whose times are among the first `known`
-        ones.
+        """Return the stencil of the first samples that depend only on the first `known` times of
+        the observable; φ is not used.
         """
         last = self._stencil.indices[:, 0, -1] // self.observable.vector_count
         samples = int(np.count_nonzero(last < known))
@@ -141,14 +141,26 @@ class CustomSensorResidual(MeasurementResidual):
 
     @property
     def first_needed_s(self) -> float:
-        """Last time [s] that the first compared sample is computed from."""
+        """Time [s] of the last row of the motion on which the prediction of the first compared
+        sample depends.
+        """
         first = int(self.is_compared.any(axis=(1, 2)).argmax())
         return float(
             self.observable_s[self._stencil.indices[first, 0, -1] // self.observable.vector_count]
         )
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the user's expression, padded with zeros to a multiple of three numbers."""
+        """Return the user's expression (m',), padded with zeros to a multiple of three numbers.
+
+        Parameters
+        ----------
+        values : (3, e · times) SX
+            Observable at the neighbouring times.
+        phi : SX
+            Nuisance parameters of the sensor, in prior standard deviations.
+        data : SX
+            Distances of the neighbouring times from the sample, and the sample's time [s].
+        """
         *places, t_s = ca.vertsplit(data)
         late = ca.SX.sym("late")
         each = self.observable.vector_count
@@ -167,8 +179,8 @@ class CustomSensorResidual(MeasurementResidual):
 
     @cached_property
     def observable_sigmas(self) -> Array:
-        """Standard deviations (3 e,) of the observable as one sample determines it, from
-        the derivatives at zero.
+        """Standard deviations (3 e,) of the observable as one sample determines it, from the
+        derivatives at zero; infinite where the readings do not depend on an entry.
         """
         nothing = np.zeros((self.observable.count, self.observable.vector_count, GROUP))
         _, _, by_u = self._evaluate(nothing, np.zeros(self.nuisance.size))
@@ -181,8 +193,8 @@ class CustomSensorResidual(MeasurementResidual):
             return 1 / np.sqrt(squares)
 
     def predict_motion(self, motion: ObservedMotion, phi: Array) -> Array:
-        """Return predictions (S, G, 3) for a motion at the observable's times; NaN for
-        samples outside.
+        """Return predictions (S, G, 3) for a motion at the observable's times, at φ; NaN for
+        samples outside these times.
         """
         predicted = self.predict(self.observable.evaluate(motion, phi), phi)
         return np.where(_is_within(self.t_s, self.observable_s)[:, None, None], predicted, np.nan)
@@ -193,8 +205,8 @@ class CustomSensorResidual(MeasurementResidual):
 
 
 def _is_within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:
-    """Return the mask (S,) of samples within the range of ascending times; none if there
-    are no times.
+    """Return the mask (S,) of samples at times (S,) within the range of ascending times `at_s`; all
+    false if there are no times.
     """
     if not len(at_s):
         return np.zeros(len(t_s), dtype=bool)
@@ -216,7 +228,7 @@ def custom_sensor_residuals(
         The experiment.
     t_s : (N,) array
         Times of the rows of x [s].
-    grid : Table
+    grid : ReactionGrid
         Times at which reaction forces are known.
     nuisance : NuisanceMap
         Nuisance parameters of the experiment.

@@ -166,16 +166,16 @@ class DepthCameraModel:
         return corrected @ rotations[image].T + translations[image]
 
     def body_middle_m(self, sample: int) -> Array:
-        """Return the middle (3,) of the undeformed body in the camera's stated frame, at an
-        image [m].
+        """Return the middle (3,) of the undeformed body, carried by the first pose, in the camera's
+        stated frame at the image with index `sample` [m].
         """
         rotations, translations = self.poses
         middle_m = rotations[0] @ self.pivot_m + translations[0]
         return (middle_m - translations[sample]) @ rotations[sample]
 
     def to_camera_m(self, phi: Array, points_m: Array, sample: int) -> Array:
-        """Return points (P, 3) of the world in the camera's frame [m]: the inverse of
-        `to_world` without bias.
+        """Return points (P, 3) of the world in the camera's frame at φ and the image with index
+        `sample` [m]: the inverse of `to_world` without bias.
         """
         basis = np.vstack([np.zeros(3), np.eye(3)])
         corner, *axes = self.to_world(phi, basis, np.zeros((4, 3)), sample)
@@ -193,16 +193,16 @@ class DepthCameraModel:
         return np.array(values) / self.nuisance.scales
 
     def eye_m(self, phi: Array, sample: int) -> Array | None:
-        """Return the position (3,) of the camera in the world at φ (k,) [m]; None for a
-        point cloud without camera.
+        """Return the position (3,) of the camera in the world at φ (k,) and the image with index
+        `sample` [m]; None for a point cloud without camera.
         """
         if self.depth.camera.matrix is None:
             return None
         return self.to_world(phi, np.zeros((1, 3)), np.zeros((1, 3)), sample)[0]
 
     def prior_weights(self, row: NuisanceRow) -> Array:
-        """Return one over the prior standard deviations (3,) of the rotation [1/rad] or
-        translation [1/m]; a large number for exact ones.
+        """Return one over the prior standard deviations (3,) of the camera's rotation [1/rad] or
+        translation [1/m], whichever `row` states; a large number if it is exact.
         """
         places = self.nuisance.indices_of_rows(row, component=self.camera_index)
         return 1 / self.nuisance.scales[places] if len(places) else np.full(3, EXACT)
@@ -213,8 +213,8 @@ class DepthCameraModel:
         return float((phi * self.nuisance.scales)[places].sum())
 
     def with_pose(self, phi: Array, rotation_vector: Array, shift_m: Array) -> Array:
-        """Return φ (k,) with another rotation error (rotation vector [rad]) and translation
-        error [m], as far as they are estimated.
+        """Return φ (k,) with another rotation error `rotation_vector` (3,) [rad] and translation
+        error `shift_m` (3,) of the camera; an error that is not estimated is ignored.
         """
         updated = phi.copy()
         angle = np.linalg.norm(rotation_vector)

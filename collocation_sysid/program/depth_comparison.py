@@ -163,8 +163,8 @@ class SurfaceComparison:
 
 
 def _positions_at_observable(residual: DepthResidual, t_s: Array, positions_m: Array) -> Array:
-    """Return positions (N, 3n) of a motion at the times of a measurement's observable,
-    interpolated.
+    """Return positions (R, 3n) at the times of a measurement's observable, interpolated from
+    positions (N, …) at times `t_s` (N,); outside these times the end positions.
     """
     position_rows = positions_m.reshape(len(t_s), -1)
     at_s = np.clip(residual.observable_s, t_s[0], t_s[-1])

@@ -187,7 +187,9 @@ def no_depth_is_empty(
 def _outline_points(
     camera_in: DepthCameraModel, surface: VisibleSurface, shape_m: Array, *, phi: Array, sample: int
 ) -> _OutlinePoints | None:
-    """Return the points where a shape (n, 3) ends in a camera's view; None where there are none.
+    """Return the points where a shape (n, 3) [m] ends in the view of a camera, at φ and the image
+    with index `sample`; None if there are none, for a point cloud, or if the body is partly behind
+    the camera.
 
     They lie `spacing_m` apart on edges between a flat triangle that faces the camera and one that
     does not, and are not in front of or behind another part of the body.
@@ -255,7 +257,9 @@ def _first_of_each_cube(points_m: Array, edge_m: float) -> Index:
 
 
 def _covered(points: Array, triangles: Array) -> NDArray[np.bool_]:
-    """Return whether points (P, 2) of an image lie within any of its triangles (T, 3, 2)."""
+    """Return whether each of points (P, 2) of an image lies within, or on the border of, any of its
+    triangles (T, 3, 2), (P,).
+    """
     covered = np.zeros(len(points), dtype=bool)
     if not len(triangles):
         return covered
@@ -284,7 +288,23 @@ def _edges(
     gate_m: float,
     sample: int,
 ) -> dict[str, NDArray]:
-    """Return the planes through the edges in an image that belong to points of an outline."""
+    """Return the planes through the edges in an image that belong to points of an outline, by
+    attribute name of `Outline`.
+
+    Parameters
+    ----------
+    camera_in : DepthCameraModel
+    points : _OutlinePoints
+        The P points of the outline.
+    image_m : (rows, columns) array
+        Depths [m]; NaN where missing.
+    phi : (k,) array
+        Nuisance parameters.
+    gate_m : float
+        Largest difference of depth at which a pixel shows the body [m].
+    sample : int
+        Index of the image.
+    """
     camera = camera_in.depth.camera
     empty = no_depth_is_empty(camera_in, image_m, sample=sample, size_m=camera_in.size_m)
     offsets = np.arange(-SEARCH_PX, SEARCH_PX + STEP_PX / 2, STEP_PX)
@@ -322,8 +342,7 @@ def _classify_pixels(
     """Classify pixels (…, 2) of an image beside a body at given depths as BODY, UNKNOWN or EMPTY.
 
     Pixels outside the image are UNKNOWN. `is_missing_empty` states whether a missing depth (NaN)
-    means that
-    nothing is there.
+    means that nothing is there.
     """
     column, row = np.moveaxis(np.round(pixels).astype(np.int64), -1, 0)
     inside = (column >= 0) & (column < image_m.shape[1]) & (row >= 0) & (row < image_m.shape[0])
@@ -339,7 +358,14 @@ def _classify_pixels(
 def _nearest_edges(
     nothing: NDArray[np.bool_], pixels: Array
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the edges nearest to pixels (P, 2) that show nothing.
+    """Return the edges nearest to pixels (P, 2).
+
+    Parameters
+    ----------
+    nothing : (rows, columns) array of bool
+        Pixels of the image that show nothing, among them `pixels`.
+    pixels : (P, 2) array
+        Pixels u, v.
 
     Returns
     -------
@@ -372,9 +398,21 @@ def _planes(
     phi: Array,
     sample: int,
 ) -> dict[str, NDArray]:
-    """Return planes through the camera and edges (P, 2) in its image, with normals outwards (P, 2).
+    """Return planes through the camera and edges in its image, by attribute name of `Outline`.
 
-    Depths (P,) [m] tell how wide a pixel is, and where the point of each plane is chosen.
+    Parameters
+    ----------
+    camera_in, camera : DepthCameraModel, DepthCamera
+    edges : (P, 2) array
+        Pixels u, v of the edges.
+    outwards : (P, 2) array
+        Unit vectors in the image away from the body, which give the sign of the normals.
+    depth_m : (P,) array
+        Depths [m] that determine how wide a pixel is, and where the point of each plane is chosen.
+    phi : (k,) array
+        Nuisance parameters.
+    sample : int
+        Index of the image.
     """
     tangents_px = np.column_stack([-outwards[:, 1], outwards[:, 0]])
     at, before, after, outside = _concatenated_rays(

@@ -130,8 +130,9 @@ class DepthResidual(MeasurementResidual):
 
     @cached_property
     def _neighbour_times(self) -> NDArray[np.int64]:
-        """Indices (S, k) of the observable's times that each image is computed from: its
-        own, or those around it.
+        """Indices (S, k) of the observable's times from which each image is computed: the one at
+        its time if all images are at such times and the clock is not estimated, else those around
+        it.
         """
         nearest = np.abs(self.observable_s - self.t_s[:, None]).argmin(axis=1)
         is_off_grid = (
@@ -173,7 +174,9 @@ class DepthResidual(MeasurementResidual):
         )
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
-        """Return the stencil of those first images whose times are among the first `known` ones."""
+        """Return the stencil of the first images that depend only on the first `known` times of the
+        observable; φ is not used.
+        """
         samples = int(np.count_nonzero(self._neighbour_times[:, -1] < known))
         return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
 
@@ -203,12 +206,24 @@ class DepthResidual(MeasurementResidual):
 
     @property
     def first_needed_s(self) -> float:
-        """Last time [s] that the first compared image is computed from."""
+        """Time [s] of the last row of the motion on which the prediction of the first compared
+        image depends.
+        """
         first = int(self.is_compared.any(axis=(1, 2)).argmax())
         return float(self.observable_s[self._neighbour_times[first, -1]])
 
     def expression(self, values_in: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the distance of a point behind the surface along the normal [m]."""
+        """Return the distance of a point behind the surface along the normal [m].
+
+        Parameters
+        ----------
+        values_in : (3, nodes · times) SX
+            Positions of the nodes of the point's face at the neighbouring times [m].
+        phi : SX
+            Nuisance parameters of the camera.
+        data : SX
+            Data of the point, see `_stencil`.
+        """
         view = self.correspondences.camera
         nodes = self.correspondences_in_use.nodes.shape[2]
         sizes = np.cumsum([0, self._neighbour_times.shape[1], nodes, 3, 3, 1, 3, 3]).tolist()
@@ -222,8 +237,8 @@ class DepthResidual(MeasurementResidual):
         return ca.dot(normal, surface) - ca.dot(in_camera, corrected) - normal_motion
 
     def rough_residuals(self, x: Array, phi: Array) -> Array:
-        """Return the distances from visible parts of the surface to the points of the first
-        image, in standard deviations.
+        """Return the distances from visible parts of the surface to the points of the first image
+        (P,), in standard deviations, at positions x (rows, 3n) and φ.
         """
         shapes = self.surface_shapes(x, phi)
         return (
@@ -266,8 +281,8 @@ class DepthResidual(MeasurementResidual):
 
     @cached_property
     def _pooling(self) -> tuple[sp.csr_array, NDArray[np.int64]]:
-        """Sparse matrix from points to patches, with entries 1/√count, and the counts (S,
-        3M) of points.
+        """Sparse matrix (S · 3M, S · E) from points to patches, with entries 1/√count, and the
+        counts (S, 3M) of points.
         """
         samples, points = self._patch_indices.shape
         patches = GROUP * -(-(int(self._patch_indices.max(initial=0)) + 1) // GROUP)
@@ -325,8 +340,8 @@ class DepthResidual(MeasurementResidual):
         )
 
     def surface_shapes(self, x: Array, phi: Array) -> Array:
-        """Return the surface nodes (s, n, 3) [m] at the images that the first rows x (rows,
-        3n) suffice for.
+        """Return the surface nodes (s, n, 3) [m] at the times of those first s images for which the
+        first rows x (rows, 3n) suffice, with the clock shift of φ.
         """
         clock_shift = self.correspondences.camera.clock_shift_s(phi)
         known = int((self._neighbour_times[:, -1] < len(x)).sum())

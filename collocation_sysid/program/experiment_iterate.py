@@ -2,8 +2,7 @@
 observables.
 
 Methods and statistics use a `ExperimentIterate` to evaluate the loss, its gradient and the forces
-at one
-iterate; derived quantities are computed once and cached.
+at one iterate; derived quantities are computed once and cached.
 """
 
 from __future__ import annotations
@@ -68,8 +67,8 @@ class ExperimentIterate:
 
     @cached_property
     def histories(self) -> tuple[AnyHistory, ...]:
-        """History variables of the body and of forces at all evaluations, followed by
-        lifted contact pressures.
+        """History variables of the body and of forces at all evaluations, then given contact
+        pressures: lifted ones where they are variables, else computed from the positions.
         """
         dynamics = self.equations.dynamics
         pressed = dynamics.contact_with_pressures(self.x, self.lifted_pressures)

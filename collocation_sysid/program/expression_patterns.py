@@ -152,7 +152,9 @@ class ExpressionPattern:
         return self._assemble(self.expression.evaluate(self._input_values(z), self.data), count)
 
     def _assemble(self, y: Array, count: int) -> Array:
-        """Add up values y (m, I) into constraints (count,)."""
+        """Return the sums (count,) of values y (m, I) over the constraints to which they belong,
+        each value divided by the unit of its row.
+        """
         assembled = np.zeros(count)
         np.add.at(assembled, self.rows.indices, y / self.rows.unit)
         return assembled
@@ -163,8 +165,8 @@ class ExpressionPattern:
         return self.rows.indices[y].ravel(), self.inputs.indices[u].ravel()
 
     def jacobian_values(self, z: Array, count: int) -> tuple[Array, Array]:
-        """Return the contributions to the constraints (count,), and the values of
-        `jacobian_entries`.
+        """Return the contributions to the scaled constraints (count,) at z, and the values of
+        `jacobian_entries`, derivatives by scaled variables.
         """
         value, slopes = self.expression.evaluate_with_jacobian(self._input_values(z), self.data)
         y, u = np.nonzero(self.expression.jacobian_pattern)

@@ -95,7 +95,9 @@ class _BandFactor:
     positive_definite: bool = True
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        """Solve for right-hand sides (k,) or (k, m)."""
+        """Return the solution for right-hand sides (k,) or (k, m) on the free dofs; the matrix is
+        symmetric.
+        """
         permuted = right[self.order]
         solved, _ = _pbtrs(self.band, permuted, lower=1)
         result = np.empty_like(right)
@@ -129,7 +131,9 @@ class _SkylineFactor:
     positive_definite: bool = True
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        """Solve for right-hand sides (k,) or (k, m)."""
+        """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, of the
+        transposed matrix if `transposed`.
+        """
         first = self.sides[-transposed]
         second = self.sides[transposed - 1]
         rows = np.atleast_2d(right.take(self.order, axis=0).T)
@@ -162,7 +166,10 @@ class _RefinedFactor:
     divergence_flags: list[bool] = field(default_factory=list)
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        """Solve for right-hand sides (k,) or (k, m)."""
+        """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, of the
+        transposed matrix if `transposed`. If the series diverges, the complete matrix is
+        factorised, also for later calls.
+        """
         if self.divergence_flags:
             return self.factorise_complete().solve(right, transposed)
         solution = correction = self.symmetric.solve(right)
@@ -184,7 +191,7 @@ class _RefinedFactor:
 
 @dataclass(frozen=True, eq=False)
 class _SparseFactor:
-    """Factor by SuperLU."""
+    """Complete LU factorisation of a sparse matrix by SuperLU."""
 
     lu: SuperLU
     positive_definite: bool
@@ -256,7 +263,9 @@ class Factoriser:
 
     @cached_property
     def is_banded(self) -> bool:
-        """Whether banded Cholesky is chosen."""
+        """Whether banded Cholesky is chosen; "auto" does so if it is estimated to be faster than a
+        sparse factorisation.
+        """
         if self.choice != "auto":
             return self.choice == "band"
         if self.is_supernodal:
@@ -265,7 +274,9 @@ class Factoriser:
 
     @cached_property
     def is_supernodal(self) -> bool:
-        """Whether supernodal Cholesky is chosen."""
+        """Whether supernodal Cholesky is chosen; "auto" does so for a wide band with much work if
+        MKL is installed.
+        """
         if self.choice != "auto":
             return self.choice == "supernodal"
         wide = self.half_bandwidth > NARROW and self._band_work > MUCH_WORK
@@ -355,7 +366,9 @@ class Factoriser:
         return _RefinedFactor(definite, self._sparse_matrix(entries), complete_factor)
 
     def _factorise_definite(self, values: Array) -> Factor | None:
-        """Return the factor of a symmetric matrix, or None if it is not positive definite."""
+        """Return the factor of a symmetric matrix (entries of the lower triangle), or None if it is
+        not positive definite.
+        """
         if self.is_supernodal:
             try:
                 pardiso = self._pool.pop()
@@ -408,8 +421,9 @@ class Factoriser:
     def _factorise_in_skyline(
         self, values: Array, skew: Array, buffer: FactorMemory | None
     ) -> Factor | None:
-        """Return the factor within the skyline, or None if there is no skyline or the
-        matrix needs row exchanges.
+        """Return the factor within the skyline of a matrix with lower triangles `values` and
+        `skew`, or None if there is no skyline or the matrix needs row exchanges. The factor is
+        written to `buffer` if that is given.
         """
         skyline = self.skyline
         if skyline is None:
@@ -462,8 +476,21 @@ class Factoriser:
         return sp.csc_array((entries, places), shape=(self._size, self._size))
 
     def _superlu(self, values: Array, pivot_below: float, skew: Array = NONE) -> SuperLU:
-        """Factorise by SuperLU with a threshold for pivoting; raise LinAlgError if the
-        matrix is singular.
+        """Factorise by SuperLU.
+
+        Parameters
+        ----------
+        values : array
+            Lower triangle of the symmetric part.
+        pivot_below : float
+            Threshold for row exchanges, from 0 (none) to 1 (partial pivoting).
+        skew : array
+            Lower triangle of the skew part; empty for none.
+
+        Raises
+        ------
+        LinAlgError
+            If the matrix is singular.
         """
         entries = values[self._full_source]
         if skew.size:

@@ -66,8 +66,25 @@ def _solve_equilibrium(
     start: Array | None,
     solver: NewtonSolver,
 ) -> Array:
-    """Return the equilibrium (3n,) under given forces with prescribed positions (3n,); see
-    `equilibrium`.
+    """Return the equilibrium (3n,) [m] under given forces at the time `at_s`.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    forces : Forces
+        Forces at that time.
+    goals_m : (3n,) array
+        Prescribed positions [m]; NaN where a dof is free.
+    at_s : float
+        Time [s].
+    start : (3n,) array or None
+        Guess [m]; None to start from the body carried by its grasps.
+    solver : NewtonSolver
+
+    Raises
+    ------
+    NewtonFailure
+        If no equilibrium is found.
     """
     zero_velocity = np.zeros((1, len(goals_m)))
     shape = experiment.rigid_positions([at_s])[0]

@@ -69,8 +69,8 @@ class SquareRootInformation:
     def with_problem(
         self, other: SquareRootInformation, indices: Index | slice = slice(None)
     ) -> SquareRootInformation:
-        """Return the problem with all rows of another, whose parameters are at `indices`
-        among these.
+        """Return the problem with all rows of another, whose parameters are those with `indices`
+        among these; the same by default.
         """
         rows = np.zeros((len(other.triangle), self.triangle.shape[1]))
         rows[:, :-1][:, indices] = other.jacobian
@@ -126,7 +126,7 @@ class SquareRootInformation:
         return np.clip(lsq_linear(square, right, (lower, upper), method="bvls").x, lower, upper)
 
     def marginal(self, count: int) -> SquareRootInformation:
-        """Return the problem in the first parameters alone, with the others eliminated at
+        """Return the problem in the first `count` parameters alone, with the others eliminated at
         their optimum.
         """
         size = self.triangle.shape[1]

@@ -5,8 +5,8 @@ For evaluations k with an equation of motion, in widths δ of the contact law,
     (b_k + g(ξ_k) − √((b_k − g(ξ_k))² + 4 r δ²)) / δ = 0,   variables b_k / δ,
 
 with the pressure variable b, the gap g and the relaxation r, see `model.contact`. The structure is
-that of a force history (`force_rows`), but b belongs to the evaluation itself instead of the one
-before. The variables are not negative.
+that of a force history (`lifted_force_histories`), but b belongs to the evaluation itself instead
+of the one before. The variables are not negative.
 """
 
 from __future__ import annotations
@@ -54,26 +54,32 @@ class LiftedContactPressure(LiftedForceHistory):
         return 1, self.segment.constraint_times, self._points.count
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        """Return the scaled variables that satisfy the equations at the part's positions."""
+        """Return the scaled variables (count,) that satisfy the equations at the iterate's
+        positions.
+        """
         xi, _ = iterate.equations.dynamics.evaluation_states(iterate.x)
         return self._contact.scaled_pressures(xi).ravel() / self.unit_m
 
     def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
-        """Return the part with b taken from z; b is zero at a stated initial state."""
+        """Return the iterate with the scaled pressures b (1, N, points) [m] taken from z; b is zero
+        at a stated initial state.
+        """
         b = np.zeros((1, self.segment.grid_times, self._points.count))
         b[:, self.first_evaluation :] = self.unit_m * z[self.columns].reshape(self.shape)
         return replace(iterate, lifted_pressures={**iterate.lifted_pressures, self.force_index: b})
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
-        """Return the scaled equations (count,)."""
+        """Return the scaled complementarity equations (count,) at an iterate; z is not used,
+        because the iterate contains b.
+        """
         return (
             self._history_of(iterate).internal_variables(slice(self.first_evaluation, None)).ravel()
             / self.unit_m
         )
 
     def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
-        """Return the history, and μ (1, N, I) such that multipliers · equations = Σ μ_k
-        (unscaled equations of k).
+        """Return the history and its weights μ (1, N, I) in the Lagrangian, such that multipliers ·
+        equations = Σ μ_k h_k with the unscaled equations h_k of evaluation k.
         """
         mu = np.zeros((1, self.segment.grid_times, self._points.count))
         mu[:, self.first_evaluation :] = multipliers[self.rows].reshape(self.shape) / self.unit_m
@@ -93,7 +99,9 @@ class LiftedContactPressure(LiftedForceHistory):
             )
 
     def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
-        """Return the equations, and the values of `jacobian_entries`."""
+        """Return the scaled equations (count,) at an iterate and z, and the values of
+        `jacobian_entries`.
+        """
         history = self._history_of(iterate)
         d = self._points.dofs
         slopes = history.derivatives(slice(None))

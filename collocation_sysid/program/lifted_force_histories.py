@@ -5,9 +5,8 @@ For evaluations k = 1 … N − 1, in mean edge lengths ℓ as positions are,
     (b_k − h(ξ_{k−1}, ν_{k−1}, c_{k−1}, b_{k−1})) / ℓ = 0,   variables b_k / ℓ,
 
 see `model.custom_force_terms`; b_0 is zero. Of the Lagrangian's second derivatives, those by
-positions
-and parameters alone are computed together with the other forces (with other weights); those with b
-are computed here.
+positions and parameters alone are computed together with the other forces (with other weights);
+those with b are computed here.
 """
 
 from __future__ import annotations
@@ -86,7 +85,9 @@ class LiftedForceHistory(LiftedVariables):
         )
 
     def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
-        """Return the part with b taken from z."""
+        """Return the iterate with b (n, N, I) taken from z; b is zero before the first
+        evaluation.
+        """
         later = z[self.columns].reshape(self.shape) * self.segment.length_m
         before = np.concatenate([np.zeros_like(later[:, :1]), later], axis=1)
         return replace(
@@ -94,7 +95,9 @@ class LiftedForceHistory(LiftedVariables):
         )
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
-        """Return the scaled equations (count,)."""
+        """Return the scaled equations (count,) at an iterate and z: b minus its value by the
+        recursion.
+        """
         predicted = self._history_of(iterate).internal_variables(slice(self.shape[1])).ravel()
         return z[self.columns] - predicted / self.segment.length_m
 
@@ -128,10 +131,13 @@ class LiftedForceHistory(LiftedVariables):
         return self.segment.dynamic_columns(self.first_phi)
 
     def _position_lags(self, first: int) -> Iterator[tuple[slice, Index, Array, Array]]:
-        """Iterate over the lags of the stencil, for N − 1 evaluations from `first_evaluation` on.
+        """Iterate over the lags of the stencil, for N − 1 evaluations from `first` on.
 
-        Yields the slice of the evaluations with this lag, the columns (T, P) in z of their
-        positions, P being the `pairs` of the points, and the coefficients p and q (T, 1).
+        Yields
+        ------
+        (slice, (T, P) array, (T, 1) array, (T, 1) array)
+            Slice of the T evaluations with this lag, the columns in z of their positions, P being
+            the `pairs` of the points, and the coefficients p and q.
         """
         dynamics = self.segment.dynamics
         times = np.arange(first, first + self.shape[1])
@@ -149,8 +155,8 @@ class LiftedForceHistory(LiftedVariables):
                 yield here, x, of_p[k], of_q[k]
 
     def _position_derivatives(self, first: int, derivatives: LawDerivatives) -> Iterator[Array]:
-        """Yield derivatives (a, T, P) by x at each lag, from those of N − 1 evaluations by
-        state and velocity.
+        """Yield derivatives (a, T, P) by positions at each lag of `_position_lags`, from
+        derivatives (a, …) by position and velocity at N − 1 evaluations from `first` on.
         """
         instance, local, _, weight = self._points.nonzero_weights
         by_y = derivatives.y[:, local, :, instance].transpose(1, 2, 0) * weight
@@ -232,7 +238,9 @@ class LiftedForceHistory(LiftedVariables):
         return concatenated_entries(each.indices() for each in self._hessian_blocks())
 
     def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
-        """Return the equations, and the values of `jacobian_entries`."""
+        """Return the scaled equations (count,) at an iterate and z, and the values of
+        `jacobian_entries`.
+        """
         history = self._history_of(iterate)
         length_m = self.segment.length_m
         d = self._points.dofs
@@ -247,8 +255,8 @@ class LiftedForceHistory(LiftedVariables):
         return self.residuals(iterate, z), np.concatenate([each.ravel() for each in blocks])
 
     def _motion_derivatives(self, slopes: LawDerivatives) -> Iterator[Array]:
-        """Yield derivatives of the equations of motion by b, from the force's derivatives
-        at all evaluations.
+        """Yield derivatives of the scaled equations of motion by the scaled b, in the order of
+        `_motion_entries`, from derivatives of the force at all N evaluations.
         """
         instance, local, *_ = self._points.nonzero_weights
         for pairs, k, _, weight in self._motion_entries():

@@ -117,7 +117,9 @@ class LiftedMemory(LiftedVariables):
         return (_body_history(iterate).previous_variables[1:] / self.unit_pa).ravel()
 
     def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
-        """Return the part with the history variables (N, width) taken from z."""
+        """Return the iterate with the history variables (N, width) [Pa] taken from z; those of the
+        first evaluation are zero.
+        """
         later = z[self.columns].reshape(self.shape) * self.unit_pa
         memory = np.concatenate([np.zeros((1, self.shape[1])), later])
         return replace(
@@ -138,7 +140,7 @@ class LiftedMemory(LiftedVariables):
 
         Returns
         -------
-        (History, (N, width) array)
+        (MemoryHistory, (N, width) array)
             The history, and μ such that multipliers · r = −Σ μ_k (m_k − d_k m_{k−1} − a_k S_k).
         """
         return _body_history(iterate), self._history_weights(multipliers)
@@ -152,8 +154,8 @@ class LiftedMemory(LiftedVariables):
 
     @cached_property
     def _stress_entries(self) -> tuple[Index, Index, Index, Index]:
-        """Index arrays of the stress derivatives of all branches: entry, variable, dof and
-        branch.
+        """Index arrays (K,) of the stress derivatives of all branches: position in
+        `stress_jacobian`, history variable in the row of all branches, dof and branch.
         """
         entries = self.segment.body.stresses.jacobian_entries
         index_arrays = []
@@ -168,7 +170,9 @@ class LiftedMemory(LiftedVariables):
 
     @cached_property
     def _motion_entries(self) -> list[_MotionEntries]:
-        """Equations of motion that contain the memory."""
+        """Sets of equations of motion (and of lifted reaction forces) that contain the memory, with
+        the entries of each.
+        """
         entries = []
         dofs = self._stress_entries[2]
         for rows in motion_equations(self.segment, self.reactions):
@@ -190,8 +194,8 @@ class LiftedMemory(LiftedVariables):
 
     @staticmethod
     def _nonzero_lags(table: Array, first: int, stop: int) -> list[_Lag]:
-        """Return the lags of a stencil table (N, lags) with non-zero coefficients, for a
-        range of evaluations.
+        """Return the lags of a stencil table (N, lags) with non-zero coefficients, for the
+        evaluations `first` … `stop` − 1.
         """
         columns = enumerate(table.T)
         return [_Lag(lag, max(lag, first), stop, column) for lag, column in columns if column.any()]
@@ -212,11 +216,15 @@ class LiftedMemory(LiftedVariables):
         return max(1, self.segment.dynamics.first_row)
 
     def _memory_columns(self, lag: _Lag, variables: Index) -> list[Index | int]:
-        """Return summands of the columns (T, K) in z of history variables."""
+        """Return arrays whose sum are the columns (T, K) in z of history variables, which are given
+        by their indices (K,).
+        """
         return [self.offsets.variable, (lag.evaluations - 1) * self.shape[1], variables]
 
     def _position_columns(self, lag: _Lag, dofs: Index) -> list[Index | int]:
-        """Return summands of the columns (T, K) in z of positions."""
+        """Return arrays whose sum are the columns (T, K) in z of the positions of dofs (K,), at the
+        lag.
+        """
         return [
             self.segment.offsets.position,
             (lag.evaluations - lag.lag) * self.segment.dof_count,
@@ -280,7 +288,7 @@ class LiftedMemory(LiftedVariables):
         return sum(each.count for each in groups[0]), sum(each.count for each in groups[1])
 
     def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
-        """Return the equations r, and the values of `jacobian_entries`."""
+        """Return the scaled equations r (count,), and the values of `jacobian_entries`."""
         history = _body_history(iterate)
         memory = iterate.segment.body.memory
         after = self.shape[0] - 1, self.shape[1]
@@ -297,7 +305,9 @@ class LiftedMemory(LiftedVariables):
         return rows, np.concatenate([each.ravel() for each in values])
 
     def _parameter_derivatives(self, history: MemoryHistory, theta_q: Array) -> Array:
-        """Return the derivatives of r by q, (nq, N − 1, width)."""
+        """Return the derivatives (nq, N − 1, width) of the scaled equations r by q; `theta_q` (k,
+        nq) are those of the constants.
+        """
         memory = history.memory
         derivatives = np.empty((theta_q.shape[1], *self.shape))
         d_q, a_q = (
@@ -314,7 +324,9 @@ class LiftedMemory(LiftedVariables):
         return derivatives / self.unit_pa
 
     def _stress_derivatives(self, history: MemoryHistory) -> list[Array]:
-        """Return the derivatives of r by x, one array for each lag."""
+        """Return the derivatives of the scaled equations r by the scaled positions through the
+        stress, one array (T, K) for each of `_stress_lags`, with K as in `_stress_entries`.
+        """
         place, own, _, number = self._stress_entries
         scale = -self.segment.length_m / self.unit_pa[own]
         a = history.fading.a.T
@@ -326,7 +338,9 @@ class LiftedMemory(LiftedVariables):
         return self._scaled_by_lag(self._stress_lags, slopes)
 
     def _force_derivatives(self, history: MemoryHistory, changes: _MotionEntries) -> list[Array]:
-        """Return the derivatives of equations of motion by m, one array for each lag."""
+        """Return the derivatives of scaled equations of motion by the scaled m, one array (T, K)
+        for each of `_force_lags`, with K as in `changes`; zero in rows whose dof is prescribed.
+        """
         place, own, dofs, _ = (each[changes.derivative_indices] for each in self._stress_entries)
         scale = self.unit_pa[own] / self.segment.force_n
         is_prescribed = self.segment.dynamics.is_temporarily_prescribed

@@ -94,7 +94,7 @@ class LiftedReactions(LiftedVariables):
         return z[self.columns] - self.consistent_values(iterate)
 
     def jacobian_entries(self) -> tuple[Index, Index]:
-        """Return rows and columns of the entries by x, by R, and by the parameters that
+        """Return rows in g and columns in z of the entries by x, by R, and by the parameters that
         change the motion.
         """
         segment = self.segment
@@ -110,7 +110,9 @@ class LiftedReactions(LiftedVariables):
         return np.concatenate(rows), np.concatenate([*columns, np.tile(of_p, self.count)])
 
     def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
-        """Return the equations, and the values of `jacobian_entries`."""
+        """Return the scaled equations (count,) at an iterate and z, and the values of
+        `jacobian_entries`.
+        """
         setting = iterate.equations
         motion = self._motion_jacobian
         dynamics = setting.dynamics
@@ -156,8 +158,8 @@ class MotionEquations(NamedTuple):
 def motion_equations(
     transcription: Transcription, reactions: LiftedReactions | None
 ) -> list[MotionEquations]:
-    """Return the equations of motion of a segment, and those of its lifted reaction forces
-    if there are any.
+    """Return the equations of motion of an experiment, and those of its lifted reaction forces;
+    None without these.
     """
     kinds = [
         (transcription.free_dofs, transcription.constrained_dofs, transcription.offsets.row, True)

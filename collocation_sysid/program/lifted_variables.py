@@ -1,11 +1,9 @@
 """Lifted variables: variables of the program that follow from the others, each with an equation.
 
 By default they are eliminated; `Collocation.has_lifted_variables` adds them so that exact matrices
-stay sparse.
-Their equations come after all other constraints, and the variables after all other variables.
-Subclass `LiftedVariables` to lift another quantity; most subclasses only declare `patterns` of
-small
-expressions, see `expression_patterns`.
+stay sparse. Their equations come after all other constraints, and the variables after all other
+variables. Subclass `LiftedVariables` to lift another quantity; most subclasses only declare
+`patterns` of small expressions, see `expression_patterns`.
 """
 
 from __future__ import annotations
@@ -100,12 +98,14 @@ class LiftedVariables(ABC):
         return -np.inf
 
     def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
-        """Return the part with those quantities replaced that these variables of z determine."""
+        """Return the iterate with those quantities replaced that these variables of z determine;
+        the iterate itself if there are none.
+        """
         return iterate
 
     @abstractmethod
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        """Return the scaled variables (count,) that satisfy the equations at the part's
+        """Return the scaled variables (count,) that satisfy the equations at the iterate's
         positions and parameters.
         """
 
@@ -117,12 +117,12 @@ class LiftedVariables(ABC):
         return ()
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
-        """Return the scaled equations (count,) at the part and z."""
+        """Return the scaled equations (count,) at the iterate and z."""
         return np.sum([pattern.residuals(z, self.count) for pattern in self.patterns], axis=0)
 
     def jacobian_entries(self) -> tuple[Index, Index]:
-        """Return rows and columns of the additional entries of ∂g/∂z, in the order of their
-        values.
+        """Return rows in g and columns in z of the additional entries of ∂g/∂z, in the order of
+        their values.
         """
         rows, columns = concatenated_entries(
             pattern.jacobian_entries() for pattern in self.patterns
@@ -130,7 +130,9 @@ class LiftedVariables(ABC):
         return self.offsets.row + rows, columns
 
     def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
-        """Return the equations (count,), and the values of `jacobian_entries`."""
+        """Return the scaled equations (count,) at an iterate and z, and the values of
+        `jacobian_entries`.
+        """
         evaluated = [pattern.jacobian_values(z, self.count) for pattern in self.patterns]
         values, slopes = zip(*evaluated, strict=True)
         return np.sum(values, axis=0), np.concatenate(slopes)
@@ -149,7 +151,8 @@ class LiftedVariables(ABC):
         multipliers: Array,
         weights: RowWeights,
     ) -> Array:
-        """Return the values of `hessian_entries`.
+        """Return the values of `hessian_entries`: second derivatives of loss_weight · loss +
+        multipliers · g.
 
         Parameters
         ----------
@@ -158,7 +161,7 @@ class LiftedVariables(ABC):
         z : array
             All variables of the program.
         loss_weight : float
-            Factor of the loss.
+            Factor of the loss; used by groups on which the loss depends.
         multipliers : array
             Multipliers of all constraints g.
         weights : RowWeights

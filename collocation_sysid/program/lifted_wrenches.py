@@ -5,8 +5,8 @@
 
 see `wrench_observable`; without a low-pass Y is W. The loss is a function of Y, whose Hessian
 couples only the few grid times around a sample. R are the lifted reaction forces of
-`reaction_rows`. W and Y are scaled by their measurement uncertainty, so that the loss has similar
-curvature by them as by positions; their equations are scaled like other equations.
+`lifted_reactions`. W and Y are scaled by their measurement uncertainty, so that the loss has
+similar curvature by them as by positions; their equations are scaled like other equations.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class LiftedWrench(LiftedVariables):
 
     @cached_property
     def _row_unit(self) -> Array:
-        """Unit (6,) of the equations [N, N m], between `_unit_text` and that of R for good
+        """Unit (6,) of the equations [N, N m], between `_unit` and that of R for good
         conditioning.
         """
         return self._reaction_unit**0.75 * self._unit**0.25
@@ -85,7 +85,7 @@ class LiftedWrench(LiftedVariables):
         return self.segment.force_n * np.repeat([1.0, self.segment.length_m], 3)
 
     def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
-        """Return the part with Y taken from z."""
+        """Return the iterate with the measured wrench (times, 2, 3) [N, N m] taken from z."""
         wrench = z[self._observable_columns].reshape(-1, 6) * self._unit
         return replace(
             iterate,
@@ -101,7 +101,7 @@ class LiftedWrench(LiftedVariables):
         return slice(self.columns.stop - self._wrench_size, self.columns.stop)
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        """Return the scaled W and Y (count,) that follow from the motion."""
+        """Return the scaled W and Y (count,) that follow from the iterate's motion."""
         own = [self.observable.evaluate_unfiltered(iterate.motion.reactions, iterate.phi)]
         if evolution := self.observable.filter_wrench(own[0], iterate.phi):
             own += [*evolution.states]
@@ -181,7 +181,7 @@ class LiftedWrench(LiftedVariables):
 
     @cached_property
     def _unit_derivatives(self) -> sp.csr_array:
-        """Derivatives of (Y, φ) by (scaled Y, φ)."""
+        """Diagonal matrix of the derivatives of (Y, φ) by (scaled Y, φ)."""
         scale = np.tile(self._unit, self.observable.count)
         return sp.csr_array(sp.diags_array(np.append(scale, np.ones(len(self.phi_columns)))))
 

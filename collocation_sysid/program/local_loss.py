@@ -90,7 +90,9 @@ class LocalLoss:
         )
 
     def _evaluate_at(self, x: Array, phi: Array, has_observation_curvature: bool) -> Array:
-        """Return the values of the entries at x and φ."""
+        """Return the values of the entries of `structure` at x (N, 3n) and φ (k,), with or without
+        the curvature of the observables.
+        """
         codes = self._codes(*self.structure)
         values = np.zeros(len(codes))
         for entries in self._entries(x, phi, has_observation_curvature):

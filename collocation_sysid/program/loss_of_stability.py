@@ -25,6 +25,7 @@ from ..array_types import Array, Index
 from ..errors import SimulationError
 from ..model.forces import Forces
 from ..recording.experiment import Experiment
+from ..recording.specimen_files import specimen_strains
 
 # λ_1/λ_3 at which the surface of a half-space is unstable: the root of ξ³ + ξ² + 3 ξ − 1.
 BIOT_RATIO = 0.29559774
@@ -105,11 +106,16 @@ class StabilityLoss:
 def explain_failure(
     experiment: Experiment, theta: Array, error: SimulationError
 ) -> SimulationError:
-    """Return the error with the mode, if a static path ended by a loss of stability;
-    otherwise the same error.
+    """Return the error of a static simulation with the mode in which the body loses its stability,
+    as a new error; the same error if there is no state, no such mode, or the mode cannot be
+    computed.
+    A homogeneous specimen has no mode: its message names the test and the strain.
+
     """
     if error.state_m is None:
         return error
+    if experiment.specimen is not None:
+        return SimulationError(specimen_message(experiment, error.time_s), error.time_s)
     try:
         instability = find_stability_loss(experiment, theta, error.state_m, error.time_s)
     except (ArpackError, RuntimeError, np.linalg.LinAlgError):
@@ -119,6 +125,19 @@ def explain_failure(
     explained_error = SimulationError(instability.message, error.time_s, error.element)
     explained_error.stability_loss = instability
     return explained_error
+
+
+def specimen_message(experiment: Experiment, time_s: float) -> str:
+    """Return the message for a specimen that has no stable equilibrium at a time [s]."""
+    assert experiment.specimen is not None
+    strain, _ = specimen_strains(experiment)
+    value = float(np.interp(time_s, experiment.t_s, strain))
+    return (
+        f"specimen '{experiment.name}': the material has no stable equilibrium in the "
+        f"{experiment.specimen.test} test at a strain of {value:.4g} with these constants. They "
+        "are probably not determined by the fitted tests: fit this kind of test too, bound the "
+        "constants, or use a law with fewer constants"
+    )
 
 
 def find_stability_loss(
@@ -160,7 +179,19 @@ def find_stability_loss(
 
 
 def _lowest(forces: Forces, x: Array, free: Index, translation_m: float) -> tuple[float, Array]:
-    """Return the lowest eigenvalue [1/s²] of K φ = λ M φ near a shift, and φ (free,)."""
+    """Return the lowest eigenvalue [1/s²] of K φ = λ M φ near a shift below zero, and φ (free,).
+
+    Parameters
+    ----------
+    forces : Forces
+        Forces at one time.
+    x : (3n,) array
+        Positions [m].
+    free : (free,) array of int
+        Free dofs.
+    translation_m : float
+        Negative of the shift [1/s²].
+    """
     state = x.reshape(1, -1)
     stiffness = -forces.linearise(state, np.zeros_like(state)).by_position[0]
     root = sp.diags_array(1 / np.sqrt(forces.mass.inertia_kg[0, free]))

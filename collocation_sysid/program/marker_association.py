@@ -3,11 +3,10 @@ clock.
 
 The place X of a marker on the undeformed body and the shift τ of its clock are estimated.
 Predictions are smooth functions of them within one element and around one sample; a
-`MarkerAssociation` states
-which. When estimates leave it, `MarkerAssociation.follow_estimates` returns another chart, and the
-problem stays the
-same up to the tolerances below. A chart also contains the surface correspondences of depth cameras,
-see `surface_correspondences`.
+`MarkerAssociation` states which. When estimates leave it, `MarkerAssociation.follow_estimates`
+returns another association, and the problem stays the same up to the tolerances below. An
+association also contains the surface correspondences of depth cameras, see
+`surface_correspondences`.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ class MarkerAssociation:
     cells : (M,) array
         Elements of estimated places.
     centre_places_m : (M, 3) array
-        Places at the centre of the chart [m].
+        Places at the centre of the association [m].
     axes : (M, 3, k) array
         Orthonormal directions in which places may move.
     crossed_edges : (M, 2, 3) array
@@ -102,7 +101,8 @@ class MarkerAssociation:
 
     @classmethod
     def from_experiment(cls, experiment: Experiment) -> MarkerAssociation:
-        """Build the chart of the stated places of an experiment's markers and depth cameras.
+        """Return the association for the stated places of an experiment's markers and depth
+        cameras.
 
         Markers without a stated place get the place where their first sample lies on the undeformed
         body in its grasp; `Transcription.place_unknown_markers` replaces it before a solve.
@@ -133,7 +133,7 @@ class MarkerAssociation:
     def from_exact_places(
         cls, body: Body, placement: Placement, points_m: Array
     ) -> MarkerAssociation:
-        """Build the chart of places (M, 3) [m] that are not estimated."""
+        """Return the association for places (M, 3) [m] that are not estimated."""
         count = len(points_m)
         none = np.zeros(count, dtype=np.int64)
         return cls(
@@ -151,7 +151,7 @@ class MarkerAssociation:
         )
 
     def matches(self, experiment: Experiment) -> bool:
-        """Whether the chart belongs to the experiment's body, and has the same priors and
+        """Whether the association belongs to the experiment's body, and has the same priors and
         cameras.
         """
         return (
@@ -168,22 +168,31 @@ class MarkerAssociation:
 
     @cached_property
     def centre_coordinates(self) -> Array:
-        """Coordinates φ (M, k) of the places at the centre of the chart."""
+        """Coordinates φ (M, k) of the places at the centre of the association."""
         return self._coordinates(self.centre_places_m)
 
     def _coordinates(self, points_m: Array) -> Array:
-        """Return φ (M, k) of places (M, 3) [m]; zero for exact places."""
+        """Return the coordinates (M, k) of places (M, 3) [m], in prior standard deviations along
+        `axes`; zero for exact places.
+        """
         sigma = np.where(self.sigma_m > 0, self.sigma_m, np.inf)[:, None]
         return np.einsum("mik,mi->mk", self.axes, points_m - self.prior_places_m) / sigma
 
     def places_m(self, phi: Array) -> Array:
-        """Return the places (M, 3) on the undeformed body at φ (M, k) [m]."""
+        """Return the places (M, 3) on the undeformed body [m] for coordinates `phi` (M, k) in prior
+        standard deviations along `axes`.
+        """
         moved = np.einsum("mik,mk->mi", self.axes, phi - self.centre_coordinates)
         return self.centre_places_m + self.sigma_m[:, None] * moved
 
     def shape_functions(self, phi: Array) -> tuple[Index, ShapeFunctions]:
-        """Return the nodes (M, npe) of each marker's element and their shape functions at φ
-        (M, k).
+        """Return the nodes (M, npe) of each marker's element, and their shape functions at its
+        place with derivatives by the k coordinates of the place.
+
+        Parameters
+        ----------
+        phi : (M, k) array
+            Coordinates of the places, in prior standard deviations along `axes`.
         """
         element = self.body.element
         k = self.axes.shape[2]
@@ -214,9 +223,9 @@ class MarkerAssociation:
     # Following the estimates ------------------------------------------------------------------
 
     def centred_at(self, points_m: Array) -> MarkerAssociation:
-        """Return the chart with its centre at places (M, 3) [m]; with `surface_gaps_and_pressures`
-        at the
-        nearest points of the surface.
+        """Return the association with its centre at places (M, 3) [m] of the estimated markers:
+        their elements, and the axes along which the places may move. With `on_surface` the centres
+        are the nearest points of the surface.
         """
         points = points_m.copy()
         cells = self.cells.copy()
@@ -230,7 +239,7 @@ class MarkerAssociation:
         return replace(self, centre_places_m=points, cells=cells, axes=axes)
 
     def follow_estimates(self, phi: Array, shift_samples: float) -> tuple[MarkerAssociation, Array]:
-        """Return a chart for estimates that have left this one, and φ in it.
+        """Return an association for estimates that have left this one, and φ in it.
 
         Parameters
         ----------
@@ -241,8 +250,8 @@ class MarkerAssociation:
 
         Returns
         -------
-        (Chart, (M, k) array)
-            The new chart, which is self if nothing has left it, and φ in it.
+        (MarkerAssociation, (M, k) array)
+            The new association, which is self if nothing has left it, and φ in it.
         """
         points = self.places_m(phi)
         changed_cell = False
@@ -259,8 +268,8 @@ class MarkerAssociation:
         return chart, chart.centre_coordinates
 
     def _without_alternation(self, points_m: Array) -> MarkerAssociation:
-        """Return the chart about places (M, 3) such that none alternates between two faces for
-        ever.
+        """Return the association about places (M, 3) [m] such that none alternates between two
+        faces for ever.
 
         Where a marker stands off an edge, the plane of each face may lead back to the other. Such a
         place stays in one of the planes, even outside the surface.
@@ -295,8 +304,8 @@ class MarkerAssociation:
         )
 
     def _is_outside(self, point: Array, cell: int) -> bool:
-        """Whether another element contains a place better than element `cell`, by more than
-        `BETTER`; false for NaN.
+        """Whether another element contains a point (3,) of the undeformed body better than the
+        element with index `cell`, by more than `BETTER`; false for NaN.
         """
         if not np.isfinite(point).all():
             return False

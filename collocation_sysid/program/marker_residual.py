@@ -157,15 +157,15 @@ class MarkerResidual(MeasurementResidual):
         return RowStencil(places, np.repeat(place[..., None], count, axis=2))
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
-        """Return the stencil of those first samples for which `known` times of the channel
-        suffice.
+        """Return the stencil of the first samples that depend only on the first `known` times of
+        the observable; φ is not used.
         """
         samples = int(np.count_nonzero(self._neighbour_indices[:, -1] < known))
         return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
 
     def shifted(self, by_s: float) -> MarkerResidual:
-        """Return the model of samples taken `by_s` seconds later, at the same stencil; self
-        if time does not matter.
+        """Return the model of samples taken `by_s` seconds later, at the same stencil; self if the
+        expression does not depend on time.
         """
         if not self._full_expression.residual.depends_on_datum(1):
             return self
@@ -178,8 +178,16 @@ class MarkerResidual(MeasurementResidual):
         return other
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the prediction y (3,) of one marker from its places (3, neighbours), its
-        φ, and the data.
+        """Return the prediction y (3,) of one marker.
+
+        Parameters
+        ----------
+        values : (3, neighbours) SX
+            Places of the marker at neighbouring grid times [m].
+        phi : SX
+            Nuisance parameters of the marker, in prior standard deviations.
+        data : (2,) SX
+            Position of the sample among the neighbours, in samples, and its time [s].
         """
         place, t_s = ca.vertsplit(data)
         own = self.own_parameters[0] if len(self.own_parameters) else np.zeros(0, dtype=np.int64)
@@ -204,8 +212,8 @@ class MarkerResidual(MeasurementResidual):
         return self.predict(self.observable.evaluate_positions(x, phi), phi)
 
     def squared_distances_m2(self, x: Array, phi: Array) -> Array:
-        """Return the squared distances [m²] of predictions from all samples that are
-        present, flat.
+        """Return the squared distances [m²] of predictions from all samples that are present (P,),
+        at positions x (rows, 3n) and φ; samples after the last row are omitted.
         """
         predicted = self.predict_positions(x, phi)
         tracks = self.markers.positions_m[: len(predicted)]

@@ -109,7 +109,7 @@ class ResidualExpression:
 
     @property
     def _input_count(self) -> int:
-        """Number of inputs u."""
+        """Number of inputs u: positions of the vectors and nuisance parameters."""
         return GROUP * self.vector_count + self.nuisance_count
 
     @property
@@ -118,7 +118,7 @@ class ResidualExpression:
         return self.data_count + 2 * self.measured_count
 
     def _residual_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
-        """Expression of the residual."""
+        """Return the expression of the residual (prediction − measurement) / σ."""
         ends = [0, self.data_count, self.data_count + self.measured_count, self._data_count]
         own, measured, weight = ca.vertsplit(data, ends)
         vectors, phi = ca.vertsplit(u, [0, GROUP * self.vector_count, self._input_count])
@@ -126,7 +126,7 @@ class ResidualExpression:
         return weight * (predicted - measured)
 
     def _loss_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
-        """Expression of the loss."""
+        """Return the expression of the robust loss of the residual."""
         return self._robust_loss(self._residual_expression(u, data), data)
 
     def _robust_loss(self, residual: ca.SX, _: ca.SX) -> ca.SX:
@@ -180,7 +180,7 @@ def huber_as_weights(
 
     Derivatives get the square root of the weight in the normal equations. Residuals are shortened
     to the threshold, so that a few outliers do not determine the noise of the others. Arguments as
-    in `huber_as_least_squares`.
+    in `huber_as_least_squares`; without threshold (None) both are returned as they are.
     """
     if huber is None:
         return residual, derivatives
@@ -386,7 +386,9 @@ class MeasurementResidual(ABC):
         return other
 
     def expression_for(self, vectors: int, data: int) -> ResidualExpression:
-        """Return the generated functions for stencils of `vectors` vectors and `data` data."""
+        """Return the generated functions for stencils with numbers of vectors and data; they are
+        created on the first call and stored.
+        """
         if (vectors, data) not in self._expressions:
             self._expressions[vectors, data] = ResidualExpression(
                 self.expression,
@@ -408,8 +410,8 @@ class MeasurementResidual(ABC):
     def _inputs_at(
         self, values: Array, phi: Array
     ) -> tuple[ResidualExpression, RowStencil, Array, Array]:
-        """Return generated functions, stencil, inputs u (k, s, E) and data of the samples
-        that can be computed.
+        """Return the generated functions, the stencil, the inputs u (k, s, E) and the data of the s
+        first samples that can be computed from values (n, e, 3) of the observable at φ.
         """
         window = self.stencil(phi, len(values))
         samples, each, vectors = window.indices.shape
@@ -458,13 +460,17 @@ class MeasurementResidual(ABC):
     def linearise(
         self, values: Array, observable_derivatives: ObservableDerivatives, phi: Array, size: int
     ) -> tuple[Array, Array]:
-        """Return residuals (s, G, g) and their derivatives (s, G, g, size) by all parameters.
+        """Return residuals (y − ŷ) / σ (s, G, g), zero where missing, and their derivatives (s, G,
+        g, size) by all parameters.
+
+        Samples s are those that the values suffice for; G is the number of `names` and g the
+        `group_size`. Without values the arrays are zero.
 
         Parameters
         ----------
         values : (n, e, 3) array
             Values of the observable.
-        observable_derivatives : MemoryForwardColumns
+        observable_derivatives : ObservableDerivatives
             Their derivatives.
         phi : (k,) array
             Nuisance parameters; they are the last of all parameters.
@@ -501,8 +507,8 @@ class MeasurementResidual(ABC):
         return grouped, derivatives.reshape(*grouped.shape, size)
 
     def _evaluate(self, values: Array, phi: Array) -> tuple[RowStencil, Array, Array]:
-        """Return the stencil, residuals (s, E, m) and their derivatives (s, E, m, u) by the
-        inputs.
+        """Return the stencil, residuals (s, E, m) in standard deviations and their derivatives (s,
+        E, m, u) by the inputs, from values (n, e, 3) of the observable at φ.
         """
         if self._linear_part is None or len(values) < self.observable.count:
             instrument, window, u, data = self._inputs_at(values, phi)
@@ -532,15 +538,17 @@ class MeasurementResidual(ABC):
         return window, np.ascontiguousarray(residual.transpose(1, 2, 0)), by_u
 
     def residual_changes(self, values: Array, by: Array, phi: Array) -> Array:
-        """Return the changes (s, M, 3, c) of the pooled residuals if the observable changes
-        by `by` (n, e, 3, c).
+        """Return the changes (s, M, 3, c) of the pooled residuals at values (n, e, 3) and φ if the
+        observable changes by `by` (n, e, 3, c), to first order.
         """
         size = by.shape[3] + len(phi)
         slopes = ObservableDerivatives.without_own(np.arange(by.shape[3]), by)
         return self.pool_values(self.linearise(values, slopes, phi, size)[1][..., : by.shape[3]])
 
     def loss(self, values: Array, phi: Array) -> float:
-        """Return the loss Σ ρ of values (n, e, 3) at φ (k,)."""
+        """Return the loss Σ ρ of values (n, e, 3) of the observable at φ (k,), over the samples
+        that these suffice for.
+        """
         if not len(values):
             return 0.0
         instrument, _, u, data = self._inputs_at(values, phi)

@@ -95,16 +95,17 @@ class DeclaredMotion:
         return np.einsum("tji,tmj->tmi", self.rotations, points_m - self.translations_m[:, None])
 
     def with_prior_motion(self, rotation: Array, translation_m: Array) -> DeclaredMotion:
-        """Return the statements with another rigid motion C before the poses U: x → U(Cx)."""
+        """Return the statements with a rigid motion C (rotation (3, 3), translation (3,) [m]) of
+        the body before the poses U: x → U(Cx).
+        """
         shifted = self.translations_m + self.rotations @ translation_m
         return replace(self, rotations=self.rotations @ rotation, translations_m=shifted)
 
 
 def carrying_grasp(experiment: Experiment) -> Grasp | None:
-    """Return the grasp that carries the body at all times, or None.
+    """Return the grasp that carries the body at all times, or None if there is none.
 
-    All other grasps must move with it. A grasp that prescribes some axes only does not carry the
-    body.
+    It must prescribe all axes at all samples, and all other grasps must move with it.
     """
     holding = [grasp for grasp in experiment.grasps if grasp.is_active(experiment.t_s).any()]
     holding.sort(key=lambda grasp: grasp.axes != "xyz")
@@ -175,8 +176,10 @@ class ModalResponse:
         )
 
     def predict(self, declared: DeclaredMotion) -> Array:
-        """Return predictions (S, T, M, 3) of the markers for S combinations of stiffness
-        and damping, the last for a rigid body [m].
+        """Return predictions (S, T, M, 3) [m] of the markers for S combinations of stiffness and
+        damping, the last for a rigid body; NaN beyond the range of a delayed track.
+
+        Displacements are limited to the size of the body.
         """
         scale = declared.mesh_scale
         loads = self._modal_loads(declared)
@@ -209,7 +212,9 @@ class ModalResponse:
         return np.asarray(np.outer(stiffnesses, self.relative_frequencies), dtype=np.float64)
 
     def _modal_loads(self, declared: DeclaredMotion) -> Array:
-        """Return the modal loads (T, K) of gravity and the grasp's acceleration."""
+        """Return the modal loads (T, K) of gravity and of the grasp's acceleration, for a declared
+        motion.
+        """
         inverse = declared.rotations.transpose(0, 2, 1)
         step_s = float(declared.t_s[1] - declared.t_s[0])
         lift = declared.gravity_m_s2 - _second_differences(declared.translations_m, step_s)

@@ -1,10 +1,10 @@
 """Equations of motion of selected dofs as rows of a sparse Jacobian, in scaled quantities.
 
-Rows are c / `force_n`, differentiated by x / `strain_length_m`; a prescribed dof has the row (x − u
-x̄) / `strain_length_m` instead. A dof that is prescribed for a part of the time has a grasp row at
-those times instead of an equation of motion, and the force on it at those times counts in no later
-row (see `Dynamics.is_temporarily_prescribed`): where a grasp begins or ends, entries differ from
-those of the scheme, and `ReleasedGrasps` corrects them.
+Rows are c / `force_n`, differentiated by x / `length_m`; a prescribed dof has the row (x − u x̄) /
+`length_m` instead. A dof that is prescribed for a part of the time has a grasp row at those times
+instead of an equation of motion, and the force on it at those times counts in no later row (see
+`Dynamics.is_temporarily_prescribed`): where a grasp begins or ends, entries differ from those of
+the scheme, and `ReleasedGrasps` corrects them.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class MotionJacobian:
 
     @cached_property
     def _skew(self) -> BlockBand:
-        """Structure of `structure` for adding the skew parts of ∂F/∂x and ∂F/∂v."""
+        """Plan that adds the skew parts of ∂F/∂x and ∂F/∂v to the values of `structure`."""
         has_skew_damping = self.dynamics.forces.has_skew_damping
         return skew_block_band(
             self.pattern.size, self._row_starts, self._blocks(), by_velocity=has_skew_damping
@@ -115,8 +115,8 @@ class MotionJacobian:
 
     @cached_property
     def _constant_positions(self) -> tuple[Index, Index]:
-        """Positions of the inertia entries, and of the unit entries of grasp rows, in the
-        values.
+        """Positions in the values of `structure` of the inertia entries, and of the unit entries of
+        grasp rows.
         """
         place = np.searchsorted(self.constrained_dofs, self.free_dofs)
         positions = [np.zeros(0, dtype=np.int64)]
@@ -267,7 +267,7 @@ class ReleasedGrasps:
         row_dofs : (k,) array
             Dof of each row of a grid time.
         scale : float
-            Factor of the rows, `strain_length_m` / `force_n`.
+            Factor of the rows, `length_m` / `force_n`.
         """
         is_prescribed = dynamics.is_temporarily_prescribed
         nothing = np.zeros(0, dtype=np.int64)

@@ -60,7 +60,8 @@ class Modes:
 
 
 def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6) -> Modes:
-    """Return the lowest modes of a body about a state.
+    """Return the lowest modes of a body about a state; those without restoring force are left out
+    and counted in `omitted_count`.
 
     Parameters
     ----------
@@ -69,7 +70,7 @@ def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
     x : (n, 3) or (3n,) array
         The state [m], which should be an equilibrium.
     free_dofs : (k,) array
-        Sorted dofs that are not prescribed.
+        Sorted dofs that are not prescribed; their masses must be positive.
     count : int
         Number of modes; there may be fewer.
     """
@@ -103,7 +104,9 @@ def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
 
 
 def _dense_modes(stiffness: sp.csc_array, mass: Array, requested: int) -> tuple[Array, Array]:
-    """Return the lowest eigenvalues and eigenvectors by a dense solver."""
+    """Return the `requested` lowest eigenvalues [1/s²] and eigenvectors (n, k) of K φ = λ M φ by a
+    dense solver, fewer if n is smaller; `mass` (n,) is the diagonal of M.
+    """
     root = np.sqrt(mass)
     scaled = stiffness.toarray() / np.outer(root, root)
     last = min(requested, len(mass)) - 1
@@ -125,8 +128,19 @@ class _ShiftedInverse(LinearOperator):
 def _lanczos_modes(
     stiffness: sp.csc_array, mass: Array, factor: Factor, translation_m: float, requested: int
 ) -> tuple[Array, Array]:
-    """Return the eigenvalues and eigenvectors nearest to `translation_m`, just below zero, by
-    shift-invert Lanczos iterations.
+    """Return the `requested` eigenvalues [1/s²] and eigenvectors (n, k) of K φ = λ M φ nearest to a
+    shift, by shift-invert Lanczos iterations, ascending.
+
+    Parameters
+    ----------
+    stiffness : sparse (n, n)
+    mass : (n,) array
+        Diagonal of M.
+    factor : Factor
+        Factor of K − shift · M.
+    translation_m : float
+        The shift, just below zero [1/s²].
+    requested : int
     """
     squares, vectors = eigsh(
         stiffness,

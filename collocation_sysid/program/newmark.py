@@ -100,7 +100,7 @@ def simulate_newmark(
         Positions at the samples [m].
     (T, 3n) array
         Velocities at the samples [m/s].
-    Forced
+    ReactionForces
         Reaction forces on the sensed dofs at all steps.
 
     Raises
@@ -161,7 +161,13 @@ class _Stepper:
         return self._balanced(state, time_s, solver.free)
 
     def advance(self, state: _State, target_s: float) -> _State:
-        """Return the state at `target_s`, in shorter steps where Newton's method fails."""
+        """Return the state at `target_s`; where Newton's method fails, in shorter steps.
+
+        Raises
+        ------
+        SimulationError or NewtonFailure
+            If the shortest step fails.
+        """
         step = target_s - state.t_s
         smallest = step * 0.5**self.options.max_halvings
         state = self._after_release(state, target_s)
@@ -186,7 +192,9 @@ class _Stepper:
         return reaction[dofs], state.x[dofs]
 
     def _force(self, state: _State, load_s: float) -> Array:
-        """Return all forces (3n,) but contact in a state, under the loads at a time [N]."""
+        """Return all forces (3n,) [N] except contact in a state, under the loads at the time
+        `load_s`.
+        """
         forces, _ = self._forces(load_s).without_contact()
         for each in state.previous_histories:
             forces = each.insert_at_same_time(forces)
@@ -199,8 +207,8 @@ class _Stepper:
         return Forces.from_experiment(self.experiment, load_s, self.theta, step_s=step_s)
 
     def _contact_n(self, x: Array, v: Array, load_s: float, step_s: float = 0.0) -> Array:
-        """Return the contact forces (3n,) at a state [N], averaged over a step of `step_s`
-        about it if that is not zero.
+        """Return the contact forces (3n,) [N] at positions x and velocities v, (3n,) each, and the
+        time `load_s`; averaged over a step of `step_s` about this state, unless that is zero.
         """
         forces = self._forces(load_s, step_s)
         total_n = np.zeros_like(x)
@@ -222,8 +230,8 @@ class _Stepper:
         )
 
     def _after_release(self, state: _State, goal_s: float) -> _State:
-        """Return the state with new accelerations at nodes that a grasp has released by
-        `goal_s`.
+        """Return the state with new accelerations at dofs that a grasp has released between the
+        state's time and `goal_s`; the same state if there are none.
         """
         before = self._solver(state.t_s)
         after = self._solver(goal_s)
@@ -232,7 +240,9 @@ class _Stepper:
         return self._balanced(state, goal_s, np.setdiff1d(after.free, before.free))
 
     def _balanced(self, state: _State, load_s: float, dofs: NDArray[np.int64]) -> _State:
-        """Return the state with the accelerations of some dofs computed from the forces on them."""
+        """Return the state with the accelerations of some dofs (indices) computed from the forces
+        on them, without contact, under the loads at the time `load_s`.
+        """
         acceleration = state.a.copy()
         acceleration[dofs] = self._force(state, load_s)[dofs] / self._mass(load_s)[dofs]
         return replace(state, a=acceleration)
@@ -306,8 +316,8 @@ class _Stepper:
     def _prescribed_motion(
         self, solver: NewtonSolver, time_s: float, step_s: float, holding_s: float
     ) -> tuple[Array, Array, Array]:
-        """Return position, velocity and acceleration of the prescribed dofs by central
-        differences over h.
+        """Return position, velocity and acceleration of the solver's prescribed dofs at `time_s`,
+        by central differences over `step_s`; grasps are those that hold at `holding_s`.
         """
         experiment = self.experiment
         nodes_m = self.experiment.body.nodes_m

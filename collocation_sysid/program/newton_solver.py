@@ -181,7 +181,7 @@ class NewtonSolver:
     def _simplified_newton(
         self, x: Array, residual: Residual, linearise: Linearise
     ) -> tuple[Array, bool]:
-        """Iterate with few factorisations (simplified Newton method).
+        """Iterate with few factorisations (simplified Newton method); the last factor is stored.
 
         Returns
         -------
@@ -231,8 +231,13 @@ class NewtonSolver:
         return (improved, done) if self.has_no_inverted_element(improved) else (x, False)
 
     def _with_prescribed(self, x: Array, goal: Array, linearise: Linearise) -> Array:
-        """Return the state with the prescribed dofs at `goal`, and free dofs in equilibrium
-        to first order.
+        """Return the state x (3n,) [m] with the prescribed dofs at `goal` (prescribed,), and the
+        free dofs in equilibrium to first order.
+
+        Raises
+        ------
+        NewtonFailure
+            If the matrix at x is singular or not positive definite, or an element of x is inverted.
         """
         state = x.copy()
         way = np.zeros_like(x)
@@ -255,8 +260,26 @@ class NewtonSolver:
         linearise: Linearise,
         keep_definite: bool,
     ) -> tuple[Array, Factor, Array]:
-        """Return the next iterate, its factor and its Newton step; raise NewtonFailure if
-        none is acceptable.
+        """Return the next iterate (3n,), its factor and the Newton step (free,) there, with the
+        first of the halved steps that is acceptable.
+
+        Parameters
+        ----------
+        x : (3n,) array
+            Present iterate [m].
+        step : (free,) array
+            Newton step at x [m].
+        factor : Factor
+            Factor at x.
+        residual, linearise : callable
+            Functions of the state.
+        keep_definite : bool
+            Whether the matrix must be positive definite.
+
+        Raises
+        ------
+        NewtonFailure
+            If no step is acceptable.
         """
         length = np.linalg.norm(step)
         share = 1.0
@@ -294,13 +317,28 @@ class NewtonSolver:
         return Retraction(self.body, prescribed.reshape(-1, 3))
 
     def _is_last(self, step: Array, share: float = 1.0) -> bool:
-        """Whether a step is shorter than `share` times the tolerance."""
+        """Whether the largest entry of a step (free or 3n,) [m] is at most `share` times the
+        tolerance.
+        """
         tolerance = share * self.options.tolerance * self._size_m
         return bool(np.abs(step).max(initial=0.0) <= tolerance)
 
     def _factorise(self, matrix: Sequence[Array], x: Array, keep_definite: bool) -> Factor:
-        """Return the factor of a matrix; raise NewtonFailure if it is singular or, with
-        `keep_definite`, not positive definite.
+        """Return the factor of a matrix on the free dofs.
+
+        Parameters
+        ----------
+        matrix : (symmetric, skew)
+            Lower triangles of both parts, the second empty for a symmetric matrix.
+        x : (3n,) array
+            State, for the failure.
+        keep_definite : bool
+            Whether a matrix that is not positive definite is a failure.
+
+        Raises
+        ------
+        NewtonFailure
+            If the matrix is singular or, with `keep_definite`, not positive definite.
         """
         try:
             with self.stopwatch.solving():
@@ -410,7 +448,9 @@ class NewtonSolvers:
         self._known: dict[bytes, NewtonSolver] = {}
 
     def for_prescribed(self, is_prescribed: NDArray[np.bool_]) -> NewtonSolver:
-        """Return the solver with the prescribed coordinates (n, 3) bool."""
+        """Return the solver for a set of prescribed coordinates (n, 3) bool; it is created on the
+        first call and stored.
+        """
         key = is_prescribed.tobytes()
         if key not in self._known:
             self._known[key] = NewtonSolver(*self._arguments, is_prescribed)

@@ -2,11 +2,10 @@
 derivatives.
 
 An observable has values c (n, e, 3) at n of the grid times: positions of e points of the body
-(`PointPositions`, here), or force and torque of a grasp (`wrench_channel.GraspWrench`). `reading`
-turns
-them into residuals. An observable is `local` if it depends on few positions at each time; then it
-provides derivatives by these positions. Other observables can be lifted to variables of the
-program, see `lifted_variables`.
+(`PointPositions`, here), or force and torque of a grasp (`wrench_observable.GraspWrench`).
+`measurement_residual` turns them into residuals. An observable is `local` if it depends on few
+positions at each time; then it provides derivatives by these positions. Other observables can be
+lifted to variables of the program, see `lifted_variables`.
 """
 
 from __future__ import annotations
@@ -93,7 +92,9 @@ class ObservableDerivatives(NamedTuple):
 
     @classmethod
     def without_own(cls, columns: Index, by: Array) -> ObservableDerivatives:
-        """Build derivatives (n, e, 3, c) by the parameters at `columns` (c,) alone."""
+        """Return derivatives `by` (n, e, 3, c) by the parameters with indices `columns` (c,), of an
+        observable whose points have no parameters of their own.
+        """
         none = np.zeros(0, dtype=np.int64)
         return cls(columns, by, none, none.reshape(0, 0), by[:, :0, :, :0])
 
@@ -160,12 +161,12 @@ class PointPositions:
 
     @property
     def count(self) -> int:
-        """Number of times."""
+        """Number of grid times at which the points are observed."""
         return len(self.rows)
 
     @property
     def vector_count(self) -> int:
-        """Number of points."""
+        """Number of observed points."""
         return len(self.association.prior_places_m)
 
     @property
@@ -185,14 +186,16 @@ class PointPositions:
         return interpolation_matrix(nodes, shape.weights, self.node_count)
 
     def _interpolate(self, x: Array, nodes: Index, weights: Array) -> Array:
-        """Return Σ_a weights[m, a, …] x_a for the known grid times, (R, m, 3, …)."""
+        """Return Σ_a weights[m, a, …] x_a, (R, m, 3, …), at those of the observable's R rows that x
+        (rows, 3n) contains, for nodes (m, a).
+        """
         rows = self.rows[self.rows < len(x)]
         at = x[rows].reshape(len(rows), -1, 3)[:, nodes]
         return np.einsum("ma...,tmai->tmi...", weights, at)
 
     def _coordinate_derivatives(self, x: Array, shape: tuple[Index, ShapeFunctions]) -> Array:
-        """Return the derivatives (R, estimated, 3, k) of estimated points by their own
-        coordinates.
+        """Return the derivatives (R, estimated, 3, k) of the points with estimated places by their
+        own k coordinates, at positions x (rows, 3n); `shape` is the result of `shape_functions`.
         """
         nodes, functions = shape
         estimated = self.association.estimated
@@ -207,7 +210,9 @@ class PointPositions:
         return self.evaluate_positions(motion.x, phi)
 
     def evaluate_positions(self, x: Array, phi: Array) -> Array:
-        """Return the positions (R, e, 3) of the points [m] for the first rows x (rows, 3n)."""
+        """Return the positions (R, e, 3) of the e points [m] at φ, at those of the observable's R
+        rows that x (rows, 3n) [m] contains.
+        """
         nodes, shape = self.shape_functions(phi)
         return self._interpolate(x, nodes, shape.weights)
 
@@ -218,7 +223,7 @@ class PointPositions:
 
         Parameters
         ----------
-        motion : ModesCheck
+        motion : ObservedMotion
             The motion, with its changes `by` (R, 3e, c).
         phi : (k,) array
             Nuisance parameters.
@@ -242,8 +247,18 @@ class PointPositions:
         columns: Index,
         changes: Array,
     ) -> ObservableDerivatives:
-        """Return the derivatives of the values if H x changes by (R, 3e, c) with the
-        parameters at `columns`.
+        """Return the derivatives of the values by parameters.
+
+        Parameters
+        ----------
+        x : (rows, 3n) array
+            Positions [m].
+        shape_functions : tuple
+            Result of `shape_functions` at φ.
+        columns : (c,) array of int
+            Parameters.
+        changes : (R, 3e, c) array
+            Derivatives of the points by these parameters through the positions x.
         """
         estimated = self.association.estimated
         changes = changes.reshape(len(changes), self.vector_count, 3, changes.shape[2])
@@ -260,7 +275,7 @@ class PointPositions:
 
         Parameters
         ----------
-        motion : ModesCheck
+        motion : ObservedMotion
             The motion, over all grid times.
         phi : (k,) array
             Nuisance parameters.
@@ -295,15 +310,24 @@ class PointPositions:
 
     @cached_property
     def _dependencies(self) -> tuple[Index, Index]:
-        """Point and corner of its element, both (w,), for each node that a value can depend on."""
+        """Point and corner of its element (w,) for each pair of a point and a node on which its
+        position can depend.
+        """
         reads = self.association.weights != 0
         reads[self.association.estimated] = True
         marker, corner = np.nonzero(reads)
         return marker, corner
 
     def _derivative_entries(self, variables: int, size: int) -> tuple[Index, Index]:
-        """Return rows and columns of ∂(c, φ)/∂(x, φ) in the order of `derivative_matrix`; all x
+        """Return rows and columns of the entries of `derivative_matrix`, in their order; all x
         precede all φ.
+
+        Parameters
+        ----------
+        variables : int
+            Number of positions N · 3n.
+        size : int
+            Number of nuisance parameters.
         """
         nodes, _ = self.shape_functions(np.zeros(size))
         marker, corner = self._dependencies
@@ -332,7 +356,11 @@ class PointPositions:
         return rows, np.concatenate([column.ravel() for _, column in pairs])
 
     def derivative_matrix(self, x: Array | None, phi: Array, position_count: int) -> sp.csr_array:
-        """Return the sparse matrix ∂(c, φ)/∂(x, φ).
+        """Return the sparse derivative of the stacked positions c of all points at all rows, and of
+        φ, by (x, φ).
+
+        The rows are those of c (3 R e), row by row of the motion, then of φ; the columns those of
+        x, then of φ.
 
         Parameters
         ----------

@@ -73,7 +73,9 @@ class Observation:
         return ObservedMotion(x, partial(self._reactions_at, x, histories))
 
     def _reactions_at(self, x: Array, histories: Sequence[AnyHistory] = ()) -> ReactionForces:
-        """Return the reaction forces on the sensed dofs at positions x (rows, 3n)."""
+        """Return the reaction forces on the sensed dofs at positions x (rows, 3n) [m]; internal
+        variables are computed from x where `histories` is empty.
+        """
         dynamics = self.equations.dynamics.truncated_to(len(x))
         dofs = self.segment.sensed_dofs
         force = forces_on_dofs(dynamics, x, dofs, histories)
@@ -111,8 +113,8 @@ class Observation:
         return ObservableResponse(tuple(map(np.stack, observed)), grasp_forces)
 
     def response_of_array(self, changes_m: Array, grasp_forces: GraspForces) -> ObservableResponse:
-        """Compute the changes of the observables from changes of the first rows of x,
-        (rows, 3n, m), at once.
+        """Return the changes of the observables, computed at once from changes (rows, 3n, m) [m] of
+        the first rows of x and from changes of the grasp forces.
         """
         changes = []
         _, dofs, count = changes_m.shape
@@ -146,7 +148,7 @@ class Observation:
 
         Returns
         -------
-        list of Motion
+        list of ObservedMotion
             One entry per measurement.
         """
 
@@ -164,9 +166,20 @@ class Observation:
     def _linearised_reactions(
         self, x: Array, grasp_forces: GraspForces, changes_m: Array, step: Array | None, by_p: bool
     ) -> ReactionForces:
-        """Return reaction forces with their changes, see `linearised_motions`; `changes_m` (rows,
-        g, c) are
-        the changes of the positions of the sensed dofs [m].
+        """Return reaction forces with their changes.
+
+        Parameters
+        ----------
+        x : (rows, 3n) array
+            Positions [m].
+        grasp_forces : GraspForces
+            Forces on the sensed dofs, and their changes.
+        changes_m : (rows, g, c) array
+            Changes of the positions of the sensed dofs [m].
+        step : (rows, 3n) array or None
+            Feasibility step [m], whose change comes before the others; None without it.
+        by_p : bool
+            Whether the columns are derivatives by parameters, which also change masses.
         """
         dynamics = self.equations.dynamics.truncated_to(len(x))
         dofs = self.segment.sensed_dofs
@@ -247,8 +260,8 @@ class Observation:
         return linearised
 
     def predict_wrenches(self, x: Array) -> list[Array]:
-        """Return the prediction (S, 6) for each wrench sensor [N, N m], NaN at samples
-        outside the known times.
+        """Return the prediction (S, 6) for each wrench sensor [N, N m] at positions x (rows, 3n);
+        NaN at samples for which the rows do not suffice.
         """
         return [
             s.predict_reactions(self.motion(x).reactions, self.phi) for s in self.segment.sensors

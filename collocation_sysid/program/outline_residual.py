@@ -33,8 +33,8 @@ class OutlineResidual(DepthResidual):
 
     @classmethod
     def from_depth(cls, depth: DepthResidual) -> OutlineResidual:
-        """Build the measurement model of the outline for the camera of a depth measurement
-        model.
+        """Return the measurement model of the outlines for the camera, images and correspondences
+        of a depth measurement model.
         """
         used = depth.correspondences.outline.is_compared
         samples, points = used.shape
@@ -75,8 +75,9 @@ class OutlineResidual(DepthResidual):
         return RowStencil(places, np.concatenate([data, width_m[None]]))
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return how far an outline point is outside of its edge [pixels], with the
-        estimated edge offset subtracted.
+        """Return how far an outline point is outside of its edge [pixels], minus the estimated
+        offset of edges; arguments as in `DepthResidual.expression`, with the width of a pixel [m]
+        as last datum.
         """
         count = data.numel() - 1
         outside_m = super().expression(values, phi, data[:count])

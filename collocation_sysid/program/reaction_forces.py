@@ -80,8 +80,9 @@ class GraspForces:
 def forces_on_dofs(
     dynamics: Dynamics, x: Array, dofs: Index, histories: Sequence[AnyHistory] = ()
 ) -> Array:
-    """Return the forces F (N, g) on dofs at the evaluations of x (N, 3n) [N], including
-    forces on prescribed dofs; zero before the first equation of motion.
+    """Return the forces F (N, g) [N] on dofs (g,) at the evaluations of x (N, 3n) [m], including
+    those on prescribed dofs; zero before the first equation of motion. Internal variables are
+    computed from x where `histories` is empty.
     """
     force = np.zeros((len(x), len(dofs)))
     force[dynamics.first_row :] = dynamics.force(x, histories)[:, dofs]

@@ -88,7 +88,11 @@ class Retraction:
         return moved.ravel()
 
     def _target(self, x: Array, increment: Array) -> Array:
-        """Return F_new at all quadrature points, (3 · points, 3), derivatives along X first."""
+        """Return the new deformation gradients at all quadrature points after an increment (3n,) of
+        positions x (3n,) [m], (3 · points, 3), derivatives along X first.
+
+        The spin of the increment is applied as a finite rotation.
+        """
         deformation = self._deformation(x)
         relative = self._deformation(increment) @ np.linalg.inv(deformation)
         strain = (relative + relative.transpose(0, 2, 1)) / 2
@@ -105,8 +109,8 @@ class Retraction:
 
 
 def _axis(normal: sp.csc_array, prescribed: NDArray[np.bool_]) -> _Axis:
-    """Return the least-squares problem of one coordinate, from the normal equations of all
-    nodes.
+    """Return the least-squares problem of one coordinate, from the normal equations (n, n) of all
+    nodes and the mask (n,) of prescribed nodes.
     """
     free = np.flatnonzero(~prescribed)
     fixed = np.flatnonzero(prescribed)

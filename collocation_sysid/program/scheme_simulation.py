@@ -177,8 +177,8 @@ def extrapolate(x: Array, first_step: Array) -> Array:
 
 
 def _extrapolate_static(x: Array, prescribed: Index, goal: Array) -> Array:
-    """Return an extrapolation of the next equilibrium: the last increment, scaled by that
-    of the prescribed dofs.
+    """Return an extrapolation (3n,) of the next equilibrium from equilibria x (k, 3n): the last
+    increment, scaled by that of the prescribed dofs towards `goal` (prescribed,).
     """
     if len(x) < 2:
         return x[-1]
@@ -240,8 +240,8 @@ class RowEquations:
         self.known -= row.mass_kg * row.r * dynamics.start_velocity_m_s
 
     def with_load_step(self, share: float) -> RowEquations:
-        """Return the row at a share of the change of a static load; other rows keep the
-        full load.
+        """Return the row with loads between those of the previous sample (share 0) and its own
+        (share 1); rows of a motion have their complete loads.
         """
         scaled = copy(self)
         if self.forces_before is not None:
@@ -249,7 +249,9 @@ class RowEquations:
         return scaled
 
     def force(self, x: Array) -> Array:
-        """Return the force F_t (3n,) [N]."""
+        """Return the force F_t (3n,) [N] at the evaluation state that follows from x_t = `x` (3n,)
+        [m], with contact.
+        """
         states = self.states(x)
         rest = self.rest.total(*states)[0]
         return rest + self.contact.force(*states) if self.contact.acts else rest
@@ -259,17 +261,17 @@ class RowEquations:
         return (self.xi + self.row.p[0] * x)[None], (self.nu + self.row.q[0] * x)[None]
 
     def residual_from(self, force: Array, x: Array) -> Array:
-        """Return c_t (3n,) from the force F_t and x_t."""
+        """Return c_t (3n,) [N] from the force F_t (3n,) [N] and x_t (3n,) [m]."""
         row = self.row
         return row.w[0] * force + self.known - row.s[0] * row.mass_kg * x
 
     def residual(self, x: Array) -> Array:
-        """Return c_t (3n,) [N]."""
+        """Return the constraints c_t (3n,) [N] at positions x_t (3n,) [m]."""
         return self.residual_from(self.force(x), x)
 
     def linearise(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return c_t (3n,), and lower triangles of the symmetric and the skew part of
-        −∂c_t/∂x_t.
+        """Return c_t (3n,) [N] at x_t = `x` (3n,) [m], and the lower triangles of the symmetric and
+        the skew part of −∂c_t/∂x_t.
         """
         states = self.states(x)
         row = self.row

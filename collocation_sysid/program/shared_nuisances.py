@@ -1,4 +1,4 @@
-"""Nuisance parameters shared by several experiments: one entry of p, one prior, one chart.
+"""Nuisance parameters shared by several experiments: one entry of p, one prior, one association.
 
 Experiments share those nuisance parameters whose `scope` is the same word in both, and whose label
 is the same: the place of a marker by its name, the pose of the cameras or of the clamp by its axis.
@@ -90,7 +90,14 @@ def nuisance_indices(experiments: Sequence[Experiment], first: int) -> list[Nuis
 
 
 def _require_same_objects(leader: Experiment, experiment: Experiment, row: NuisanceRow) -> None:
-    """Raise InputError if a nuisance parameter is shared by experiments whose objects differ."""
+    """Check that the objects on which a shared nuisance parameter depends are the same in two
+    experiments.
+
+    Raises
+    ------
+    InputError
+        If they differ.
+    """
     theirs = row.same(leader)
     ours = row.same(experiment)
     for entry in ours:
@@ -103,7 +110,14 @@ def _require_same_objects(leader: Experiment, experiment: Experiment, row: Nuisa
 def _require_same_prior(
     one: tuple[Experiment, NuisanceEntry], other: tuple[Experiment, NuisanceEntry]
 ) -> None:
-    """Raise InputError if a shared φ has two priors, or a shared marker two stated places."""
+    """Check that a nuisance parameter shared by two experiments has one prior, and a shared marker
+    one stated place.
+
+    Raises
+    ------
+    InputError
+        If they differ.
+    """
     leader, first = one
     experiment, second = other
     row = second.row
@@ -141,8 +155,8 @@ def _sharing_error(
 def shared_charts(
     experiments: Iterable[tuple[NuisanceIndices, NuisanceMap, MarkerAssociation]],
 ) -> list[MarkerAssociation]:
-    """Return the charts, with shared places and clocks equal to those of the first
-    experiment that shares them.
+    """Return the associations, with shared places and clocks equal to those of the first experiment
+    that shares them.
     """
     leaders = dict[int, tuple[MarkerAssociation, int]]()
     samples = dict[int, int]()

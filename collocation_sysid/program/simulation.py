@@ -65,7 +65,7 @@ class Trajectory:
         Node velocities [m/s]; zero in a static experiment.
     markers_m : (T, M, 3) array
         Markers [m].
-    reactions : (Table, ReactionForces)
+    reactions : (ReactionGrid, ReactionForces)
         Reaction forces on the dofs of instrumented grasps, and their times.
     wrenches : tuple of (S, 6) arrays
         Predictions of the force–torque sensors at their times [N] and [N m], NaN outside the known
@@ -160,7 +160,9 @@ def _simulate(
     options: NewtonOptions | None,
     progress: Progress | None,
 ) -> Trajectory:
-    """Return what `simulate` does, without the reasons of its errors."""
+    """Return what `simulate` returns; see there for the arguments. Errors do not have the reasons
+    that `simulate` adds.
+    """
     if timestep_s is not None and not timestep_s > 0:
         raise InputError(f"timestep_s = {timestep_s:g}, expected a positive time")
     if isinstance(substeps, str) and substeps != "auto":
@@ -190,7 +192,7 @@ def _with_automatic_steps(
 ) -> Trajectory:
     """Return the simulation of a dynamic experiment whose steps are halved until it is accurate.
 
-    A number of steps that cannot be simulated counts as inaccurate.
+    A number of steps that cannot be simulated counts as inaccurate. Arguments as in `simulate`.
 
     Raises
     ------
@@ -221,10 +223,10 @@ def _with_automatic_steps(
 
 
 def _accepted_error_m(trajectory: Trajectory) -> float:
-    """Return the error of positions that needs no finer steps [m].
+    """Return the error of positions [m] at which a simulation needs no finer steps.
 
-    It is relative to the largest distance of a node from its first position; of a body that stays
-    where it is, it is rounding.
+    It is relative to the largest distance of a node from its first position; for a body that does
+    not move it is a rounding error.
     """
     positions = trajectory.positions_m
     farthest_m = np.linalg.norm(positions - positions[0], axis=2).max()
@@ -284,8 +286,17 @@ def _custom_sensor_values(
     reactions: tuple[ReactionGrid, ReactionForces],
     ideal: NuisanceMap,
 ) -> tuple[Array, ...]:
-    """Return the predictions (S, m) of the custom sensors for a motion, without nuisance
-    parameters.
+    """Return the predictions (S, m) of each custom sensor for a motion (T, n, 3) [m] at the
+    samples, without nuisance parameters.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    positions_m : (T, n, 3) array
+    reactions : (ReactionGrid, ReactionForces)
+        Reaction forces of the motion, and their times.
+    ideal : NuisanceMap
+        Nuisance map without parameters.
     """
     readings = custom_sensor_residuals(experiment, experiment.t_s, reactions[0], ideal)
 
@@ -300,8 +311,8 @@ def _custom_sensor_values(
 
 
 def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experiment:
-    """Return the experiment with other samples (S, 6) of the force–torque sensors, in the
-    order of the grasps that have one.
+    """Return the experiment with other samples (S, 6) [N, N m] of its force–torque sensors, one
+    array for each grasp that has one, in the order of the grasps.
     """
     samples = iter(wrenches)
     grasps = []
@@ -312,7 +323,7 @@ def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experime
 
 
 def with_readings(experiment: Experiment, values: Sequence[ArrayLike]) -> Experiment:
-    """Return the experiment with other samples (S, m) of its custom sensors."""
+    """Return the experiment with other samples (S, m) of its custom sensors, one array for each."""
     pairs = zip(experiment.readings, values, strict=True)
     return replace(experiment, readings=[replace(g, values=v) for g, v in pairs])
 

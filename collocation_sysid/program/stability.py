@@ -89,7 +89,8 @@ def _instability(iterate: ExperimentIterate) -> Instability | None:
 
 
 def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
-    """Return the largest Re(s) of M s² + D s + K at a state [1/s]; 0 where none is positive.
+    """Return the largest Re(s) of M s² + D s + K at a state [1/s]; 0 where none exceeds the
+    rounding errors, or no dof is free.
 
     Parameters
     ----------
@@ -98,7 +99,7 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
     x : (3n,) array
         State [m].
     free_dofs : (k,) array
-        Sorted dofs that are not prescribed.
+        Sorted dofs that are not prescribed; their masses must be positive.
     """
     if not len(free_dofs):
         return 0.0
@@ -120,7 +121,9 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
 
 
 def _is_definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array) -> bool:
-    """Whether a matrix is positive semidefinite up to rounding; true for zero."""
+    """Whether a matrix on the free dofs, given by its lower triangle, is positive semidefinite up
+    to rounding relative to `mass` (free,); true for zero.
+    """
     own = pattern.diagonal[free_dofs]
     largest = float((lower[own] / mass).max())
     if largest <= 0:
@@ -131,7 +134,9 @@ def _is_definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass
 
 
 def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
-    """Return the largest Re(s) of s² + D s + K."""
+    """Return the largest Re(s) [1/s] of the exponents s of s² + D s + K, for mass-normalised
+    matrices (n, n).
+    """
     size = len(stiffness.diagonal())
     if size <= DENSE:
         return float(_exponents(stiffness.toarray(), damping.toarray()).real.max())
@@ -144,8 +149,8 @@ def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
 
 
 def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
-    """Return directions (n, k) with the smallest eigenvalues of a matrix, or approximations
-    if the iteration stops early.
+    """Return directions (n, k) with the smallest eigenvalues of a matrix; if the iteration stops
+    early, those that have converged and the start vector.
     """
     start = np.random.default_rng(0).normal(size=len(matrix.diagonal()))
     options = {"which": "SA", "tol": TOLERANCE, "v0": start, "ncv": 12 * DIRECTIONS}
@@ -187,8 +192,8 @@ class _CayleyTransform(LinearOperator):
 
 
 def _growth_about(stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> float:
-    """Return the largest Re(s) of s² + D s + K for sparse matrices, with |s| of about σ; at
-    least 0.
+    """Return the largest Re(s) of the exponents s with |s| of about `sigma` [1/s] that solve det(s²
+    + D s + K) = 0, for sparse matrices; at least 0.
     """
     turning = _CayleyTransform(stiffness, damping, sigma)
     try:

@@ -89,12 +89,13 @@ class ContactCandidates:
         )
 
     def inputs(self, contact: Contact, xi: Array, nu: Array, theta: Array) -> tuple[Array, Array]:
-        """Return the inputs and the data of the contact law's generated force.
+        """Return the inputs (k, i) and the data (d, i) of the law's `point_force_function` at the i
+        candidates.
 
         Parameters
         ----------
         contact : Contact
-            Contact force with this law.
+            Contact force with this law, which provides the data of the points.
         xi, nu : (3n,) arrays
             State [m] and velocity [m/s].
         theta : (k,) array
@@ -109,7 +110,9 @@ class ContactCandidates:
         return np.concatenate(own), np.concatenate([data, contact.data_of(self.point_indices)])
 
     def assemble(self, push: Array, size: int) -> Array:
-        """Return forces (size,) on the dofs of a body from forces (3, i) on the points [N]."""
+        """Return forces (size,) [N] on the dofs of a body from forces `push` (3, i) [N] on the i
+        candidates.
+        """
         on_nodes = self.weights[:, :, None] * push.T[:, None]
         summed = np.bincount(self.dofs.ravel(), weights=on_nodes.ravel(), minlength=size)
         return np.asarray(summed, dtype=float)
@@ -202,8 +205,11 @@ class StepContact:
         return force, symmetric, skew
 
     def _candidates(self, xi: Array, nu: Array) -> Iterator[tuple[ContactCandidates, Array, Array]]:
-        """Iterate over the candidates of each contact, with inputs and data of its law; the
-        search is repeated if the state has changed by more than the margin allows.
+        """Yield for each contact its candidates, and the inputs and data of its law at ξ and ν,
+        (3n,) each.
+
+        The search for candidates is repeated if the state has changed by more than the margin
+        allows.
         """
         ends = np.array([xi - self._half_s * nu, xi + self._half_s * nu])
         if not np.abs(ends - self._from).max() <= CHANGE * self._margin_m:

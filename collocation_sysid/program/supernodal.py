@@ -42,7 +42,9 @@ MISSING = (
 
 @cache
 def load_mkl() -> Any:
-    """Return the MKL library, or None where it is not installed; the result is cached."""
+    """Return the MKL library, set to 32-bit integers and one thread, or None if it is not
+    installed; the result is cached.
+    """
     paths = []
     try:
         files = metadata.files("mkl") or []

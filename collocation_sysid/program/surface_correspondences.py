@@ -2,9 +2,8 @@
 
 Points are not labelled: each belongs to the nearest point of the surface, for the current shape and
 camera pose (iterative closest points). A `SurfaceCorrespondences` states these correspondences for
-every image;
-it is renewed as estimates change, as charts of marker places are. In between, residuals along the
-surface normals are smooth.
+every image; it is renewed as estimates change, as associations of marker places are. In between,
+residuals along the surface normals are smooth.
 """
 
 from __future__ import annotations
@@ -209,7 +208,7 @@ class SurfaceCorrespondences:
 
         Returns
         -------
-        Sighting
+        SurfaceCorrespondences
             The new correspondences; self if neither shapes, camera nor gate have changed.
         """
         known = len(shapes_m)
@@ -241,8 +240,8 @@ class SurfaceCorrespondences:
         return np.minimum(distances_m, initial_gate_m(self.body.nodes_m))
 
     def next_gate_m(self, shapes_m: Array, phi: Array) -> float:
-        """Return a narrower gate if the points are near enough to the surface [m], else the
-        present gate.
+        """Return the gate for the next search [m]: narrower if the points are near enough to the
+        surfaces (S, n, 3), else the present one.
         """
         gate_m = max(self._expected_distance_m(shapes_m, phi), self.camera.depth.gate_m)
         return gate_m if gate_m <= NARROWER * self.gate_m else self.gate_m
@@ -281,12 +280,28 @@ def _match_image(
 ) -> dict[str, NDArray]:
     """Find the correspondences of one image.
 
+    Parameters
+    ----------
+    camera : DepthCameraModel
+    surface : VisibleSurface
+    body : Body
+    sample : int
+        Index of the image.
+    x : (n, 3) array
+        Positions of the surface's nodes at the image [m].
+    phi : (k,) array
+        Nuisance parameters.
+    gate_m : float
+        Largest distance of a point from the surface [m].
+    settled : bool
+        Whether the search has nearly converged, so that points hidden behind other parts of the
+        body are left out.
+
     Returns
     -------
     dict of arrays
         Arrays of the points within the gate, by attribute name of `SurfaceCorrespondences`; and
-        "reasons", the
-        numbers of points left out in the order of `EXCLUSION_REASONS`.
+        "reasons", the numbers of points left out in the order of `EXCLUSION_REASONS`.
     """
     depth = camera.depth
     cloud = camera.depth.clouds[sample]

@@ -192,8 +192,8 @@ class PrescribedColumns:
         solution[self.dofs[prescribed]] = self.columns[t, prescribed]
 
     def force(self, sweep: Sweep, step: FactorisedStep) -> Array | float:
-        """Return the contribution (free, c) of the prescribed changes at a time step to F'
-        [N]; 0 if nothing changes.
+        """Return the contribution (free, c) [N] of the prescribed changes at a time step to the
+        changes of the force on the free dofs; 0 if nothing changes.
         """
         now = np.where(self.is_prescribed[step.t, :, None], self.columns[step.t], 0.0)
         # What is only parameters of other kinds does not move them.
@@ -587,8 +587,25 @@ class Sweep:
         rows: list[StencilRow],
         buffers: Sequence[FactorMemory | None] = (),
     ) -> list[Factor]:
-        """Factorise −∂c_t/∂x_t of some rows; dofs that are prescribed for a part of the
-        time get a diagonal entry alone.
+        """Return the factors of −∂c_t/∂x_t of some rows, computed on several threads; dofs that are
+        prescribed for a part of the time have a diagonal entry alone.
+
+        Parameters
+        ----------
+        dynamics : Dynamics
+        linearisation : Linearisation
+            Derivatives of the forces at these rows alone.
+        grid_times : slice
+            Grid times of the rows.
+        rows : list of StencilRow
+            Coefficients of each row.
+        buffers : sequence of FactorMemory or None
+            Memory that the factors reuse, see `Factoriser.factorise_each`.
+
+        Raises
+        ------
+        SimulationError
+            If a matrix is singular.
         """
         pattern = self.pattern
         is_prescribed = dynamics.is_temporarily_prescribed[grid_times]
@@ -635,7 +652,7 @@ class ForwardSubstitution:
     ----------
     solver : Sweep
         Factorised time steps.
-    columns : QuantityTable
+    columns : SweepColumns
         Right-hand sides.
     state : ForwardState, optional
         State after earlier rows; by default there are none.
@@ -733,8 +750,9 @@ class ForwardSubstitution:
                 yield solution
 
     def _residual(self, step: FactorisedStep, acceleration: Array) -> Array:
-        """Return c_t on the free dofs [N]; call it for every row in ascending order,
-        because it stores the forces.
+        """Return c_t on the free dofs (free,) [N], from the acceleration (3n,) of the row.
+
+        It stores the force, which later rows need: call it once for every row, in ascending order.
         """
         solver = self.solver
         row = step.row
@@ -795,7 +813,19 @@ class ForwardSubstitution:
     def _store_grasp_forces(
         self, grasp_forces: GraspForces, step: FactorisedStep, force: Array, solution: Array
     ) -> None:
-        """Store F_t and dF_t of the dofs of instrumented grasps in `grasp_forces`, in place."""
+        """Store the force F_t and its changes on the dofs of instrumented grasps in `grasp_forces`,
+        in place.
+
+        Parameters
+        ----------
+        grasp_forces : GraspForces
+        step : FactorisedStep
+            Row t.
+        force : (3n, c) array
+            Changes of the force at fixed positions.
+        solution : (3n, c) array
+            Changes of x_t.
+        """
         row = step.row
         dofs = self.solver.sensed
         matrix = self.solver.of_sensed
@@ -807,12 +837,14 @@ class ForwardSubstitution:
         )
 
     def _stencil_sum(self, weights: Sequence[float], solution: Array) -> Array:
-        """Return Σ_i weights[i] Y_{t−i} (3n, c): the change of ξ or ν of row t."""
+        """Return Σ_i weights[i] Y_{t−i} (3n, c) with Y_t = `solution`: the change of ξ or ν of row
+        t for the weights p or q.
+        """
         return weights[0] * solution + weighted_sum_of_past(weights, self.past, self.shape)
 
     def _past_force(self, step: FactorisedStep, row: StencilRow) -> Array | float:
-        """Return the force G Σ p_i Y_{t−i} + C Σ q_i Y_{t−i} of earlier rows (free, c),
-        with as few products as possible.
+        """Return the change of force G Σ p_i Y_{t−i} + C Σ q_i Y_{t−i} of earlier rows, i ≥ 1,
+        (free, c) [N], with as few products as possible; 0 if the row has no such lag.
         """
         matrix = self.solver.matrix
         if not row.nonzero_lags:

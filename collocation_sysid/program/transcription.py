@@ -1,13 +1,10 @@
 """Transcription of one experiment: its variables, constraints and their derivatives.
 
 The constraints are the discrete equations of motion of a collocation scheme. Values are scaled:
-variables x / `strain_length_m`, equations of motion c / `force_n`, and constraints of grasped dofs
-(x − u
-x̄) / `strain_length_m`, which prescribe the pose u of the grasp applied to the undeformed position
-x̄.
+variables x / `length_m`, equations of motion c / `force_n`, and constraints of grasped dofs (x − u
+x̄) / `length_m`, which prescribe the pose u of the grasp applied to the undeformed position x̄.
 `Collocation` concatenates the segments of all experiments; use a `Transcription` where one
-experiment is
-treated alone.
+experiment is treated alone.
 
 Symbols: N grid times, n nodes, q shared parameters, φ nuisance parameters of the experiment, z all
 variables and g all constraints of the nonlinear program.
@@ -246,10 +243,11 @@ class Transcription:
         return sensed_dofs(self.experiment)
 
     def with_association(self, association: MarkerAssociation) -> Transcription:
-        """Return the segment with other elements, clock samples and correspondences for its
-        measurements.
+        """Return the transcription with another association: elements, clock samples and
+        correspondences of its measurements.
 
-        Everything that does not depend on the chart is shared with the copy.
+        Everything that does not depend on the association is shared with the copy, also what has
+        been computed.
         """
         other = replace(self, association=association)
         # Nothing but how the markers are read depends on the chart.
@@ -258,7 +256,7 @@ class Transcription:
         return other
 
     def follow_estimates(self, phi: Array, x: Array) -> tuple[MarkerAssociation, Array]:
-        """Update the chart where estimates have left it.
+        """Update the association where estimates have left it.
 
         Markers get the elements that contain their estimated places, clocks the nearest samples,
         and depth cameras the correspondences in the current shapes.
@@ -272,8 +270,8 @@ class Transcription:
 
         Returns
         -------
-        (Chart, (k,) array)
-            The chart, which is the present one if nothing has left it, and φ in the new chart.
+        (MarkerAssociation, (k,) array)
+            The association, which is the present one if nothing has left it, and φ in it.
         """
         nuisance = self.nuisance
         places = self.markers.coordinate_parameters
@@ -304,8 +302,8 @@ class Transcription:
 
         Returns
         -------
-        (Chart, (k,) array)
-            The chart, and φ in it.
+        (MarkerAssociation, (k,) array)
+            The association, and φ in it.
         """
         phi = phi.copy()
         sightings = tuple(depth.aligned_correspondences(x, phi) for depth in self.depths)
@@ -317,7 +315,9 @@ class Transcription:
         return (replace(chart, correspondences=sightings) if sightings else chart), phi
 
     def _place_markers(self, phi: Array, x: Array) -> tuple[MarkerAssociation, Array]:
-        """Return the chart and φ with unknown marker places initialised from rows x (rows, 3n)."""
+        """Return the association and φ (k,) with unknown marker places initialised from rows x
+        (rows, 3n) [m]; unchanged if all places are stated.
+        """
         markers = self.experiment.markers
         rows = self.markers.sample_rows
         if markers.located.all():
@@ -339,8 +339,7 @@ class Transcription:
     @property
     def rows_to_place(self) -> int:
         """Number of rows of x that `place_unknown_markers` needs; 0 if all places are stated and
-        there is
-        no depth camera.
+        there is no depth camera.
         """
         unknown = ~self.experiment.markers.located
         first = self.experiment.markers.is_present[:, unknown].argmax(axis=0)
@@ -358,7 +357,9 @@ class Transcription:
 
     @property
     def guess_phi(self) -> Array:
-        """Nuisance parameters φ (k,) at the centre of the chart."""
+        """Nuisance parameters φ (k,) at the start of a solve: zero, except for the clock and camera
+        poses of the association.
+        """
         phi = np.zeros(self.nuisance.size)
         time_shifts = self.nuisance.indices_of_rows(TIME)
         phi[time_shifts] = (
@@ -371,8 +372,8 @@ class Transcription:
         return self._with_marker_places(phi, self.association.centre_coordinates)
 
     def _with_marker_places(self, phi: Array, place_coordinates: Array) -> Array:
-        """Return φ (k,) with the coordinates `place_coordinates` (M, k') of the estimated marker
-        places replaced.
+        """Return φ (k,) with other coordinates of the estimated marker places, from
+        `place_coordinates` (M, k').
         """
         updated = phi.copy()
         estimated = self.association.estimated
@@ -586,8 +587,8 @@ class Transcription:
         return self.nuisance.with_times(changed, phi)
 
     def with_prescribed_positions(self, x: Array, phi: Array) -> Array:
-        """Return positions x (N, 3n) with the prescribed dofs where φ (k,) puts their
-        grasps [m].
+        """Return positions x (N, 3n) [m] with the prescribed dofs at the positions to which their
+        grasps move at φ (k,).
         """
         goals = self._prescribed_positions(self.prescribed_motion.evaluate_at(phi))
         return np.where(np.isnan(goals), x, goals)
@@ -614,8 +615,9 @@ class Transcription:
     def _scaled_constraints(
         self, x: Array, residual: Array, equations: EquationsAtParameters
     ) -> Array:
-        """Return the scaled constraints at positions x (N, 3n) [m] with the residual (N,
-        3n) of the motion [N].
+        """Return the scaled constraints (constraints,) at positions x (N, 3n) [m] with the residual
+        (N, 3n) of the equations of motion [N]; where a grasp prescribes a dof, the distance from
+        its prescribed position.
         """
         rows = residual / self.force_n
         goals = equations.dynamics.prescribed_m
@@ -637,8 +639,8 @@ class Transcription:
     def residual_n(
         self, x: Array, equations: EquationsAtParameters, histories: Sequence[AnyHistory] = ()
     ) -> Array:
-        """Return the violation of the equations of motion (N, free dofs) [N]; arguments as
-        in `constraint_values`.
+        """Return the residuals of the equations of motion (N, free dofs) [N], zero while a grasp
+        prescribes the dof; arguments as in `constraint_values`.
         """
         residual = equations.dynamics.residual(x, histories)
         return self.dynamics.zero_prescribed_forces(residual)[:, self.free_dofs]
@@ -705,7 +707,7 @@ class Transcription:
         Parameters
         ----------
         multipliers : (constraints,) array
-            Weights of the scaled constraints of this segment.
+            Weights of the scaled constraints of this experiment.
         reaction_weights : (N, 3n) array or 0
             Additional weights of the residuals c [1/N], applied to the complete force balance
             including dofs that are prescribed at that time.
@@ -819,7 +821,16 @@ class Transcription:
         return blocks
 
     def _curvature_terms(self, distance: int, factors: Factors) -> list[BlockTerm]:
-        """Return the terms of the block at a distance in time, from the evaluations k = t + i."""
+        """Return the terms of the Hessian's block between rows at a distance in time, a sum over
+        the evaluations k = t + i.
+
+        Parameters
+        ----------
+        distance : int
+            Difference of the rows' indices.
+        factors : callable
+            Factors of the second derivatives, from the coefficients p and q of both rows.
+        """
         p = self.dynamics.state_weights
         q = self.dynamics.tables.q / self.dynamics.step_s
         terms = []
@@ -912,8 +923,18 @@ class Transcription:
         weights: Array,
         lifted_histories: Sequence[WeightedHistory],
     ) -> SecondDerivatives:
-        """Return the weighted second derivatives of the forces at all N evaluations,
-        including a stated initial state.
+        """Return the weighted second derivatives of the forces at all N evaluations, including a
+        stated initial state.
+
+        Parameters
+        ----------
+        x : (N, 3n) array
+            Positions [m].
+        equations : EquationsAtParameters
+        weights : (N, 3n) array
+            Weights of the forces.
+        lifted_histories : sequence of WeightedHistory
+            Lifted history variables, with weights of their equations.
         """
         dynamics = equations.dynamics
         forces = dynamics.forces

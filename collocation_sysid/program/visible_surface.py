@@ -80,8 +80,8 @@ class VisibleSurface:
 
     @cached_property
     def edges(self) -> tuple[Index, Index]:
-        """Edges (K, 2) between two flat triangles, as indices into `nodes`, and these
-        triangles (K, 2).
+        """Edges (K, 2) between two flat triangles, as indices into `nodes`, and the indices (K, 2)
+        of these triangles; edges with another number of triangles are omitted.
         """
         triangles = self.plane_triangles
         ends = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -141,8 +141,8 @@ class VisibleSurface:
         return weights, np.einsum("pa,pai->pi", weights, corners), tangents
 
     def subdivided_triangles(self, x: Array, divisions: int = 4) -> Array:
-        """Return corners (F·parts², 3, 3) of triangles on a deformed surface, each side of
-        a face divided into `divisions` [m].
+        """Return the corners (F · divisions², 3, 3) [m] of triangles on a surface deformed to x (n,
+        3) [m], with each side of a face divided into `divisions`.
         """
         i, j = np.indices((divisions, divisions)).reshape(2, -1)
         up = i + j < divisions

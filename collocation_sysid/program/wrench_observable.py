@@ -90,7 +90,9 @@ class ReactionGrid:
         return float(self.t_s[-1] - self.t_s[0]) / max(1, len(self.t_s) - 1)
 
     def reaction_times(self, grasp: Grasp) -> Index:
-        """Return the indices of the times at which the reaction forces of a grasp are known."""
+        """Return the indices of the grid times at which the reaction forces of a grasp are known:
+        it must hold at all times on which they depend.
+        """
         is_holding = grasp.is_active(self.t_s)
         rows = self.has_reaction & is_holding
         for lag in range(1, self.reach + 1):
@@ -112,7 +114,7 @@ class GraspWrench:
         Frame of the sensor, see `Wrench`.
     point_m : (3,) array
         Origin of the sensor, see `Wrench` [m].
-    reaction_grid : Table
+    reaction_grid : ReactionGrid
         Times at which reaction forces are known.
     nuisance : NuisanceMap
         Nuisance parameters of the experiment.
@@ -161,7 +163,7 @@ class GraspWrench:
 
     @cached_property
     def t_s(self) -> Array:
-        """Times (n,) [s]."""
+        """Grid times (n,) with a known wrench [s]."""
         return self.reaction_grid.t_s[self.known_rows]
 
     @property
@@ -206,7 +208,7 @@ class GraspWrench:
             Frame of the sensor, see `Wrench`.
         point_m : (3,) array
             Origin of the sensor [m].
-        grid : Table
+        grid : ReactionGrid
             Times at which reaction forces are known.
         nuisance : NuisanceMap
             Nuisance parameters of the experiment.
@@ -271,7 +273,9 @@ class GraspWrench:
         return np.concatenate(u), self.moment_data[:, : len(k)]
 
     def reaction_jacobians(self, reactions: ReactionForces) -> tuple[Array, Array]:
-        """Return A and B (n, 6, d) of the change dW = A dR + B dx of the wrench."""
+        """Return A and B (n, 6, d) of the change dW = A dR + B dx of the wrench without tool, with
+        the d dofs of the grasp.
+        """
         by_u = MOMENT.evaluate_with_jacobian(*self.moment_inputs(reactions))[1]
         by_u = np.transpose(by_u, (2, 0, 3, 1))
         return _by_dof(by_u[..., 3:]), _by_dof(by_u[..., :3])
@@ -298,7 +302,9 @@ class GraspWrench:
         return GeneratedFunction(self._tool_wrench, len(self.tool_parameters), sum(TOOL_DATA))
 
     def _tool_wrench(self, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Expression of the wrench of the tool."""
+        """Expression of the wrench (6,) of the tool in the sensor's axes [N, N m], from its
+        parameters φ and the data of `tool_inputs`.
+        """
         axes, turn, turn_rate, shift, shift_rate = ca.vertsplit(data, np.cumsum([0, *TOOL_DATA]))
         axes, turn, turn_rate = (ca.reshape(each, 3, 3).T for each in (axes, turn, turn_rate))
         count = len(self.tool_parameters) - len(self.nuisance.gravity_indices)
@@ -312,10 +318,11 @@ class GraspWrench:
         return ca.vertcat(axes.T @ pull, axes.T @ ca.cross(turn @ centre + shift, pull))
 
     def tool_inputs(self, phi: Array, count: int) -> tuple[Array, Array]:
-        """Return inputs (k,) and data (33, n) of `tool` at the first `count` times.
+        """Return inputs (k,) and data (33, n) of `tool` at the first `count` times, at φ.
 
-        The data are Q, the rotation of the grasp and its second derivative, the grasp's translation
-        from o, and the second derivative of the translation.
+        The data are the sensor's axes Q, the rotation of the grasp and its second derivative, the
+        translation of the grasp relative to the sensor's origin o, and the second derivative of the
+        translation.
         """
         axes, points = (each[:count] for each in self.frames)
         rotations, shifts = self.poses_at(self.known_rows[:count])
@@ -339,7 +346,9 @@ class GraspWrench:
         return rotation_rates, translation_rates
 
     def evaluate_unfiltered(self, reactions: ReactionForces, phi: Array) -> Array:
-        """Return the wrench W (n, 6) including the tool, before the low-pass [N, N m]."""
+        """Return the wrench W (n, 6) [N, N m] of reaction forces at φ including the tool, before
+        the low-pass.
+        """
         value = self.evaluate_without_tool(reactions)
         if len(self.tool_parameters):
             value = value + self.tool.evaluate(*self.tool_inputs(phi, len(value))).T
@@ -353,8 +362,8 @@ class GraspWrench:
         return self.parameter_indices(SENSOR_LAG)
 
     def filter_wrench(self, value: Array, phi: Array) -> RecursionTrajectory | None:
-        """Return the low-pass of W (n, 6) as an evolution; None without a low-pass or
-        without times.
+        """Return the low-pass filtered W (n, 6) as a recursion with derivatives; None without a
+        low-pass or without times.
         """
         if not len(self.low_pass_parameters) or not len(value):
             return None
@@ -372,7 +381,9 @@ class GraspWrench:
     # As channels are --------------------------------------------------------------------------
 
     def evaluate(self, motion: ObservedMotion, phi: Array) -> Array:
-        """Return Y = L W (n, 2, 3) [N, N m]."""
+        """Return the measured wrench Y = L W (n, 2, 3) [N, N m] of a motion at φ: force and torque,
+        with the low-pass L if there is one.
+        """
         value = self.evaluate_unfiltered(motion.reactions, phi)
         evolution = self.filter_wrench(value, phi)
         return (evolution.states[0] if evolution else value).reshape(-1, 2, 3)
@@ -384,7 +395,7 @@ class GraspWrench:
 
         Parameters
         ----------
-        motion : ModesCheck
+        motion : ObservedMotion
             Motion whose reaction forces have changes `reaction_by` and `position_by` with c
             columns.
         phi : (k,) array
@@ -419,7 +430,9 @@ class GraspWrench:
         )
 
     def vjp(self, motion: ObservedMotion, phi: Array, by_values: Array) -> VectorJacobianProduct:
-        """Vector–Jacobian product: derivatives of a scalar from those by Y (n, 2, 3)."""
+        """Vector–Jacobian product at a motion and φ: the derivatives of a scalar by positions,
+        reaction forces and φ, from those by Y (n, 2, 3).
+        """
         forced = motion.reactions
         by_phi = np.zeros(len(phi))
         by_x = np.zeros_like(motion.x)
@@ -451,7 +464,7 @@ class GraspWrench:
         grasp : Grasp
             Grasp whose poses have errors; the result is 0 for another grasp, or a frame fixed in
             the world.
-        motion : ModesCheck
+        motion : ObservedMotion
             Motion with its reaction forces.
         phi : (k,) array
             Nuisance parameters.
@@ -494,7 +507,15 @@ def _moment(u: ca.SX, data: ca.SX) -> ca.SX:
 
 
 def _in_moved_frame(offset: ca.SX, data: ca.SX) -> ca.SX:
-    """Expression of a wrench (6,) in a frame that is rotated and translated."""
+    """Expression of a wrench (6,) in a frame that is rotated and translated by an offset.
+
+    Parameters
+    ----------
+    offset : (6,) SX
+        Rotation vector [rad] and translation [m].
+    data : (18,) SX
+        Axes, force, torque and reference point.
+    """
     turn, shift = ca.vertsplit(offset, 3)
     axes, force, torque, point = ca.vertsplit(data, [0, 9, 12, 15, 18])
     axes = ca.reshape(axes, 3, 3).T
@@ -510,8 +531,18 @@ def _by_dof(by_node: Array) -> Array:
 
 
 def _low_pass_step(before: ca.SX, now: ca.SX, last: ca.SX, lag: ca.SX, data: ca.SX) -> ca.SX:
-    """One step of Y' = (W − Y) / T, with W linear between grid times and constant before
-    the first.
+    """One step of Y' = (W − Y) / T, with W linear between grid times and constant before the first.
+
+    Parameters
+    ----------
+    before : (6,) SX
+        Previous Y.
+    now, last : (6,) SX
+        Present and previous W.
+    lag : SX
+        T in units of its prior standard deviation.
+    data : (2,) SX
+        One at the first time, else zero; and that unit in time steps.
     """
     began = data[0]
     share = lag * data[1]

@@ -2,9 +2,9 @@
 
     ŷ(s) = Σ_k ℓ_k(s + τ) Y_k + tare,
 
-where Y is the wrench on the grid (`wrench_channel`), τ the shift of the sensor's clock, and ℓ are
-the cubic weights of the four grid times around the sample. Each sample is compared at its own time,
-however many there are in a step, so that no averaging hides a motion.
+where Y is the wrench on the grid (`wrench_observable`), τ the shift of the sensor's clock, and ℓ
+are the cubic weights of the four grid times around the sample. Each sample is compared at its own
+time, however many there are in a step, so that no averaging hides a motion.
 """
 
 from __future__ import annotations
@@ -114,8 +114,8 @@ class WrenchResidual(MeasurementResidual):
         return min(2 if self.observable.reaction_grid.is_static else NEIGHBOURS, known)
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
-        """Return the stencil of all samples: the grid times around each, and their
-        distances from it.
+        """Return the stencil of all samples: the grid times around each, among the first `known`,
+        shifted by the clock of φ, and their distances from it.
         """
         clock = self.observable.parameter_indices(SENSOR_TIME)
         used = self._neighbour_count(known)
@@ -133,8 +133,16 @@ class WrenchResidual(MeasurementResidual):
         )
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the prediction (6,) from wrenches at neighbouring grid times, the shift of
-        the clock and the tare.
+        """Return the prediction (6,).
+
+        Parameters
+        ----------
+        values : (3, 2 · times) SX
+            Wrenches at neighbouring grid times [N, N m].
+        phi : SX
+            Shift of the clock, if estimated, and tare, in prior standard deviations.
+        data : (times,) SX
+            Distances of these times from the sample [s].
         """
         times = data.numel()
         tared = np.flatnonzero(self.wrench.measured_components)
@@ -177,8 +185,8 @@ class WrenchResidual(MeasurementResidual):
 
 
 def _is_covered(observable: GraspWrench, t_s: Array, known: int) -> NDArray[np.bool_]:
-    """Return the mask (S,) of the samples within the first `known` grid times for any shift
-    of the clock.
+    """Return the mask (S,) of the samples at times (S,) that lie within the first `known` grid
+    times for any admissible shift of the clock; all false if none are known.
     """
     if not known:
         return np.zeros(len(t_s), dtype=bool)
@@ -202,7 +210,7 @@ def wrench_residuals(
     ----------
     experiment : Experiment
         The experiment.
-    grid : Table
+    grid : ReactionGrid
         Times at which reaction forces are known.
     nuisance : NuisanceMap
         Nuisance parameters of the experiment.

@@ -12,6 +12,7 @@ measured reaction forces.
 - `custom_sensor`: custom sensors.
 - `nuisance`: unknowns of a single recording, with their priors.
 - `environment`: the density of the air.
+- `specimen`, `specimen_stretches`, `homogeneous_deformation`: material tests without a mesh.
 
 Files are read by `marker_files` (markers), `pose_files` (poses), `time_tables` (forces,
 displacements, pressures, custom sensors) and the subpackage `formats`; `recording_writers` writes
@@ -58,6 +59,7 @@ from .recording_writers import write_wrench_csv as write_wrench_csv
 from .rigid_fit import align_to_template as align_to_template
 from .rigid_fit import fit_poses as fit_poses
 from .sample_times import sample_interval_s as sample_interval_s
+from .specimen import Specimen as Specimen
 from .tendon import Tendon as Tendon
 from .time_tables import displaced_axes as displaced_axes
 from .time_tables import read_displacement as read_displacement

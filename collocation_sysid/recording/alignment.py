@@ -123,13 +123,22 @@ def _cut_to_poses(
     grasp_intervals_s: Sequence[tuple[float, float]],
     fewest: int,
 ) -> tuple[MarkerTable, list[str]]:
-    """Return the markers at times for which every grasp that holds has a pose, and notes on the
-    cuts.
+    """Return the markers at times for which every active grasp has a pose, and notes on the cuts.
+
+    Parameters
+    ----------
+    table : MarkerTable
+    poses : sequence of PoseSequence
+        Poses of each grasp; a single pose holds for all time.
+    grasp_intervals_s : sequence of (float, float)
+        Time window of each grasp [s].
+    fewest : int
+        Smallest number of samples that must remain.
 
     Raises
     ------
     InputError
-        If fewer than `fewest` samples remain.
+        If fewer samples remain.
     """
     t_s = table.t_s
     is_inside = np.ones(len(t_s), dtype=bool)
@@ -186,7 +195,13 @@ def _cut_to_window(table: MarkerTable, window_s: tuple[float, float]) -> MarkerT
 
 
 def _even_grid(t_s: Array, rate_hz: float) -> Array:
-    """Return evenly spaced times at a rate [Hz] from the first time on, within the given times."""
+    """Return evenly spaced times at a rate [Hz] from the first time on, up to the last of `t_s`.
+
+    Raises
+    ------
+    InputError
+        If the rate is not positive, or leaves fewer than two times.
+    """
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise InputError(f"resample_hz is {rate_hz:g}; expected a rate above 0")
     count = int(np.floor((t_s[-1] - t_s[0]) * rate_hz + _SAME_TIME_STEPS)) + 1
@@ -199,8 +214,8 @@ def _even_grid(t_s: Array, rate_hz: float) -> Array:
 
 
 def _interpolate_markers(table: MarkerTable, grid: Array) -> Array:
-    """Return marker positions on the grid; NaN beside a missing sample or within a gap of the
-    times.
+    """Return marker positions (G, M, 3) [m] at the times `grid` (G,), linear between samples; NaN
+    beside a missing sample or within a gap of the times.
     """
     t_s = table.t_s
     x = table.positions_m
@@ -259,7 +274,9 @@ def _tolerance_s(poses: PoseSequence, t_s: Array) -> float:
 
 
 def _interpolation_note(poses: PoseSequence, grid: Array) -> str:
-    """Return a note on poses that were interpolated to the grid, without its subject."""
+    """Return the predicate of a note on poses that were interpolated to the times `grid` (G,), and
+    on gaps of the poses; the caller adds the subject.
+    """
     how = "held" if poses.interpolation == "hold" else f"interpolated ({poses.interpolation})"
     at = f"{_rate_hz(grid):.6g} Hz {_span_text(grid)}" if len(grid) > 1 else _span_text(grid)
     note = f", recorded at {_rate_hz(poses.t_s):.6g} Hz, were {how} at the markers' times, {at}"
@@ -276,8 +293,8 @@ def _interpolation_note(poses: PoseSequence, grid: Array) -> str:
 
 
 def _jump_notes(poses: PoseSequence, grid: Array) -> list[str]:
-    """Return a note on jumps of smooth poses within the grid, without its subject; empty if
-    none.
+    """Return the predicate of a note on jumps of smoothly interpolated poses between the first and
+    last time of `grid` (G,), as a list; empty if there are none.
     """
     if poses.interpolation != "smooth":
         return []

@@ -46,15 +46,30 @@ def read_only_floats(
 def float_converter(
     shape: tuple[int | None, ...], name: str, finite: bool = True
 ) -> Callable[[ArrayLike], Array]:
-    """Return a converter of field values that applies `read_only_floats` with these arguments."""
+    """Return a function that copies values to a read-only array; arguments and errors are those of
+    `read_only_floats`.
+    """
     return lambda values: read_only_floats(values, shape, name, finite)
 
 
 def read_only_tracks(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
-    """Return a read-only copy of marker positions (T, M, 3) whose shape has been checked.
+    """Return a read-only copy of marker positions (T, M, 3).
 
     A sample with a coordinate that is not finite is missing: all three of its coordinates become
     NaN.
+
+    Parameters
+    ----------
+    values : array_like
+    shape : tuple of int or None
+        Expected shape; None allows any length.
+    name : str
+        Name of the positions, for messages.
+
+    Raises
+    ------
+    InputError
+        If the values are not numbers, or the shape differs.
     """
     tracks = read_only_floats(values, shape, name, finite=False)
     is_complete = np.isfinite(tracks).all(axis=2, keepdims=True)

@@ -132,7 +132,19 @@ class Gauge:
         vars(self).update(values=self._checked_values(count), columns=tuple(self.columns or names))
 
     def _checked_values(self, count: int) -> Array:
-        """Return the values (S, m), zeros if none were given; `count` is m by the expression."""
+        """Return the measured values as a read-only array (S, m); zeros if none were given. NaN
+        marks missing values.
+
+        Parameters
+        ----------
+        count : int
+            Number m of values that the expression gives.
+
+        Raises
+        ------
+        InputError
+            If the values do not have S rows and m columns, or are infinite or all missing.
+        """
         where = f"the reading '{self.name}'"
         samples = len(self.sample_times_s)
         if self.values is None:
@@ -197,8 +209,10 @@ class Gauge:
         return ca.vec(ca.SX(ca.vertcat(*read) if isinstance(read, (list, tuple)) else read))
 
     def _count_of_values(self) -> int:
-        """Return the number m of values of the expression, after evaluating it and its Jacobian at
-        rest.
+        """Evaluate the expression and its Jacobian at rest, and return the number m of its values.
+
+        Rest means the undeformed places of the points without velocity, or force and torque of one
+        each.
 
         Raises
         ------

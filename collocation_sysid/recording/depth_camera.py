@@ -99,7 +99,7 @@ class DepthCamera:
 
     def pose_at(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """Return rotations (S, 3, 3) and translations (S, 3) [m] from the camera's frame to the
-        world.
+        world at times (S,) [s]; the same for all times if the camera does not move.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         rotation = self.pose[:3, :3]
@@ -284,10 +284,24 @@ class Depth:
         t_s: ArrayLike = (0.0,),
         **options: Any,
     ) -> Depth:
-        """Return the measurements of depth images (S, rows, columns) or (rows, columns), see
-        `points_from_image`.
+        """Return the measurements of depth images [m] (S, rows, columns), or (rows, columns) for
+        one.
 
-        At most `MOST_OUTLINED` of the images are stored, for the outlines of the body.
+        Pixels become points by `points_from_image`. At most `MOST_OUTLINE_IMAGES` of the images are
+        stored, for the outlines of the body.
+
+        Parameters
+        ----------
+        name : str
+        images_m : array_like
+        camera : DepthCamera
+            Camera with a matrix.
+        sigma_m : float
+            Standard deviation of the depth [m].
+        t_s : (S,) array_like
+            Times [s].
+        **options
+            Further fields of `Depth`.
         """
         images = np.asarray(images_m, dtype=float)
         images = images[None] if images.ndim == 2 else images
@@ -300,7 +314,12 @@ class Depth:
         """Return the finite points of a cloud (P, 3) or (P, 6), one for each cube of a grid of
         `spacing_m`.
 
-        Of the points in a cube the one nearest to its centre across the optical axis is kept.
+        Of the points in a cube the one nearest to its centre across the optical axis is selected.
+
+        Raises
+        ------
+        InputError
+            For another shape.
         """
         if cloud.ndim != 2 or cloud.shape[1] not in (3, 6):
             raise InputError(
@@ -347,9 +366,8 @@ class Depth:
 
 
 def samples_with_outlines(count: int) -> set[int]:
-    """Return the indices of the samples, of `count`, whose images are stored for their outlines.
-
-    At most `MOST_OUTLINED`, evenly spread.
+    """Return the indices of those of `count` samples whose images are stored for their outlines: at
+    most `MOST_OUTLINE_IMAGES`, evenly spread.
     """
     return set(
         np.unique(np.linspace(0, count - 1, min(count, MOST_OUTLINE_IMAGES)).astype(int)).tolist()

@@ -21,6 +21,7 @@ from .custom_sensor import Gauge
 from .depth_camera import Depth
 from .environment import air_density, usual_air_density
 from .grasp import Grasp, free_rigid_motions, prescribed_dofs
+from .homogeneous_deformation import HomogeneousDeformation
 from .loads import Force, LoadTime, PointMass, smooth_ramp
 from .markers import Markers
 from .measured_wrench import Wrench
@@ -90,7 +91,7 @@ class Experiment:
     tendons : sequence of Tendon
         Tendons in the body.
     pressures : sequence of Pressure
-        Pressures in cavities, or on patches with a held rim.
+        Pressures in cavities, or on patches whose rim is held.
     readings : sequence of Gauge
         Custom sensors.
     depths : sequence of Depth
@@ -101,6 +102,9 @@ class Experiment:
     nuisance : Nuisance
         Standard deviations of the unknowns of this recording alone, which are estimated too: by
         default those of a careful laboratory; `Nuisance.none` for ideal data.
+    specimen : HomogeneousDeformation, optional
+        Homogeneous deformation of a material test without a mesh, see `Specimen`; None for a body
+        with a mesh.
 
     Raises
     ------
@@ -132,6 +136,7 @@ class Experiment:
     depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=())
     nuisance: Nuisance = DEFAULT_NUISANCE
     air_density_kg_m3: float = key(converter=air_density, default_factory=usual_air_density)
+    specimen: HomogeneousDeformation | None = None
 
     def __post_init__(self) -> None:
         loads = ("masses", "forces", "tendons", "pressures")
@@ -225,8 +230,7 @@ class Experiment:
     @cached_property
     def free_dofs(self) -> Index:
         """Sorted dofs that are not in `prescribed_dofs`; grasps with a time window may hold some of
-        them
-        for a while.
+        them for a while.
         """
         return np.setdiff1d(np.arange(self.body.nodes_m.size), self.prescribed_dofs)
 
@@ -235,8 +239,8 @@ class Experiment:
 
         Returns
         -------
-        held : (T, n, 3) bool
-            Whether the coordinate is prescribed.
+        is_prescribed : (T, n, 3) bool
+            Whether a grasp prescribes the coordinate.
         positions_m : (T, n, 3)
             Prescribed coordinates [m]; NaN where a coordinate is free.
         """
@@ -263,9 +267,8 @@ class Experiment:
         return is_prescribed
 
     def prescribed_positions(self, t_s: ArrayLike) -> Array:
-        """Return the prescribed coordinates of `prescribed_dofs` at the times `t_s` (T,), as (T,
-        held)
-        [m].
+        """Return the coordinates of `prescribed_dofs` (g,) at the times `t_s` (T,), (T, g) [m]; NaN
+        at times at which a dof is free.
         """
         positions = self.prescribed_displacements(t_s)[1]
         return positions.reshape(len(positions), -1)[:, self.prescribed_dofs]
@@ -291,8 +294,7 @@ class Experiment:
 
         In a motion the share rises, or falls, from one sample before to one sample after `from_s`
         or `until_s`, see `loads.smooth_ramp`; a load that joins at or before the first sample acts
-        fully
-        from the start. In a static experiment the share jumps at these times.
+        fully from the start. In a static experiment the share jumps at these times.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         first_share, last_share = (
@@ -301,8 +303,8 @@ class Experiment:
         return first_share - last_share
 
     def _share_since(self, load: PointMass | Force, change: LoadTime, times: Array) -> Array:
-        """Return the share (T,) of a load that has joined (or left, by `change`) at the given
-        times.
+        """Return the share (T,), from 0 to 1, of a load whose time `change` ("from_s" or "until_s")
+        has passed at the given times, see `share`.
         """
         at_s = getattr(load, change)
         if self.is_static:
@@ -312,12 +314,16 @@ class Experiment:
         return np.full(len(times), float(at_s <= self.t_s[0]))
 
     def changes_within(self, load: PointMass | Force, change: LoadTime) -> bool:
-        """Return whether a load joins (or leaves, by `change`) within a motion; false if static."""
+        """Return whether the time `change` ("from_s" or "until_s") of a load is after the first and
+        before the last sample of a motion; false if the experiment is static.
+        """
         within = self.t_s[0] < getattr(load, change) < self.t_s[-1]
         return bool(within) and not self.is_static
 
     def declared_node_forces_n(self, t_s: ArrayLike) -> Array:
-        """Return the forces besides gravity on each node at times `t_s` (T,), as (T, n, 3) [N]."""
+        """Return the stated forces on each node, without gravity and actuators, at times `t_s`
+        (T,), as (T, n, 3) [N].
+        """
         n = len(self.body.nodes_m)
         times = np.atleast_1d(t_s)
         total = np.broadcast_to(np.zeros(3), (len(times), n, 3))
@@ -385,7 +391,7 @@ class Experiment:
 
     @property
     def upward_direction(self) -> Array:
-        """(3,) unit vector against gravity; the z axis if there is no gravity."""
+        """Unit vector (3,) against gravity; the z axis if there is no gravity."""
         pull = np.linalg.norm(self.gravity_m_s2)
         return -self.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0])
 
@@ -402,17 +408,16 @@ class Experiment:
         return poses.at(times)
 
     def _undeformed_places(self, points_m: Array, t_s: Array) -> Array:
-        """Return the undeformed places (M, 3) of points (M, 3) seen at `t_s` (M,) if the body moved
-        rigidly.
+        """Return the places (M, 3) on the undeformed body of points (M, 3) [m], the mth measured at
+        the time `t_s[m]`, if the body moved rigidly as in `rigid_positions`.
         """
         rotations, translations = self.rigid_motion(t_s)
         return np.einsum("mji,mj->mi", rotations, points_m - translations)
 
     @property
     def place_sigma_m(self) -> Array:
-        """(M,) prior standard deviation of each marker's place [m]; zero where the place is exact.
-
-        The diagonal of the body where no place is given.
+        """Prior standard deviation (M,) of each marker's place [m]; zero where the place is exact,
+        the diagonal of the body where no place is given.
         """
         markers = self.markers
         usual = self.nuisance.marker_offset_m or 0.0
@@ -572,7 +577,7 @@ class Experiment:
 
     def _append_obstacle_frames(self, node_count: int) -> None:
         """Append positions and velocities of the obstacles' frames to a given start state without
-        them.
+        them, in place; a state that has them is unchanged.
 
         Parameters
         ----------

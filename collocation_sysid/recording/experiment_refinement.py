@@ -47,8 +47,8 @@ def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
 
 
 def _interpolated(state: Array | None, body: Body, finer: Body) -> Array | None:
-    """Interpolate nodal vectors (n, 3) to the nodes of the finer body by the shape functions; None
-    stays.
+    """Return nodal vectors (n, 3) of a body, interpolated to the nodes (n', 3) of the finer body by
+    the shape functions; None for None.
     """
     if state is None:
         return None

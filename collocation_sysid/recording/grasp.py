@@ -45,20 +45,21 @@ class Grasp:
     poses : PoseSequence or (T, 4, 4) array
         Rigid motion that carries the nodes.
     from_s : float
-        First time at which it holds; from the start by default.
+        First time [s] of the grasp or contact; the start of the recording by default.
     until_s : float
-        Last time at which it holds; if this is the first sample time, the body is released from its
-        equilibrium in this grasp. To the end by default.
+        Last time [s] of the grasp or contact; the end of the recording by default. If a grasp ends
+        at the first sample, the body is released from its equilibrium in this grasp.
     sigma_m : float, optional
-        Standard deviation of the noise in each position of the poses; estimated from their
-        roughness where it is not given.
+        Standard deviation of the noise in each position of the poses [m]; estimated from their
+        roughness by default.
     sigma_rad : float, optional
-        Standard deviation of the noise in each rotation, about each axis [rad]; likewise.
+        Standard deviation of the noise in each rotation, about each axis [rad]; estimated from the
+        roughness of the poses by default.
     selection : Selection, optional
         The selection that the nodes come from; None for node numbers. On a finer mesh it is
         evaluated again.
     axes : str
-        Axes of the world along which it holds; the nodes slide along the others.
+        Axes of the world along which the nodes are prescribed; they slide along the others.
     zero : str
         Axes along which the zero of the poses is uncertain, as that of a test bench's crosshead,
         with the standard deviation in the experiment's `nuisance`; none by default.
@@ -81,8 +82,13 @@ class Grasp:
         self._check_times_and_axes()
 
     def _check_times_and_axes(self) -> None:
-        """Check the times and the axes of the zero, and store a selection of nodes in
-        `selection_from_section`.
+        """Check the time window and the uncertain axes, in place: `zero` loses the axes that the
+        grasp does not hold, and nodes given as a selection are stored as `selection`, too.
+
+        Raises
+        ------
+        InputError
+            If `from_s` is after `until_s`, or `zero` is not a combination of axes.
         """
         if not self.from_s <= self.until_s:
             raise InputError(
@@ -103,8 +109,8 @@ class Grasp:
         return self._with_nodes(select_on_body(self.nodes, body), t_s)
 
     def _with_nodes(self, nodes: Index, t_s: Array) -> Self:
-        """Return the grasp with these nodes, and matrices as poses at `t_s`; itself if nothing
-        changes.
+        """Return the grasp with other nodes; poses that are matrices (T, 4, 4) become a
+        `PoseSequence` at the times `t_s` (T,). Return self if nothing changes.
         """
         poses = self.poses
         if not isinstance(poses, PoseSequence):
@@ -123,7 +129,9 @@ class Grasp:
         return (3 * self.nodes[:, None] + self.axis_indices).ravel()
 
     def is_active(self, t_s: ArrayLike) -> NDArray[np.bool_]:
-        """Return whether the nodes are held at the times `t_s` (T,), as (T,) bool."""
+        """Return whether the nodes are held at the times `t_s` (T,), as (T,) bool: from `from_s` to
+        `until_s`, both included.
+        """
         times = np.asarray(t_s, dtype=np.float64)
         return (times >= self.from_s - TIME_TOLERANCE_S) & (
             times <= self.until_s + TIME_TOLERANCE_S
@@ -212,8 +220,8 @@ def _null_space(matrix: Array) -> Array:
 
 
 def _axis_aligned_basis(vectors: Array) -> Iterator[Array]:
-    """Yield an orthonormal basis of the span of vectors (k, 3), along coordinate axes where
-    possible.
+    """Yield the unit vectors (3,) of an orthonormal basis of the span of vectors (k, 3), along
+    coordinate axes where possible.
     """
     _, values, directions = np.linalg.svd(vectors.reshape(-1, 3), full_matrices=False)
     space = directions[values > SMALLEST_SINGULAR_VALUE]

@@ -64,7 +64,9 @@ class TimeSeries:
         vars(self).update(values=rows, t_s=t_s)
 
     def values_at(self, t_s: ArrayLike) -> Array:
-        """Return scalar values (T,) at the times (T,); the end values outside the samples."""
+        """Return scalar values (T,) at the times (T,) [s], linear between samples; outside the
+        samples the value of the first or last one. The values must be scalars.
+        """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         if self.t_s is None:
             return np.full(len(times), self.values[0])
@@ -92,12 +94,11 @@ class TimeSeries:
 
 
 def smooth_ramp(time_steps: Any) -> Any:
-    """Return a smooth ramp from 0 at u ≤ −1 to 1 at u ≥ 1, with a continuous derivative.
+    """Return a smooth ramp from 0 at u ≤ −1 to 1 at u ≥ 1, with a continuous derivative, for u =
+    `time_steps`: an array or a CasADi expression.
 
     The derivative is a hat function, so that the sum over an even grid with unit spacing is the
-    remaining length after u = 0, wherever u = 0 lies between grid points. `time_steps` is an array
-    or a
-    CasADi expression.
+    remaining length after u = 0, wherever u = 0 lies between grid points.
     """
     return (abs(time_steps) < 1) * (0.5 + time_steps - 0.5 * time_steps * abs(time_steps)) + (
         time_steps >= 1
@@ -137,12 +138,14 @@ class PointMass(Load):
     Parameters
     ----------
     nodes : (k,) int array or Selection
-        Nodes that carry it in equal parts, selected as in a grasp.
+        Nodes that carry the mass in equal parts, selected as in a grasp.
     mass_kg : float
     from_s : float
-        When it joins the body, with the uncertainty nuisance.joining; always there by default.
+        Time at which the mass joins the body [s], with the uncertainty nuisance.joining; before the
+        recording by default.
     until_s : float
-        When it leaves the body, likewise.
+        Time at which the mass leaves the body [s], with the same uncertainty; after the recording
+        by default.
     selection : Selection, optional
         The selection that the nodes come from; None for node numbers. On a finer mesh it is
         evaluated again.
@@ -179,7 +182,7 @@ class Force(Load):
     Parameters
     ----------
     nodes : (k,) int array or Selection
-        Nodes that it acts on in equal parts, selected as in a grasp.
+        Nodes on which the force acts in equal parts, selected as in a grasp.
     force_n : (3,) or (m, 3) array
         Constant force [x, y, z].
     t_s : (m,) array, optional
@@ -188,9 +191,10 @@ class Force(Load):
         The selection that the nodes come from; None for node numbers. On a finer mesh it is
         evaluated again.
     from_s : float
-        When it begins to act, with the uncertainty nuisance.joining; always by default.
+        Time at which the force begins [s], with the uncertainty nuisance.joining; before the
+        recording by default.
     until_s : float
-        When it ends, likewise.
+        Time at which the force ends [s], with the same uncertainty; after the recording by default.
     """
 
     nodes: Index = key(Nodes, converter=node_converter("the force"), read=selection_from_section)
@@ -208,8 +212,10 @@ class Force(Load):
         vars(self).update(force_n=course.values, t_s=course.t_s)
 
     def node_forces_n(self, t_s: ArrayLike, node_count: int) -> Array:
-        """Return the force on each node at the times `t_s` (T,), (T, n, 3) [N], without its time
-        window.
+        """Return the force on each node at the times `t_s` (T,), (T, n, 3) [N], distributed equally
+        over its nodes; zero outside the samples of a force that varies.
+
+        The window from `from_s` to `until_s` is not applied, see `Experiment.share`.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=float))
         total = np.repeat(self.force_n[:1], len(times), axis=0)

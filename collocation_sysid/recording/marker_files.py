@@ -107,7 +107,14 @@ def read_markers(
 
 
 def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
-    """Read the markers that `choose` picks from a file of any known format."""
+    """Return the tracks of the markers that `choose` selects from a file of any known format;
+    `choose` returns their indices from the labels.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is of no known format.
+    """
     content = read_bytes(path)
     if c3d.is_c3d(content):
         return c3d.read(path, content, choose)
@@ -120,10 +127,13 @@ def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
 def _label_chooser(names: Sequence[str] | None, renamed: Mapping[str, str]) -> LabelChooser:
     """Return the function that picks the requested markers from the labels in a file.
 
+    It raises an `InputError` if labels or names repeat, if a label of `renamed` or a name is not
+    there, or if nothing is chosen.
+
     Parameters
     ----------
     names : sequence of str or None
-        Names after renaming; None for all.
+        Names after renaming, in the order of the result; None for all but the excluded labels.
     renamed : mapping of str to str
         From labels in the file to names.
     """
@@ -170,8 +180,13 @@ def _require_one_of(name: str, known: Sequence[str], what: str) -> None:
 
 
 def _length_unit(raw: RawTracks, length_unit: str | None) -> str:
-    """Return the unit of length by the file or by the user; an `InputError` if they differ or both
-    lack.
+    """Return the unit of length by the file or by the user, `length_unit`, else the default of the
+    format.
+
+    Raises
+    ------
+    InputError
+        If both differ, or none states a unit.
     """
     if length_unit and raw.unit and length_unit != raw.unit:
         raise InputError(
@@ -188,7 +203,14 @@ def _length_unit(raw: RawTracks, length_unit: str | None) -> str:
 
 
 def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
-    """Return the times (T,) of the frames [s]: as in the file, else from the frame rate."""
+    """Return the times (T,) of the frames [s]: as in the file, else from the frame rate of the file
+    or the user, `rate_hz`.
+
+    Raises
+    ------
+    InputError
+        If neither times nor a rate are known, or a rate disagrees with the times or with the other.
+    """
     t_s = raw.t_s
     rates = {raw.rate_key: raw.rate_hz, "rate_hz": rate_hz}
     declared_rates = {key: rate for key, rate in rates.items() if rate}

@@ -33,7 +33,7 @@ _PLACES = Key(
     "places",
     Literal["free", "surface"],
     lambda word: word == "surface",
-    description="Whether estimated positions may be anywhere, or stay on the surface.",
+    description="Estimated positions on the undeformed body: anywhere in it, or on its surface.",
     default="free",
 )
 
@@ -57,16 +57,18 @@ class Markers:
         NaN where a place is not known: the estimate then starts from the first sample, with a prior
         as wide as the body. The same holds for all markers without places and placement.
     placement : Placement, optional
-        Weights of the nodes, one row per marker, in place of `marker_places_m`.
+        Weights of the nodes, one row per marker, in place of `places_m`.
     places_sigma_m : (M,) array or float, optional
         Standard deviation of the given places, zero for exact ones; that of the experiment's
         nuisance by default.
     on_surface : bool
         Whether estimated places stay on the surface: two coordinates in place of three.
     located : (M,) bool array, optional
-        Whether a place is given; derived from `marker_places_m` by default.
+        Whether a place is given; derived from `places_m` by default.
     attach : {"auto", "vertex", "embedded"}
-        See `place_markers`.
+        Nodes that carry a marker. "vertex": the nearest node. "embedded": the nodes of the
+        tetrahedron that contains the marker or is nearest to it. "auto": the nearest node if it
+        lies within 5 % of the mean edge length, otherwise "embedded".
     max_distance_m : float, optional
         Largest distance of a marker from the body; the mean edge length by default.
 
@@ -109,7 +111,14 @@ class Markers:
         self._check_places(m)
 
     def _check_places(self, m: int) -> None:
-        """Check the places of the m markers and store them with `located`."""
+        """Check the places of the m markers, and store them in place: without a placement
+        `places_m` (m, 3), NaN where unknown, and `located` (m,); `places_sigma_m` as an array (m,).
+
+        Raises
+        ------
+        InputError
+            If both places and a placement are given, or their number is not m.
+        """
         places_m = self.places_m
         placement = self.placement
         known = self.located
@@ -195,8 +204,8 @@ class Markers:
 
     @cached_property
     def first_samples(self) -> tuple[Array, Array]:
-        """First present sample of every marker (M, 3) [m], NaN if there is none, and its time (M,)
-        [s].
+        """Return the first present sample (M, 3) of every marker [m], NaN if there is none, and its
+        time (M,) [s].
         """
         rows = self.is_present.argmax(axis=0)
         return self.positions_m[rows, np.arange(len(self.names))], self.t_s[rows]

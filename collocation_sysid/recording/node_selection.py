@@ -64,7 +64,7 @@ KINDS: dict[str, Any] = {
 
 
 def selection_from_section(section: NodesSection | str) -> Selection:
-    """Return the selection that a table states, or that a text names."""
+    """Return the selection that a table in the problem file states; a text names a point array."""
     if isinstance(section, str):
         return Named(section)
     ((kind, value),) = ((KINDS[key], value) for key, value in section if value is not None)

@@ -1,6 +1,6 @@
 """Nuisance parameters: unknowns of a single recording, which are estimated with a prior.
 
-`ROWS` declares each kind once: the fields of `Nuisance`, the keys of the problem file, limits,
+`KINDS` declares each kind once: the fields of `Nuisance`, the keys of the problem file, limits,
 tables and texts follow from it.
 """
 
@@ -58,8 +58,7 @@ class NuisanceRow:
     """A kind of nuisance parameter of a recording; its values have normal priors with mean zero.
 
     A recording has one value for each component (marker, grasp, …) and axis. Custom kinds state
-    what they do to a marker's predicted position (`reading`) or to its time (`clock_hypothesis`),
-    and go into
+    what they do to a marker's predicted position (`reading`) or to its time (`clock`), and go into
     `Nuisance(own=[…])`.
 
     Attributes
@@ -157,9 +156,10 @@ class NuisanceRow:
 
 
 def cayley_rotation(rotation_vector: ca.SX) -> ca.SX:
-    """Return the rotation matrix (3, 3) of Cayley parameters turn / 2, a rational function.
+    """Return the rotation matrix (3, 3) with the Cayley parameters `rotation_vector` / 2, a
+    rational function.
 
-    Its angle is that of the rotation vector `rotation_vector` (3,) [rad] up to third order.
+    Its angle is that of the rotation vector (3,) [rad] up to third order.
     """
     half = ca.skew(rotation_vector / 2)
     return ca.SX.eye(3) + 2 / (1 + ca.sumsqr(rotation_vector) / 4) * (half + half @ half)
@@ -174,7 +174,9 @@ def in_readable_unit(value: float, unit: str) -> tuple[float, str]:
 
 
 def _rotate_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
-    """Rotate a marker's predicted position y (3,) by `values` (3,) [rad] about the pivot."""
+    """Return a marker's predicted position y (3,) [m], rotated by the rotation vector `values` (3,)
+    [rad] about the pivot of `data`; the time is not used.
+    """
     pivot = ca.DM(data.pivot_m)
     return cayley_rotation(values) @ (y - pivot) + pivot
 
@@ -185,8 +187,8 @@ def _shift_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
 
 
 def _distort_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
-    """Apply radial distortion of first order, with the coefficient `values` [1/m²], about the
-    pivot.
+    """Return a marker's predicted position y (3,) [m] with radial distortion of first order, with
+    the coefficient `values` [1/m²], about the pivot of `data`; the time is not used.
     """
     away = y - ca.DM(data.pivot_m)
     return y + values * ca.sumsqr(away) * away
@@ -390,6 +392,17 @@ GRASP_SHIFT = NuisanceRow(
     description="a constant translation of the body in its grasps; both if the start is an "
     "equilibrium and markers measure it",
     same=_hand_eye_sharing_key,
+)
+STRAIN_ZERO = NuisanceRow(
+    "strain_zero",
+    "1",
+    None,
+    key="strain_zero",
+    changes=("grasps",),
+    applies=lambda experiment: experiment.specimen is not None,
+    label="zero of the strain",
+    sentence="offset of the strain: {size}",
+    description="a constant offset of the strains of a specimen",
 )
 ZERO = NuisanceRow(
     "displacement_zero_m",
@@ -689,7 +702,7 @@ GAUGE = NuisanceRow("reading", "", None, of="gauge", changes=())
 
 
 class _NuisanceBase:
-    """Checks and look-ups of `Nuisance`, whose fields are made from the table `ROWS`."""
+    """Checks and look-ups of `Nuisance`, whose fields are made from the table `KINDS`."""
 
     scope: Mapping[str, str]
     own: Sequence[NuisanceRow]
@@ -712,7 +725,7 @@ class _NuisanceBase:
 
     @property
     def kinds(self) -> tuple[NuisanceRow, ...]:
-        """All kinds of nuisance parameters that may be estimated: `ROWS`, then custom ones."""
+        """All kinds of nuisance parameters that may be estimated: `KINDS`, then custom ones."""
         return (*KINDS, *self.own)
 
     def sigma(self, row: NuisanceRow) -> float | None:
@@ -721,8 +734,8 @@ class _NuisanceBase:
 
     @classmethod
     def none(cls, **deviations: Any) -> Nuisance:
-        """Return a `Nuisance` that estimates only the fields given here, with their standard
-        deviations.
+        """Return a `Nuisance` that estimates only the fields given by name, with their standard
+        deviations; all others are None and thus exact.
         """
         nothing: dict[str, Any] = {row.name: None for row in KINDS}
         return Nuisance(**(nothing | deviations))
@@ -758,7 +771,7 @@ if TYPE_CHECKING:
 
     @dataclass(frozen=True, init=False)
     class Nuisance(_NuisanceBase):
-        """Type stub of the class that is made from `ROWS` below: one field for each kind."""
+        """Type stub of the class that is made from `KINDS` below: one field for each kind."""
 
         def __init__(self, **deviations: Any) -> None: ...
         def __getattr__(self, name: str) -> float | None: ...

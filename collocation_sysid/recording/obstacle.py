@@ -58,17 +58,19 @@ class Obstacle(Grasp):
     poses : PoseSequence or (T, 4, 4) array
         Motion of its frame; at rest in the body's frame by default.
     name : str
-        For messages and pictures.
+        Name in messages and pictures.
     friction : float or str
         Coefficient of friction; or the name of a parameter, whose bounds are 0 and 2.
     faces : Selection, optional
-        Faces that may touch it: those whose corners are all selected. All by default.
+        Faces of the body that may touch the obstacle: those whose corners are all selected. All by
+        default.
     stiffness_pa_m : float, optional
-        κ of the pressure κ (⟨δ − g⟩² − ⟨−g⟩²)/δ at the gap g; by default 100 times Young's modulus
-        at the current parameters over the mean edge of the face at each point.
+        Contact stiffness κ [Pa/m] in the pressure κ (⟨δ − g⟩² − ⟨−g⟩²)/δ at the gap g; by default
+        100 times Young's modulus at the current parameters over the mean edge of the face at each
+        point.
     width_m : float, optional
-        δ, the gap at which the pressure begins; by default that edge over 5000, with friction over
-        500.
+        Gap δ at which the pressure begins [m]; by default the mean edge of the face over 5000, or
+        over 500 with friction.
     slip : float, optional
         Sliding speed [m/s], or slip from sample to sample [m] of a static experiment, at which
         friction is 0.7 of its limit.
@@ -119,8 +121,10 @@ class Obstacle(Grasp):
             )
 
     def with_frame_nodes(self, frame: Index, t_s: Array) -> Obstacle:
-        """Return the obstacle with the nodes (4,) of its frame, and matrices as poses at `t_s`
-        (T,).
+        """Return the obstacle tied to the nodes (4,) of its frame: the origin and the ends of three
+        axes.
+
+        Poses that are matrices (T, 4, 4) become a `PoseSequence` at the times `t_s` (T,).
         """
         same = np.array_equal(frame, self.nodes)
         return self._with_nodes(self.nodes if same else frame, t_s)
@@ -131,8 +135,8 @@ class Obstacle(Grasp):
 
     @property
     def offset_direction(self) -> Array:
-        """(3,) direction of its uncertain offset: axes with an uncertain zero, else the normal of
-        its shape.
+        """Direction (3,) of the obstacle's uncertain offset: the sum of the axes whose zero is
+        uncertain; if there are none, the direction that its shape states.
         """
         uncertain_axes = np.array([float(axis in self.zero) for axis in "xyz"])
         return uncertain_axes if uncertain_axes.any() else self.shape.offset_direction
@@ -145,7 +149,7 @@ class Obstacle(Grasp):
         return orthogonal_axes(self.shape.offset_direction)
 
     def displaced(self, offset_m: float, tilt_rad: Array, delay_s: float) -> Obstacle:
-        """Return the obstacle shifted, tilted and delayed.
+        """Return a copy of the obstacle, shifted and tilted in its own frame, and delayed.
 
         Parameters
         ----------
@@ -154,7 +158,7 @@ class Obstacle(Grasp):
         tilt_rad : (2,) array
             Rotation about the axes `tilt_axes`, through the middle of its shape.
         delay_s : float
-            Delay of its motion.
+            Delay of its motion, added to the times of its poses.
         """
         motion = np.eye(4)
         middle = self.shape.tilt_centre_m
@@ -181,7 +185,8 @@ def _contact_surface(body: Body, obstacle: Obstacle) -> ContactSurface:
 
 
 def with_obstacle_frames(body: Body, obstacles: Sequence[Obstacle], *, is_static: bool) -> Body:
-    """Return the body with four nodes for the frame of each obstacle.
+    """Return the body with four nodes for the frame of each obstacle, and the coefficients of
+    friction that are parameters among its constants.
 
     The Jacobian of the contact forces is not symmetric if an obstacle has friction, or if pressures
     are averaged over time steps, which happens in motions without `relaxed` contact.

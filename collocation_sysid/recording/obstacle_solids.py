@@ -57,8 +57,9 @@ class Solid(ABC):
 
 
 def _unit_vector_converter(name: str) -> Any:
-    """Return a converter that normalises a vector (3,); it raises an `InputError` for a zero
-    vector.
+    """Return a function that normalises a vector (3,).
+
+    It raises an `InputError` that begins with `name` for a zero vector or another shape.
     """
 
     def made(value: Any) -> Array:
@@ -106,9 +107,8 @@ class Plane(Solid):
         return self.point_m
 
     def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
-        """Return a square with edges of `body_size_m` about the point of the plane that is nearest
-        to
-        `about_m`.
+        """Return a closed polyline (5, 3) of a square with edges of `size_m` about the point of the
+        plane that is nearest to `about_m` (3,).
         """
         middle = about_m - (about_m - self.point_m) @ self.normal * self.normal
         u, v = orthogonal_axes(self.normal) * size_m / 2
@@ -145,7 +145,13 @@ class Sphere(Solid):
 
 
 def _checked_ends(value: Any) -> Array:
-    """Check the two ends (2, 3) of an axis; an `InputError` is raised if they coincide."""
+    """Return the two ends (2, 3) of an axis [m] as a read-only array.
+
+    Raises
+    ------
+    InputError
+        If they coincide, or have another shape.
+    """
     ends = float_converter((2, 3), "ends_m")(value)
     if (ends[0] == ends[1]).all():
         raise InputError("the ends of an axis are at the same place; expected two places")
@@ -160,7 +166,9 @@ class _AxialSolid(Solid):
     ends_m: Array = key(tuple[Vector, Vector], converter=_checked_ends)
 
     def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
-        """Return a circle at each end and four lines between them; both arguments are ignored."""
+        """Return a closed circle at each end and four lines between them; both arguments are
+        ignored.
+        """
         axis = np.diff(self.ends_m, axis=0)[0]
         first, last = (_circle(end, axis, self.radius_m) for end in self.ends_m)
         quarters = range(0, len(first) - 1, (len(first) - 1) // 4)
@@ -191,7 +199,7 @@ class Cylinder(_AxialSolid):
     ends_m : (2, 3) array
         Centres of both ends.
     rounding_m : float
-        Radius of its edges.
+        Radius of the rounded edges [m]; zero for sharp edges.
     """
 
     rounding_m: float = key(NotNegative, default=0.0)
@@ -228,9 +236,9 @@ class Cuboid(Solid):
     Parameters
     ----------
     corners_m : (2, 3) array
-        Its lowest and its highest corner.
+        Lowest and highest corner.
     rounding_m : float
-        Radius of its edges.
+        Radius of the rounded edges [m]; zero for sharp edges.
     """
 
     corners_m: Array = key(tuple[Vector, Vector], converter=float_converter((2, 3), "corners_m"))
@@ -251,7 +259,7 @@ class Cuboid(Solid):
         return self.corners_m.mean(axis=0)
 
     def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
-        """Return the twelve edges; both arguments are ignored."""
+        """Return the twelve edges, (2, 3) each; both arguments are ignored."""
         corners = np.array(list(product(*self.corners_m.T)))
         differences = (corners[:, None] != corners).sum(axis=2)
         return [corners[[i, j]] for i, j in np.argwhere(differences == 1) if i < j]
@@ -295,8 +303,9 @@ else:
 
 
 class SolidSection(Section):
-    """The solid, by exactly one of these keys, in the frame of its poses; without poses in the
-    body's.
+    """Rigid solid, described by exactly one of these keys in the frame of its poses.
+
+    Without poses the frame is that of the undeformed body.
 
     Attributes
     ----------

@@ -159,8 +159,8 @@ class LocatedBody:
         self.triangles = nodes_m[body.mesh.surface]
 
     def weights_at_node(self, node: int) -> tuple[Index, Array]:
-        """Return nodes (npe,) and weights (npe,) of a marker on a node: those of an element with
-        that node.
+        """Return nodes (npe,) and weights (npe,) of a marker on a node: those of the first element
+        with that node; the weight of the node is 1.
         """
         cell = self.body.cells[np.argmax((self.body.cells == node).any(axis=1))]
         return cell, (cell == node).astype(np.float64)
@@ -175,8 +175,8 @@ class LocatedBody:
         return self.body.cells[cell], self._shape_functions_at(point, cell), distance
 
     def nearest_cell(self, point: Array) -> tuple[int, float]:
-        """Return the element that contains a point (3,), or is nearest to it, and its
-        distance [m].
+        """Return the index of the element that contains a point (3,), or is nearest to it, and its
+        distance from the body [m], 0 inside.
         """
         depth = self.barycentric(point, slice(None)).min(axis=1)
         cell = int(np.argmax(depth))
@@ -201,8 +201,8 @@ class LocatedBody:
         return nodes, weights
 
     def nearest_surface_point(self, point: Array) -> tuple[Array, Array]:
-        """Return the nearest point (3,) of the surface, and two unit tangents (3, 2) of its
-        face.
+        """Return the nearest point (3,) [m] of the surface of straight triangles, and two
+        orthogonal unit tangents of its face as columns (3, 2).
         """
         nearest = nearest_points_of_triangles(point, self.triangles)
         face = int(np.linalg.norm(point - nearest, axis=1).argmin())
@@ -246,8 +246,8 @@ class LocatedBody:
 
 
 def nearest_points_of_triangles(point: Array, triangles: Array) -> Array:
-    """Return the nearest point of each triangle (F, 3, 3) to a point (3,), or to (F, 3), as
-    (F, 3).
+    """Return the point (F, 3) of each triangle (F, 3, 3) that is nearest to one point (3,), or to
+    the point (F, 3) of that triangle.
     """
     point = point[..., None, :]
     ends = np.roll(triangles, -1, axis=1)

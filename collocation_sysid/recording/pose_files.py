@@ -90,8 +90,13 @@ def read_poses(
 def _checked_sequence(
     t_s: Array, positions_m: Array, quaternions: Array, row_names: list[str]
 ) -> PoseSequence:
-    """Return a pose sequence; a faulty pose raises an `InputError` that names its entry of
-    `row_names`.
+    """Return a pose sequence from times (T,) [s], positions (T, 3) [m] and quaternions (T, 4),
+    ordered x, y, z, w.
+
+    Raises
+    ------
+    InputError
+        If a pose is faulty; the message names its entry of `row_names` (T,).
     """
     if fault := first_pose_fault(t_s, positions_m, quaternions):
         raise InputError(fault[1], where=row_names[fault[0]])
@@ -109,8 +114,8 @@ def _read_columns(grid: TextTable, places: Iterable[int]) -> Array:
 
 
 def _with_column_names(table: TextTable) -> TextTable:
-    """Name the columns of a table with eight columns whose first row is numbers; others are
-    unchanged.
+    """Return a table with eight columns whose names are numbers with the usual names of poses, and
+    the numbers as its first row; other tables unchanged.
     """
     if len(table.columns) != 8 or not all(map(is_number, table.columns)):
         return table
@@ -128,6 +133,12 @@ def _column_error(grid: TextTable) -> InputError:
 
 def _position_columns(grid: TextTable, length_unit: str | None) -> tuple[list[int], float]:
     """Return the indices of the columns of x, y, z, and the factor from their unit to metres.
+
+    Parameters
+    ----------
+    grid : TextTable
+    length_unit : str or None
+        Unit of columns whose names state none; None if it is not given.
 
     Raises
     ------
@@ -167,6 +178,12 @@ def _quaternion_columns(grid: TextTable, order: str | None, columns: list[int]) 
         Stated order of the columns; needed if the columns are numbered.
     columns : list of int
         Columns that hold neither time nor position.
+
+    Raises
+    ------
+    InputError
+        If the columns are neither named nor numbered as those of a quaternion, the order is needed
+        and missing, or the names contradict it.
     """
     place = {grid.columns[k]: k for k in columns}
     if sorted(place) == ["qw", "qx", "qy", "qz"]:
@@ -192,7 +209,14 @@ def _quaternion_columns(grid: TextTable, order: str | None, columns: list[int]) 
 
 
 def _read_archive(path: str | Path) -> tuple[Array, Array]:
-    """Return `t_s` (T,) and `matrices` (T, 4, 4) of a NumPy archive, in the file's unit."""
+    """Return `t_s` (T,) [s] and `matrices` (T, 4, 4) of a NumPy archive, in the file's unit of
+    length.
+
+    Raises
+    ------
+    InputError
+        If the file is no such archive, or its arrays have other shapes.
+    """
     try:
         arrays = load_arrays(path)
     except InputError:
@@ -215,7 +239,21 @@ def _read_archive(path: str | Path) -> tuple[Array, Array]:
 def _from_matrices(
     t_s: Array, matrices: Array, length_unit: str | None, row_names: list[str]
 ) -> PoseSequence:
-    """Return the poses of matrices (T, 4, 4); `row_names` name the rows in messages."""
+    """Return the poses of matrices (T, 4, 4) at times (T,) [s].
+
+    Parameters
+    ----------
+    t_s, matrices : arrays
+    length_unit : str or None
+        Unit of the translations, a key of `METRES_PER_UNIT`; None for metres.
+    row_names : list of str
+        Name of each matrix, for messages.
+
+    Raises
+    ------
+    InputError
+        If a matrix is no rigid motion, or times do not increase.
+    """
     if fault := first_matrix_fault(t_s, matrices):
         raise InputError(fault[1], where=row_names[fault[0]])
     metres = METRES_PER_UNIT[length_unit or "m"]

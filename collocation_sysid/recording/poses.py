@@ -190,7 +190,9 @@ class PoseSequence:
 
     @cached_property
     def jumps_s(self) -> Array:
-        """Times of the samples after which the position or the rotation jumps."""
+        """Times (j,) of the samples after which the position or the rotation jumps [s]; empty
+        without jumps.
+        """
         of_position = jump_intervals(self.t_s, self.positions_m)
         of_rotation = jump_intervals(self.t_s, self.quaternions_xyzw)
         return self.t_s[np.union1d(of_position, of_rotation)]
@@ -307,7 +309,8 @@ def jump_intervals(t_s: Array, values: Array) -> Index:
     """Return the indices of the intervals in which values (m, k) jump; interval i begins at sample
     i.
 
-    A jump is a change that is more than 10 times as fast as those just before and just after.
+    A jump is a change that is more than 10 times as fast as those just before and just after, and
+    not small compared with the range of the values. The first and the last interval are not tested.
     """
     change = np.linalg.norm(np.diff(values, axis=0), axis=1)
     rate = change / np.diff(t_s)
@@ -388,8 +391,8 @@ def require_determined_motion(
 
 
 def _typical_step_s(poses: PoseSequence, first_s: float, last_s: float) -> float:
-    """Median time between consecutive poses of a span between which the grasp moves [s]; 0 if it
-    rests.
+    """Return the median time [s] between consecutive poses from `first_s` to `last_s` between which
+    the grasp moves; 0 if it rests.
     """
     shift_m = np.abs(np.diff(poses.positions_m, axis=0)).max(axis=1)
     turn = np.abs(np.diff(poses.quaternions_xyzw, axis=0)).max(axis=1)

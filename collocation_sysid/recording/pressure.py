@@ -116,8 +116,10 @@ class Pressure(Actuator[EnclosedVolume]):
         return volume
 
     def on_refined_body(self, body: Body, finer: Body) -> Pressure:
-        """Return the pressure on a body whose mesh is that of `body` with every element split in
-        eight.
+        """Return the pressure on the body `finer`, whose mesh is that of `body` with every element
+        split in eight.
+
+        A selection by position or name stays as it is; faces given by indices are split in four.
         """
         if isinstance(self.faces, Selection) and not isinstance(self.faces, Indices):
             return replace(self, body_measure=None)

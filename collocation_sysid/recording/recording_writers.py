@@ -51,7 +51,9 @@ def write_wrench_csv(path: str | Path, t_s: ArrayLike, values: ArrayLike) -> Non
 
 
 def write_columns_csv(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
-    """Write columns (T,) under their names, blank for NaN."""
+    """Write columns (T,) under their names, blank for NaN; the file is replaced only when it is
+    complete.
+    """
     _write_csv(path, [*columns], np.column_stack([np.asarray(each) for each in columns.values()]))
 
 
@@ -59,8 +61,7 @@ def write_gauge_csv(
     path: str | Path, t_s: ArrayLike, names: Sequence[str], values: ArrayLike
 ) -> None:
     """Write values (S, m) of a custom sensor as `read_custom_sensor` reads them; NaN becomes a
-    blank
-    cell.
+    blank cell.
     """
     _write_csv(path, ["t_s", *names], np.column_stack([np.asarray(t_s), np.asarray(values)]))
 

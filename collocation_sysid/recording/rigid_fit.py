@@ -81,6 +81,9 @@ def fit_poses(
 ) -> RigidFit:
     """Fit the rigid motion of markers at every frame.
 
+    Where the visible markers of positive weight do not determine a rotation, the pose is NaN and
+    the frame is counted as missing.
+
     Parameters
     ----------
     reference_m : (B, 3) array
@@ -203,10 +206,10 @@ def align_to_template(
 
 def least_rigid_marker(reference_m: Array, positions_m: Array) -> int:
     """Return the index of the marker whose distances to the others differ most between two
-    configurations.
+    configurations, (B, 3) each; distances to NaN are ignored.
 
-    Both are (B, 3); frames need not agree, as distances do not depend on them. A rigid fit would
-    distribute one marker's motion over all of them.
+    The frames of the configurations need not agree, as distances do not depend on them. A rigid fit
+    would distribute one marker's motion over all of them.
     """
 
     def distances(points: Array) -> Array:
@@ -245,8 +248,10 @@ def _mean(points: Array, weight: Array) -> Array:
 
 
 def _best_motions(source: Array, target: Array, weight: Array) -> tuple[Array, Array]:
-    """Return least-squares rotations (T, 3, 3) and translations (T, 3) from source to target (T, B,
-    3).
+    """Return rotations (T, 3, 3) and translations (T, 3) that map source to target points (T, B, 3)
+    with the least squared distances, weighted by `weight` (T, B).
+
+    Points of weight zero may be NaN.
     """
     source_mean = _mean(source, weight)
     target_mean = _mean(target, weight)

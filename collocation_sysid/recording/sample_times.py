@@ -64,8 +64,8 @@ def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = Non
 
 
 def first_unordered_time(t_s: Array) -> tuple[int, str] | None:
-    """Return the index of the first time that does not exceed its predecessor, and a message; else
-    None.
+    """Return the index of the first time that is not at least `SHORTEST_STEP_S` after its
+    predecessor, and a message; None if all times increase. NaN counts as not increasing.
     """
     faulty = np.flatnonzero(~(np.diff(t_s) > SHORTEST_STEP_S))
     if not faulty.size:
@@ -80,10 +80,10 @@ def evenly_spaced_s(t_s: Array) -> Array:
 
 
 def printed_rounding_s(t_s: Array) -> float:
-    """Return the unit of the last decimal if rounding to it made even times uneven, else 0.
+    """Return the unit of the last decimal [s] if rounding to it made even times uneven, else 0.
 
-    Times of 30 Hz printed as 0.033, 0.067, 0.1 give 0.001; times 0.01, 0.02, 0.03 are even as
-    they stand and give 0.
+    Times of 30 Hz printed as 0.033, 0.067, 0.1 give 0.001; times 0.01, 0.02, 0.03 are even without
+    rounding and give 0. The result is limited to a fraction of the mean step.
     """
     mean_s = float(t_s[-1] - t_s[0]) / max(len(t_s) - 1, 1)
     if np.abs(t_s - evenly_spaced_s(t_s)).max() <= 1e-6 * mean_s:

@@ -96,8 +96,12 @@ class Tendon(Actuator[PolylineLength]):
         vars(self).update(tension_n=tension.values, t_s=tension.t_s, declared_values=tension)
 
     def _measure_on(self, body: Body) -> PolylineLength:
-        """Return the length of the polyline in a body; an `InputError` if a point is too far
-        outside.
+        """Return the length of the polyline in a body.
+
+        Raises
+        ------
+        InputError
+            If a point is too far outside the body.
         """
         shape = LocatedBody(body.nodes_m, body)
         embedded = [shape.weights_at_point(point) for point in self.points_m]
@@ -112,8 +116,17 @@ class Tendon(Actuator[PolylineLength]):
         return PolylineLength(nodes, weights, len(body.nodes_m))
 
     def energy_amplitude(self, declared_value: Any, factor: Any, offset: Any) -> Any:
-        """Return the tension at the body, max(0, factor · stated − lost); 0 if the stated tension
-        is 0.
+        """Return the tension at the body, max(0, factor · stated − lost) [N]; 0 if the stated
+        tension is 0.
+
+        Parameters
+        ----------
+        declared_value : array or SX
+            Stated tension [N].
+        factor : float or SX
+            Factor of the stated tension.
+        offset : float or SX
+            Tension lost by friction [N].
         """
         pull = factor * declared_value - offset
         return (declared_value > 0) * (pull > 0) * pull

@@ -211,8 +211,8 @@ def displaced_axes(
     axis: str = "z",
     length_m: float | None = None,
 ) -> str:
-    """Return the axes along which a file has displacements, such as "z"; see
-    `read_displacement`.
+    """Return the axes along which a file has displacements, such as "z"; empty if it has none.
+    Arguments and errors are those of `read_displacement`.
     """
     shifts = _axis_components(
         _read_displacements(path, columns, length_m, timed=False), DISPLACEMENTS, axis
@@ -224,15 +224,32 @@ def displaced_axes(
 def _read_displacements(
     path: str | Path, columns: Mapping[str, str] | None, length_m: float | None, timed: bool
 ) -> QuantityTable:
-    """Read the columns of a displacement, or of a strain if the undeformed length is given."""
+    """Read the columns of a displacement, or of a strain if the undeformed length `length_m` [m] is
+    given.
+
+    Parameters
+    ----------
+    path : str or Path
+    columns : mapping or None
+        Names of columns by quantity; None to recognise them.
+    length_m : float or None
+    timed : bool
+        Whether a column of times is required.
+
+    Raises
+    ------
+    InputError
+        As `read_columns`.
+    """
     quantities = (*DISPLACEMENTS, DISPLACEMENT) if length_m is None else (STRAIN,)
     return read_columns(path, quantities, columns, requires_times=timed)
 
 
 def _axis_components(table: QuantityTable, quantities: Sequence[Quantity], axis: str) -> Array:
-    """Return the (T, n) values of the `quantities` quantities; NaN where missing.
+    """Return the values (T, n) of n quantities, one for each axis; NaN where missing.
 
-    A machine's quantity, whose name contains no axis, becomes the component along `axis`.
+    A machine's quantity, whose name contains no axis, becomes the component along `axis` ("x", "y"
+    or "z").
     """
     places = {quantity.key: k for k, quantity in enumerate(quantities)}
     values = np.full((len(table.t_s), len(quantities)), np.nan)

@@ -64,6 +64,9 @@ def _check_verdict(findings: CheckResult) -> Line:
 
 def _body_section(body: BodyCheck) -> Table:
     """Return the table of a body: size, mass, mesh, element quality, rest shape and fields."""
+    if body.is_homogeneous:
+        names = ", ".join(f"'{name}'" for name in body.experiments)
+        return labelled("Specimens", {"homogeneous": f"{names}; exact, without a mesh"})
     size = " × ".join(f"{1e3 * x:.4g}" for x in body.size_m)
     low, mean, high = (1e3 * x for x in body.edges_m)
     worst = ", ".join(f"{e.element} ({e.quality:.2f})" for e in body.worst_elements)
@@ -136,14 +139,15 @@ def _measurements_section(findings: QuickCheck) -> Table:
     for recording in findings.recordings[:SHOWN_RECORDINGS]:
         kind = ", validation" if recording.validation else ""
         when = f"{recording.duration_s:.3g} s at {recording.rate_hz:.4g} Hz"
+        kind_text = recording.test or ("static" if recording.static else when)
         rows[f"'{recording.experiment}'"] = (
-            f"{'static' if recording.static else when}: {recording.frames} × "
-            f"{_marker_summary(recording)}{kind}"
+            f"{kind_text}: {recording.frames} × {_marker_summary(recording)}{kind}"
         )
     if len(findings.recordings) > SHOWN_RECORDINGS:
         rows["…"] = f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
-    densities = {recording.air_density_kg_m3 for recording in findings.recordings}
-    rows["air"] = ", ".join(map(_air_description, sorted(densities)))
+    densities = {r.air_density_kg_m3 for r in findings.recordings if not r.test}
+    if densities:
+        rows["air"] = ", ".join(map(_air_description, sorted(densities)))
     for recording in findings.recordings[:SHOWN_RECORDINGS]:
         rows |= _grasp_rows(recording.experiment, findings.holds)
     return labelled("Measurements", rows)
@@ -169,7 +173,8 @@ def _marker_summary(recording: RecordingCheck) -> str:
     marker.
     """
     if not recording.markers:
-        return f"{', '.join(recording.instruments)}, no markers"
+        besides = "" if recording.test else ", no markers"
+        return f"{', '.join(recording.instruments)}{besides}"
     besides = "".join(f", {name}" for name in recording.instruments)
     farthest = recording.farthest_marker
     most_missing = recording.most_missing_marker

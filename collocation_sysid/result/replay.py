@@ -23,6 +23,7 @@ from ..fem.elements import EDGES
 from ..files import RESULT_FILE, damage_refused, require_own
 from ..recording.experiment import Experiment
 from ..recording.sample_times import TIME_TOLERANCE_S
+from ..recording.specimen_files import specimen_strains
 from ..runs.result_content import Result
 
 ARRAYS_FILE = "trajectory.npz"
@@ -32,7 +33,7 @@ WRENCH_PREFIX = "wrench_"
 GROUP_PREFIXES = {"readings": "reading_", "fields": "field_", "visible_points": "visible_"}
 # Prefix of the unit of a custom sensor, before its name.
 UNIT_PREFIX = "unit_"
-# Arrays of the body, the same for all experiments of a run.
+# Arrays of the body, the same for all experiments of a run but specimens, which have their own.
 BODY_ARRAYS = (
     "undeformed_m",
     "tetrahedra",
@@ -64,6 +65,7 @@ ARRAY_LAYOUT = {
     "obstacles_m": ("f", "To3"),
     "gaps_m": ("f", "TF"),
     "pressures_pa": ("f", "TF"),
+    "strain": ("f", "T"),
 }
 # Side of the square that represents a plane, over the body's largest extent.
 PLANE_SIZE_RATIO = 1.4
@@ -139,6 +141,8 @@ class MotionRecord:
         face.
     reading_units : mapping of name to str
         Units of the custom sensors that state one.
+    strain : (T,), or None
+        Strain of a specimen without a mesh; None for other experiments.
     """
 
     name: str
@@ -170,6 +174,7 @@ class MotionRecord:
     fields: Mapping[str, Array] = field(default_factory=dict)
     visible_points: Mapping[str, Array] = field(default_factory=dict)
     reading_units: Mapping[str, str] = field(default_factory=dict)
+    strain: Array | None = None
 
     @classmethod
     def from_experiment(
@@ -231,6 +236,7 @@ class MotionRecord:
             _obstacle_outlines(experiment),
             *(contact or (None, None)),
             reading_units={gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit},
+            strain=specimen_strains(experiment)[0] if experiment.specimen else None,
         )
 
     @property
@@ -266,7 +272,7 @@ class MotionRecord:
         """Return the arrays to store in a file, by name; attributes that are None are left out.
 
         The names begin with `prefix`, except those of the body, which all experiments of a run
-        share.
+        share but specimens.
         Simulated positions are rounded to single precision.
         """
         stored: dict[str, Any] = {key: getattr(self, key) for key in ARRAY_LAYOUT}
@@ -283,7 +289,8 @@ class MotionRecord:
             stored |= {f"{front}{name}": values for name, values in getattr(self, group).items()}
         stored |= {f"{UNIT_PREFIX}{n}": np.array(unit) for n, unit in self.reading_units.items()}
         there = {key: value for key, value in stored.items() if value is not None}
-        return {key if key in BODY_ARRAYS else prefix + key: value for key, value in there.items()}
+        shared = BODY_ARRAYS if self.strain is None else ()
+        return {key if key in shared else prefix + key: value for key, value in there.items()}
 
     @classmethod
     def from_arrays(cls, name: str, arrays: Mapping[str, Any]) -> MotionRecord:
@@ -298,7 +305,8 @@ class MotionRecord:
             If sizes, types or values of the arrays are not consistent.
         """
         prefix = f"{name}/" if f"{name}/t_s" in arrays else ""
-        own = {key: key if key in BODY_ARRAYS else prefix + key for key in ARRAY_LAYOUT}
+        shared = () if f"{prefix}{BODY_ARRAYS[0]}" in arrays else BODY_ARRAYS
+        own = {key: key if key in shared else prefix + key for key in ARRAY_LAYOUT}
         needed = {each.name for each in fields(cls) if each.default is MISSING}
         stored: dict[str, Any] = {
             key: arrays[at] if key in needed else arrays.get(at) for key, at in own.items()
@@ -320,7 +328,8 @@ class MotionRecord:
         stored["static"] = bool(arrays.get(f"{prefix}static", False))
         _require_shapes(stored)
         stored["marker_names"] = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
-        stored["part_names"] = [str(part) for part in arrays["part_names"]]
+        names_key = "part_names" if "part_names" in shared else f"{prefix}part_names"
+        stored["part_names"] = [str(part) for part in arrays[names_key]]
         parts = stored["surface_parts"]
         if len(stored["marker_names"]) != len(stored["marker_places_m"]):
             raise ValueError(f"{len(stored['marker_names'])} marker_names")

@@ -1,4 +1,4 @@
-"""Reports as self-contained HTML pages or Markdown, and the report of a folder of compare or sweep.
+"""Reports as self-contained HTML pages or Markdown, and reports of studies.
 
 The content of a report is a `TitledParts`: `comparison_report` makes one from a study's folder,
 `run_sections.run_report` one from a run folder.
@@ -68,7 +68,7 @@ class StudySummary:
 
 
 def comparison_report(folder: str | Path) -> TitledParts:
-    """Return the report of a folder that compare or sweep wrote.
+    """Return the report of the folder of a study.
 
     Raises
     ------
@@ -76,7 +76,9 @@ def comparison_report(folder: str | Path) -> TitledParts:
         If the folder has no ``summary.json``, or a damaged one.
     """
     folder = Path(folder)
-    content = read_json(folder / SUMMARY_FILE, "a folder of compare or sweep")
+    content = read_json(
+        folder / SUMMARY_FILE, "a folder of compare-methods, compare-models or sweep"
+    )
     with damage_refused(folder, SUMMARY_FILE, "repeat the study; finished runs are kept"):
         study = read(StudySummary, content)
         pictures = [Picture(f, CAPTIONS.get(f.stem, f.stem)) for f in own_pictures(folder)]

@@ -281,7 +281,8 @@ def _coverage_sentence(result: Result) -> str:
     contain.
     """
     moving = any(not each.static for each in result.fit.experiments.values())
-    kinds = ("step", "mesh") if moving else ("mesh",)
+    meshed = any(each.test is None for each in result.fit.experiments.values())
+    kinds = ("step", "mesh") if moving else ("mesh",) if meshed else ()
     covered = [f"the {kind} error" for kind in kinds if kind in result.discretisation_kinds]
     missing = [f"the {kind} error" for kind in kinds if kind not in result.discretisation_kinds]
     parts = listed(["noise", *covered, "systematic effects"])

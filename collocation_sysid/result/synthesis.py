@@ -26,6 +26,8 @@ from ..problem.bench_files import (
 from ..problem.problem_reading import parse_toml
 from ..problem.recording_schema import ExperimentSection, WrenchSection
 from ..problem.schema import ProblemFile
+from ..problem.specimen_reader import layout_from_section
+from ..problem.specimen_schema import SpecimenSection
 from ..program.simulation import NEWMARK, Trajectory, simulate
 from ..recording import (
     Experiment,
@@ -34,6 +36,7 @@ from ..recording import (
     write_poses_csv,
 )
 from ..recording.recording_writers import write_columns_csv
+from ..recording.specimen_files import SpecimenLayout, specimen_columns
 from ..validated_types import Count, NotNegative, Options, Positive
 from ..written_files import LIST_FILE, hashes_of, is_written_here, list_as_text, listed_hashes
 from .run_writers import (
@@ -47,6 +50,8 @@ from .run_writers import (
 
 # The key of the file of markers, see `_table_names`.
 _MARKERS_KEY = "markers"
+# Key of the table of a specimen.
+_SPECIMEN_KEY = "specimen"
 
 
 @dataclass(frozen=True)
@@ -196,7 +201,7 @@ def write_data(
 
 def _write_tables(
     experiment: Experiment,
-    section: ExperimentSection | None,
+    section: ExperimentSection | SpecimenSection | None,
     trajectory: Trajectory,
     files: Mapping[str, Path],
     rng: np.random.Generator,
@@ -207,7 +212,7 @@ def _write_tables(
     Parameters
     ----------
     experiment : Experiment
-    section : ExperimentSection or None
+    section : ExperimentSection, SpecimenSection or None
         Table of the experiment in the problem file; None without a file.
     trajectory : Trajectory
         The simulated motion.
@@ -217,6 +222,10 @@ def _write_tables(
         Source of the noise; its state advances.
     recipe : Recipe
     """
+    if experiment.specimen is not None or isinstance(section, SpecimenSection):
+        stated = section if isinstance(section, SpecimenSection) else None
+        _write_specimen(experiment, stated, trajectory, files[_SPECIMEN_KEY], rng, recipe)
+        return
     noise = recipe.noise_m * rng.normal(size=trajectory.markers_m.shape)
     names = experiment.markers.names
     tracks = trajectory.markers_m + noise
@@ -248,6 +257,26 @@ def _write_tables(
         noise = recipe.noise_own * gauge.sigma * rng.normal(size=read.shape)
         key = f"reading_{gauge.name}"
         write_gauge_csv(files[key], gauge.sample_times_s, gauge.columns, read + noise)
+
+
+def _write_specimen(
+    experiment: Experiment,
+    section: SpecimenSection | None,
+    trajectory: Trajectory,
+    file: Path,
+    rng: np.random.Generator,
+    recipe: Recipe,
+) -> None:
+    """Write the table of a specimen with simulated stresses and noise; see `_write_tables`."""
+    assert experiment.specimen is not None
+    values = {}
+    for gauge, read in zip(experiment.readings, trajectory.custom_sensor_values, strict=True):
+        noise = recipe.noise_own * gauge.sigma * rng.normal(size=read.shape)
+        values[gauge.name] = (read + noise)[:, 0]
+    layout = SpecimenLayout(test=experiment.specimen.test, columns={})
+    if section is not None:
+        layout = layout_from_section(section)
+    write_columns_csv(file, specimen_columns(experiment, values, layout))
 
 
 def _wrench_layouts(section: ExperimentSection | None) -> list[WrenchSection]:
@@ -307,7 +336,7 @@ def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> Non
         require_only_written(place)
 
 
-def _experiment_sections(problem: Problem) -> dict[str, ExperimentSection]:
+def _experiment_sections(problem: Problem) -> dict[str, ExperimentSection | SpecimenSection]:
     """Return the table of each experiment in the problem file, by name; empty without a file."""
     if (origin := problem.origin) is None:
         return {}
@@ -315,11 +344,17 @@ def _experiment_sections(problem: Problem) -> dict[str, ExperimentSection]:
     return {section.name: section for section in file.experiment}
 
 
-def _table_names(experiment: Experiment, section: ExperimentSection | None) -> dict[str, str]:
+def _table_names(
+    experiment: Experiment, section: ExperimentSection | SpecimenSection | None
+) -> dict[str, str]:
     """Return the names of the files of an experiment, by their content: markers, poses_2, …
 
-    On a test bench the names, and the keys too, are those of the problem file.
+    On a test bench and of specimens the names are those of the problem file.
     """
+    if experiment.specimen is not None or isinstance(section, SpecimenSection):
+        if isinstance(section, SpecimenSection):
+            return {_SPECIMEN_KEY: Path(str(section.file)).name}
+        return {_SPECIMEN_KEY: f"{experiment.name}.csv"}
     keys = [_MARKERS_KEY] * bool(experiment.markers.names)
     for k in range(len(experiment.grasps)):
         moved = section and section.moved_sections[k]

@@ -32,10 +32,16 @@ def finer_step(problem: Problem) -> Problem:
 
 
 def finer_mesh(problem: Problem) -> Problem:
-    """Return the problem with every tetrahedron split into eight."""
-    bodies = {id(body): refine_body(body) for body in problem.bodies}
+    """Return the problem with every tetrahedron split into eight, except in the cells of specimens,
+    which are exact.
+    """
+    meshed = [each.body for each in problem.experiments if each.specimen is None]
+    bodies = {id(body): refine_body(body) for body in {id(b): b for b in meshed}.values()}
     experiments = [
-        experiment_refinement.refined_experiment(e, bodies[id(e.body)]) for e in problem.experiments
+        e
+        if e.specimen is not None
+        else experiment_refinement.refined_experiment(e, bodies[id(e.body)])
+        for e in problem.experiments
     ]
     return replace(problem, experiments=experiments)
 
@@ -86,13 +92,19 @@ def solve_refined(
     Raises
     ------
     InputError
-        For another number of levels, or where a finer problem is not solved.
+        For another number of levels, where a finer problem is not solved, or where all recordings
+        are specimens without a mesh.
     KeyboardInterrupt
         If a solve was interrupted; the levels passed to `save_progress` are complete.
     """
     if not 2 <= levels <= MOST_LEVELS:
         raise InputError(f"levels = {levels}; expected 2 or {MOST_LEVELS}")
     fitted = [experiment for experiment in problem.experiments if not experiment.validation]
+    if all(experiment.specimen is not None for experiment in fitted):
+        raise InputError(
+            "the deformation of specimens is homogeneous and exact, without a mesh and time steps; "
+            "expected a recording of a body with a mesh to refine"
+        )
     coarse = replace(problem, experiments=fitted, notes=())
     moving = any(not experiment.is_static for experiment in fitted)
     solved = {(each.refined, each.halvings): each for each in solved_levels}

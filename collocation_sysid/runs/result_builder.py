@@ -234,6 +234,7 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
             depth=depths.get(name),
             friction=friction_summaries(experiment, part.equations.dynamics, part.x) or None,
             air_density_kg_m3=experiment.air_density_kg_m3,
+            test=experiment.specimen and experiment.specimen.test,
         )
     pooled = pooled_wrench_rms(solution)
     parts = {

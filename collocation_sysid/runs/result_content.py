@@ -312,6 +312,8 @@ class FittedExperiment:
         Distances of its points from the fitted surface.
     air_density_kg_m3 : float
         Density of the air around the body in the model; zero in a vacuum.
+    test : str, optional
+        Kind of material test of a specimen without a mesh.
     """
 
     rms_m: float
@@ -329,6 +331,7 @@ class FittedExperiment:
     friction: Mapping[str, FrictionSummary] | None = optional()
     depth: Mapping[str, DepthError] | None = optional()
     air_density_kg_m3: float = 0.0
+    test: str | None = optional()
 
 
 @dataclass(frozen=True)

@@ -130,7 +130,7 @@ class Assessment:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Messages of the concerns, in the order of `solution_concerns`."""
+        """Messages of the concerns, in the order of `concerns`."""
         return tuple(concern.message for concern in self.concerns)
 
     def combined_with(self, other: Assessment) -> Assessment:
@@ -140,8 +140,8 @@ class Assessment:
 
 
 def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
-    """Return concerns about likely misspecifications, "doubtful" if the misfit decreases by
-    more than a factor of two without one.
+    """Return a concern for each likely misspecification: "doubtful" if the misfit decreases by more
+    than a factor of two without it, else "check".
     """
     return [
         replace(cause, subject=f"likely: {cause.subject}").concern(
@@ -199,7 +199,7 @@ def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:
 
 
 def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
-    """Return a concern if markers are much noisier than the others."""
+    """Return a concern if markers are much noisier than the others, as a list; else empty."""
     if not level.unequal_p < RARE:
         return []
     usual = float(np.median([*level.factors.values()]))
@@ -242,14 +242,15 @@ def numerical_concerns(
     combined_std_errors: Mapping[str, float | None],
     refinement: Refinement | None,
 ) -> list[Concern]:
-    """Return a concern if step or mesh dominate the uncertainty of a parameter.
+    """Return a concern if the correction for step and mesh is large compared with the standard
+    uncertainty of a parameter; it names the parameter with the largest ratio.
 
     Parameters
     ----------
     optimum : mapping of name to Estimate
         Estimates before the correction of the discretisation error.
     combined_std_errors : mapping of name to float or None
-        Combined standard uncertainties; None if unknown.
+        Combined standard uncertainties; None if unknown, then the parameter is left out.
     refinement : Refinement or None
         Discretisation errors; None if they are unknown, which is no concern.
     """
@@ -305,7 +306,9 @@ def probe_concerns(probes: Iterable[Probe], corrections: Mapping[str, float]) ->
 
 
 def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
-    """Return the estimate of a parameter with an assumption relaxed, as text."""
+    """Return the estimate of a parameter by a probe that relaxes an assumption, multiplied by a
+    correction, as text.
+    """
     move = probe.moves.get(name)
     if move is None:
         return f"{symbol_of(name)} not determined"
@@ -314,7 +317,9 @@ def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
 
 
 def outlier_share_concerns(diagnoses: Iterable[MarkerDiagnosis]) -> list[Concern]:
-    """Return a concern if too many samples are beyond Huber's threshold."""
+    """Return a concern if too many samples of all markers are beyond Huber's threshold, as a list;
+    else empty.
+    """
     diagnoses_list = tuple(diagnoses)
     share = sum(d.wild for d in diagnoses_list) / max(1, sum(d.samples for d in diagnoses_list))
     return concern_if(share > WILD, share > HARDLY_TAME, "residuals/wild", percent=100 * share)
@@ -474,8 +479,8 @@ def prediction_concerns(
     count: int,
     size: str = "",
 ) -> list[Concern]:
-    """Return a concern if a prediction, for which nothing was fitted, differs from the
-    measurements.
+    """Return a concern if a prediction, for which nothing was fitted, differs from the measurements
+    by more than chance and a limit; else an empty list.
 
     Parameters
     ----------
@@ -565,8 +570,8 @@ def rotation_step_concerns(
     limit_rad: float = WARNING_ANGLE_RAD,
     code: str = "scheme/turns",
 ) -> list[Concern]:
-    """Return a concern if a grasp rotates by more than `limit_rad` [rad] within a step of the
-    grid.
+    """Return a concern with a code if a grasp rotates by more than `limit_rad` [rad] within a step
+    of the grid with this many substeps; else an empty list.
     """
     turn = fastest_rotation(experiment, substeps)
     sizes = {"step_ms": 1e3 * turn.step_s, "rate_rad_s": turn.rate_rad_s}

@@ -172,7 +172,9 @@ def toeplitz_product(autocorrelation: Array, values: Array) -> Array:
 
 
 def _lagged(columns: Array, is_present: Mask, lag: int) -> Array:
-    """Return D_k times the columns (T, r) of one channel, at its present samples."""
+    """Return D_k times the columns (T, r) of one channel, with D_k the symmetric matrix of ones at
+    the lag k (the identity for k = 0), at its present samples (T,).
+    """
     if lag == 0:
         return columns
     shifted = np.zeros_like(columns)
@@ -214,8 +216,8 @@ def fit_autoregression(autocovariance: Array, samples: float) -> Array:
 
 
 def process_autocorrelation(coefficients: Array, samples: int) -> Array:
-    """Return the autocorrelation (samples,) of an autoregressive process, from its
-    Yule–Walker equations.
+    """Return the autocorrelation (samples,) of an autoregressive process with coefficients
+    (order,), from its Yule–Walker equations; white noise for order 0.
     """
     order = len(coefficients)
     correlation = np.zeros(samples + order)
@@ -320,7 +322,11 @@ class ErrorProcess:
 
 
 def analyse_dependence(fit: LinearisedFit, information: Information) -> Dependence:
-    """Test the residuals for correlation in time, among channels and in space."""
+    """Test the residuals of a fit for correlation in time, among channels and in space.
+
+    Residuals at the level of rounding count as uncorrelated. Blocks with a floor of noise are not
+    tested in space.
+    """
     if fit.chi_squared <= ROUNDING**2 * fit.measurement_count:
         return Dependence(0.0, np.inf, 1.0)
     pairs = zip(fit.blocks, information.scaled_jacobians, strict=True)
@@ -345,8 +351,8 @@ def analyse_dependence(fit: LinearisedFit, information: Information) -> Dependen
 
 
 def _channel_correlation_p(fit: LinearisedFit) -> float:
-    """Return the p-value of the Lagrange-multiplier test of Breusch and Pagan (1980) on all
-    pairs of channels; 1 without pairs.
+    """Return the p-value of the Lagrange-multiplier test of Breusch and Pagan (1980) on all pairs
+    of channels within each block; 1 without pairs.
     """
     statistic = 0.0
     pairs = 0
@@ -389,7 +395,9 @@ def error_processes(fit: LinearisedFit, information: Information) -> tuple[Error
 
 
 def _long_lag_autocovariances(block: ResidualBlock, autocovariance: Array, order: int) -> Array:
-    """Return the autocovariances (T,) at lags beyond those given, and zero up to there."""
+    """Return the autocovariances (T,) of a block's errors by an autoregression of an order, at lags
+    beyond those given (K,); zero at the given ones.
+    """
     coefficients = _autoregression_of(block, autocovariance[: order + 1])
     tail = max(0.0, autocovariance[0]) * process_autocorrelation(coefficients, len(block.t_s))
     tail[: len(autocovariance)] = 0.0
@@ -397,7 +405,9 @@ def _long_lag_autocovariances(block: ResidualBlock, autocovariance: Array, order
 
 
 def _autoregression_of(block: ResidualBlock, autocovariance: Array) -> Array:
-    """Return the coefficients of the autoregression of a block's errors."""
+    """Return the coefficients (order,) of the autoregression of a block's errors, from
+    autocovariances (order + 1,).
+    """
     residual, _, present = block.channels
     channels = _effective_channels(_channel_covariance(residual, present))
     return fit_autoregression(autocovariance, _mean_sample_count(present) * channels)
@@ -409,7 +419,9 @@ def _mean_sample_count(present: NDArray[np.bool_]) -> float:
 
 
 def _error_process(block: ResidualBlock, slope: Array, autocovariance: Array) -> ErrorProcess:
-    """Estimate the error process of one block from autocovariances of its errors."""
+    """Return the error process of one block, from autocovariances (K,) of its errors and
+    derivatives `slope` (T, 3M, r) of its residuals.
+    """
     residual, _, present = block.channels
     over_space = estimate_spatial_correlation(block, slope)
     measured = present.any(axis=0)
@@ -508,8 +520,8 @@ def score_covariance(
 def _innovations(
     residual: Array, present: NDArray[np.bool_], coefficients: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the part of the residuals that earlier samples do not predict, (T − order,
-    3M), and a mask of where it is known.
+    """Return the part of the residuals (T, 3M) that earlier samples do not predict, (T − order,
+    3M), and a mask of where it is known: where all these samples are present.
     """
     order = len(coefficients)
     innovation = residual[order:].copy()

@@ -66,14 +66,16 @@ class CameraDescription:
 
 
 def _scaled(seeing: CameraDescription, factor: float) -> CameraDescription:
-    """Return the description with the translation of the pose scaled."""
+    """Return the description with the translation of the camera's pose multiplied by a factor."""
     pose = seeing.pose.copy()
     pose[:3, 3] *= factor
     return replace(seeing, pose=pose)
 
 
 def _rotated(seeing: CameraDescription, rotation: list[list[int]]) -> CameraDescription:
-    """Return the description with the camera's frame rotated by a matrix (3, 3)."""
+    """Return the description with the camera's frame rotated by a matrix (3, 3), about its own
+    axes.
+    """
     pose = seeing.pose.copy()
     pose[:3, :3] = pose[:3, :3] @ np.array(rotation, dtype=float)
     return replace(seeing, pose=pose)
@@ -151,7 +153,9 @@ def require_depth_units(experiment: Experiment) -> None:
 
 
 def camera_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield hypotheses for depth cameras that see hardly anything of the body."""
+    """Yield hypotheses for each depth camera of an experiment that sees hardly anything of the
+    body: one mistake or two that explain it, or none.
+    """
     for depth in experiment.depths:
         view = _CameraTrial(experiment, depth)
         here = view.visible_share(view.declared)
@@ -214,8 +218,8 @@ class _CameraTrial:
         self.body_m = float(np.median(np.linalg.norm(self.shape_m - eye_m, axis=1)))
 
     def visible_share(self, seeing: CameraDescription) -> float:
-        """Return the share of the surface facing the camera that has points nearby, for a
-        description.
+        """Return the share, from 0 to 1, of the surface facing the camera that has points of the
+        first image nearby, for a description of the camera; 0 if nothing faces it.
         """
         motion = seeing.carrier @ seeing.pose
         turn = motion[:3, :3]
@@ -248,6 +252,8 @@ class _CameraTrial:
         return []
 
     def _corrected(self, mistakes: tuple[str, ...]) -> CameraDescription:
-        """Return the stated description with some mistakes corrected."""
+        """Return the stated description with some mistakes, given by name, corrected one after the
+        other.
+        """
         undo = dict(chain.from_iterable(kind.items() for kind in (*MISTAKES, POWERS)))
         return reduce(lambda seeing, name: undo[name](seeing), mistakes, self.declared)

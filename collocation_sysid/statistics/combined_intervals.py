@@ -5,8 +5,7 @@ statistical part (noise of the measurements, nuisance parameters), the discretis
 step, and mesh where it was refined), and the systematic effects of the budget (type B evaluation,
 JCGM 100:2008, 4.3). All three are added in quadrature in the coordinate in which the parameter is
 estimated, its logarithm as a rule, see `IntervalCoordinate`. The known part of the discretisation
-error is
-corrected, not only budgeted (ibid., 3.2.4): the reported value is the extrapolated one.
+error is corrected, not only budgeted (ibid., 3.2.4): the reported value is the extrapolated one.
 """
 
 from __future__ import annotations
@@ -63,6 +62,8 @@ def combine(
     bounds: Interval = (-np.inf, np.inf),
 ) -> CombinedEstimate:
     """Correct an estimate and combine the contributions to its uncertainty.
+
+    An estimate at a bound is not corrected and has no uncertainty.
 
     Parameters
     ----------
@@ -144,5 +145,5 @@ def _clip(bounds: Interval, value: float) -> float:
 
 
 def _interval(at: IntervalCoordinate, low: float, high: float, bounds: Interval) -> Interval:
-    """Return the interval between two coordinates as values clipped to bounds."""
+    """Return the interval between two coordinates as values, clipped to bounds."""
     return _clip(bounds, at.to_value(low)), _clip(bounds, at.to_value(high))

@@ -131,6 +131,14 @@ TOPICS: Mapping[str, Topic] = {
             "sign": "along {axis} the displacement of grasp {grasp} and its force on the body have "
             "opposite signs (correlation {correlation:.2f}), as if the body produced energy: "
             "one of the signs is wrong; set sign = -1 for the displacement or for the wrench",
+            "specimen-true-stress": "its stresses fit as true stresses (force over deformed "
+            'area): set stress = "true", or divide the forces by the undeformed area',
+            "specimen-compression": "its strains and stresses fit as those of a compression test: "
+            "set strain_sign = -1 and stress_sign = -1",
+            "specimen-percent": "its strains fit as percent: name the unit in the column, "
+            '"strain (%)"',
+            "specimen-unit": "its stresses fit if multiplied by {factor:g}: the unit of the column "
+            "is probably {unit}",
             "wrench-sign": "it fits with the opposite sign: it is the force of the body on the "
             "grasp instead of that of the grasp on the body; change its sign",
             "wrench-sign/part": "its {what} fit with the opposite sign, the other components do "
@@ -176,7 +184,7 @@ TOPICS: Mapping[str, Topic] = {
         "trust",
         "Look at the residuals over time: a constant part indicates a wrong position or "
         "offset, large residuals at the beginning a wrong time of release, an oscillation a "
-        "wrong stiffness or damping. The command compare --materials tests whether another "
+        "wrong stiffness or damping. The command compare-models --materials tests whether another "
         "material law predicts better.",
         {
             "outline": "{percent:.0f} % of the model's outline are more than {pixels:.0f} pixels "
@@ -473,8 +481,8 @@ class Concern:
 
 
 def concern_if(is_present: bool, is_gross: bool, code: str, **data: Any) -> list[Concern]:
-    """Return a list with a concern if `is_present`, graded "doubtful" if `is_gross` and else
-    "check"; otherwise an empty list.
+    """Return a list with the concern of a code and its data, graded "doubtful" if `is_gross` and
+    else "check"; an empty list unless `is_present`.
     """
     return [Concern(code, "doubtful" if is_gross else "check", data)] if is_present else []
 

@@ -55,7 +55,7 @@ class _EffectColumns(SweepColumns):
         residual: Array | None,
         free: Index,
     ) -> tuple[Array, Array]:
-        """Return R (k, free, c) and F_R (k, 3n, c), see `QuantityTable.right_hand_sides`."""
+        """Return R (k, free, c) and F_R (k, 3n, c), see `SweepColumns.right_hand_sides`."""
         return self.rows_n[rows][:, free].copy(), self.forces_n[rows].copy()
 
 
@@ -74,7 +74,9 @@ class ResidualChanges(NamedTuple):
     blocks: list[Array]
 
     def without(self, assumptions: Iterable[str]) -> ResidualChanges:
-        """Return the changes without some assumptions, each with all its components."""
+        """Return the changes without the assumptions of these names, each with all its
+        components.
+        """
         excluded = set(assumptions)
         remaining = [
             k for k, name in enumerate(self.names) if name.partition(" ")[0] not in excluded
@@ -86,7 +88,8 @@ class ResidualChanges(NamedTuple):
 def changes_of_assumptions(
     collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
 ) -> ResidualChanges:
-    """Return the changes of the residuals by all assumptions of a fit.
+    """Return the changes of the residuals by all assumptions of a fit and by nuisance parameters
+    that are not estimated, each off by its standard deviation.
 
     Parameters
     ----------
@@ -111,8 +114,17 @@ def changes_of_assumptions(
 def changes_of_nuisances(
     collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
 ) -> ResidualChanges:
-    """Return the changes of the residuals by nuisance parameters that are not estimated;
-    arguments as in `changes_of_assumptions`.
+    """Return the changes of the residuals by nuisance parameters that are not estimated, each off
+    by its standard deviation.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    z : array
+        Variables at the answer.
+    deviations : mapping
+        Standard deviation by the name of the nuisance parameter; None for an exact one. For those
+        not given the standard deviation of the kind is used.
     """
 
     def with_added_nuisances(experiment: Experiment) -> Experiment:
@@ -145,7 +157,7 @@ def changed_residuals(
     *,
     surface_correlation: float = CORRELATION,
 ) -> ResidualChanges:
-    """Return the changes of the residuals by some assumptions.
+    """Return the changes of the residuals by some assumptions, each off by its standard deviation.
 
     Parameters
     ----------
@@ -162,8 +174,9 @@ def changed_residuals(
     changes: list[Array] = []
     for part in collocation.iterates(z):
         at = ExperimentAtAnswer(part, collocation.parameters, surface_correlation)
+        is_specimen = part.segment.experiment.specimen is not None
         effects = [
-            (row.effect(at, axis), sigma)
+            (None if is_specimen and not row.of_specimens else row.effect(at, axis), sigma)
             for row, sigma in assumptions
             for axis in range(len(row.components))
         ]
@@ -174,8 +187,13 @@ def changed_residuals(
 def _changes_by_effects(
     fitted: ExperimentAtAnswer, effects: Sequence[tuple[Effect | None, float]]
 ) -> Iterator[Array]:
-    """Yield the changes (T, M, 3, a) of the residuals of each measurement by effects, each
-    with its standard deviation; None has no effect.
+    """Yield the changes (T, M, 3, a) of the residuals of each measurement by a effects.
+
+    Parameters
+    ----------
+    fitted : ExperimentAtAnswer
+    effects : sequence of (Effect or None, float)
+        Effects per unit, each with its standard deviation in that unit; None has no effect.
     """
     part = fitted.iterate
     count = len(effects)
@@ -229,7 +247,7 @@ def propagate_columns(
         The experiment at the answer.
     solver : Sweep
         Factorised time steps.
-    columns : QuantityTable
+    columns : SweepColumns
         Right-hand sides, not by parameters.
     inertia_n : (N, g, c) array or 0
         Changes of the equations of motion of the sensed dofs, which reaction forces do not contain

@@ -1,12 +1,11 @@
 """Deeper checks of a fit: refits of parts of the data, and with assumptions relaxed.
 
 Windows of time and recordings are fitted alone by one Gauss–Newton step from the answer, as for
-`scatter`. An assumption that is relaxed joins the linearised fit as one more nuisance parameter,
-with the deviation of the budget as its prior and the changes of the residuals as its derivative,
-see `changes_of_nuisances`. Where its amplitude is significant, the effect is computed again at the
-parameters
-that the step leads to, and a step is taken from there, until parameters settle; the remaining error
-is of second order in the amplitude. Error bars are those of any fit.
+`recording_scatter`. An assumption that is relaxed joins the linearised fit as one more nuisance
+parameter, with the deviation of the budget as its prior and the changes of the residuals as its
+derivative, see `consider_analysis`. Where its amplitude is significant, the effect is computed
+again at the parameters that the step leads to, and a step is taken from there, until parameters
+settle; the remaining error is of second order in the amplitude. Error bars are those of any fit.
 """
 
 from __future__ import annotations
@@ -50,11 +49,12 @@ SETTLED = 0.02
 
 
 def routine_probes_with_steps(fit: SolvedFit) -> tuple[Probe, ...]:
-    """Relax the routine assumptions by one linear step, and iterate the one that gives concern.
+    """Return the probes that relax the routine assumptions by one linear step each; the most
+    significant of those that give concern is iterated.
 
     A linear step suffices to find that an assumption is wrong, but not for estimates that change by
-    much of their value. The most significant assumption that gives concern therefore takes a few
-    further steps, each with a simulation.
+    much of their value. That assumption therefore takes a few further steps, each with a
+    simulation.
     """
     probes = routine_probes(fit)
     alarming = [probe for probe in probes if is_alarming(probe)]
@@ -91,13 +91,13 @@ def _window_probes(at: SolvedFit) -> Iterator[Probe]:
 
 
 def _third(block: ResidualBlock, k: int) -> slice:
-    """Return the slice of the samples in third k (an index) of a block's time."""
+    """Return the slice of the samples in third k (an index) of a block's samples."""
     ends = np.round(np.linspace(0, len(block.t_s), len(WINDOWS) + 1)).astype(int)
     return slice(int(ends[k]), int(ends[k + 1]))
 
 
 def _restrict(block: ResidualBlock, cut: slice) -> ResidualBlock:
-    """Return the block with some samples only."""
+    """Return the block with the samples in the slice `cut` only."""
     own = ("t_s", "is_present", "residual", "jacobian", "misfit", "components")
     there = {name: each[cut] for name in own if (each := getattr(block, name)) is not None}
     shaken = block.disturbances
@@ -115,7 +115,21 @@ def _recording_probes(at: SolvedFit) -> Iterator[Probe]:
 def _part_probe(
     at: SolvedFit, kind: Kind, name: str, alone: LinearisedFit, step: Array
 ) -> Iterator[Probe]:
-    """Yield the probe of a part of the data, unless it has fewer measurements than parameters."""
+    """Yield the probe of a part of the data, unless it has fewer measurements than parameters.
+
+    Parameters
+    ----------
+    at : SolvedFit
+        Fit to all data.
+    kind : str
+        Kind of part: "window" or "recording".
+    name : str
+        Name of the part.
+    alone : LinearisedFit
+        Fit to the part.
+    step : array
+        Parameters of the part's fit less those of the joint one.
+    """
     if alone.measurement_count <= len(alone.names):
         return
     uncertainty = at.uncertainty_of_refit(
@@ -127,9 +141,10 @@ def _part_probe(
 
 
 def _with_significant_moves(probe: Probe, limit: float) -> Probe:
-    """Return the probe with the estimates in `report` that differ more than by chance.
+    """Return the probe with the names, in `sentences`, of the estimates that differ by more than
+    `limit` of their standard errors.
 
-    A part differs from the whole with less than its own error bar (Hausman 1978).
+    A part of the data differs from all data with less than its own error bar (Hausman 1978).
     """
     significant = (
         n for n, move in probe.moves.items() if abs(move.change) > limit * move.std_error

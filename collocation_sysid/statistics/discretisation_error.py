@@ -161,8 +161,8 @@ class Refinement:
         return max(moves.items(), key=lambda each: round(each[1], 6), default=("", 0.0))
 
     def suggested_substeps(self, estimates: Mapping[str, Estimate], order: float) -> int:
-        """Return the number of steps per sample that makes every correction small, if the errors
-        belong to one step; at most `MOST_SUBSTEPS`.
+        """Return the number of steps per sample, from 1 to `MOST_SUBSTEPS`, that makes every
+        correction small if the present errors are those of one step per sample.
 
         Parameters
         ----------
@@ -281,15 +281,15 @@ def discretisation_errors(
     step_order: float,
     linear: Container[str],
 ) -> dict[str, DiscretisationError]:
-    """Return the discretisation errors of all estimates that change; fixed values and those at a
-    bound are left out.
+    """Return the discretisation errors by name of all estimates whose values differ between the
+    levels; others, such as fixed values, are left out.
 
     Parameters
     ----------
     estimates : mapping of str to Estimate
         Answers.
     by_step, by_mesh : sequences of mappings of str to float
-        Values by name, see `discretisation_error`.
+        Values by name at each finer level, see `discretisation_error`.
     step_order : float
         Order of the scheme.
     linear : container of str
@@ -306,7 +306,7 @@ def discretisation_errors(
 
 
 def change_in_observations(fit: LinearisedFit, residual_changes: Sequence[Array]) -> Array:
-    """Return the change (p,) of the parameters if the predictions change by given residuals.
+    """Return the change (p,) of the parameters, to first order, if the residuals change.
 
     Parameters
     ----------
@@ -319,15 +319,16 @@ def change_in_observations(fit: LinearisedFit, residual_changes: Sequence[Array]
 
 
 def estimate_changes(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
-    """Return the changes (p, a) of the estimates with changes of the residuals; estimates at a
-    bound do not change.
+    """Return the changes (p, a) of all parameters of a fit, to first order, with a changes of the
+    residuals; parameters at a bound do not change.
 
     Parameters
     ----------
     fit : LinearisedFit
         The fit.
     changes : sequence of (T, M, 3, a) arrays
-        Changes of the residuals of each block, in units of σ.
+        Changes of the residuals of each block, in units of σ; where nothing is measured they are
+        ignored.
     """
     free = np.flatnonzero(~fit.at_bound)
     count = changes[0].shape[-1] if changes else 0

@@ -102,7 +102,7 @@ class IntervalCoordinate:
         return 1.0 if self.is_linear else 1 / value
 
     def from_value(self, value: float) -> float:
-        """Return the coordinate of a value."""
+        """Return the coordinate of a value; infinite or NaN outside its domain."""
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.is_odds:
                 return float(np.log(value / (0.5 - value)))
@@ -176,8 +176,8 @@ def user_estimates(
 
 
 def relative_derivatives(parameters: Parameters, q: Array) -> Array:
-    """Return the derivative (nq,) of each parameter by its q over its size: 1 for a
-    logarithm and for a field's mode coefficient.
+    """Return the derivative (nq,) of each parameter by its q, over the parameter's size: 1 for a
+    logarithmic scale and for coefficients of fields.
     """
     slopes = []
     for item, coordinate in zip(parameters.free, q, strict=True):
@@ -190,7 +190,18 @@ def relative_derivatives(parameters: Parameters, q: Array) -> Array:
 def derived_estimates(
     derived: DerivedModuli, covariance_q: Array, at_bound: Mask, quantiles: Array
 ) -> dict[str, Estimate]:
-    """Return the estimates of the moduli that follow from the parameters, by the delta method."""
+    """Return the estimates of the moduli that follow from the parameters, by the delta method.
+
+    Parameters
+    ----------
+    derived : DerivedModuli
+    covariance_q : (nq, nq) array
+        Covariance of q.
+    at_bound : (nq,) array of bool
+        Parameters at a bound; a modulus that depends on one has no interval.
+    quantiles : (nq,) array
+        Half widths of intervals in standard deviations.
+    """
     estimates = {}
     for name, value in derived.values.items():
         gradient = derived.derivatives[name]
@@ -211,7 +222,18 @@ def derived_estimates(
 def _parameter_estimate(
     item: Parameter, value: float, deviation: float, quantile: float
 ) -> Estimate:
-    """Return the estimate of a parameter whose q has the standard deviation `deviation`."""
+    """Return the estimate of a parameter with its interval.
+
+    Parameters
+    ----------
+    item : Parameter
+    value : float
+        Estimated value.
+    deviation : float
+        Standard deviation of its coordinate q; NaN or a large one if it is not determined.
+    quantile : float
+        Half width of the interval in standard deviations.
+    """
     if item.scale == "log":
         return _logarithmic_estimate(item.name, value, deviation, quantile)
     if without_region(item.name) == "poisson" and value > 0:
@@ -226,7 +248,9 @@ def _parameter_estimate(
 
 
 def _scaled_estimate(estimate: Estimate, ratio: float) -> Estimate:
-    """Return the estimate multiplied by a number."""
+    """Return the estimate, standard error and interval multiplied by a number, which may be
+    negative.
+    """
     ends = estimate.statistical95 and sorted(
         (ratio * estimate.statistical95[0], ratio * estimate.statistical95[1])
     )
@@ -249,7 +273,10 @@ def _estimate_at_bound(value: float) -> Estimate:
 
 
 def _logarithmic_estimate(name: str, value: float, deviation: float, quantile: float) -> Estimate:
-    """Return the estimate of a value whose logarithm has the standard deviation `deviation`."""
+    """Return the estimate of a value whose logarithm has the standard deviation `deviation`, NaN or
+    a large one if it is not determined; `quantile` is the half width of the interval in standard
+    deviations.
+    """
     if not deviation <= UNDETERMINED:  # or NaN
         return Estimate(value, reason="the data do not determine it")
     at = IntervalCoordinate.for_estimate(name, [value], linear=False)
@@ -298,8 +325,8 @@ def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -
 
 
 def _unidentifiable_notes(reasons: Mapping[str, str]) -> list[str]:
-    """Return one note for each parameter that is not identifiable, and one for two
-    confounded with each other.
+    """Return one note for each parameter that is not identifiable, by the reasons, and one for two
+    parameters that are confounded with each other.
     """
     notes = []
     mentioned = set()
@@ -322,8 +349,8 @@ def _unidentifiable_notes(reasons: Mapping[str, str]) -> list[str]:
 
 
 def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[str]:
-    """Return notes on memory branches that were not found, and on those slower than the
-    longest recording [s].
+    """Return notes on memory branches whose share ended at zero, may be zero, or whose relaxation
+    is slower than the longest recording [s].
     """
     notes = []
     for name, share in estimates.items():
@@ -397,7 +424,19 @@ def noise_notes(requested: str, kind: Noise, level: NoiseLevel, errors: str) -> 
 
 
 def correlation_notes(requested: str, errors: str, dependence: Dependence) -> list[str]:
-    """Return notes on correlated residuals, and how the error bars account for that."""
+    """Return notes on correlated residuals and how the error bars account for that.
+
+    Empty if they are not correlated, or if their correlation is explained, so that independent
+    errors were used without having been requested.
+
+    Parameters
+    ----------
+    requested : str
+        Errors that the user requested.
+    errors : str
+        Errors that were used.
+    dependence : Dependence
+    """
     if not dependence.is_correlated or (errors != "autocorrelated" and requested != "independent"):
         return []
     pattern = "are correlated between markers or axes"
@@ -420,7 +459,9 @@ def correlation_notes(requested: str, errors: str, dependence: Dependence) -> li
 
 
 def disagreement_notes(fit: LinearisedFit, scatter: RecordingComparison | None) -> list[str]:
-    """Return notes on parameters on which the recordings disagree."""
+    """Return notes on parameters on which the recordings disagree; empty without a comparison
+    (None).
+    """
     if scatter is None:
         return []
     return [

@@ -185,7 +185,8 @@ class FieldEstimate:
         Parameters
         ----------
         length_m : float, optional
-            Correlation length; None means the present one.
+            Correlation length; None means the present one. If the present one is given, the result
+            is 0 for any `factor`.
         factor : float
             Factor of the amplitude.
         """
@@ -201,7 +202,9 @@ class FieldEstimate:
         return self._log_evidence(prior) - self._log_evidence(np.eye(size))
 
     def _log_evidence(self, prior: Array) -> float:
-        """Return ln Z(D) for a prior covariance D (m, m)."""
+        """Return the logarithm of the evidence Z(D) for a prior covariance D (m, m) of the
+        coefficients, up to a constant that does not depend on D.
+        """
         alone, score = self._data_information
         both = np.eye(len(alone)) + alone @ prior
         return float(score @ prior @ np.linalg.solve(both, score) - np.linalg.slogdet(both)[1]) / 2
@@ -337,7 +340,7 @@ def _with_phases(estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float)
 
 
 def _quantiles(values: Array) -> tuple[float, float, float]:
-    """Return lower end, median and upper end of the 95 % interval of samples."""
+    """Return lower end, median and upper end of the 95 % interval of samples (any shape)."""
     lower, median, upper = np.quantile(values, [ENDS[0], 0.5, ENDS[1]])
     return float(lower), float(median), float(upper)
 
@@ -359,12 +362,12 @@ def field_estimates_at(collocation: Collocation, z: Array) -> dict[str, FieldEst
 def mean_logarithm(
     body: Body, parameters: Parameters, q: Array, *, part_index: int, names: Sequence[str]
 ) -> tuple[float, Array]:
-    """Return the logarithm of the mean of a part's field, and its derivatives by some parameters.
+    """Return the logarithm of the mean of a part's field, and its derivatives by some parameters;
+    for a density the ratio to the stated density in place of the logarithm.
 
     Parameters
     ----------
     body : Body
-        The body.
     parameters : Parameters
         Shared parameters.
     q : (nq,) array
@@ -384,8 +387,15 @@ def mean_logarithm(
 
 
 def _mean_logarithm(constants: ThetaMap, part_index: int, modes: FieldModes) -> GeneratedFunction:
-    """Return the generated logarithm of the mean of a part's field as a function of q; of a
-    density, the density over the stated one.
+    """Return the generated logarithm of the mean of a part's field as a function of q; for a
+    density, the generated ratio to the stated density.
+
+    Parameters
+    ----------
+    constants : ThetaMap
+    part_index : int
+    modes : FieldModes
+        Field of the part.
     """
     body = constants.body
     part = constants.body.parts[part_index]

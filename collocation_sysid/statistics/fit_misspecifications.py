@@ -1,9 +1,10 @@
 """Misspecification hypotheses for a fit that misses its data: refits without a mistake, ranked by
 misfit.
 
-The tests of `modal` cost little. The others change the experiment that fits worst: it is fitted
-again with each mistake corrected, and the factor by which its misfit decreases is the strength of
-the hypothesis. Of the directions of gravity, the natural modes choose the one that is refitted.
+The tests of `modal_misspecifications` cost little. The others change the experiment that fits
+worst: it is fitted again with each mistake corrected, and the factor by which its misfit decreases
+is the strength of the hypothesis. Of the directions of gravity, the natural modes choose the one
+that is refitted.
 
 Hypotheses about measured wrenches are in `wrench_causes`.
 """
@@ -31,6 +32,7 @@ from .modal_misspecifications import (
     gravity_hypotheses,
 )
 from .plausibility import load_sign_hypotheses
+from .specimen_misspecifications import find_specimen_misspecifications
 from .wrench_causes import wrench_causes
 
 # RMS residual in standard deviations up to which there is nothing to explain.
@@ -83,6 +85,7 @@ def find_misspecifications(solution: Solution, budget: int | None = None) -> tup
     hypotheses = [
         *wrench_causes(solution),
         *(cause for e in fitted for cause in load_sign_hypotheses(e)),
+        *find_specimen_misspecifications(solution),
     ]
     if max(misfits) > NOISE:
         worst = fitted[int(np.argmax(misfits))]
@@ -97,7 +100,18 @@ def find_misspecifications(solution: Solution, budget: int | None = None) -> tup
 def _refit_hypotheses(
     solution: Solution, experiment: Experiment, budget: int | None
 ) -> list[Hypothesis]:
-    """Return the hypotheses without which the experiment fits far better."""
+    """Return the hypotheses whose correction lets the first samples of an experiment fit far
+    better; empty if these cannot be fitted.
+
+    Parameters
+    ----------
+    solution : Solution
+        The fit; refits begin at the guess of its problem.
+    experiment : Experiment
+    budget : int or None
+        Largest number of sweeps for all refits together; None for the default, see
+        `find_misspecifications`.
+    """
     first = first_samples(experiment, MOST_SAMPLES)
     alone = _Refitter(solution, first, budget)
     fitted_m = alone.fit(first)
@@ -136,15 +150,18 @@ def _gravity_hypotheses(declared: Experiment, comparison: ModalComparison) -> It
 
 
 def _grasp_layer_hypotheses(declared: Experiment, of: str) -> Iterator[Hypothesis]:
-    """Yield hypotheses of grasps one layer of elements deeper or less deep."""
+    """Yield hypotheses, about the subject `of`, of grasps one layer of elements deeper or less
+    deep, where that is possible.
+    """
     for deeper, deep in ((True, "deeper"), (False, "less deep")):
         if (layered := _with_shifted_grasps(declared, deeper)) is not None:
             yield Hypothesis("grasp-layer", of, {"deep": deep}, layered)
 
 
 def _slip_hypotheses(declared: Experiment, fitted_m: Array, of: str) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that one marker slipped, if its residuals change abruptly; the
-    experiment is then refitted without it.
+    """Yield the hypothesis, about the subject `of`, that the marker whose residuals change most
+    abruptly slipped; `corrected` is the experiment without it. None if no change is abrupt, or too
+    few markers remain.
     """
     residual = _residual(declared, fitted_m)
     described = DeclaredMotion.from_experiment(declared)
@@ -162,8 +179,8 @@ def _slip_hypotheses(declared: Experiment, fitted_m: Array, of: str) -> Iterator
 
 
 def _largest_step(residual: Array) -> tuple[float, int]:
-    """Return by what factor two means explain residuals (T, 3) better than one, and the
-    sample at which the second begins.
+    """Return the factor by which two means explain residuals (T, 3) better than one, and the index
+    of the sample at which the second begins; 1 and 0 for too few samples. NaN is ignored.
     """
     present = np.flatnonzero(np.isfinite(residual[:, 0]))
     if len(present) < 2 * SHORTEST:
@@ -208,7 +225,9 @@ class _Refitter:
         return None if fitted_m is None else _misfit(experiment, fitted_m)
 
     def _fit(self, experiment: Experiment) -> Array | None:
-        """Fit one experiment and count the sweeps."""
+        """Return the markers (T, M, 3) [m] of a fit of one experiment, and subtract its sweeps from
+        those allowed; None if none are left, or the fit fails.
+        """
         if self.sweeps <= 0:
             return None
         method = ReducedSpace(max_iterations=min(self.each, self.sweeps), tolerance=TOLERANCE)
@@ -225,7 +244,18 @@ class _Refitter:
 def _clock_hypotheses(
     alone: _Refitter, declared: Experiment, fitted_m: Array, of: str
 ) -> Iterator[Hypothesis]:
-    """Yield the clock lag for which residuals and velocities agree best, after a few refits."""
+    """Yield the clock lag for which residuals and velocities agree best, after a few refits.
+
+    Parameters
+    ----------
+    alone : _Refitter
+    declared : Experiment
+        Experiment as stated.
+    fitted_m : (T, M, 3) array
+        Markers of its fit [m].
+    of : str
+        Subject of the hypothesis.
+    """
     least = _misfit(declared, fitted_m)
     lag_s = 0.0
     shifted = declared
@@ -249,7 +279,9 @@ def _clock_hypotheses(
 
 
 def with_pose_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
-    """Return the experiment with its poses `lag_s` later [s]; None if too few samples remain."""
+    """Return the experiment with its poses `lag_s` [s] later (negative: earlier); None if fewer
+    than three samples remain, or the result is no valid experiment.
+    """
     t_s = experiment.t_s
     is_covered = t_s <= t_s[-1] + min(lag_s, 0.0) + 1e-9
     if is_covered.sum() < 3:
@@ -287,8 +319,9 @@ def _delayed_poses(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
 
 
 def _marker_lag_s(experiment: Experiment, predicted_m: Array) -> float:
-    """Return by how much the markers lag behind the fit [s]: Σ r·v / Σ v·v of residuals and
-    velocities.
+    """Return by how much the markers lag behind predicted tracks (T, M, 3) [m], in seconds: Σ r·v /
+    Σ v·v of residuals (fitted less measured) and velocities; 0 without motion. Missing samples are
+    ignored.
     """
     v = np.gradient(predicted_m, experiment.timestep_s, axis=0)
     residual = np.where(
@@ -322,7 +355,7 @@ def _with_shifted_grasps(experiment: Experiment, deeper: bool) -> Experiment | N
 
 
 def _residual(experiment: Experiment, predicted_m: Array) -> Array:
-    """Return fitted less measured markers (T, M, 3) [m], NaN where missing."""
+    """Return predicted less measured markers (T, M, 3) [m], NaN where missing."""
     return np.where(
         experiment.markers.is_present[..., None],
         predicted_m - experiment.markers.positions_m,
@@ -331,6 +364,8 @@ def _residual(experiment: Experiment, predicted_m: Array) -> Array:
 
 
 def _misfit(experiment: Experiment, predicted_m: Array) -> float:
-    """Return the root mean square of the residuals in standard deviations."""
+    """Return the root mean square of the residuals of predicted markers (T, M, 3) [m] in standard
+    deviations; missing samples are ignored.
+    """
     scaled = _residual(experiment, predicted_m) / experiment.markers.sigma_m[:, None]
     return root_mean(scaled[experiment.markers.is_present] ** 2)

@@ -83,7 +83,16 @@ def _combination_sentences(uncertainty: Uncertainty) -> list[str]:
 def _combination_sentence(
     uncertainty: Uncertainty, members: NDArray[np.intp], eigenvalue: float, vector: Array
 ) -> str:
-    """Return the sentence about one combination of confounded parameters (members are indices)."""
+    """Return the sentence about one combination of confounded parameters.
+
+    Parameters
+    ----------
+    uncertainty : Uncertainty
+    members : array of int
+        Indices of the parameters.
+    eigenvalue, vector : float, array
+        Eigenvalue and eigenvector of their correlation.
+    """
     names = [uncertainty.names[k] for k in members]
     deviations = np.sqrt(np.diag(uncertainty.covariance))[members]
     quantiles = uncertainty.quantiles[members]
@@ -143,7 +152,7 @@ def _precision_text(factor: float) -> str:
 
 
 def _product_text(names: Sequence[str], powers: Array) -> str:
-    """Return a product of powers of parameters as text."""
+    """Return a product of powers of parameters as text, such as "a · b^0.5"."""
     parts = []
     for name, power in zip(names, powers, strict=True):
         parts.append(name if abs(power - 1) < 5e-3 else f"{name}^{power:.2g}")

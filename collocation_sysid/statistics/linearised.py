@@ -35,7 +35,7 @@ from ..program.sweep import Sweep
 
 
 def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
-    """Return the sensitivities dx/dp of each experiment, (N, 3n, m) [m per unit of p].
+    """Return the sensitivities dx/dp of each experiment at z, (N, 3n, m) [m per unit of p].
 
     Prescribed dofs have zeros, and so has x_0 unless it follows as an equilibrium.
 
@@ -155,7 +155,9 @@ class ResidualBlock:
 
     @property
     def is_outlier(self) -> Mask:
-        """Mask (T, M) of the samples beyond Huber's threshold."""
+        """Mask (T, M) of the samples whose residual Huber's loss has shortened; all false without
+        Huber's loss.
+        """
         if self.misfit is None:
             return np.zeros(self.is_present.shape, dtype=bool)
         return np.linalg.norm(self.misfit, axis=2) > np.linalg.norm(self.residual, axis=2) + 1e-9
@@ -215,7 +217,7 @@ class DerivedModuli:
 
 
 def parameter_values(collocation: Collocation, q: Array) -> dict[str, float]:
-    """Return derived moduli and parameters by name, at q."""
+    """Return derived moduli and parameters by name, in SI units, at q (nq,)."""
     constants = (segment.constants for segment in collocation.transcriptions)
     return {**DerivedModuli.from_bodies(constants, q).values, **collocation.parameters.values(q)}
 
@@ -258,14 +260,16 @@ class LinearisedFit:
         return sum(block.measurement_count for block in self.blocks)
 
     def with_disturbances(self, samples: Iterable[Array | None]) -> LinearisedFit:
-        """Return the fit with samples of known errors of the residuals for each block; None
-        where there are none.
+        """Return the fit with samples (K, T, M, 3) of known errors of the residuals for each block;
+        None for a block without them.
         """
         pairs = zip(self.blocks, samples, strict=True)
         return replace(self, blocks=tuple(replace(b, disturbances=each) for b, each in pairs))
 
     def after_step(self, step: Array) -> LinearisedFit:
-        """Return the fit after a step (p,) of all parameters, to first order."""
+        """Return the fit after a step (p,) of all parameters, to first order: with changed
+        residuals and the same derivatives.
+        """
         blocks_after = (replace(b, residual=b.residual + b.jacobian @ step) for b in self.blocks)
         at_best = self.prior_residual + self.prior_jacobian * step
         return replace(self, blocks=tuple(blocks_after), prior_residual=at_best)
@@ -278,6 +282,9 @@ class LinearisedFit:
 
 def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
     """Linearise a fit at a solution.
+
+    Residuals and derivatives are weighted as Huber's loss does at the optimum, see
+    `huber_as_weights`.
 
     Parameters
     ----------
@@ -340,8 +347,8 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
 
 
 def _covariance_by_phases(collocation: Collocation) -> Array | None:
-    """Return the covariance (nq, nq) of q due to unknown phases; None if there is no
-    two-phase field.
+    """Return the covariance (nq, nq) of q due to unknown phases of two-phase fields; None if there
+    is no such field, or it has no samples.
     """
     names = [item.name for item in collocation.parameters.free]
     covariance: Array | None = None
@@ -385,7 +392,7 @@ class Information:
 
 
 def factorise_information(fit: LinearisedFit) -> Information:
-    """Factorise the information of a fit."""
+    """Return the information of residuals and priors of a fit about all parameters, factorised."""
     all_rows = least_squares_of_fit(fit)
     slopes = tuple(block.channels[1] @ all_rows.root for block in fit.blocks)
     prior = all_rows.root * fit.prior_jacobian[:, None]

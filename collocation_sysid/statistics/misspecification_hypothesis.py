@@ -1,9 +1,10 @@
 """Misspecification hypotheses: what may be described wrongly, how it is tested, and its message.
 
 A hypothesis is tested by the misfit with the mistake corrected: by natural modes for many
-stiffnesses (`modal`), by another fit, or by the wrench of a fit to the markers alone (`causes`).
-Contradictions and jumps need no test (`plausible`). All are ranked by the factor by which the
-misfit decreases. An accepted hypothesis becomes a concern of the topic "description".
+stiffnesses (`modal_misspecifications`), by another fit, or by the wrench of a fit to the markers
+alone (`wrench_causes`). Contradictions and jumps need no test (`plausibility`). All are ranked by
+the factor by which the misfit decreases. An accepted hypothesis becomes a concern of the topic
+"description".
 """
 
 from __future__ import annotations
@@ -89,7 +90,12 @@ class HypothesisTest:
     noise_level: float = 0.0
 
     def accepted(self, hypotheses: Iterable[Hypothesis]) -> Iterator[Hypothesis]:
-        """Iterate over the hypotheses that fit far better, with their strength."""
+        """Yield those hypotheses, with their strength, whose correction decreases the misfit by the
+        required factor, or from above the noise to below it.
+
+        The strength is the factor by which the misfit decreases, divided by the handicap. A
+        hypothesis whose misfit cannot be computed (None) is omitted.
+        """
         for each in hypotheses:
             if (misfit := self.misfit_of(each.corrected)) is None:
                 continue
@@ -101,8 +107,18 @@ class HypothesisTest:
 def clock_hypothesis(
     subject: str, lag_s: float, corrected: Any, handicap: float = 1.0
 ) -> Hypothesis:
-    """Return the hypothesis that the markers' clock is late by `lag_s` [s] (negative:
-    early) compared with the poses.
+    """Return the hypothesis that the markers' clock is late by `lag_s` [s] (negative: early)
+    compared with the poses.
+
+    Parameters
+    ----------
+    subject : str
+        Beginning of the message.
+    lag_s : float
+    corrected : object
+        Description with the mistake corrected.
+    handicap : float
+        Divisor of the hypothesis' strength.
     """
     when, do = ("late", "add") if lag_s > 0 else ("early", "subtract")
     data = {"when": when, "by_ms": 1e3 * abs(lag_s), "do": do}

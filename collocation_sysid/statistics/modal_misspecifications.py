@@ -102,8 +102,8 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _axes(name: str, tracks_m: Array) -> Iterator[Hypothesis]:
-    """Yield the tracks (T, M, 3) with their axes in every other order and of either sign,
-    as hypotheses.
+    """Yield the tracks (T, M, 3) with their axes in every other order and of either sign, as
+    hypotheses about the experiment of a name; the tracks are their `corrected`.
     """
     for axes, (order, signs) in OTHER_AXES.items():
         turned = np.array(signs) * tracks_m[..., list(order)]
@@ -158,7 +158,9 @@ class ModalComparison:
         return float(self._misfits_m(declared, self.response.predict(declared)).min())
 
     def best_prediction(self, declared: DeclaredMotion) -> Array:
-        """Return the markers (T, M, 3) of the best stiffness [m]."""
+        """Return the markers (T, M, 3) [m] as predicted from a description with the stiffness and
+        damping that fit best.
+        """
         predicted = self.response.predict(declared)
         return predicted[int(self._misfits_m(declared, predicted).argmin())]
 
@@ -200,8 +202,8 @@ class ModalComparison:
         ).accepted(_axes(self.declared.name, declared_m))
 
     def _misfits_m(self, declared: DeclaredMotion, predicted: Array) -> Array:
-        """Return the misfit (S,) of each prediction: root mean square distance of the best
-        90 % of the samples, and the floor [m].
+        """Return the misfit (S,) [m] of each prediction (S, T, M, 3): the root of the mean squared
+        distance of the nearest 90 % of the samples plus the squared floor.
         """
         present = np.isfinite(declared.tracks_m[..., 0]) & np.isfinite(predicted[0, ..., 0])
         distance = np.linalg.norm(predicted - declared.tracks_m, axis=3)[:, present]
@@ -235,7 +237,9 @@ class ModalComparison:
         yield Hypothesis("camera-frame", declared.name, corrected=moved_tracks, handicap=FITTED)
 
     def _clock_hypotheses(self) -> Iterator[Hypothesis]:
-        """Yield the hypothesis of the clock lag that fits best."""
+        """Yield the hypothesis of the clock lag that fits best, unless the allowed lags are
+        none.
+        """
         declared = self.declared
         predicted = self.response.predict(declared)
         allowed = LAGS_S[np.abs(LAGS_S) < LONGEST_LAG * np.ptp(declared.t_s)].tolist()
@@ -246,7 +250,9 @@ class ModalComparison:
             yield clock_hypothesis(declared.name, lag_s, replace(declared, lag_s=lag_s), FITTED)
 
     def _name_hypotheses(self) -> Iterator[Hypothesis]:
-        """Yield the hypothesis that markers have each other's names, tested on these markers."""
+        """Yield the hypothesis that markers have each other's names, tested on these markers; none
+        with fewer than two markers or a marker without samples.
+        """
         declared = self.declared
         squares = np.sum(
             (declared.tracks_m[:, :, None] - self.best_prediction(declared)[:, None]) ** 2, axis=3
@@ -270,15 +276,17 @@ class ModalComparison:
 
 
 def _with_markers(declared: DeclaredMotion, tracks_m: Array, markers: Index) -> DeclaredMotion:
-    """Return the description with the tracks of some markers only."""
+    """Return the description with the tracks `tracks_m` (T, M, 3) [m] of some markers (indices)
+    only; the others are missing (NaN).
+    """
     few_m = np.full_like(tracks_m, np.nan)
     few_m[:, markers] = tracks_m[:, markers]
     return replace(declared, tracks_m=few_m)
 
 
 def _fit_rigid_motion(from_m: Array, to_m: Array) -> tuple[Array, Array]:
-    """Return rotation (3, 3) and translation (3,) that map points to others, both (T, M,
-    3), by least squares.
+    """Return rotation (3, 3) and translation (3,) that map points `from_m` to `to_m`, both (T, M,
+    3) [m], by least squares; points that are NaN in either are ignored.
     """
     both = np.isfinite(from_m[..., 0]) & np.isfinite(to_m[..., 0])
     a = from_m[both]

@@ -97,7 +97,7 @@ class NoiseLevel:
 
     @cached_property
     def factors(self) -> dict[str, float]:
-        """Size of the errors of each marker over σ."""
+        """Standard deviation of the errors of each marker over σ, by the marker's name."""
         return dict(zip(self.names, np.sqrt(self.variances).tolist(), strict=True))
 
     @property
@@ -150,7 +150,10 @@ class NoiseLevel:
 
 
 def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseLevel:
-    """Compare the residuals of a fit with the stated σ.
+    """Return the size of the errors of each marker compared with the stated σ, with tests, from the
+    residuals of a fit.
+
+    Blocks with a floor of noise are left out.
 
     Parameters
     ----------
@@ -250,8 +253,8 @@ def project_errors(information: Information, errors: Sequence[Array]) -> tuple[A
 
 
 def _known_error_moments(fit: LinearisedFit, information: Information) -> tuple[Array, Array]:
-    """Return the covariance (r, r) of the score, and sums of squares (G, K) of each marker,
-    due to known errors.
+    """Return the covariance (r, r) of the score, and the sums of squares (G, K) of each of G
+    markers in each of K samples, due to known errors; zeros with K = 1 if there are none.
     """
     is_used = [block.is_present.any(axis=0) & (not block.has_noise_floor) for block in fit.blocks]
     if not len((samples := disturbance_samples(fit))[0]):
@@ -274,7 +277,25 @@ def _solve_noise_level(
     prior: Array,
     of_score: Array,
 ) -> NoiseLevel:
-    """Solve for the variances of the markers and test them."""
+    """Return the variances of the markers' errors, and tests of them.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Names of the G markers.
+    squares : (G,) array
+        Sum of squared residuals of each marker, in units of σ².
+    counts : (G,) array
+        Number of measured values.
+    besides : (G, K) array
+        Sums of squares due to known errors, in K samples.
+    shares : (G, r, r) array
+        Part of each marker in the information.
+    prior : (r, r) array
+        Information of the priors.
+    of_score : (r, r) array
+        Covariance of the score due to known errors.
+    """
     fitted = np.trace(shares, axis1=1, axis2=2)
     own_freedoms = np.maximum(counts - fitted, 0.0)
     # Sums of squares with these means and twice these "spreads" as variances are tested as χ² of
@@ -313,7 +334,9 @@ def _solve_noise_level(
 
 
 def _bartlett(squares: Array, freedoms: Array) -> float:
-    """Return the p-value of Bartlett's test of equal variances."""
+    """Return the p-value of Bartlett's test of equal variances, from sums of squares (G,) and
+    degrees of freedom (G,); 1 for fewer than two groups.
+    """
     used = (freedoms >= 1) & (squares > 0)
     count = int(used.sum())
     each = freedoms[used]

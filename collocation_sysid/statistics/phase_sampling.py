@@ -226,7 +226,9 @@ def initial_phases(
 
 
 def _class_threshold(values: Array, weights: Array) -> float:
-    """Return the threshold between two classes with the least weighted variance within (Otsu)."""
+    """Return the threshold between two classes of values (E,) with the least weighted variance
+    within (Otsu); the upper class includes it.
+    """
     order = np.argsort(values)
     sorted_values = values[order]
     weight = np.cumsum(weights[order])
@@ -273,7 +275,7 @@ def _run_chain(
     seed: int,
     settings: SamplerSettings,
 ) -> PosteriorDraws:
-    """Draw phases, contrast and parameters by one chain.
+    """Draw phases, contrast and parameters by one chain, whose first quarter is discarded.
 
     Parameters
     ----------
@@ -282,7 +284,7 @@ def _run_chain(
     faces : InternalFaces
         Faces between elements.
     start : (E,) array
-        Initial phases, 0 or 1.
+        Initial phases, 0 or 1; not modified.
     seed : int
         Seed of the random numbers.
     settings : SamplerSettings

@@ -33,7 +33,9 @@ def placement_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that the mesh has unconnected parts, some of which no grasp holds."""
+    """Yield the hypothesis that the mesh has unconnected parts, some of which no grasp holds; none
+    if all are held.
+    """
     cells = experiment.body.cells
     count = len(experiment.body.nodes_m)
     first = np.repeat(cells[:, 0], cells.shape[1] - 1)

@@ -90,8 +90,8 @@ def _likely_length(body: Body, *, too_large: bool) -> str:
 
 
 def material_hypothesis(body: Body, theta: Array) -> Hypothesis | None:
-    """Return the hypothesis that no material is as dense and as soft as a body with constants θ;
-    None if one may be.
+    """Return the hypothesis that no material is as dense and as soft as a body with constants θ
+    (k,); None if there may be one.
 
     Motion determines the stiffness over the density only, so a wrong density leaves no other trace.
     """
@@ -117,8 +117,8 @@ TOUCHING = 0.05
 
 
 def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield hypotheses of a wrong sign, where displacement and load of a static experiment are
-    anticorrelated.
+    """Yield hypotheses of a wrong sign of a wrench, where displacement and load of a static
+    experiment are anticorrelated.
 
     Dynamic experiments are not tested, because of inertia.
     """
@@ -146,8 +146,8 @@ def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _pushing_axis(grasp: Grasp, shifts_m: Array) -> str:
-    """Return the world axis along which an obstacle moves most; "" if it does not move, or
-    its force is not in world axes.
+    """Return the world axis along which an obstacle moves most, from its shifts (S, 3) [m]; "" for
+    a grasp, if the obstacle does not move, or if its force is not in world axes.
     """
     moved_m = np.ptp(shifts_m, axis=0)
     if not isinstance(grasp, Obstacle) or grasp.wrench is None:
@@ -177,7 +177,15 @@ def step_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _common_jump(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]:
-    """Yield the hypothesis of a step of all markers together that the poses do not have."""
+    """Yield the hypothesis of the largest step of all markers together that the poses do not have;
+    only samples with all markers are used.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    moved_m : (T, m, 3) array
+        Points carried by the poses [m].
+    """
     tracks_m = experiment.markers.positions_m
     sigma_m = experiment.markers.sigma_m
     complete = np.isfinite(tracks_m).all(axis=(1, 2))
@@ -199,8 +207,8 @@ STILL_SIGMAS = 6.0
 
 
 def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that poses are wrong, if markers move on a body that starts at
-    rest and that nothing moves.
+    """Yield the hypothesis that poses are wrong, if markers move although the body starts at rest
+    and neither grasps nor loads change.
     """
     t_s = experiment.t_s
     grasps = experiment.grasps
@@ -245,8 +253,8 @@ def _marker_box_m(experiment: Experiment) -> Array:
 
 
 def step_sizes(x: Array) -> Array:
-    """Return the size (T − 3, M) of a step between samples k + 1 and k + 2 of tracks x (T,
-    M, 3); NaN in gaps.
+    """Return the size (T − 3, M) [m] of a step between samples k + 1 and k + 2 of tracks x (T, M,
+    3), from second differences of opposite directions; 0 for smooth motion, NaN in gaps.
     """
     second = x[2:] - 2 * x[1:-1] + x[:-2]
     opposite = -np.sum(second[:-1] * second[1:], axis=2)
@@ -254,8 +262,8 @@ def step_sizes(x: Array) -> Array:
 
 
 def _pose_jump_hypotheses(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]:
-    """Yield the hypothesis of the largest jump of points (T, m, 3) carried by the poses, if
-    the markers do not follow it.
+    """Yield the hypothesis of the largest jump of points `moved_m` (T, m, 3) [m] carried by the
+    poses, if the markers do not follow it.
     """
     sizes = step_sizes(moved_m).max(axis=1)
     k = int(sizes.argmax())
@@ -286,8 +294,20 @@ def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
 def _step_hypothesis(
     code: str, experiment: Experiment, k: int, size_m: float, usual_m: float, marker: str = ""
 ) -> Iterator[Hypothesis]:
-    """Yield the hypothesis of a step between samples k + 1 and k + 2, if it is far larger
-    than usual.
+    """Yield the hypothesis of a step between samples k + 1 and k + 2, if it is far larger than
+    usual.
+
+    Parameters
+    ----------
+    code : str
+        Code of the concern.
+    experiment : Experiment
+    k : int
+        Index as in `step_sizes`.
+    size_m, usual_m : float
+        Size of the step, and of usual changes [m].
+    marker : str
+        Name of the marker; empty for all.
     """
     data = {"marker": marker, "by_mm": 1e3 * size_m, "t_s": experiment.t_s[k + 2]}
     if size_m >= SUDDEN * usual_m:
@@ -295,7 +315,9 @@ def _step_hypothesis(
 
 
 def _is_lasting(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
-    """Whether the marker's distances from the others remain changed after a sample."""
+    """Whether the distances of a marker (index) from the others in tracks (T, M, 3) remain changed
+    from the index `sample` on, by a part of the step `step_m` [m]; true if there are no others.
+    """
     to_others = np.linalg.norm(tracks - tracks[:, marker : marker + 1], axis=2)
     others = np.delete(to_others, marker, axis=1)
     if not others.shape[1]:
@@ -308,7 +330,9 @@ def _is_lasting(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
 
 
 def _usual_change(sizes: Array) -> float:
-    """Return the 90 % quantile of changes without the largest three; 0 if there are no others."""
+    """Return the 90 % quantile of changes of any shape, without NaN and the largest three; 0 if
+    there are no others.
+    """
     rest = np.sort(sizes[np.isfinite(sizes)])[:-3]
     return float(np.quantile(rest, LIVELY)) if len(rest) else 0.0
 
@@ -355,8 +379,8 @@ def name_exchange_hypotheses(
 
 
 def _marker_identities(experiment: Experiment) -> tuple[Index, float]:
-    """Return the identity (T, M) of each marker among those of the first samples, and the
-    factor by which exchanged names fit better.
+    """Return the identity (T, M) of each marker among those of the first samples, and the factor by
+    which exchanged names fit better; 0 if no names are exchanged.
     """
     markers = experiment.markers
     grasp = carrying_grasp(experiment)
@@ -379,8 +403,15 @@ def _marker_identities(experiment: Experiment) -> tuple[Index, float]:
 
 
 def _best_assignment(before_m: Array, now_m: Array, sigma_m: Array) -> tuple[Index, float]:
-    """Return the assignment of markers to those of the sample before, and the factor by
-    which it is nearer than no exchange.
+    """Return the assignment (M,) of markers to those of the sample before, and the factor by which
+    it is nearer than no exchange.
+
+    Parameters
+    ----------
+    before_m, now_m : (M, 3) arrays
+        Positions at both samples [m]; a common shift does not matter.
+    sigma_m : (M,) array
+        Standard deviation of each marker [m].
     """
     same = np.arange(len(now_m))
     if len(now_m) < 2:

@@ -131,7 +131,9 @@ def with_pose_noise(
 
 
 def _grasp_noise(name: str, grasp: Grasp) -> PoseNoise:
-    """Return the noise of a grasp's poses, as stated or else as estimated."""
+    """Return the noise of a grasp's poses, as stated or else as estimated; `name` is that of the
+    experiment.
+    """
     rough_m, rough_rad = estimate_pose_noise(grasp.poses)
     sigma_m = rough_m if grasp.sigma_m is None else grasp.sigma_m
     sigma_rad = rough_rad if grasp.sigma_rad is None else grasp.sigma_rad
@@ -141,7 +143,9 @@ def _grasp_noise(name: str, grasp: Grasp) -> PoseNoise:
 def _residual_samples(
     iterate: ExperimentIterate, noises: Sequence[PoseNoise], rng: np.random.Generator
 ) -> list[Array]:
-    """Return samples (K, T, M, 3) of the changes of each measurement's residuals."""
+    """Return K samples (K, T, M, 3) of the changes of each measurement's residuals by noise of the
+    poses of each grasp.
+    """
     segment = iterate.segment
     prescribed = iterate.equations.prescribed
     value_count = prescribed.positions_m.size * 8
@@ -167,8 +171,9 @@ def _residual_samples(
 def _pose_samples(
     iterate: ExperimentIterate, grasp: Grasp, noise: PoseNoise, rng: np.random.Generator, count: int
 ) -> tuple[Array, Array]:
-    """Return samples of translation and rotation errors of the poses at grid times, each
-    (N, c, 3); zero while the grasp does not hold.
+    """Return `count` samples of translation [m] and rotation [rad] errors of the poses of a grasp
+    at the N grid times, (N, count, 3) each; zero while the grasp does not hold, and for a single
+    pose.
     """
     t_s = iterate.segment.dynamics.t_s
     samples = np.zeros((2, len(t_s), count, 3))
@@ -190,9 +195,16 @@ def _add_displacements(
     shifts: Array,
     rotations: Array,
 ) -> None:
-    """Add the displacements of a grasp's nodes due to pose errors to `displacements_m` (N, g, c),
-    in
-    place.
+    """Add the displacements of a grasp's nodes due to pose errors to `displacements_m` (N, g, c)
+    [m], in place.
+
+    Parameters
+    ----------
+    displacements_m : (N, g, c) array
+    iterate : ExperimentIterate
+    grasp : Grasp
+    shifts, rotations : (N, c, 3) arrays
+        Translation [m] and rotation vector [rad] errors.
     """
     segment = iterate.segment
     prescribed = iterate.equations.prescribed
@@ -210,7 +222,9 @@ def _add_displacements(
 
 
 def _interpolate(poses: PoseSequence, values: Array, t_s: Array) -> Array:
-    """Return values (m, …) at the poses' times interpolated to times, as the poses are."""
+    """Return values (m, …) at the poses' times, interpolated to the times `t_s` as the poses
+    are.
+    """
     if poses.interpolation == "smooth" and len(poses.t_s) > 3:
         return CubicSpline(poses.t_s, values)(t_s)
     kind = "previous" if poses.interpolation == "hold" else "linear"

@@ -138,7 +138,18 @@ def compute_profile(
 
 
 def _find_end(rise: Callable[[float], float], step: float, bound: float) -> float | None:
-    """Return where the loss has risen enough, on one side; None if it has not at the bound."""
+    """Return the change of the logarithm of the parameter at which the loss has risen enough, on
+    the side to which `step` points; None if it has not at the bound.
+
+    Parameters
+    ----------
+    rise : callable
+        Function of that change; zero where the loss has risen enough, negative below.
+    step : float
+        First change that is tried.
+    bound : float
+        Change at which the bound is reached.
+    """
     inside = 0.0
     closest = min if step > 0 else max
     for _ in range(MOST_DOUBLINGS):
@@ -158,7 +169,17 @@ def _message(
     interval: tuple[float | None, float | None],
     bounds: tuple[float, float],
 ) -> str:
-    """Return the message for an interval."""
+    """Return the message for an interval of a parameter.
+
+    Parameters
+    ----------
+    parameter : str
+        Name of the parameter.
+    interval : (float or None, float or None)
+        Ends; None for one that lies beyond the bound.
+    bounds : (float, float)
+        Bounds of the parameter.
+    """
     lower, upper = interval
     how = "(95 %, profile likelihood)"
     if lower is not None and upper is not None:
@@ -217,8 +238,8 @@ def _loss_of(solution: Solution) -> float:
 
 
 def _loss_with_fixed(solution: Solution, item: Parameter, value: float) -> float:
-    """Return the smallest loss with one parameter fixed at a value, from the answer;
-    infinite if the solve does not converge.
+    """Return the smallest loss, with priors, with one parameter fixed at a value, searched from the
+    answer; infinite if the solve does not converge.
     """
     before = solution.collocation
     started = before.parameters.with_guess(solution.parameters)
@@ -235,7 +256,9 @@ def _loss_with_fixed(solution: Solution, item: Parameter, value: float) -> float
 
 
 def _noise_scale(solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, k: int) -> float:
-    """Return the variance of the estimate over that for the stated σ; 1 if it is not finite."""
+    """Return the variance of the parameter with index k over its variance for independent errors of
+    the stated σ; 1 if that ratio is not finite.
+    """
     size = relative_derivatives(solution.collocation.parameters, solution.q)[k]
     standard_error = size * least_squares_of_fit(fit).standard_errors[k]
     scale = float(uncertainty.covariance[k, k] / standard_error**2)

@@ -76,7 +76,9 @@ class RecordingComparison:
 
     @property
     def chi_squared(self) -> Array:
-        """χ² of the disagreement on each parameter (nq,)."""
+        """χ² of the disagreement on each parameter (nq,); recordings that do not determine it (NaN)
+        are left out.
+        """
         with np.errstate(invalid="ignore", divide="ignore"):
             weight = np.nan_to_num(1 / self.deviations**2)
             mean = np.nansum(weight * self.differences, axis=0) / weight.sum(axis=0)
@@ -95,7 +97,9 @@ class RecordingComparison:
         return np.asarray((freedom > 0) & (p < SIGNIFICANT / len(freedom)))
 
     def widen(self, variances: Array) -> Array:
-        """Return variances (nq,) of q of the joint fit, increased where recordings disagree."""
+        """Return the variances (nq,) of q of the joint fit, increased for parameters on which the
+        recordings disagree.
+        """
         ratio = self.chi_squared / np.maximum(self.degrees_of_freedom, 1)
         with np.errstate(invalid="ignore", divide="ignore"):
             of_all = 1 / np.nansum(1 / self.deviations**2, axis=0)
@@ -112,8 +116,8 @@ def blocks_by_recording(fit: LinearisedFit) -> dict[str, list[int]]:
 
 
 def single_fits(fit: LinearisedFit) -> Iterator[tuple[LinearisedFit, Array]]:
-    """Iterate over the fits to each recording alone, each with its parameters less the
-    joint ones.
+    """Yield for each recording the fit to it alone, and the step from the joint parameters to its
+    own, in the order of its names.
     """
     for name, block_numbers in blocks_by_recording(fit).items():
         # What recordings share they have to find alone, too.
@@ -160,7 +164,8 @@ def fit_part(
 def compare_recordings(
     fit: LinearisedFit, alone: Mapping[str, tuple[Array, Array, Array]]
 ) -> RecordingComparison:
-    """Compare recordings by the result of each alone.
+    """Compare recordings by the result of each alone; a parameter that a recording hardly
+    determines has NaN there.
 
     Parameters
     ----------
@@ -184,7 +189,9 @@ def compare_recordings(
 
 
 def _sensitivities_to_differences(fit: LinearisedFit, names: Sequence[str], excess: Array) -> Array:
-    """Return `RecordingComparison.sensitivities` (p, nq n); zero for parameters at a bound."""
+    """Return `RecordingComparison.sensitivities` (p, nq n) for n recordings, by name; zero for
+    parameters at a bound.
+    """
     own = [least_squares_of_blocks(fit, blocks_by_recording(fit)[name]) for name in names]
     each = np.array([o.information for o in own])
     scores = np.array([o.score for o in own])

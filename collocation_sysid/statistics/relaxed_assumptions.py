@@ -3,9 +3,8 @@ estimates.
 
 A relaxed assumption joins the linearised fit as one or several nuisance parameters: its prior has
 the deviation of the uncertainty budget, or a multiple of it, and its derivatives are the changes of
-the residuals if the assumption is wrong, see `changes_of_nuisances`. `routine_probes` uses this in
-every
-solve, `deep_probes` for a deeper check.
+the residuals if the assumption is wrong, see `consider_analysis`. `routine_probes` uses this in
+every solve, `deep_probes` for a deeper check.
 """
 
 from __future__ import annotations
@@ -138,14 +137,18 @@ class SolvedFit:
     changes: ResidualChanges
 
     def uncertainty_of_refit(self, fit: LinearisedFit, p: Array) -> Uncertainty:
-        """Return estimates and error bars of another fit at its parameters p (p,)."""
+        """Return estimates and error bars of another fit at its parameters p (p,), with the error
+        model of this one.
+        """
         q = p[: fit.shared_count]
         constants = (segment.constants for segment in self.collocation.transcriptions)
         fit = replace(fit, derived=DerivedModuli.from_bodies(constants, q))
         return uncertainty_from_fit(fit, self.collocation.parameters, q, self.error_model)
 
     def changes_of_estimates(self, uncertainty: Uncertainty) -> dict[str, EstimateChange]:
-        """Return the changes of the estimates that a refit determines, by name."""
+        """Return the changes of the estimates that a refit determines precisely, from those of the
+        joint fit, by name.
+        """
         changes = {}
         for name, each in {**uncertainty.estimates, **uncertainty.derived}.items():
             error = each.statistical_std_error
@@ -167,7 +170,9 @@ class SolvedFit:
 
 
 def _share_of_interval(change: float, interval: tuple[float, float] | None) -> float | None:
-    """Return a change over the half width of an interval; None without one."""
+    """Return a change over the half width of an interval, with its sign; None without an
+    interval.
+    """
     return None if interval is None else 2 * change / max(interval[1] - interval[0], 1e-300)
 
 
@@ -241,7 +246,8 @@ def with_relaxed_assumption(
         Changes of its residuals by the assumptions, each off by its standard deviation, which is
         the unit of the new parameters.
     name : str
-        Name of the assumption with its component.
+        Name of the assumption with its component. If `changes` does not contain it, no parameter is
+        added.
     widening : float
         Standard deviation of the prior of the new parameters, in these deviations.
     """
@@ -278,7 +284,8 @@ def relaxed_probe(fit: SolvedFit, name: str, wide: LinearisedFit, p: Array) -> P
     Returns
     -------
     Probe
-        Its size is that of the most significant amplitude, if there are several. `report` is empty.
+        Its size is that of the most significant amplitude, if there are several; its `sentences`
+        are empty.
     """
     first = len(fit.fit.names)
     step = gauss_newton_step(wide)

@@ -26,9 +26,10 @@ REMEDIES: Mapping[str, str] = {
     "stiffness_drift": "repeat the first recording at the end",
     "time_scale": "compare all clocks with a reference clock",
     "poisson": "measure Poisson's ratio in a tension test, or estimate it",
-    "damping_law": "compare the laws with compare --damping on faster and slower motions, or state "
-    'damping_law = "none" where the law is known',
-    "rayleigh_damping": "compare the laws with compare --damping on motions that rotate the body",
+    "damping_law": "compare the laws with compare-models --damping on faster and slower motions, "
+    'or state damping_law = "none" where the law is known',
+    "rayleigh_damping": "compare the laws with compare-models --damping on motions that rotate "
+    "the body",
     "grip_layer_m": "glue the body to a stiff plate, or attach markers to the body beside the grip",
     "machine_compliance_m_n": "press the platens against each other without a specimen and state "
     "the slope of displacement over force",

@@ -108,7 +108,9 @@ def diagnose_markers(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
 
 
 def _estimated_kinds(fit: LinearisedFit, block: ResidualBlock) -> tuple[bool, bool]:
-    """Return whether marker offsets, and a time shift, of the experiment are estimated."""
+    """Return whether marker offsets, and a time shift, of the block's experiment are among the
+    parameters of the fit.
+    """
     kinds = [name.removeprefix(f"{block.name}: ") for name in fit.names[fit.shared_count :]]
     return any(k.startswith("offset") for k in kinds), any(k.startswith("time") for k in kinds)
 
@@ -121,7 +123,21 @@ def _diagnose_marker(
     level: NoiseLevel,
     outliers: Mapping[str, Outlier],
 ) -> MarkerDiagnosis:
-    """Diagnose one marker of a block."""
+    """Return the diagnosis of one marker of a block.
+
+    Parameters
+    ----------
+    block : ResidualBlock
+    marker : int
+        Index of the marker; it must have a sample.
+    shared : int
+        Number of shared parameters.
+    estimated_kinds : (bool, bool)
+        Whether marker offsets, and a time shift, are estimated.
+    level : NoiseLevel
+    outliers : mapping of str to Outlier
+        Outlier of each marker that has one, by "experiment/marker".
+    """
     present = block.is_present[:, marker]
     name = f"{block.name}/{block.marker_names[marker]}"
     residual = block.residual[:, marker] * block.sigma_m[marker]
@@ -187,8 +203,8 @@ def _lag1(varying: Array, present: NDArray[np.bool_]) -> float:
 
 
 def _largest_peak(varying: Array, t_s: Array) -> tuple[float, float]:
-    """Return frequency [Hz] and share of the power of the largest peak of the periodogram;
-    zeros if there is none.
+    """Return the frequency [Hz] of the largest peak in the periodogram of evenly sampled values (T,
+    3), and its share of the power; zeros if there is none.
     """
     if len(t_s) < 4:
         return 0.0, 0.0
@@ -214,7 +230,21 @@ def _message(
     motion: Array,
     estimated: tuple[bool, bool],
 ) -> str:
-    """Return the message for a marker without outlier."""
+    """Return the message for a marker without outlier: the likely cause of its residuals.
+
+    Parameters
+    ----------
+    diagnosis : MarkerDiagnosis
+    pairs : int
+        Number of pairs of consecutive present samples.
+    block : ResidualBlock
+        Residuals of the experiment's markers.
+    motion : (T, k) array
+        Derivatives of the marker's residuals by the shared parameters, which have the frequency of
+        the motion.
+    estimated : (bool, bool)
+        Whether marker offsets, and a time shift, are estimated.
+    """
     t_s = block.t_s
     name = f"{diagnosis.experiment}/{diagnosis.marker}"
     size = f"{1e3 * diagnosis.rms_m:.2g} mm RMS"
@@ -270,8 +300,8 @@ def _white_noise_message(diagnosis: MarkerDiagnosis) -> str:
 
 
 def _oscillation_message(diagnosis: MarkerDiagnosis, t_s: Array, motion: Array) -> str:
-    """Return the description of oscillating residuals, compared with the frequency of the
-    motion.
+    """Return the description of oscillating residuals at times (T,) [s], compared with the
+    frequency of the motion, which derivatives `motion` (T, k) of the residuals show.
     """
     share = f"{100 * diagnosis.oscillating_share:.0f} % of the squared residuals"
     record_s = (t_s[1] - t_s[0]) * len(t_s)
@@ -335,7 +365,9 @@ class Outlier:
 
 
 def remove_outliers(fit: LinearisedFit) -> tuple[LinearisedFit, tuple[Outlier, ...]]:
-    """Return the fit without its outliers, and the outliers; the same fit if there are none."""
+    """Return the fit without its outliers, which count as missing, and the outliers; the same fit
+    and an empty tuple if there are none.
+    """
     blocks = []
     outliers = []
     for block in fit.blocks:
@@ -350,7 +382,10 @@ def remove_outliers(fit: LinearisedFit) -> tuple[LinearisedFit, tuple[Outlier, .
 
 
 def _find_outlier(block: ResidualBlock, marker: int, significance: float) -> Outlier | None:
-    """Return the sample that dominates a marker's residuals; None if none does."""
+    """Return the sample that dominates the residuals of a marker (index); None if none does.
+
+    It would occur by chance with a probability below `significance`.
+    """
     power = np.sum(block.residual[:, marker] ** 2, axis=1)
     count = int(block.is_present[:, marker].sum())
     sample = int(power.argmax())
@@ -372,7 +407,9 @@ def _find_outlier(block: ResidualBlock, marker: int, significance: float) -> Out
 
 
 def _without_sample(block: ResidualBlock, marker: int, sample: int) -> ResidualBlock:
-    """Return the block without one sample of a marker."""
+    """Return the block without one sample of a marker, both given by index: it counts as
+    missing.
+    """
     is_included: Mask = np.ones(block.is_present.shape, dtype=bool)
     is_included[sample, marker] = False
     each = is_included[..., None]

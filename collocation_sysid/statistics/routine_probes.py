@@ -67,7 +67,7 @@ def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
     Returns
     -------
     tuple of Probe
-        Probes with `routine` set; `report` is empty where the amplitude is not significant.
+        Probes with `routine` set; `sentences` is empty where the amplitude is not significant.
     """
     limit = significance_limit(solved_fit.changes)
     probes = []

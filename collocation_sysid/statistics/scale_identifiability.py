@@ -28,8 +28,8 @@ LEAST_REMAINDER = 1e-8
 def parameters_of_open_scale(
     experiments: Iterable[Experiment], parameters: Parameters
 ) -> tuple[str, ...]:
-    """Return the parameters of which only ratios can be determined, densities among them;
-    mostly empty.
+    """Return the names of the parameters of which only ratios can be determined, densities among
+    them; empty if no density is estimated or a known force sets the scale.
     """
     if not any(is_density(item.name) for item in parameters.free):
         return ()
@@ -112,8 +112,17 @@ def _scaled_parameters(
 def _common_scaling(
     body: Body, theta: Array, slope: Array, includes_declared: bool
 ) -> Array | None:
-    """Return the change of θ (k,) if all moduli and densities change by a common factor;
-    None if a density cannot.
+    """Return the change of θ (k,) if all moduli and densities change by a common factor; None if a
+    density cannot change.
+
+    Parameters
+    ----------
+    body : Body
+    theta : (k,) array
+    slope : (k, nq) array
+        Derivatives of θ by q.
+    includes_declared : bool
+        Whether stated densities count as changeable.
     """
     if not includes_declared and not all(part.has_free_density for part in body.parts):
         return None
@@ -135,7 +144,9 @@ LEAST_RESTRAINT = 2.0
 
 
 def is_motionless(experiment: Experiment) -> bool:
-    """Whether neither grasps, loads nor markers change, except for noise."""
+    """Whether neither grasps, loads nor markers of an experiment change, except for the noise of
+    the markers.
+    """
     markers = experiment.markers
     t_s = experiment.t_s
     sigma_m = float(np.median(markers.sigma_m)) if markers.names else 0.0

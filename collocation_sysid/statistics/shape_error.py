@@ -88,8 +88,11 @@ def surface_modes(body: Body, known: Index, correlation: float = CORRELATION) ->
 
 
 def _correlation_modes(points_m: Array, weights: Array, length_m: float) -> Array:
-    """Return the strongest modes (n, SURFACE_MODES or fewer) of a correlated field, scaled
-    by their standard deviations.
+    """Return the strongest modes (n, SURFACE_MODES or fewer) of a random field with unit variance
+    and correlation length `length_m` at points (n, 3), scaled by their standard deviations.
+
+    `weights` (n,) are the areas of the points. Of more than `MOST_NODES` points a random subset
+    determines the modes.
     """
     count = min(len(points_m), MOST_NODES)
     chosen = np.sort(np.random.default_rng(0).permutation(len(points_m))[:count])
@@ -109,8 +112,8 @@ def _correlation_modes(points_m: Array, weights: Array, length_m: float) -> Arra
 
 
 def _harmonic_extension(nodes: ElementNodes, surface: Index, values: Array) -> Array:
-    """Return values (n, m) with those inside the surface replaced by the solution of
-    Laplace's equation on the mesh graph.
+    """Return values (n, m) at the corners with those inside the surface (indices of nodes) replaced
+    by the solution of Laplace's equation on the mesh graph.
     """
     count = len(nodes.points_m)
     extended = values.copy()
@@ -129,8 +132,8 @@ def _harmonic_extension(nodes: ElementNodes, surface: Index, values: Array) -> A
 
 
 def _extend_to_all_nodes(body: Body, corner_fields: Array) -> Array:
-    """Return fields (m, n, 3) at all nodes from those at the corners; nodes of obstacle
-    frames have zero.
+    """Return fields (m, n, 3) at all nodes from those at the corners (m, corners, 3): mid nodes
+    have the mean of both ends, nodes of obstacle frames zero.
     """
     fields = np.zeros((len(corner_fields), *body.nodes_m.shape))
     corners = corner_fields.shape[1]
@@ -142,7 +145,11 @@ def _extend_to_all_nodes(body: Body, corner_fields: Array) -> Array:
 
 
 def standing_nodes(body: Body, gravity_m_s2: Array) -> Index:
-    """Return the lowest nodes of a body, on which it stands if nothing grips it."""
+    """Return the indices of the lowest nodes of the undeformed body, on which it stands if nothing
+    grips it.
+
+    Down is the direction of gravity (3,); that of −z if there is no gravity.
+    """
     points_m = body.nodes.points_m
     length = float(np.linalg.norm(gravity_m_s2))
     up = -np.asarray(gravity_m_s2) / length if length else np.array([0.0, 0.0, 1.0])

@@ -43,7 +43,9 @@ class FirstContact:
 
     @classmethod
     def from_motion(cls, contact: Contact, x: Array) -> FirstContact:
-        """Find first contact in a motion x (N, 3n), or the nearest approach if there is none."""
+        """Return the first contact in a motion x (N, 3n) [m], or the nearest approach if there is
+        none.
+        """
         law = contact.law_of_contact
         nearest_m = np.inf
         row = 0

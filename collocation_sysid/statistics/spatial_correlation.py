@@ -66,8 +66,8 @@ def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialC
 
     Returns
     -------
-    SpatialErrors or None
-        None if the block has no places or no samples.
+    SpatialCorrelation or None
+        None if the block has no places, no samples, or too few points in each.
     """
     residual, _, present = block.channels
     if block.places_m is None or not present.any():
@@ -124,8 +124,17 @@ def _correlation_matrix(distances_m: Array, share: float, length_m: float) -> Ar
 def _restricted_likelihood(
     contrasts: list[tuple[Array, Array, Array]], share: float, length_m: float
 ) -> tuple[float, float]:
-    """Return −2 log-likelihood up to a constant, and the variance s² that maximises the
-    likelihood.
+    """Return −2 log-likelihood up to a constant, and the variance s² that maximises the likelihood.
+
+    Parameters
+    ----------
+    contrasts : list of (array, array, array)
+        For each sample, contrasts z (k,), the matrix (n, k) that forms them from n points, and the
+        distances (n, n) of the points [m].
+    share : float
+        Share a of the variance that is correlated.
+    length_m : float
+        Correlation length [m].
     """
     squares = 0.0
     logarithms = 0.0

@@ -72,14 +72,20 @@ def _part_concerns(
 ) -> Iterator[Concern]:
     """Yield a concern for each part with an unstable point, about the point of least margin.
 
+    Of each part with a material that is examined, the `POINTS` points with the largest strains of
+    all times are examined; inverted elements and margins that are not finite are left out.
+
     Parameters
     ----------
     body : Body
     theta : (k,)
+        Constants of the body.
     stretches : (T, E, q, 3)
+        Principal stretches at the quadrature points, ascending.
     experiment : str
         Name of the experiment.
     t_s : (T,)
+        Times [s].
     """
     for part, constants in zip(body.parts, body.split_theta(theta), strict=True):
         if not is_examined(part.material):

@@ -2,11 +2,10 @@
 wrong.
 
 An assumption is a row of `ASSUMPTIONS`: its standard deviation, and its effect on the equations of
-motion, c = Σ w F − M a, or on the prescribed displacements; `changes_of_nuisances` propagates
-effects to the
-residuals. Assumptions that change only the measurements (cameras, clocks) are nuisance parameters,
-see `recording.nuisance`. `Assumptions` is the table of the problem file in which users state
-standard deviations.
+motion, c = Σ w F − M a, or on the prescribed displacements; `consider_analysis` propagates effects
+to the residuals. Assumptions that change only the measurements (cameras, clocks) are nuisance
+parameters, see `recording.nuisance`. `Assumptions` is the table of the problem file in which users
+state standard deviations.
 """
 
 from __future__ import annotations
@@ -33,6 +32,7 @@ from ..program.collocation import ExperimentIterate
 from ..program.contact_summary import surface_gaps_and_pressures
 from ..program.reaction_forces import forces_on_dofs, reaction_forces
 from ..recording.grasp import free_rigid_motions
+from ..recording.homogeneous_deformation import STRESS_PER_FORCE, HomogeneousDeformation
 from ..recording.nuisance import KINDS
 from ..schema_tables import ByForm, Section
 from ..validated_types import Options, Positive
@@ -55,6 +55,8 @@ AIR_DENSITY_DEVIATION = 0.03
 # depend on its shape, on edges, on amplitude and on frequency.
 AIR_COEFFICIENT_DEVIATION = 0.4
 _AXES = "xyz"
+# Poisson's ratio of an incompressible material.
+INCOMPRESSIBLE_POISSON = 0.5
 # Laws of damping that a real material may obey: Rayleigh's resists rotation, as no material does.
 OBJECTIVE_DAMPINGS = ("kelvin-voigt", "material")
 # Differences by a displacement: its largest entry over the length of an edge.
@@ -136,8 +138,8 @@ class ExperimentAtAnswer:
 
     @cached_property
     def states(self) -> tuple[Array, Array]:
-        """States ξ [m] and velocities ν [m/s] at the evaluations, each (N, 3n); zero before
-        the first.
+        """States ξ [m] and velocities ν [m/s] at the evaluations, (N, 3n) each; zero before the
+        first evaluation.
         """
         xi, nu = self.dynamics.evaluation_states(self.iterate.x)
         return self.pad_rows(xi), self.pad_rows(nu)
@@ -205,8 +207,8 @@ class ExperimentAtAnswer:
         return self.body.inverse_equilibrium.solve(self.theta)
 
     def force_change_by_reference(self, moved_m: Array) -> Array:
-        """Return the first-order change (N, 3n) of the material's forces if the stress-free
-        positions change by (n, 3) [m].
+        """Return the first-order change (N, 3n) [N] of the material's forces if the stress-free
+        positions change by `moved_m` (n, 3) [m].
         """
         largest = float(np.abs(moved_m).max(initial=0.0))
         if not largest:
@@ -228,8 +230,10 @@ class ExperimentAtAnswer:
 
     @cached_property
     def surface_modes_m(self) -> Array:
-        """Displacements (modes, n, 3) of the nodes if the surface is off by the thickness
-        of the body, for each mode [m].
+        """Modes (modes, n, 3) of an error of the surface along its normal: displacements [m] of the
+        nodes if the standard deviation of the error is the thickness of the body.
+
+        Places of the surface that are in contact with an obstacle are known and do not move.
         """
         segment = self.iterate.segment
         gaps_m = surface_gaps_and_pressures(segment.experiment, self.theta, self.iterate.x)[0]
@@ -241,8 +245,8 @@ class ExperimentAtAnswer:
 
     @cached_property
     def likely_support_dofs(self) -> Index:
-        """Dofs that were probably supported while the mesh was made: those prescribed in
-        the recording, or else the lowest nodes.
+        """Dofs that were probably supported while the mesh was made: those prescribed in the
+        recording or, if these leave rigid motions, those of the lowest nodes.
         """
         prescribed = self.iterate.equations.prescribed.dofs
         own = prescribed[prescribed < self.body.nodes.points_m.size]
@@ -254,7 +258,9 @@ class ExperimentAtAnswer:
         return own
 
     def weight_and_drag(self, mass_kg: Array) -> Array:
-        """Return weight and γ_m damping (N, 3n) of masses (3n,) [N]."""
+        """Return the weight and the mass-proportional damping (N, 3n) [N] of masses (3n,) or (N,
+        3n) [kg].
+        """
         return mass_kg * (self.gravity - self.body.tied_damping_rate(self.theta) * self.states[1])
 
     @property
@@ -290,7 +296,7 @@ class ExperimentAtAnswer:
 
     @cached_property
     def contacts(self) -> dict[int, Contact]:
-        """Contact forces derived from an energy, by their index among the further forces."""
+        """Contact forces with an energy, by their index in `Forces.external_terms`."""
         further = enumerate(self.dynamics.forces.external_terms)
         return {
             k: each
@@ -299,7 +305,9 @@ class ExperimentAtAnswer:
         }
 
     def contact_n(self, index: int) -> Array:
-        """Return the forces (N, 3n) of one of `contact_terms` at the evaluations [N]."""
+        """Return the forces (N, 3n) [N] of one of `contacts` (its index) at the evaluations; zero
+        before the first.
+        """
         xi, nu = self.dynamics.evaluation_states(self.iterate.x)
         forces = self.dynamics.evaluated_forces
         term = forces.external_terms[index]
@@ -325,7 +333,9 @@ class ExperimentAtAnswer:
 
 
 def _dof_mask(dofs: Index, nodes: int) -> NDArray[np.bool_]:
-    """Return the mask (n, 3) of the coordinates of n nodes that are among the dofs."""
+    """Return the mask (n, 3) of the coordinates that are among the dofs (k,), for n = `nodes`
+    nodes.
+    """
     mask = np.zeros(3 * nodes, dtype=bool)
     mask[dofs] = True
     return mask.reshape(nodes, 3)
@@ -351,6 +361,8 @@ class Assumption:
         component; None if there is no effect in this experiment.
     component_names : str
         Names of components with independent errors, separated by spaces; empty if there is one.
+    of_specimens : bool
+        Whether it concerns homogeneous specimens too, which have neither a mesh nor grips.
     """
 
     name: str
@@ -359,6 +371,7 @@ class Assumption:
     description: str
     effect: Callable[[ExperimentAtAnswer, int], Effect | None]
     component_names: str = ""
+    of_specimens: bool = False
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -415,8 +428,8 @@ def _mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _density_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
-    """Effect of a density that is higher at one end of the body and lower at the other, by
-    a share.
+    """Effect of a density that increases along an axis (index) of the body, by a share at one end,
+    and decreases as much towards the other.
     """
     place = at.body.nodes_m[:, axis]
     middle = np.average(place, weights=at.own_mass_kg[::3])
@@ -425,10 +438,11 @@ def _density_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
 
 
 def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
-    """Effect of a stiffness that is higher along one axis by a share of E: the energy ½ E e² of the
-    strain e along it.
+    """Effect of a stiffness that is higher along one axis (index) by a share of E: the energy ½ E
+    e² of the strain e along it.
 
-    Rayleigh damping K(x) v follows by its time derivative.
+    Rayleigh damping K(x) v follows by its time derivative. For specimens e is such that its stress
+    at large stretches λ, (λ − 1/λ²) / 3, is a constant share of that of Neo-Hooke's law.
     """
     body = at.body
     xi, nu = at.states
@@ -442,7 +456,10 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
         stretch, rate = (
             np.einsum("eqa,eaj->eqj", slopes, each.reshape(-1, 3)[body.cells]) for each in (x, v)
         )
-        strain = 0.5 * (np.sum(stretch**2, axis=2, keepdims=True) - 1)
+        squared = np.sum(stretch**2, axis=2, keepdims=True)
+        strain = 0.5 * (squared - 1)
+        if at.iterate.segment.experiment.specimen is not None:
+            strain = (1 - squared**-1.5) / 3
         pull = (strain + gamma * np.sum(stretch * rate, axis=2, keepdims=True)) * stretch
         pull = weight[..., None] * (pull + gamma * strain * rate)
         np.subtract.at(own.reshape(-1, 3), body.cells, np.einsum("eqa,eqj->eaj", slopes, pull))
@@ -471,7 +488,9 @@ def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Effect of a larger Poisson's ratio where it is stated; None where it is estimated."""
+    """Effect of a larger Poisson's ratio where it is stated (fixed, or tied to a fixed one); None
+    if there is none.
+    """
     items = {item.name: item for item in at.parameters.items}
     constants = {
         name
@@ -482,21 +501,25 @@ def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
     if not constants:
         return None
     values = at.parameters.values(at.iterate.q)
+    # Both differences stay below ½, where the bulk modulus would be infinite.
+    largest = max(values[name] for name in constants)
+    step = min(SMALL, (INCOMPRESSIBLE_POISSON - largest) / 2)
     larger, smaller = (
         at.internal_n(
             theta=at.body.theta_from_values(
                 {n: v + way * (n in constants) for n, v in values.items()}
             )
         )
-        for way in (SMALL, -SMALL)
+        for way in (step, -step)
     )
-    return Effect((larger - smaller) / (2 * SMALL))
+    return Effect((larger - smaller) / (2 * step))
 
 
 def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Effect of a compliant layer of the body's own material in the grips; None without a grip.
+    """Effect of a compliant layer of the body's own material between body and grippers; None
+    without a gripper.
 
-    A grasp that prescribes some axes only is a platen or a plane of symmetry, not a grip.
+    A grasp that prescribes some axes only is a platen or a plane of symmetry, not a gripper.
     """
     prescribed = at.iterate.equations.prescribed
     holding = at.iterate.segment.experiment.body_grasps
@@ -513,17 +536,21 @@ def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _is_driven(at: ExperimentAtAnswer) -> NDArray[np.bool_]:
-    """Return the mask (g,) of grasped dofs whose prescribed position changes."""
+    """Return the mask (g,) of grasped dofs whose prescribed position changes; times at which a dof
+    is free (NaN) are ignored.
+    """
     goals = at.iterate.equations.prescribed.positions_m
     return np.asarray(np.nanmax(goals, axis=0) > np.nanmin(goals, axis=0))
 
 
 def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Effect of the compliance of a test bench: displacements are measured behind its
-    frame. None for dynamic experiments.
+    """Effect of the compliance of a test bench: displacements are measured behind its frame. None
+    for dynamic experiments, and if no prescribed position changes.
     """
     experiment = at.iterate.segment.experiment
     prescribed = at.iterate.equations.prescribed
+    if experiment.specimen is not None:
+        return _machine_of_specimen(at, experiment.specimen)
     if not experiment.is_static or not (driven := _is_driven(at)).any():
         return None
     displacement_m = np.zeros_like(at.grasp_force_n)
@@ -537,11 +564,33 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
     return Effect(displacement_m=displacement_m)
 
 
+def _machine_of_specimen(
+    at: ExperimentAtAnswer, deformation: HomogeneousDeformation
+) -> Effect | None:
+    """Effect of the compliance C of a test bench on a homogeneous specimen of area A and length L,
+    whose strain is smaller than the displacement over the length by C A P / L, with its nominal
+    stress P. None if the strain was measured on the specimen.
+    """
+    if not deformation.area_over_length_m:
+        return None
+    dofs = at.iterate.equations.prescribed.dofs
+    direction, normal = (_AXES.index(axis) for axis in deformation.first_stress)
+    loaded = np.searchsorted(dofs, 3 * (1 + normal) + direction)
+    stress_pa = STRESS_PER_FORCE * at.grasp_force_n[:, loaded]
+    strain_m_n = -deformation.area_over_length_m * stress_pa
+    displacement_m = np.zeros_like(at.grasp_force_n)
+    for node, (by_strain_m, _) in deformation.displaced_nodes().items():
+        columns = np.searchsorted(dofs, 3 * node + np.arange(3))
+        displacement_m[:, columns] = strain_m_n[:, None] * by_strain_m
+    return Effect(displacement_m=displacement_m)
+
+
 def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Effect of friction on nodes that slide along platens, perpendicular to the loading axis; None
-    without platens.
+    for a dynamic experiment and without platens.
 
-    Planes of symmetry have no normal force in the loading direction, and no friction.
+    Friction has the size of the normal force and is opposite to the displacement. Planes of
+    symmetry have no normal force in the loading direction, and no friction.
     """
     experiment = at.iterate.segment.experiment
     prescribed = at.iterate.equations.prescribed
@@ -565,7 +614,9 @@ def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of rigid contact in place of the pressure law, to first order."""
+    """Effect of rigid contact in place of the pressure law, to first order; None without contact
+    that has an energy.
+    """
     if not at.contacts:
         return None
     xi, nu = at.dynamics.evaluation_states(at.iterate.x)
@@ -583,7 +634,9 @@ def _buoyancy(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _added_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of more added mass, as a share of that in the model; None in a vacuum."""
+    """Effect of more added mass, as a share of that in the model; None in a vacuum and for a static
+    experiment.
+    """
     if at.iterate.segment.experiment.is_static or not at.added_mass_kg.any():
         return None
     return Effect(mass_kg=at.added_mass_kg)
@@ -595,7 +648,8 @@ def _air_drag(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
-    """Effect of replacing the stated damping law by another with the same γ_r.
+    """Effect of replacing the stated damping law by another (its name in `DAMPINGS`) with the same
+    γ_r.
 
     Parts with a custom law keep it, and so do parts of linear material, for which all laws agree.
     None if there is no difference, or the experiment is static.
@@ -635,9 +689,9 @@ def _rayleigh_damping(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
-    """Effect of a mesh that was made under the body's own weight along one of its axes.
+    """Effect of a mesh that was made under the body's own weight along one of its axes (index).
 
-    None if the problem states the stress-free shape.
+    None if the problem states the rest shape.
     """
     if at.body.rest_shape is not None:
         return None
@@ -647,7 +701,9 @@ def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
 
 
 def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
-    """Effect of an error of the surface along its normal, by one mode of a smooth random field."""
+    """Effect of an error of the surface along its normal, by one mode (index) of a smooth random
+    field; grasped nodes move with the surface.
+    """
     moved_m = at.surface_modes_m[mode]
     prescribed_motion = at.iterate.segment.prescribed_motion
     rotations: Array = np.nan_to_num(prescribed_motion.pose_rows[0])
@@ -675,11 +731,14 @@ ASSUMPTIONS = (
         "density at one end of the body relative to that in its middle", _density_gradient, "x y "
         "z"),
     Assumption("anisotropy", "1", 0.05,
-        "stiffness along one axis relative to that across it", _anisotropy, "x y z"),
+        "stiffness along one axis relative to that across it", _anisotropy, "x y z",
+        of_specimens=True),
     Assumption("stiffness_drift", "1", 0.02,
-        "stiffness at the end of a recording relative to that at its beginning", _drift),
+        "stiffness at the end of a recording relative to that at its beginning", _drift,
+        of_specimens=True),
     Assumption("time_scale", "1", 1e-4, "rate of all clocks", _time_scale),
-    Assumption("poisson", "", 0.02, "Poisson's ratio, if it is stated", _poisson),
+    Assumption("poisson", "", 0.02, "Poisson's ratio, if it is stated", _poisson,
+        of_specimens=True),
     Assumption("damping_law", "1", 1.0,
         "damping force of another objective law, as a fraction of its difference from the "
             "stated law",
@@ -690,7 +749,8 @@ ASSUMPTIONS = (
         _rayleigh_damping),
     Assumption("grip_layer_m", "m", 2e-4,
         "compliance of grip and skin, as the thickness of a layer of the body's material", _grip),
-    Assumption("machine_compliance_m_n", "m/N", 1e-6, "compliance of the test bench", _machine),
+    Assumption("machine_compliance_m_n", "m/N", 1e-6, "compliance of the test bench", _machine,
+        of_specimens=True),
     Assumption("platen_friction", "", 0.1,
         "coefficient of friction of platens between which nodes slide", _platen_friction),
     Assumption("contact_stiffness", "1", 1.0,
@@ -712,9 +772,9 @@ class KnownEffect(Section):
     Attributes
     ----------
     mean : float
-        Its size.
+        Size of the effect, positive.
     deviation : float
-        Standard deviation of its size.
+        Standard deviation of the size.
     """
 
     mean: Positive
@@ -742,7 +802,9 @@ class _AssumptionsBase(Options):
 
     @classmethod
     def exact(cls) -> Assumptions:
-        """Return the table with all assumptions exactly true, as for a simulated recording."""
+        """Return the table with all assumptions exactly true ("none"), as for a simulated
+        recording.
+        """
         exact: dict[str, Literal["none"]] = dict.fromkeys(vars(Assumptions()), "none")
         return Assumptions(**exact)
 
@@ -757,7 +819,9 @@ class _AssumptionsBase(Options):
 
     @property
     def means(self) -> dict[str, float]:
-        """Known effects by name, each over its standard deviation."""
+        """Known effects by name, the mean of each over its standard deviation; other assumptions
+        are omitted.
+        """
         return {
             name: deviation.mean / deviation.deviation
             for name, deviation in vars(self).items()
@@ -770,7 +834,7 @@ if TYPE_CHECKING:
     @dataclass(frozen=True, init=False)
     class Assumptions(_AssumptionsBase):
         """Standard deviations of all assumptions and nuisance parameters, one field per row
-        of `ASSUMPTIONS` and of `recording.nuisance.ROWS`.
+        of `ASSUMPTIONS` and of `recording.nuisance.KINDS`.
         """
 
         def __init__(
@@ -794,6 +858,6 @@ else:
         namespace={
             "__module__": __name__,
             "__doc__": _DOCUMENTATION
-            + "\n".join(f"{name}\n    {said}." for name, _, said in _FIELDS),
+            + "\n".join(f"{name}\n    {description}." for name, _, description in _FIELDS),
         },
     )

@@ -9,12 +9,11 @@ The block of the shared parameters q is reported; nuisance parameters of single 
 by what they could have explained. For independent errors of the stated σ, C is A⁻¹. If the
 residuals are larger or smaller than σ, Cov(e) = s² I with their variance s², and where markers
 differ each has its own variance (see `noise_level`); intervals are then Student's. If a test finds
-the residuals correlated, in time or among markers, Cov(e) is that of `process_autocorrelation`. The
-output states which was used.
+the residuals correlated, in time or among markers, Cov(e) is that of `autocorrelation`. The output
+states which was used.
 
 Use `uncertainty_at` at a solution, or `uncertainty_from_fit` where the linearised fit is known.
-Estimated
-marker places have error bars too, see `marker_places`.
+Estimated marker places have error bars too, see `marker_places`.
 """
 
 from __future__ import annotations
@@ -315,7 +314,7 @@ def _error_bars(
 def _reported_covariance(
     covariance: Array, fit: LinearisedFit, parameters: Parameters, q: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the covariance of all parameters as it is reported, and a mask (nq,) of shared
+    """Return the covariance (p, p) of all parameters as it is reported, and a mask (nq,) of shared
     parameters at a bound.
 
     Rows and columns of parameters at a bound are NaN; shared parameters that the data do not
@@ -340,8 +339,10 @@ def _reported_covariance(
 def _widen_by_scatter(
     covariance_q: Array, quantiles: Array, scatter: RecordingComparison | None
 ) -> tuple[Array, Array, Array]:
-    """Return covariance (nq, nq) and quantiles (nq,), larger where recordings disagree, and
-    the factors (nq,) of the intervals.
+    """Return covariance (nq, nq) and quantiles (nq,), larger where recordings disagree, and the
+    factors (nq,) of the standard deviations.
+
+    Without a comparison (None) they are unchanged.
     """
     if scatter is None:
         return covariance_q, quantiles, np.ones(len(quantiles))
@@ -356,8 +357,8 @@ def _widen_by_scatter(
 def _compare_recordings(
     fit: LinearisedFit, parameters: Parameters, q: Array, errors: ErrorModel
 ) -> RecordingComparison | None:
-    """Return the comparison of single recordings with their own error bars; None if there
-    are fewer than two to compare.
+    """Return the comparison of single recordings with their own error bars; None if fewer than two
+    recordings have enough measurements.
     """
     if len(blocks_by_recording(fit)) < 2:
         return None
@@ -374,8 +375,8 @@ def _compare_recordings(
 
 
 def _has_no_information(parameters: Parameters, q: Array, variances: Array) -> NDArray[np.bool_]:
-    """Return the mask (nq,) of dampings that could be a hundred times their usual value
-    without being noticed.
+    """Return the mask (nq,) of damping parameters that could be a hundred times their usual value
+    without being noticed, from the variances (nq,) of q.
     """
     uninformed = []
     for item, at, variance in zip(parameters.free, q, variances, strict=True):
@@ -399,8 +400,8 @@ def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool]:
 def _is_explained(
     fit: LinearisedFit, factored: Information, level: NoiseLevel, result: Dependence
 ) -> bool:
-    """Whether known disturbances (such as noise of the poses) explain residuals as
-    correlated as those found.
+    """Whether known disturbances (such as noise of the poses) explain residuals as correlated as
+    those in `result`; false without disturbances.
     """
     added = disturbance_samples(fit)
     if not len(added[0]):
@@ -485,8 +486,8 @@ class MarkerPlace:
 def marker_places(
     iterate: ExperimentIterate, uncertainty: Uncertainty | None = None
 ) -> dict[str, MarkerPlace]:
-    """Return the places of an experiment's markers at a solution, by name; without
-    `uncertainty` they have no errors.
+    """Return the places of an experiment's markers at a solution, by the marker's name; without
+    `uncertainty` (None), and where it is not finite, a place has no standard errors.
     """
     segment = iterate.segment
     chart = segment.association
@@ -506,8 +507,8 @@ def marker_places(
 
 
 def _std_errors_m(iterate: ExperimentIterate, uncertainty: Uncertainty | None) -> Array | None:
-    """Return the standard errors (M, 3) of the markers' coordinates [m], or None without
-    `uncertainty`.
+    """Return the standard errors (M, 3) of the coordinates of an experiment's marker places [m],
+    zero for exact places; None without `uncertainty`.
     """
     if uncertainty is None:
         return None

@@ -176,15 +176,14 @@ class VarianceSources:
         )
 
     def noise_shares(self, by_q: Array) -> tuple[float, float]:
-        """Return shares of the statistical variance of an estimate with the derivative
-        `derivatives`
+        """Return shares of the statistical variance of an estimate with the derivative `by_q`
         (nq,).
 
         Returns
         -------
         (float, float)
             Share that would remain with known nuisance parameters; and share that would remain if
-            recordings agreed.
+            recordings agreed. Both are 1 if the variance is 0 or not finite.
         """
         scaled_by_noise = self.widening * by_q
         known, all_free, all_scaled_by_noise = (
@@ -222,15 +221,15 @@ class VarianceSources:
         return more * float(student_ppf(0.975, freedom) / NORMAL_95) ** 2
 
     def known_effect(self, by_q: Array) -> float:
-        """Return the correction for known effects of an estimate with the derivative `derivatives`
-        (nq,).
+        """Return the change of an estimate with the derivative `by_q` (nq,) by all known effects,
+        to first order.
         """
         sizes = [self.means.get(name.partition(" ")[0], 0.0) for name in self.names]
         return float(by_q @ self.sensitivities @ sizes)
 
     def variances_of_assumptions(self, by_q: Array) -> dict[str, float]:
-        """Return the variance by each assumption, its components summed, of an estimate
-        with the derivative `derivatives` (nq,).
+        """Return the variance by each assumption, its components summed, of an estimate with the
+        derivative `by_q` (nq,), by the assumption's name.
         """
         variances: dict[str, float] = {}
         for name, way in zip(self.names, by_q @ self.sensitivities, strict=True):
@@ -250,7 +249,7 @@ def budget(
     Parameters
     ----------
     sources : VarianceSources
-        What moves the estimates beside the noise.
+        Covariances and sensitivities of the fit.
     uncertainty : Uncertainty
         Statistical uncertainty of the fit.
     numerical : mapping of estimate to DiscretisationError
@@ -273,7 +272,19 @@ def _line(
     error: DiscretisationError | None,
     parameters: Parameters,
 ) -> BudgetLine:
-    """Return the budget of one estimate that has a statistical interval."""
+    """Return the budget of one estimate that has a statistical interval.
+
+    Parameters
+    ----------
+    name : str
+        Name of the estimate.
+    estimate : Estimate
+    sources : VarianceSources
+    error : DiscretisationError or None
+        None if the discretisation error is not known.
+    parameters : Parameters
+        Provides scale and bounds.
+    """
     assert estimate.statistical95 is not None
     linear, bounds = parameters.scale_and_bounds(name)
     ends = estimate.statistical95
@@ -319,7 +330,9 @@ def _line(
 
 
 def _variance(at: IntervalCoordinate, middle: float, ends: Interval) -> float:
-    """Return the variance of a 95 % interval, one end of which may be cut off by a bound."""
+    """Return the variance, in the coordinate of the interval, of a 95 % interval about a middle
+    value, one end of which may be cut off by a bound: the mean of both sides.
+    """
     centre = at.from_value(middle)
     low, high = map(at.from_value, ends)
     if np.isclose(centre - low, high - centre, rtol=1e-6):
@@ -333,7 +346,9 @@ def _ranked(shares: Mapping[str, float]) -> dict[str, float]:
 
 
 def _estimate_derivatives(fit: LinearisedFit, parameters: Parameters, q: Array) -> dict[str, Array]:
-    """Return the derivatives (nq,) of each estimate by q, by name."""
+    """Return the derivatives (nq,) of each estimate by q, by name: parameters, tied ones and
+    derived moduli; zero for fixed ones.
+    """
     values = parameters.values(q)
     slopes = {name: np.zeros(len(q)) for name in values}
     for k, item in enumerate(parameters.free):
@@ -346,8 +361,7 @@ def _estimate_derivatives(fit: LinearisedFit, parameters: Parameters, q: Array) 
 
 def main_sources(shares: Mapping[str, Mapping[str, float]], minimum_share: float) -> list[str]:
     """Return the sources with at least a share `minimum_share` in the variance of some estimate,
-    the
-    largest first.
+    the largest first.
 
     Parameters
     ----------

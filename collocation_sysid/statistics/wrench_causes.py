@@ -124,7 +124,9 @@ def wrench_mistakes(collocation: Collocation) -> list[Hypothesis]:
 
 
 def _misses(part: ExperimentIterate) -> bool:
-    """Whether the residuals of a wrench exceed the noise."""
+    """Whether the residuals of any wrench sensor of an experiment are larger than the noise by a
+    factor; false without sensors.
+    """
     # They are behind the markers.
     pairs = zip(part.segment.sensors, part.observables[1:], strict=False)
     return any(
@@ -145,8 +147,8 @@ def _markers_misfit(part: ExperimentIterate) -> float:
 def _from_markers(
     collocation: Collocation, transcriptions: Sequence[Transcription], method: ReducedSpace
 ) -> list[ExperimentIterate]:
-    """Return experiments fitted to their markers alone, with the nuisance parameters of the
-    wrenches at zero; empty if the fit fails.
+    """Return experiments fitted to their markers alone by a method, with the nuisance parameters of
+    the wrenches at zero; empty if there are none or the fit fails.
     """
     if not transcriptions:
         return []
@@ -207,7 +209,9 @@ class _OneSensor:
         self.declared = DescribedWrench(sensor.wrench, segment.experiment.nuisance.tare or 0.0)
 
     def causes(self) -> Iterator[Hypothesis]:
-        """Yield the hypotheses that improve the fit; if there is none, that of a large tare."""
+        """Yield the hypotheses whose correction improves the fit far enough; if there is none, that
+        of a large tare.
+        """
         accepted: list[Hypothesis] = []
         misfit = self.misfit(self.declared)
         if misfit > MISFIT:
@@ -264,8 +268,9 @@ class _OneSensor:
         return self._known[at]
 
     def _gain(self, columns: slice) -> float:
-        """Return the positive factor with which the samples of some columns fit best; NaN
-        if there is none.
+        """Return the positive factor with which the samples of some columns (slice) fit best,
+        relative to the other columns if the scale of the prediction is unknown; NaN if there is
+        none.
         """
         measured, predicted = self._scaled_by_sigma(self.declared)
         slope = _slope(measured[:, columns], predicted[:, columns])
@@ -357,8 +362,8 @@ class _OneSensor:
 
 
 def _without_tare(values: Array, tare: float) -> Array:
-    """Return columns (S, c) over the noise, without the offsets that a tare of so many
-    standard deviations explains.
+    """Return columns (S, c) in standard deviations, without the offset that a tare with a prior of
+    `tare` standard deviations explains: none for 0, the mean if infinite. NaN is ignored.
     """
     is_measured = np.isfinite(values)
     prior_weight = 0.0 if np.isinf(tare) else np.inf if not tare else 1 / tare**2
@@ -368,15 +373,17 @@ def _without_tare(values: Array, tare: float) -> Array:
 
 
 def _slope(measured: Array, predicted: Array) -> float:
-    """Return the factor of the prediction that fits the samples best; NaN if the prediction
-    is zero.
+    """Return the factor of the prediction that fits the samples best, by least squares; NaN if the
+    prediction is zero. NaN in either is ignored.
     """
     square = float(np.nansum(predicted**2))
     return float(np.nansum(measured * predicted)) / square if square else np.nan
 
 
 def _multiplied(wrench: Wrench, columns: slice, factor: float) -> Wrench:
-    """Return the wrench with some columns multiplied; their noise is not decreased."""
+    """Return the wrench with the values of some columns (slice) multiplied by a factor; its noise
+    is increased with a large factor, but not decreased.
+    """
     values: Array = np.array(wrench.values)
     values[:, columns] *= factor
     larger = max(1.0, abs(factor))

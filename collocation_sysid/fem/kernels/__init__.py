@@ -2,7 +2,8 @@
 
 - `batch`: what is evaluated, the interface, and the reference evaluator, CasADi's ``Function.map``.
 - `simd`: the fast evaluator, vector code compiled by LLVM; `instructions`: CasADi operations in
-LLVM. - `jit`: compilation to native code, cached on disk.
+  LLVM.
+- `jit`: compilation to native code, cached on disk.
 - `instances`: functions of a few numbers at many instances.
 - `combine`: linear combinations of rows into sparse values; `skyline`: factorisation of bands.
 - `threads`: distribution of time steps and experiments over threads.
@@ -13,9 +14,9 @@ argument forces one.
 
 Kernels that are not in the cache are compiled at once, however small the body; for a body of fewer
 than `simd.OPTIMISED_FROM_POINTS` quadrature points without optimisation: the kernels of 48
-elements, with second
-derivatives, then take LLVM 0.5 s of processor time instead of 2.5 s. For larger bodies optimisation
-is worthwhile: 1,296 elements at 20 states are linearised in 9 ms instead of 16 ms.
+elements, with second derivatives, then take LLVM 0.5 s of processor time instead of 2.5 s. For
+larger bodies optimisation is worthwhile: 1,296 elements at 20 states are linearised in 9 ms instead
+of 16 ms.
 """
 
 from __future__ import annotations

@@ -47,7 +47,11 @@ Combiner = Callable[[int, int, Array, Array, Array], None]
 
 
 def combine_with_numpy(plan: CombinationPlan) -> Combiner:
-    """Return the reference combiner, one indexed NumPy statement for each task."""
+    """Return the reference combiner, one indexed NumPy statement for each task.
+
+    The combiner ``combine(start, stop, a, b, values)`` executes the tasks of column blocks `start`
+    … `stop` − 1 on the rows of a and b, and writes to `values` in place.
+    """
 
     def combine(start: int, stop: int, a: Array, b: Array, values: Array) -> None:
         """Run the tasks of column blocks `start` … `stop` − 1 on rows a and b, writing to
@@ -69,7 +73,9 @@ def combine_with_numpy(plan: CombinationPlan) -> Combiner:
 
 
 def compile_combiner(plan: CombinationPlan) -> Combiner:
-    """Return a compiled combiner with the same arguments and result as `combine_with_numpy`."""
+    """Return a compiled combiner with the same arguments and result as that of
+    `combine_with_numpy`.
+    """
     from .jit import NativeCode, compile_function
 
     signature = (*[ctypes.c_int64] * 3, *[ctypes.c_void_p] * 7)

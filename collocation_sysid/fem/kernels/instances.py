@@ -23,7 +23,11 @@ Instances = Callable[[list[Array]], list[Array]]
 
 
 def make_casadi_instance_evaluator(function: ca.Function) -> Instances:
-    """Return the reference evaluator: the function mapped over instances by CasADi."""
+    """Return the reference evaluator: the function mapped over instances by CasADi.
+
+    It takes a list of arrays (size, instances), one for each input, and returns such a list of
+    outputs; each size is the number of structural nonzeros.
+    """
     mapped: dict[int, ca.Function] = {}
 
     def evaluate(inputs: list[Array]) -> list[Array]:
@@ -52,7 +56,8 @@ def make_casadi_instance_evaluator(function: ca.Function) -> Instances:
 
 
 def compile_instance_evaluator(function: ca.Function) -> Instances:
-    """Return an evaluator in vector code, each lane of which is one instance.
+    """Return an evaluator in vector code, each lane of which is one instance; arguments and results
+    are those of `make_casadi_instance_evaluator`.
 
     Raises
     ------

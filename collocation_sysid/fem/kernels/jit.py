@@ -208,7 +208,9 @@ def cache_folder() -> Path:
 
 
 def load_object(key: str) -> bytes | None:
-    """Return the code stored for a key; None if there is none that can be trusted."""
+    """Return the code stored for a key; None if there is none, if it is damaged, or if others could
+    have written it.
+    """
     folder = cache_folder()
     if not folder.is_dir() or not _is_trusted(folder):
         return None
@@ -237,7 +239,9 @@ def store_object(key: str, code: bytes) -> None:
 
 
 def cache_fault() -> str | None:
-    """Return why kernels are not stored, or None if they are; the folder is created if missing."""
+    """Return why compiled kernels cannot be stored, or None if they can. The folder of the cache is
+    created if missing.
+    """
     folder = cache_folder()
     try:
         for missing in [p for p in (folder, *folder.parents) if not p.exists()][::-1]:

@@ -117,7 +117,7 @@ class SimdEvaluator:
 
 
 def _emit_kernel(kernel: ElementKernel, points: int, lanes: int) -> ir.Module:
-    """Return the LLVM module of a kernel; see `_SkylineEmitter` for the arguments."""
+    """Return the LLVM module of a kernel; see `_KernelEmitter` for the arguments."""
     return _KernelEmitter(kernel, points, lanes).emit()
 
 
@@ -334,7 +334,12 @@ class _KernelEmitter:
             b.store(b.fadd(b.load(address), b.extract_element(value, I32(lane))), address)
 
     def _load_point_data(self, memory: list, t: Value, point: Value) -> list:
-        """Return the data of a quadrature point of W elements at time step t."""
+        """Return the data of a quadrature point of W elements at time step t, a vector for each
+        datum.
+
+        `memory` contains the length of a row, the positions in the row of each point's data, and
+        the rows of all time steps.
+        """
         b = self.builder
         length, places, rows = memory
         row = b.gep(rows, [b.mul(t, length)])

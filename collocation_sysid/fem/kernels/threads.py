@@ -1,8 +1,7 @@
 """Distribution of time steps, or of experiments, over threads.
 
 `run_in_slices` distributes consecutive time steps of one evaluation; `map_experiments` distributes
-whole
-experiments, each of which then runs on one thread.
+whole experiments, each of which then runs on one thread.
 """
 
 from __future__ import annotations
@@ -27,7 +26,9 @@ _alone = threading.local()
 
 
 def available_threads() -> int:
-    """Return ``COLLOCATION_SYSID_THREADS``, or the number of cores that this process may use."""
+    """Return ``COLLOCATION_SYSID_THREADS``, at least 1, or the number of cores that this process
+    may use.
+    """
     override = os.environ.get("COLLOCATION_SYSID_THREADS")
     if override:
         return max(1, int(override))
@@ -44,7 +45,11 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
 
 
 def run_in_slices(run: Callable[[int, int], None], count: int, threads: int) -> None:
-    """Call ``run(start, stop)`` on consecutive slices of ``range(count)``, one per thread.
+    """Call ``run(start, stop)`` on consecutive slices of ``range(count)``, one per thread, and wait
+    for all.
+
+    On a thread of `map_experiments`, or with one thread, it is called once for the complete range.
+    An exception of ``run`` is passed on.
 
     Raises
     ------
@@ -101,7 +106,9 @@ def run_single_threaded(run: Callable[..., R], *arguments: Any) -> R:
 
 
 def concurrent_count(items: int, threads: int) -> int:
-    """Return how many of these items run at the same time."""
+    """Return how many of this many items `map_experiments` runs at the same time: one with one
+    thread or within an experiment, else at most two per thread.
+    """
     if threads == 1 or getattr(_alone, "in_experiment", False):
         return 1
     return max(1, min(items, 2 * threads))

@@ -101,7 +101,9 @@ class CasadiSolver(Options):
         )
 
     def _settings(self, functions: NlpFunctions) -> dict[str, Any]:
-        """Return the options of the plugin with its cache of functions."""
+        """Return the options of the plugin with its cache of functions; options of the user
+        (`casadi`) replace those of the method, and mappings are merged.
+        """
         cache = {n: functions.function(n, *o.split()) for n, o in self.functions.items()}
         settings = {"cache": cache, **self._plugin_settings()}
         for name, value in self.casadi.items():
@@ -116,7 +118,7 @@ class CasadiSolver(Options):
 
 @dataclass(frozen=True)
 class SqpMethod(CasadiSolver):
-    """SQP, with convex QPs."""
+    """Sequential quadratic programming (SQP) with convex quadratic programs."""
 
     name: ClassVar[str] = "casadi:sqpmethod"
     functions: ClassVar[Mapping[str, str]] = {
@@ -149,7 +151,7 @@ class SqpMethod(CasadiSolver):
 
 @dataclass(frozen=True)
 class Sleqp(CasadiSolver):
-    """Trust-region SLP-EQP."""
+    """SLP-EQP in a trust region: steps of QPs with the active constraints of linear programs."""
 
     name: ClassVar[str] = "casadi:sleqp"
     functions: ClassVar[Mapping[str, str]] = {
@@ -216,7 +218,10 @@ def refusal_reason(name: str) -> str | None:
 
 
 def _judge(collocation: Collocation, status: Status, z: Array, multipliers: Array) -> Status:
-    """Return the status of a solution, checked by the constraints and optimality of the NLP."""
+    """Return the status of a solution after a check of its constraints and optimality: a converged
+    one that violates constraints is infeasible, and one that stalled is acceptable if it is nearly
+    optimal.
+    """
     if status.converged:
         violation = np.abs(collocation.constraint_values(z)).max(initial=0.0)
         return status if violation <= FEASIBLE else Status.INFEASIBLE
@@ -227,7 +232,9 @@ def _judge(collocation: Collocation, status: Status, z: Array, multipliers: Arra
 
 
 def _hessian_values(collocation: Collocation, hessian: Hessian) -> HessianValues:
-    """Return the function that writes the Hessian's values, for `NlpFunctions`."""
+    """Return the function that writes the Hessian's values at z to its last argument, in place; the
+    multipliers are used only if `hessian` is "exact".
+    """
 
     def values(z: Array, weight: float, multipliers: Array, out: Array) -> None:
         collocation.hessian_values(z, weight, multipliers if hessian == "exact" else None, out)

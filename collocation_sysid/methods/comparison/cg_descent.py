@@ -219,7 +219,20 @@ def minimise_cg_descent(
 
 
 def _next_direction(d: Array, previous: Array, g: Array, y: Array, truncation: float) -> Array:
-    """Return the next direction; the steepest descent after a step without positive curvature."""
+    """Return the next direction of descent (n,); the steepest descent after a step without positive
+    curvature.
+
+    Parameters
+    ----------
+    d : (n,) array
+        Direction of the last step.
+    previous, g : (n,) arrays
+        Gradient before and after that step.
+    y : (n,) array
+        Their difference.
+    truncation : float
+        Limit of the conjugacy parameter, relative to the gradient.
+    """
     curvature = float(d @ y)
     if curvature <= 0:
         return -g
@@ -229,7 +242,9 @@ def _next_direction(d: Array, previous: Array, g: Array, y: Array, truncation: f
 
 
 def _initial_step(x: Array, f: float, g: Array) -> float:
-    """Return the step size of the first line search, rule I0."""
+    """Return the step size of the first line search at x with the value f and the gradient g, rule
+    I0.
+    """
     steepest = float(np.abs(g).max())
     if x.any():
         return FIRST * float(np.abs(x).max()) / steepest
@@ -237,8 +252,17 @@ def _initial_step(x: Array, f: float, g: Array) -> float:
 
 
 def _initial_step_after(line: _LineSearch, last: float, change: float) -> float:
-    """Return the initial step size of a later line search: I1 (parabola through a sample of
-    the value) or I2.
+    """Return the initial step size of a later line search: I1 (parabola through a sample of the
+    value, which is evaluated) or I2.
+
+    Parameters
+    ----------
+    line : _LineSearch
+        The new search.
+    last : float
+        Step size of the last one.
+    change : float
+        Change of the value by the last one.
     """
     if change > SMALL_CHANGE * abs(line.value):
         sample_step = SAMPLED * last
@@ -285,7 +309,7 @@ class _AverageValue:
     approximate: bool = False
 
     def add(self, value: float) -> None:
-        """Update the average with a value."""
+        """Update the average size with the size of a value, in place."""
         self.weight = 1 + self.options.memory * self.weight
         self.size += (abs(value) - self.size) / self.weight
 
@@ -352,8 +376,10 @@ class _LineSearch:
         return self.function.value(self.x + step * self.direction)
 
     def search(self, step: float) -> _LineTrial | None:
-        """Return a trial that satisfies the Wolfe conditions (L0 … L3), starting at a step
-        size; None if none is found.
+        """Return a trial that satisfies the Wolfe conditions (L0 … L3), starting at a step size.
+
+        None if the allowed number of trials does not contain one, or no number lies between the
+        ends of the interval.
         """
         try:
             a, b = self._bracket(step)
@@ -372,11 +398,13 @@ class _LineSearch:
             return None
 
     def _try(self, step: float) -> _LineTrial:
-        """Evaluate a trial; raise `_TrialAccepted` if it satisfies the Wolfe conditions.
+        """Return the trial at a step size, and count it.
 
         Raises
         ------
-        _Exhausted
+        _TrialAccepted
+            If the trial satisfies the Wolfe conditions.
+        _TrialsExhausted
             After too many trials.
         """
         if self.trials >= self.options.max_trials:
@@ -402,7 +430,9 @@ class _LineSearch:
         return is_decreased and not self.approximate
 
     def _bracket(self, step: float) -> tuple[_LineTrial, _LineTrial]:
-        """Return an interval at whose ends the slopes have opposite signs, rules B0 … B3."""
+        """Return an interval at whose ends the slopes have opposite signs, starting with a step
+        size, rules B0 … B3. See `_try` for the exceptions.
+        """
         low = self.start
         while True:
             trial = self._try(step)
@@ -414,7 +444,11 @@ class _LineSearch:
             step = EXPANSION * step
 
     def _update(self, a: _LineTrial, b: _LineTrial, step: float) -> tuple[_LineTrial, _LineTrial]:
-        """Return a smaller interval, if `step` is within it, rules U0 … U3."""
+        """Return an interval within (a, b) with the trial at `step` as one of its ends, rules U0 …
+        U3; (a, b) itself if `step` is outside.
+
+        See `_try` for the exceptions.
+        """
         if not a.step < step < b.step:
             return a, b
         trial = self._try(step)
@@ -425,8 +459,8 @@ class _LineSearch:
         return self._cut(a, trial)
 
     def _cut(self, a: _LineTrial, b: _LineTrial) -> tuple[_LineTrial, _LineTrial]:
-        """Return an interval with an ascending end, from a low descending point and a high
-        one, rule U3.
+        """Return an interval with an ascending end within (a, b), from a low descending point a and
+        a high one b, rule U3. See `_try` for the exceptions.
         """
         while True:
             trial = self._try((1 - CUT) * a.step + CUT * b.step)
@@ -438,7 +472,9 @@ class _LineSearch:
                 b = trial
 
     def _double_secant(self, a: _LineTrial, b: _LineTrial) -> tuple[_LineTrial, _LineTrial]:
-        """Return a smaller interval by two secant steps, rules S1 … S4."""
+        """Return an interval within (a, b) after two secant steps, rules S1 … S4. See `_try` for
+        the exceptions.
+        """
         step = _secant(a, b)
         low, high = self._update(a, b, step)
         if high.step == step:

@@ -131,7 +131,7 @@ class _ScaledMerit:
     ----------
     start : (free,) array
         Initial s, zeros.
-    bounds : HandBounds
+    bounds : Bounds
         Bounds of s.
     replacement_value : float
         Value that replaces an infinite merit, for solvers that interpolate values.
@@ -164,7 +164,9 @@ class _ScaledMerit:
         self._last: tuple[Array, Array, float, Array] | None = None
 
     def to_variables(self, s: Array) -> Array:
-        """Return all variables (variables,) from s."""
+        """Return all variables (variables,) from s (free,); constant ones have their initial
+        values.
+        """
         z = self.z.copy()
         free_values = z[self.free] + self.unit * s
         free_values[self.mapped] = self.middle + self.half * np.sin(self._angles(s))
@@ -176,20 +178,24 @@ class _ScaledMerit:
         return self.angle + (self.unit * s)[self.mapped] / (self.half * np.cos(self.angle))
 
     def _slopes(self, s: Array) -> Array:
-        """Return dz / (unit ds) (free,)."""
+        """Return the derivatives (free,) of the free variables by unit · s: those of the sine map
+        for mapped variables, 1 for others.
+        """
         slopes = np.ones(len(s))
         slopes[self.mapped] = np.cos(self._angles(s)) / np.cos(self.angle)
         return slopes
 
     def evaluate_at(self, s: Array) -> tuple[Array, float, Array]:
-        """Return z, m and ∇m at s; the result of the last s is stored."""
+        """Return z (variables,), m and ∇m (variables,) at s (free,); a repeated call with the same
+        s does not evaluate again.
+        """
         if self._last is None or not np.array_equal(self._last[0], s):
             z = self.to_variables(s)
             self._last = (s.copy(), z, *self.merit.value_and_gradient(z))
         return self._last[1:]
 
     def value(self, s: Array) -> float:
-        """Return m at s."""
+        """Return the merit function m at the variables s."""
         return self.merit.value(self.to_variables(s))
 
     def value_and_gradient(self, s: Array) -> tuple[float, Array]:
@@ -198,14 +204,18 @@ class _ScaledMerit:
         return value, gradient[self.free] * self.unit * self._slopes(s)
 
     def finite_value_and_gradient(self, s: Array) -> tuple[float, Array]:
-        """Return m and ∂m/∂s; a large value and zeros where the merit is infinite."""
+        """Return m and ∂m/∂s (free,) at s; `replacement_value` and zeros if the merit is
+        infinite.
+        """
         value, gradient = self.value_and_gradient(s)
         return (
             (value, gradient) if np.isfinite(value) else (self.replacement_value, np.zeros(len(s)))
         )
 
     def project_gradient(self, s: Array, z: Array, gradient: Array) -> Array:
-        """Return ∂m/∂z (variables,) with zeros at active bounds."""
+        """Return ∂m/∂z (variables,) with zeros at active bounds; derivatives by mapped variables
+        decrease towards their bounds.
+        """
         projected = self.merit.problem.project_gradient(z, gradient)
         projected[self.free] *= np.minimum(np.abs(self._slopes(s)), 1.0)
         return projected

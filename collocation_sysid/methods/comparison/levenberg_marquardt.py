@@ -60,19 +60,20 @@ def minimise_levenberg_marquardt(
     merit : MeritFunction
         Merit function.
     z : (variables,) array
-        Initial variables.
+        Initial variables; not modified.
     tolerance : float
         Largest entry of the projected gradient at the end.
     max_iterations : int
         Largest number of accepted steps.
     report : callable
         Function that is called with every iterate, its value and its projected gradient; an
-        exception ends the minimisation.
+        exception ends the minimisation. The last iterate is the result.
 
     Returns
     -------
     bool
-        Whether the tolerance was reached; false if rounding prevents it.
+        Whether the tolerance was reached; false after `max_iterations` steps, or if rounding
+        prevents it.
     """
     damping = DAMPING
     growth = 2.0
@@ -199,7 +200,9 @@ class _QuadraticModel:
             return self._step(damping)
 
     def _step(self, damping: float) -> Array | None:
-        """Return the damped step, see `step`."""
+        """Return the step (variables,) of the model with `damping` added to the diagonal of the
+        positions; None if the matrix is not positive definite.
+        """
         positions = self._positions
         border = self.problem.parameter_indices
         band = self._band.copy("F")
@@ -224,9 +227,15 @@ class _QuadraticModel:
         return step
 
     def _bounded_step(self, schur: Array, slope: Array) -> Array | None:
-        """Minimise ½ dᵀ S d + sᵀ d over the parameters' steps d within bounds and reach.
+        """Return the steps d of the parameters that minimise ½ dᵀ S d + sᵀ d within bounds and
+        reach; None if S is not positive definite.
 
-        Return None if S is not positive definite.
+        Parameters
+        ----------
+        schur : (parameters, parameters) array
+            S.
+        slope : (parameters,) array
+            s.
         """
         try:
             factor = cholesky(schur, lower=True)
@@ -315,7 +324,9 @@ class _QuadraticModel:
 
 
 def _narrow_order(square: sp.coo_array) -> Index:
-    """Return an order of the positions that makes the band narrow."""
+    """Return an order (n,) of the positions that makes the band of a symmetric matrix narrower; the
+    identity if none is found.
+    """
     order = reverse_cuthill_mckee(sp.csr_array(square), symmetric_mode=True).astype(np.int64)
     place = np.empty_like(order)
     place[order] = np.arange(len(order))

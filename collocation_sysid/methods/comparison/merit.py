@@ -84,8 +84,8 @@ class PenaltyProblem:
             return self.nlp.constraint_values(z)
 
     def has_valid_elements(self, z: Array) -> bool:
-        """Return whether z is finite and no element is inverted where the equations of
-        motion are evaluated.
+        """Return whether z is finite and no element is inverted at the states at which the
+        equations of motion are evaluated.
         """
         if not np.isfinite(z).all():
             return False
@@ -110,9 +110,10 @@ class PenaltyProblem:
         return convert_variables(z, self.original, self.nlp)
 
     def to_original(self, z: Array) -> Array:
-        """Return variables of the given problem, with grasped nodes at their prescribed positions.
+        """Return variables of the given problem from z, with grasped nodes at their prescribed
+        positions.
 
-        They are not moved to the prescribed positions if that would invert elements.
+        Grasped nodes stay where they are if that would invert elements.
         """
         positions = [
             part.segment.with_prescribed_positions(part.x, part.phi)
@@ -173,7 +174,9 @@ class MeritFunction:
         return self.value_from_constraints(z, rows), self.gradient(z, rows, jacobian)
 
     def gradient(self, z: Array, rows: Array, jacobian: sp.csc_array) -> Array:
-        """Return ∇m (variables,) from g and J at z."""
+        """Return ∇m (variables,) from the constraints g (`rows`) and their Jacobian at z, zero for
+        constant variables.
+        """
         slope = self.problem.nlp.gradient(z) + jacobian.T @ self.multiplier_estimate(rows)
         return np.where(self.problem.is_free, slope, 0.0)
 
@@ -182,7 +185,7 @@ class MeritFunction:
         return self.multipliers + self.rho * rows
 
     def value_from_constraints(self, z: Array, rows: Array) -> float:
-        """Return m from g at z; infinite if it is not finite."""
+        """Return m at z from the constraints g there (`rows`); infinite if m is not finite."""
         penalty = float(self.multipliers @ rows + self.rho / 2 * (rows @ rows))
         value = self.problem.nlp.objective(z) + penalty
         return value if np.isfinite(value) else np.inf

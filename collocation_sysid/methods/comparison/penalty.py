@@ -184,7 +184,7 @@ class PenaltyOptions(Options):
 
         Raises
         ------
-        Ended
+        SearchEnded
             If further stages would not improve the solution.
         """
         raise NotImplementedError
@@ -192,7 +192,7 @@ class PenaltyOptions(Options):
 
 @dataclass(frozen=True)
 class Penalty(PenaltyOptions):
-    """The equations of motion are not constraints, but violations are penalised, as in the paper.
+    """Penalty method: violations of the equations of motion are penalised, as in the paper.
 
     Attributes
     ----------
@@ -215,8 +215,13 @@ class Penalty(PenaltyOptions):
         return self.rho if self.schedule == "constant" else self.rho_max
 
     def next_stage(self, stage: Stage, before: ConstraintViolation, z: Array) -> Stage:
-        """Return the next stage, with a larger ρ if the schedule says so, see
-        `PenaltyOptions.next_stage`.
+        """Return the next stage, with a larger ρ if the schedule says so; see
+        `PenaltyOptions.next_stage` for the arguments.
+
+        Raises
+        ------
+        SearchEnded
+            If an increase is due, but ρ is at its limit.
         """
         rho = stage.merit.rho
         is_increase_due = (
@@ -241,7 +246,7 @@ class Penalty(PenaltyOptions):
 
 @dataclass(frozen=True)
 class AugmentedLagrangian(PenaltyOptions):
-    """A penalty with multipliers, so that ρ need not become large."""
+    """Augmented Lagrangian: a penalty with multipliers, so that ρ need not become large."""
 
     name: ClassVar[str] = "augmented-lagrangian"
 
@@ -251,9 +256,13 @@ class AugmentedLagrangian(PenaltyOptions):
         return max(FIRST_GRADIENT, self.tolerance)
 
     def next_stage(self, stage: Stage, before: ConstraintViolation, z: Array) -> Stage:
-        """Return the next stage with updated multipliers, and a larger ρ if much violation remains.
+        """Return the next stage with updated multipliers, and a larger ρ if much violation remains;
+        see `PenaltyOptions.next_stage` for the arguments.
 
-        See `PenaltyOptions.next_stage`.
+        Raises
+        ------
+        SearchEnded
+            If ρ is at its limit and the violation does not decrease.
         """
         rho = stage.merit.rho
         tolerance = stage.tolerance
@@ -307,7 +316,7 @@ class _PenaltySolve:
 
         Raises
         ------
-        Ended
+        SearchEnded
             If no further progress is possible or a limit is reached.
         """
         options = self.options
@@ -340,14 +349,14 @@ class _PenaltySolve:
         )
 
     def _minimise(self) -> Stage:
-        """Minimise the merit of the present stage from the last iterate, and return the stage with
-        its result.
+        """Minimise the merit of the present stage from the last iterate, which is updated, and
+        return the stage with its result.
 
         The tolerance is larger where ρ or the curvature of the loss makes rounding dominate.
 
         Raises
         ------
-        Ended
+        SearchEnded
             If a limit of iterations or time is reached.
         """
         stage = self.stage
@@ -382,7 +391,7 @@ class _PenaltySolve:
         )
 
     def _record(self) -> None:
-        """Add the last iterate to the history."""
+        """Add the last iterate to the history, as variables of the given problem with its loss."""
         nlp = self.problem.original
         z = self.problem.to_original(self.variables)
         self.recorder.add_variables(self.iterations, z, nlp.objective(z) / nlp.loss_scale)

@@ -6,7 +6,7 @@ This is the usual method in the literature, as a baseline: the only variables ar
 optimum is that of the other methods. The gradient is computed
 
 - "forward": from the sensitivities Z = dx/dp, solved with the trajectory, for Gauss–Newton steps in
-a trust region (SciPy's `least_squares_of_fit`, "dogbox": steps of at most one in each parameter's
+a trust region (SciPy's `least_squares`, "dogbox": steps of at most one in each parameter's
 logarithm at first);
 - "adjoint": from one sweep backward in time for the multipliers y of c_xᵀ y = −∂L/∂x, as dL/dp =
 ∂L/∂p + yᵀ ∂c/∂p for any number of parameters, for SciPy's L-BFGS-B.
@@ -43,7 +43,7 @@ MEMORY = 20
 
 @dataclass(frozen=True)
 class Shooting(Options):
-    """Single shooting.
+    """Single shooting: simulate with trial parameters, and improve them.
 
     Attributes
     ----------
@@ -97,6 +97,13 @@ def simulate_variables(
     collocation: Collocation, p: Array, stopwatch: Stopwatch | None = None
 ) -> Array:
     """Return variables z (variables,) at the parameters p = (q, φ), with simulated positions.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    p : (np,) array
+    stopwatch : Stopwatch, optional
+        Measures the simulations.
 
     Raises
     ------
@@ -196,7 +203,9 @@ class _ShootingSearch:
     # Optimisers -------------------------------------------------------------------------------
 
     def _gauss_newton(self) -> tuple[Status, str]:
-        """Minimise by SciPy's `least_squares_of_fit`."""
+        """Minimise by SciPy's `least_squares`; return the status and a sentence with SciPy's
+        message.
+        """
         result = least_squares(
             self._residual,
             np.zeros(len(self.first)),  # then the trust region starts at one
@@ -212,7 +221,7 @@ class _ShootingSearch:
         return status, f"{status.sentence} (SciPy: {result.message})"
 
     def _residual(self, step: Array) -> Array:
-        """Return the residuals after a step from the first parameters; infinite if the
+        """Return the residuals after a step (np,) from the first parameters; infinite if the
         simulation fails.
         """
         shot = self._try(self.first + step)
@@ -226,7 +235,7 @@ class _ShootingSearch:
         return shot.slope
 
     def _quasi_newton(self) -> tuple[Status, str]:
-        """Minimise by SciPy's L-BFGS-B."""
+        """Minimise by SciPy's L-BFGS-B; return the status and a sentence with SciPy's message."""
         result = minimize(
             self._objective,
             self.first,
@@ -274,8 +283,8 @@ class _ShootingSearch:
 
         Raises
         ------
-        Ended
-            If a simulation fails as close to the best as the tolerance.
+        SearchEnded
+            If a simulation fails as close to the best as the tolerance, or a limit is reached.
         """
         if self.last is not None and np.array_equal(p, self.last.p):
             return self.last
@@ -293,11 +302,12 @@ class _ShootingSearch:
         return shot
 
     def _simulate(self, p: Array) -> _SimulatedPoint:
-        """Simulate at p with derivatives, and record it if it is the best.
+        """Return the simulation at p with derivatives, and count it. If its objective is the
+        smallest, it becomes the best one and part of the history.
 
         Raises
         ------
-        Ended
+        SearchEnded
             If a limit of simulations or time is reached.
         SimulationError
             If the simulation fails.

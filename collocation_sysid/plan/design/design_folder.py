@@ -157,7 +157,7 @@ def _gripper_poses(design: Design) -> PoseSequence:
     name = design.recording.template.name
     if origin is None:
         return design.poses
-    sections = ProblemFile.model_validate(tomllib.loads(origin.text)).experiment
+    sections = ProblemFile.model_validate(tomllib.loads(origin.text)).recordings
     (section,) = (section for section in sections if section.name == name)
     if (transform := section.grasp_list[0].gripper_to_body) is None:
         return design.poses

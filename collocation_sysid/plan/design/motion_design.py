@@ -149,7 +149,7 @@ class Design:
 
     @property
     def poses(self) -> PoseSequence:
-        """Poses of the hand."""
+        """Poses of the hand along the designed motion."""
         return self.experiment.grasps[0].poses
 
     @property

@@ -124,7 +124,9 @@ def _header_counts(content: bytes) -> tuple[int, int | None]:
 
 
 def _labels(parameters: Mapping[str, NDArray]) -> list[str]:
-    """Return the labels of the points; those beyond the 255th are in LABELS2, LABELS3 …"""
+    """Return the labels of the points, stripped, in the order of the points; those beyond the 255th
+    are in the parameters LABELS2, LABELS3 …
+    """
     keys = [key for key in parameters if key.startswith("LABELS")]
     ordered = sorted(keys, key=lambda key: int(key.removeprefix("LABELS") or 1))
     return [str(label).strip() for key in ordered for label in parameters[key]]

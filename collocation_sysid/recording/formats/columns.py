@@ -42,12 +42,18 @@ class Quantity:
         SI unit, as it is written in the names of columns.
     words : str
         Words, separated by blanks, of which machines use one in the column's name.
+    qualifier : str
+        Key of `QUALIFIERS` whose words the column's name has too; "" for a name without any.
+    unitless : bool
+        Whether the column's name may state no unit, which then is 1.
     """
 
     key: str
     dimension: str
     unit: str
     words: str = ""
+    qualifier: str = ""
+    unitless: bool = False
 
     @property
     def column(self) -> str:
@@ -71,9 +77,20 @@ STRAIN = Quantity("strain", "ratio", "1", "strain dehnung stauchung déformation
 STRESS = Quantity("stress", "pressure", "pa", "stress spannung contrainte")
 TENSION = Quantity("tension", "force", "n", "tension")
 PRESSURE = Quantity("pressure", "pressure", "pa", "pressure druck pression")
+_STRETCHES = "stretch lambda λ streckung"
+STRETCH = Quantity("stretch", "ratio", "1", _STRETCHES, unitless=True)
+SECOND_STRETCH = Quantity("second_stretch", "ratio", "1", _STRETCHES, "second", unitless=True)
+LATERAL_STRETCH = Quantity("lateral_stretch", "ratio", "1", _STRETCHES, "lateral", unitless=True)
+SECOND_STRAIN = Quantity("second_strain", "ratio", "1", STRAIN.words, "second")
+LATERAL_STRAIN = Quantity("lateral_strain", "ratio", "1", STRAIN.words, "lateral")
+VOLUME_RATIO = Quantity("volume_ratio", "ratio", "1", "volumenverhältnis", unitless=True)
+SECOND_STRESS = Quantity("second_stress", "pressure", "pa", STRESS.words, "second")
+TRUE_STRESS = Quantity("true_stress", "pressure", "pa", STRESS.words, "deformed")
 KNOWN_QUANTITIES = (
     *(TIME, *DISPLACEMENTS, *FORCES, *TORQUES),
     *(DISPLACEMENT, FORCE, STRAIN, STRESS, TENSION, PRESSURE),
+    *(STRETCH, SECOND_STRETCH, LATERAL_STRETCH, SECOND_STRAIN, LATERAL_STRAIN),
+    *(VOLUME_RATIO, SECOND_STRESS, TRUE_STRESS),
 )
 
 # A column's name and its unit: Load (kN), Load [kN], Load / kN, Load in kN, load_kn.
@@ -83,6 +100,12 @@ _NAMED = re.compile(
 )
 # Strains and stresses of the deformed specimen, which neither its length nor its area multiplies.
 _DEFORMED = {"true", "wahre", "cauchy", "logarithmic"}
+# Words of a name by what they make of a quantity: it is another one with them.
+QUALIFIERS = {
+    "deformed": _DEFORMED,
+    "second": {"second", "zweite"},
+    "lateral": {"lateral", "transverse", "quer", "querdehnung"},
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +135,7 @@ def read_columns(
     requires_times: bool = True,
     requires_all: bool = False,
 ) -> QuantityTable:
-    """Read those of the `quantities` quantities that a table has, in any order.
+    """Read those of some quantities that a table has, in any order, in SI units.
 
     Parameters
     ----------
@@ -123,7 +146,7 @@ def read_columns(
         follow the name, as in "Load (N)". Other columns are not looked for if a quantity besides
         the time is mapped; without mapping, columns are recognised by name.
     blank_allowed : bool
-        Whether cells may be blank.
+        Whether cells may be blank, which become NaN; a column of blank cells alone is refused.
     requires_times : bool
         Whether times are required; otherwise rows are numbered in seconds if there are no times.
     requires_all : bool
@@ -157,7 +180,24 @@ def read_columns(
 def _find_columns(
     grid: TextTable, quantities: Sequence[Quantity], mapped: Mapping[str, str]
 ) -> dict[str, tuple[int, float]]:
-    """Return column index and factor to SI of each quantity that the table has, by its key."""
+    """Return index of the column and factor to SI of each quantity that the table has, by the
+    quantity's key; quantities without a column are omitted.
+
+    Parameters
+    ----------
+    grid : TextTable
+    quantities : sequence of Quantity
+        Quantities that are searched for, besides the time.
+    mapped : mapping of str to str
+        Names of columns by key, as stated by the user. If it contains more than the time, only the
+        time is recognised by its name; other quantities are those stated.
+
+    Raises
+    ------
+    InputError
+        For an unknown key, a column that does not exist or exists twice, or a unit that is missing
+        or wrong.
+    """
     by_key = {quantity.key: quantity for quantity in (TIME, *quantities)}
     for key in mapped:
         if key not in by_key:
@@ -174,7 +214,15 @@ def _find_columns(
 
 
 def _column_named_by_user(grid: TextTable, quantity: Quantity, name: str) -> tuple[int, float]:
-    """Return index and factor to SI of the column that the user names for a quantity."""
+    """Return index and factor to SI of the column that the user names for a quantity; the unit is
+    in `name` or in the name of the column.
+
+    Raises
+    ------
+    InputError
+        If the column does not exist or exists twice, or its unit is missing or of another
+        dimension.
+    """
     bare, unit_of_user = name_and_unit(name)
     column = name if name in grid.columns else bare
     if grid.columns.count(column) != 1:
@@ -184,6 +232,8 @@ def _column_named_by_user(grid: TextTable, quantity: Quantity, name: str) -> tup
             f"{', '.join(grid.columns)}{hint_at(name, grid.columns)}"
         )
     unit = name_and_unit(column)[1] or unit_of_user
+    if unit is None and quantity.unitless:
+        unit = quantity.unit
     if quantity in (STRAIN, STRESS) and _words(column) & _DEFORMED:
         raise grid.error_at(
             f"column {column} refers to the deformed specimen; expected engineering "
@@ -209,6 +259,8 @@ def find_column(grid: TextTable, quantity: Quantity) -> tuple[int, float] | None
         for k, column in enumerate(grid.columns)
         if _name_fits(column, quantity)
     }
+    if quantity.unitless:
+        units = {k: unit or quantity.unit for k, unit in units.items()}
     factors = {k: si_factor(unit, quantity.dimension) for k, unit in units.items() if unit}
     fitting = [(k, factor) for k, factor in factors.items() if factor is not None]
     if len(fitting) > 1:
@@ -224,10 +276,15 @@ def find_column(grid: TextTable, quantity: Quantity) -> tuple[int, float] | None
 
 
 def _name_fits(column: str, quantity: Quantity) -> bool:
-    """Return whether the name of a column, without its unit, fits a quantity."""
+    """Return whether the name of a column, without its unit, is the key of a quantity or contains
+    one of its words; columns of deformed sizes (true stress) never fit by a word.
+    """
     name, _ = name_and_unit(column)
-    called = _words(name) & set(quantity.words.split())
-    return name.lower() == quantity.key or bool(called and not _words(name) & _DEFORMED)
+    words = _words(name)
+    called = words & set(quantity.words.split())
+    qualifiers = {key for key, of_key in QUALIFIERS.items() if words & of_key}
+    own = {quantity.qualifier} if quantity.qualifier else set()
+    return name.lower() == quantity.key or bool(called and qualifiers == own)
 
 
 def name_and_unit(column: str) -> tuple[str, str | None]:
@@ -249,7 +306,14 @@ def _words(name: str) -> set[str]:
 
 
 def _require_known_columns(grid: TextTable, quantities: Sequence[Quantity], all_of: bool) -> None:
-    """Raise an `InputError` if a column holds no known quantity."""
+    """Check that every column holds a known quantity; see `_columns_error` for `quantities` and
+    `all_of`.
+
+    Raises
+    ------
+    InputError
+        If one does not.
+    """
     known = {quantity.key for quantity in KNOWN_QUANTITIES}
     for column in grid.columns:
         if name_and_unit(column)[0].lower() not in known:
@@ -260,7 +324,18 @@ def _require_known_columns(grid: TextTable, quantities: Sequence[Quantity], all_
 def _columns_error(
     grid: TextTable, quantities: Sequence[Quantity], all_of: bool, why: str = ""
 ) -> InputError:
-    """Return the error for a table without the wanted columns; `why` is added to its message."""
+    """Return the error for a table without the wanted columns.
+
+    Parameters
+    ----------
+    grid : TextTable
+    quantities : sequence of Quantity
+        Wanted quantities.
+    all_of : bool
+        Whether all of them are needed, or one.
+    why : str
+        Addition to the message.
+    """
     expected = ", ".join(quantity.column for quantity in quantities)
     needed = [
         f"; a {quantity.key} needs {size} of the undeformed specimen"
@@ -276,7 +351,9 @@ def _columns_error(
 
 
 def _unit_error(grid: TextTable, column: str, unit: str | None, quantity: Quantity) -> InputError:
-    """Return the error for a column without a unit, or with a unit of another dimension."""
+    """Return the error for a column without a unit (`unit` is None), or with a unit of another
+    dimension.
+    """
     has = f"has the unit {unit}" if unit else "names no unit"
     remedy = f"call it {quantity.column}, or {column.split('_')[0]} ({quantity.unit})"
     return grid.error_at(

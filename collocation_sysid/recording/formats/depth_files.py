@@ -36,6 +36,9 @@ from .topics import sort_by_time
 
 # Depth of one count of an integer image if none is stated [m], as is usual for depth cameras.
 USUAL_COUNT_M = 1e-3
+# Largest length in a depth file [m]. Depths in micrometres that are read as metres are below it, so
+# that a wrong unit is named by `check`; damaged floating-point numbers are mostly far above it.
+LARGEST_LENGTH_M = 1e6
 # Endings of files with images, and with clouds of points.
 IMAGES = (".png", ".exr")
 CLOUDS = (".ply", ".pcd", ".npy", ".xyz")
@@ -117,9 +120,9 @@ def read_depth(
     require_regular(path)
     kind = path.suffix.lower()
     if kind not in _READERS:
-        known_camera_fields = ", ".join(_READERS)
+        expected = ", ".join(_READERS)
         raise InputError(
-            f"is a {kind or 'file without an ending'}; expected one of {known_camera_fields}", path
+            f"is a {kind or 'file without an ending'}; expected one of {expected}", path
         )
     try:
         content = _READERS[kind](path)
@@ -138,8 +141,25 @@ def read_depth(
 def _read_topic(
     path: Path, address: TopicAddress, count_m: float | None, length_m: float, known: Container[str]
 ) -> DepthFileContent:
-    """Return the messages of a topic in the order of their times, and the camera model beside
-    them.
+    """Read the messages of a topic in the order of their times, and the camera model beside them.
+
+    Parameters
+    ----------
+    path : Path
+        Path with the topic, for messages.
+    address : TopicAddress
+        Log and topic.
+    count_m : float or None
+        Depth of one count of an integer image [m]; None for a millimetre.
+    length_m : float
+        Unit of the coordinates of clouds [m].
+    known : container of str
+        "matrix" and "distortion" if they are known otherwise and therefore not read.
+
+    Raises
+    ------
+    InputError
+        If the topic is missing or has no depth data.
     """
     with open_log(address.log, address.episode) as log:
         require_topic(log, address.topic)
@@ -182,7 +202,23 @@ def _camera_of_topic(log: Log, topic: str) -> tuple[str, Any] | None:
 
 
 def _read_folder(path: Path, count_m: float | None, length_m: float) -> DepthFileContent:
-    """Read all files of a folder, which must be of one kind; times.csv has their times."""
+    """Read all depth files of a folder, in the order of their names.
+
+    Parameters
+    ----------
+    path : Path
+        Folder with images or clouds of one kind. Its file times.csv, if there is one, has their
+        times; without it the times of the result are None.
+    count_m : float or None
+        Depth of one count of an integer image [m]; None for a millimetre.
+    length_m : float
+        Unit of the coordinates of clouds [m].
+
+    Raises
+    ------
+    InputError
+        If there are no files, files of several kinds, or another number of times than files.
+    """
     files = sorted(each for each in path.iterdir() if each.suffix.lower() in (*IMAGES, *CLOUDS))
     if not files:
         raise InputError(f"has no {', '.join((*IMAGES, *CLOUDS))}; expected images or clouds", path)
@@ -201,28 +237,79 @@ def _read_folder(path: Path, count_m: float | None, length_m: float) -> DepthFil
 
 
 def _in_metres(image: Array, count_m: float | None) -> Array:
-    """Return depths [m] of an image (rows, columns) of counts or metres."""
+    """Return depths [m] of an image (rows, columns) of integer counts, each `count_m` [m] or a
+    millimetre if None, or of floats in metres.
+
+    Raises
+    ------
+    InputError
+        If the image has several channels.
+    """
     if image.ndim != 2:
         raise InputError(f"has the shape {image.shape}; expected one channel of depths")
     if image.dtype.kind in "iu":
         return image * (USUAL_COUNT_M if count_m is None else count_m)
-    return image.astype(float)
+    metres = image.astype(float)
+    _require_possible_lengths(metres)
+    return metres
+
+
+def _require_possible_lengths(values_m: Array) -> None:
+    """Refuse lengths [m] beyond `LARGEST_LENGTH_M`; values that are not finite are not compared.
+
+    Raises
+    ------
+    InputError
+        With the largest length, which no camera can have measured.
+    """
+    largest_m = np.max(np.abs(values_m), initial=0.0, where=np.isfinite(values_m))
+    if largest_m > LARGEST_LENGTH_M:
+        raise InputError(
+            f"contains the length {largest_m:.3g} m; expected at most {LARGEST_LENGTH_M:,.0f} m: "
+            "the file is damaged, or its unit is another one (length_unit, count_m)"
+        )
 
 
 def _scaled_cloud(points: Array, path: Path, length_m: float) -> Array:
-    """Return points (P, 3) or (P, 6) in metres; an `InputError` for another shape."""
-    points = np.asarray(points, dtype=float)
+    """Return points (P, 3) or (P, 6) in metres; normals in the last three columns are unchanged.
+
+    Parameters
+    ----------
+    points : array
+        Points in the unit `length_m` [m].
+    path : Path
+        File, for messages.
+
+    Raises
+    ------
+    InputError
+        For another shape.
+    """
+    with np.errstate(invalid="ignore"):  # a damaged file may have signalling NaN
+        points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise InputError(
             f"has the shape {points.shape}; expected x, y, z of each point, and after them nx, "
             "ny, nz if normals are known",
             path,
         )
-    return np.hstack([length_m * points[:, :3], points[:, 3:]])
+    places_m = length_m * points[:, :3]
+    with located(path):
+        _require_possible_lengths(places_m)
+    return np.hstack([places_m, points[:, 3:]])
 
 
 def _read_npz(path: Path) -> DepthFileContent:
-    """Read depth_m, depth_counts or points_m, and the camera model, from a NumPy archive."""
+    """Read depth_m, depth_counts or points_m, and the camera model, from a NumPy archive.
+
+    One image or cloud may lack the axis of samples. Counts are multiplied by count_m, by default
+    `USUAL_COUNT_M`.
+
+    Raises
+    ------
+    InputError
+        If the archive has none of the three arrays, or several.
+    """
     arrays = load_arrays(path)
     names = [name for name in ("depth_m", "depth_counts", "points_m") if name in arrays]
     if len(names) != 1:
@@ -235,6 +322,8 @@ def _read_npz(path: Path) -> DepthFileContent:
         values = values * float(arrays.get("count_m", USUAL_COUNT_M))
     samples = [np.asarray(each, dtype=float) for each in (values if values.ndim == 3 else [values])]
     clouded = names[0] == "points_m"
+    for sample in samples:
+        _require_possible_lengths(sample)
     camera = (arrays.get(name) for name in ("t_s", "camera_matrix", "camera_pose"))
     return DepthFileContent([] if clouded else samples, samples if clouded else [], *camera)
 
@@ -257,7 +346,14 @@ def _standard_error_silenced() -> Iterator[None]:
 
 
 def _read_exr(path: Path) -> Array:
-    """Read the depths [m] of an OpenEXR image."""
+    """Read the depths (rows, columns) [m] of an OpenEXR image: the channel Z, R, Y or V, else the
+    first.
+
+    Raises
+    ------
+    InputError
+        If the package OpenEXR is not installed.
+    """
     try:
         library = import_module("OpenEXR")
     except ImportError as missing:
@@ -273,7 +369,13 @@ def _read_exr(path: Path) -> Array:
 
 
 def _points_from_columns(columns: Mapping[str, Array]) -> Array:
-    """Return points (P, 3), or (P, 6) with normals, from named columns."""
+    """Return points (P, 3), or (P, 6) with normals, from columns by name.
+
+    Raises
+    ------
+    InputError
+        If x, y or z is missing.
+    """
     if not {*"xyz"} <= {*columns}:
         raise InputError(f"has the columns {', '.join(columns)}; expected x, y and z among them")
     return _with_normals(np.column_stack([columns[axis] for axis in "xyz"]), columns)
@@ -288,7 +390,13 @@ def _with_normals(points: Array, columns: Mapping[str, Array]) -> Array:
 
 
 def _read_pcd(path: Path) -> Array:
-    """Read the points (P, 3) or (P, 6) of a PCD file, ascii or binary."""
+    """Read the points (P, 3) or (P, 6) of a PCD file, ascii or binary.
+
+    Raises
+    ------
+    InputError
+        If the file has no header, is compressed, or lacks a coordinate.
+    """
     raw = path.read_bytes()
     head = dict[str, list[str]]()
     begins = 0

@@ -26,7 +26,9 @@ _PACKED = np.dtype([("kind", "<i4"), ("scale", "<f4"), ("shift", "<f4")])
 
 
 def depth_kind(message: Any) -> str:
-    """Return the kind of depth data in a message as text; empty if there is none."""
+    """Return a description of the depth data in a message, such as "depth images, 640 x 480"; empty
+    if it contains none.
+    """
     if hasattr(message, "point_step") and hasattr(message, "fields"):
         return "clouds of points"
     if getattr(message, "encoding", None) in ENCODINGS and hasattr(message, "step"):
@@ -105,7 +107,14 @@ def _field(message: Any, name: str) -> Any:
 
 
 def decode_image(message: Any) -> Any:
-    """Return the pixels (rows, columns) of an image: integer counts, or metres."""
+    """Return the pixels (rows, columns) of an image message: integer counts of a depth unit, or
+    floats in metres.
+
+    Raises
+    ------
+    InputError
+        If a compressed image cannot be decoded.
+    """
     if not hasattr(message, "encoding"):
         return _decode_compressed(str(message.format), _message_data(message))
     order = ">" if getattr(message, "is_bigendian", 0) else "<"
@@ -145,8 +154,14 @@ def _decode_compressed(kind: str, data: bytes) -> Any:
 
 
 def read_png(source: Path | BytesIO) -> Any:
-    """Return the counts (rows, columns) of a PNG with 16 bits and one channel; else an
-    `InputError`.
+    """Return the counts (rows, columns) of a PNG image with 16 bits and one channel, as int64.
+
+    Raises
+    ------
+    InputError
+        If the image has other bits or channels.
+    PIL.UnidentifiedImageError
+        If the source is no image.
     """
     from PIL.Image import open as opened
 
@@ -157,7 +172,14 @@ def read_png(source: Path | BytesIO) -> Any:
 
 
 def decode_cloud(message: Any) -> dict[str, Array]:
-    """Return the columns (P,) of a cloud of points by name, as floats."""
+    """Return the columns (P,) of a cloud of points by name, as floats.
+
+    Raises
+    ------
+    InputError
+        If its fields are of unknown types, do not lie within the bytes of a point, or repeat, or
+        the message has another number of bytes.
+    """
     order = ">" if getattr(message, "is_bigendian", 0) else "<"
     fields = list(message.fields)
     try:
@@ -190,6 +212,11 @@ def _unpadded_rows(message: Any, step: int, size: int) -> Any:
         Bytes from row to row.
     size : int
         Bytes of a pixel or point.
+
+    Raises
+    ------
+    InputError
+        If the message has another number of bytes, or its rows are too short.
     """
     data = np.frombuffer(_message_data(message), "u1")
     height = message.height

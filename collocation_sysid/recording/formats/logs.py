@@ -119,7 +119,7 @@ class Log(Protocol):
 
 @contextmanager
 def open_log(path: Path, episode: int | None = None) -> Iterator[Log]:
-    """Open a log, whose format is recognised by its content.
+    """Open a log, whose format is recognised by its content, for a ``with`` block.
 
     Parameters
     ----------
@@ -130,7 +130,8 @@ def open_log(path: Path, episode: int | None = None) -> Iterator[Log]:
     Raises
     ------
     InputError
-        If it is no log, is damaged, or a package that reads it is missing.
+        If it is no log, is damaged, or a package that reads it is missing. Any other exception in
+        the ``with`` block, except `ImportError`, is taken for damage.
     """
     for each in (path, *(path.iterdir() if path.is_dir() else ())):
         require_regular(each)

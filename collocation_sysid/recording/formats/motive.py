@@ -31,7 +31,14 @@ class _MarkerColumns:
 
 
 def read(text: str, choose: LabelChooser) -> RawTracks:
-    """Read a Motive CSV file; `choose` picks the markers."""
+    """Read a Motive CSV file; `choose` returns the indices of the markers to read from their
+    labels.
+
+    Raises
+    ------
+    InputError
+        If the text is no such file, or a cell is not a number.
+    """
     rows = separated_rows(text, ",")
     first = rows[0]
     pairs = zip(first.cells[::2], first.cells[1::2], strict=False)

@@ -25,7 +25,9 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
 
 
 def _read_wide(table: TextTable, choose: LabelChooser) -> RawTracks:
-    """Read a table with three columns for each marker."""
+    """Read a table with three columns for each marker; `choose` returns the indices of the markers
+    to read from their labels.
+    """
     labels = _wide_labels(table)
     place = {column: k for k, column in enumerate(table.columns)}
     places = [[place[f"{label}_{axis}"] for axis in "xyz"] for label in labels]
@@ -72,7 +74,14 @@ def _wide_labels(table: TextTable) -> list[str]:
 
 
 def _read_long(table: TextTable, choose: LabelChooser) -> RawTracks:
-    """Read a table with one row for each marker and time."""
+    """Read a table with one row for each marker and time; `choose` returns the indices of the
+    markers to read from their labels.
+
+    Raises
+    ------
+    InputError
+        If a name is blank, a column is missing, or the times of a marker do not increase.
+    """
     axes, unit = _long_columns(table)
     of_row = [row.cells[table.columns.index("marker")] for row in table.rows]
     if "" in of_row:
@@ -93,8 +102,13 @@ def _read_long(table: TextTable, choose: LabelChooser) -> RawTracks:
 
 
 def _long_columns(table: TextTable) -> tuple[list[str], str | None]:
-    """Return the names of the columns of x, y and z, and the unit in these names; None
-    without one.
+    """Return the names of the columns of x, y and z, and the unit in these names; None if they name
+    none.
+
+    Raises
+    ------
+    InputError
+        If the columns are not exactly t_s, marker and three coordinates of one unit.
     """
     for unit in (None, *METRES_PER_UNIT):
         axes = [f"{axis}_{unit}" if unit else axis for axis in "xyz"]

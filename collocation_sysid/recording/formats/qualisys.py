@@ -17,7 +17,14 @@ _KEY = re.compile(r"(?!NAN$)[A-Z][A-Z0-9_]*")
 
 
 def read(text: str, choose: LabelChooser) -> RawTracks:
-    """Read a Qualisys TSV file; `choose` picks the markers."""
+    """Read a Qualisys TSV file; `choose` returns the indices of the markers to read from their
+    labels.
+
+    Raises
+    ------
+    InputError
+        If the text is no such file, or a cell is not a number.
+    """
     rows = tab_rows(text)
     count = next((k for k, row in enumerate(rows) if not _KEY.fullmatch(row.cells[0])), len(rows))
     above = {row.cells[0]: row for row in rows[:count]}

@@ -59,8 +59,7 @@ class LabelChooser(Protocol):
 
     def __call__(self, labels: Sequence[str], excluded: Collection[str] = ()) -> list[int]:
         """Return the indices of the chosen labels; those in `excluded` only if they are requested
-        by
-        name.
+        by name.
         """
         ...
 
@@ -85,7 +84,7 @@ def tracks_of_table(
         Indices of the markers to read.
     time : int or None
         Index of the column of times, if there is one.
-    **stated
+    **fields
         Further fields of `RawTracks`.
     """
     cells = numeric_cells(
@@ -173,7 +172,7 @@ def tracks_of_frames(
     labels : sequence of str
     frames : list of Row
     choose : LabelChooser
-    **stated
+    **fields
         Further fields of `RawTracks`.
 
     Raises

@@ -211,7 +211,7 @@ def read_table(text: str) -> TextTable:
     Raises
     ------
     InputError
-        If it is no such text, has no rows, or rows of different lengths.
+        If the text is no such table, has no rows, or rows of different lengths.
     """
     rows = separated_rows(text)
     # The names are above the first row that holds several cells, of numbers only.

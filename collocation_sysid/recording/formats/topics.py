@@ -135,7 +135,8 @@ def topic_as_csv(address: TopicAddress) -> bytes:
 
 
 def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
-    """Return the description of a topic from its first messages.
+    """Return the description of a topic from its first messages: type, number of messages, rate,
+    possible uses and the addresses to write for them.
 
     Parameters
     ----------
@@ -177,7 +178,9 @@ def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
 
 
 def _possible_uses(columns: set[str], message: Any) -> str:
-    """Return the possible uses of messages with these columns, in words."""
+    """Return the possible uses of messages as text, from their `columns` of numbers and one
+    example; empty if there are no columns.
+    """
     if not columns:
         return ""
     if columns == {*POSE}:
@@ -213,9 +216,17 @@ def sort_by_time(messages: list[tuple[int, Any]], start_ns: int) -> tuple[Array,
 
 
 def measurement_time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
-    """Return the time of measurement of a message, or of its recording if it has no stamp [s].
+    """Return the time of measurement of a message [s], or of its recording if it has no stamp.
 
     The time counts from the log's first message, or is absolute if the stamp is of another clock.
+
+    Parameters
+    ----------
+    message : object
+    recorded_ns : int
+        Time at which the message was recorded [ns].
+    start_ns : int
+        Time at which the first message of the log was recorded [ns].
     """
     first = next(iter(_first_list(message)), None)
     stamps = (
@@ -242,7 +253,8 @@ def _nanoseconds(stamp: Any) -> int:
 
 
 def _message_values(message: Any, *, by_namespace: bool) -> Row:
-    """Return the numbers of a message by their columns.
+    """Return the numbers of a message by their columns: a wrench, joint positions, a pose, points,
+    or other numbers; empty if it has none.
 
     With `by_namespace` the names of markers begin with their namespace.
     """
@@ -378,7 +390,9 @@ def _poses_of_transforms(messages: Iterable[tuple[int, Any]], start_ns: int) -> 
 
 
 def _all_transforms(log: Log, moving: Iterable[tuple[int, Any]], topic: str) -> Edges:
-    """Return the poses of a topic's transforms and of the fixed transforms in its static topic."""
+    """Return the poses of a topic's transforms `moving` and of the fixed transforms in its static
+    topic, which have the time 0, by (parent, child) and time [s].
+    """
     still = (
         log.messages(topic + STATIC_TOPIC_SUFFIX)
         if topic + STATIC_TOPIC_SUFFIX in log.topics
@@ -410,9 +424,17 @@ def moving_chains(edges: Edges) -> list[tuple[str, str]]:
 
 
 def _poses_through_frames(edges: Edges, address: TopicAddress) -> tuple[Array, Array]:
-    """Return times (T,) and poses (T, 7) of one frame in another, through all frames between them.
+    """Return times (T,) [s] and poses (T, 7) of one frame in another: position, then quaternion (x,
+    y, z, w), through all frames between them.
 
     The times are those of the most frequent transform; others are interpolated along screw motions.
+
+    Parameters
+    ----------
+    edges : Edges
+        Poses of child frames in their parents, by (parent, child) and time [s].
+    address : TopicAddress
+        States the two frames; None is possible if there is only one pair.
 
     Raises
     ------
@@ -451,8 +473,13 @@ def _poses_through_frames(edges: Edges, address: TopicAddress) -> tuple[Array, A
 def _requested_frames(
     edges: Mapping[tuple[str, str], Any], address: TopicAddress
 ) -> tuple[str, str]:
-    """Return the parent and the child frame that an address asks for; an `InputError` if not
-    there.
+    """Return the parent and the child frame that an address states; without a statement, those of
+    the only transform.
+
+    Raises
+    ------
+    InputError
+        If a frame does not exist, or none are stated and there are several transforms.
     """
     frames = list(dict.fromkeys(frame for edge in edges for frame in edge))
     if address.frames is None:
@@ -473,7 +500,8 @@ def _requested_frames(
 def _frame_path(
     edges: Mapping[tuple[str, str], Any], parent: str, child: str
 ) -> list[tuple[str, str]]:
-    """Return the edges on the path from one frame through the common ancestor to the other.
+    """Return the edges (parent, child) on the path from one frame through the common ancestor to
+    the other.
 
     Raises
     ------

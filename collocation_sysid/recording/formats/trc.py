@@ -16,7 +16,13 @@ _KEYS = ("DataRate", "NumFrames", "NumMarkers", "Units")
 
 
 def read(text: str, choose: LabelChooser) -> RawTracks:
-    """Read a TRC file; `choose` picks the markers."""
+    """Read a TRC file; `choose` returns the indices of the markers to read from their labels.
+
+    Raises
+    ------
+    InputError
+        If the text is no such file, or a cell is not a number.
+    """
     rows = [row for row in tab_rows(text) if any(row.cells)]
     if len(rows) < 5:
         raise InputError("ends within the header of a TRC file", where=f"line {rows[-1].line}")

@@ -3,8 +3,9 @@
 `write_export` writes the files of a target in `TARGETS`, `verify_export` runs the target and
 compares its prediction with that of this package. One module per simulator: `mujoco`, `newton`,
 `usd`, `sofa`, `febio` and `calculix`. For all of them, `identified` reads the body from a run
-folder, `export_target` describes what a simulator can express, and `obstacle_shapes` converts
-obstacles. `rerun_recording` writes the motion of a run for a viewer instead.
+folder, `export_destination` finds format and place of the option --to, `export_target` describes
+what a simulator can express, and `obstacle_shapes` converts obstacles. `rerun_recording` writes the
+motion of a run for a viewer instead.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from ...recording import write_poses_csv
 from ...serialisation import as_json
 from ..run_writers import replaced_folder
 from . import calculix, febio, mujoco, newton, rerun_recording, sofa, usd
+from .export_destination import ExportDestination, parse_destination
 from .export_target import ExportedFiles, ExportTarget, PredictionComparison
 from .identified import IdentifiedBody
 
@@ -27,13 +29,18 @@ IDENTIFIED_FILE = "identified.json"
 
 
 TARGETS: dict[str, ExportTarget] = {
-    "mujoco": ExportTarget("MuJoCo", mujoco.export, mujoco.verify),
-    "newton": ExportTarget("Newton", newton.export),
-    "usd": ExportTarget("OpenUSD", usd.export, usd.verify),
-    "sofa": ExportTarget("SOFA", sofa.export),
-    "febio": ExportTarget("FEBio", febio.export),
-    "calculix": ExportTarget("CalculiX", calculix.export, calculix.verify),
-    "json": ExportTarget("JSON", lambda body: ExportedFiles({}, ())),
+    "mujoco": ExportTarget("MuJoCo", mujoco.MODEL, mujoco.export, mujoco.verify),
+    "newton": ExportTarget("Newton", newton.MODULE_FILE, newton.export),
+    "usd": ExportTarget("OpenUSD", usd.STAGE_FILE, usd.export, usd.verify),
+    "sofa": ExportTarget("SOFA", sofa.SCENE, sofa.export),
+    "febio": ExportTarget("FEBio", febio.MODEL, febio.export),
+    "calculix": ExportTarget("CalculiX", calculix.DECK, calculix.export, calculix.verify),
+    "json": ExportTarget("JSON", IDENTIFIED_FILE, lambda body: ExportedFiles({}, ())),
+}
+# Main file of each format: the targets, and the recording for a viewer.
+MAIN_FILES = {
+    **{name: target.main_file for name, target in TARGETS.items()},
+    rerun_recording.TARGET: rerun_recording.RECORDING_FILE,
 }
 
 
@@ -123,12 +130,15 @@ def target_named(name: str) -> ExportTarget:
 
 __all__ = [
     "IDENTIFIED_FILE",
+    "MAIN_FILES",
     "TARGETS",
+    "ExportDestination",
     "ExportTarget",
     "ExportedFiles",
     "IdentifiedBody",
     "PredictionComparison",
     "comparison_table",
+    "parse_destination",
     "target_named",
     "verify_export",
     "write_export",

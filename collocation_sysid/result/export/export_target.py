@@ -34,8 +34,8 @@ VISCOELASTICITY = (
     "instantaneous one is {at_once:.4g} times that"
 )
 MOTION = (
-    "grasped nodes are fixed at their positions of the first sample; the motion is in "
-    "poses_1.csv and so on, and your simulation has to apply it"
+    "grasped nodes are fixed at their positions of the first sample; the motion is in the CSV "
+    "files of poses beside this file, and your simulation has to apply it"
 )
 UNTESTED = (
     "untested: written according to the description of the format, but never read by the simulator"
@@ -84,6 +84,8 @@ class ExportTarget:
     ----------
     name : str
         Name of the simulator as it writes it itself.
+    main_file : str
+        Name of the file that the simulator opens; its suffix is that of the format.
     export : callable
         Returns the files for a body.
     verify : callable, optional
@@ -93,6 +95,7 @@ class ExportTarget:
     """
 
     name: str
+    main_file: str
     export: Callable[[IdentifiedBody], ExportedFiles]
     verify: Callable[[IdentifiedBody, Path], Sequence[PredictionComparison]] | None = None
 

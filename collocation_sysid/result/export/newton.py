@@ -40,7 +40,7 @@ import newton
 import numpy as np
 import warp as wp
 
-body = json.loads(Path(__file__).with_name("body.json").read_text(encoding="utf-8"))
+body = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
 
 
 def add_to(builder):
@@ -92,6 +92,8 @@ def model(device=None):
 
 def export(body: IdentifiedBody) -> ExportedFiles:
     """Return the module ``body.py`` and its numbers ``body.json``.
+
+    The module reads the JSON file with its own name, so that both can be renamed together.
 
     The elastic constants are those of Newton's `SolverVBD`, whose energy is the stable neo-Hookean
     one of

@@ -133,8 +133,8 @@ def vertex_colours(
     for corner in faces.T:
         for sample, row in zip(sums, finite, strict=True):
             np.add.at(sample, corner, row)
-    around = np.bincount(faces.ravel(), minlength=count)
-    means = sums / np.maximum(around, 1)
+    triangle_counts = np.bincount(faces.ravel(), minlength=count)
+    means = sums / np.maximum(triangle_counts, 1)
     scaled = (means - low) / ((high - low) or 1.0)
     return mpl.colormaps["cividis"](np.clip(scaled, 0.0, 1.0), bytes=True)
 
@@ -166,7 +166,7 @@ class _Recording:
         self._write_parameters(result, np.array(span_s))
 
     def close(self) -> None:
-        """Complete the file."""
+        """Write what is buffered and close the file."""
         self.stream.flush()
         self.stream.disconnect()
 
@@ -219,8 +219,8 @@ class _Recording:
         radius_m = MARKER_RADIUS_RATIO * extent_m
         shapes_m = replay.shapes_m
         assert shapes_m is not None
-        held = [x[h] for x, h in zip(shapes_m, replay.is_prescribed, strict=True)]
-        self._write_points(self._path(name, "grasped"), replay.t_s, held, BLACK, radius_m / 2)
+        grasped_m = [x[h] for x, h in zip(shapes_m, replay.is_prescribed, strict=True)]
+        self._write_points(self._path(name, "grasped"), replay.t_s, grasped_m, BLACK, radius_m / 2)
         for kind, markers_m, colour in (
             ("measured", replay.measured_m, ORANGE),
             ("fitted", replay.markers_m, BLUE),
@@ -229,10 +229,10 @@ class _Recording:
             if markers_m is not None and len(replay.marker_names):
                 path = self._path(name, "markers", kind)
                 self._write_points(path, replay.t_s, [*markers_m], colour, radius_m)
-        seen = [replay.depth_points_m(k) for k in range(len(replay.t_s))]
-        if any(map(len, seen)):
+        depth_points_m = [replay.depth_points_m(k) for k in range(len(replay.t_s))]
+        if any(map(len, depth_points_m)):
             path = self._path(name, "depth_points")
-            self._write_points(path, replay.t_s, seen, ORANGE, radius_m / 4)
+            self._write_points(path, replay.t_s, depth_points_m, ORANGE, radius_m / 4)
         self._write_obstacles(replay)
         self._write_residuals(replay)
         self._write_wrenches(replay)
@@ -326,11 +326,11 @@ class _Recording:
 
     def _write_curve(self, path: str, t_s: Array, values: Sequence[float] | Array) -> None:
         """Write a number over time; times at which it is not finite are left out."""
-        numbers = np.asarray(values, dtype=float)
-        there = np.isfinite(numbers)
-        if there.any():
-            columns = self.rr.Scalars.columns(scalars=numbers[there])
-            self._send(path, t_s[there], columns, None)
+        curve = np.asarray(values, dtype=float)
+        is_finite = np.isfinite(curve)
+        if is_finite.any():
+            columns = self.rr.Scalars.columns(scalars=curve[is_finite])
+            self._send(path, t_s[is_finite], columns, None)
 
     def _send(self, path: str, t_s: Array, columns: Any, counts: Sequence[int] | None) -> None:
         """Send columns at times [s]; `counts` are the numbers of rows per time, None for one."""

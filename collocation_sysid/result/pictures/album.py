@@ -24,6 +24,7 @@ from .over_time import marker_errors, marker_tracks, sensor_picture
 from .search_pictures import convergence, scan_picture
 from .shapes import contact_pictures, shapes_picture
 from .spectrum import spectrum_picture
+from .stress_strain import strain_picture
 
 
 def all_pictures(
@@ -49,8 +50,9 @@ def all_pictures(
         pictures["correlation"] = correlation_matrix(confidence)
     if result.budget:
         pictures["budget"] = budget_picture(result.budget)
-    if replays:
-        body = replays[0]
+    with_mesh = [replay for replay in replays if replay.strain is None]
+    if with_mesh:
+        body = with_mesh[0]
         pictures["mesh"] = mesh_picture(body)
         pictures["elements"] = elements_picture(body.undeformed_m, body.tetrahedra)
         for name, values in body.fields.items():
@@ -78,6 +80,12 @@ def _experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
     fitted = _infinities_as_nan(replay.markers_m)
     rolled_out = _infinities_as_nan(replay.rolled_out_m)
     names = replay.marker_names
+    if replay.strain is not None:
+        for name, values in replay.readings.items():
+            unit = replay.reading_units.get(name, "")
+            picture = strain_picture(replay.strain, replay.t_s, values, name, unit)
+            yield f"{name.replace(' ', '_')}_{replay.name}", picture
+        return
     if len(names):
         yield f"tracks_{replay.name}", marker_tracks(t_s, names, measured, fitted, rolled_out)
         yield f"error_{replay.name}", marker_errors(t_s, measured, fitted, rolled_out)

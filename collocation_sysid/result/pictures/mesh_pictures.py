@@ -241,20 +241,20 @@ def elements_picture(nodes_m: Array, tetrahedra: NDArray[np.integer]) -> Figure:
     quality = np.minimum(mean_ratios(nodes_m, tetrahedra), 1.0)  # rounding
     size_mm = 1e3 * np.sqrt((edge_lengths(nodes_m, tetrahedra) ** 2).mean(axis=1))
     figure = framed_figure(COLUMN_MM, 42, 13, 2, 9.5, 5.5)
-    left, right = figure.subplots(1, 2, sharey=True, gridspec_kw={"wspace": 0.08})
+    size_axes, quality_axes = figure.subplots(1, 2, sharey=True, gridspec_kw={"wspace": 0.08})
     widest = float(size_mm.max())
     spread = np.ptp(size_mm) > 0.02 * widest
     limits = (float(size_mm.min()), widest) if spread else (0.9 * widest, 1.1 * widest)
-    left.hist(size_mm, HISTOGRAM_BINS, range=limits, color=BLUE)
-    right.hist(quality, HISTOGRAM_BINS, range=(0.0, 1.0), color=BLUE)
+    size_axes.hist(size_mm, HISTOGRAM_BINS, range=limits, color=BLUE)
+    quality_axes.hist(quality, HISTOGRAM_BINS, range=(0.0, 1.0), color=BLUE)
     worst = float(quality.min())
-    right.axvline(worst, color=VERMILION, lw=1.0)
-    style_axes(left, f"{len(tetrahedra)} elements", "size [mm]", "elements")
-    style_axes(right, f"worst {worst:.2f}", "quality, 1 = regular")
-    right.title.set_color(VERMILION)
-    for axes in (left, right):
+    quality_axes.axvline(worst, color=VERMILION, lw=1.0)
+    style_axes(size_axes, f"{len(tetrahedra)} elements", "size [mm]", "elements")
+    style_axes(quality_axes, f"worst {worst:.2f}", "quality, 1 = regular")
+    quality_axes.title.set_color(VERMILION)
+    for axes in (size_axes, quality_axes):
         axes.grid(False, axis="x")
         axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
-    left.xaxis.set_major_locator(MaxNLocator(4))
-    right.set_xticks((0.0, 0.5, 1.0))
+    size_axes.xaxis.set_major_locator(MaxNLocator(4))
+    quality_axes.set_xticks((0.0, 0.5, 1.0))
     return figure

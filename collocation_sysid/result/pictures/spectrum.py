@@ -108,9 +108,9 @@ def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
     for group in _neighbour_groups(shown, 0.05 * limit_hz):
         for hertz in shown[group]:
             axes.axvline(hertz, color="#808080", lw=0.8, ls=(0, (2, 1.5)), zorder=0.9)
-        numbers = f"{group[0] + 1}" if len(group) == 1 else f"{group[0] + 1}–{group[-1] + 1}"
+        mode_label = f"{group[0] + 1}" if len(group) == 1 else f"{group[0] + 1}–{group[-1] + 1}"
         axes.annotate(
-            numbers, (shown[group].mean(), 1.0), xycoords=("data", "axes fraction"),
+            mode_label, (shown[group].mean(), 1.0), xycoords=("data", "axes fraction"),
             xytext=(0, -1), textcoords="offset points", ha="center", va="top",
             fontsize=SMALL_PT, bbox={"fc": "white", "ec": "none", "pad": 0.8},
         )  # fmt: skip

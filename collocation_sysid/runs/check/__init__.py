@@ -198,7 +198,10 @@ def _quick_fields(problem: Problem, positions_m: Mapping[str, Array]) -> dict[st
         "bodies": bodies,
         "recordings": tuple(check_recording(e, positions_m.get(e.name)) for e in experiments),
         "holds": tuple(
-            grasp_check for e in experiments for grasp_check in check_grasps(e, edges_m[e.name])
+            grasp_check
+            for e in experiments
+            if e.specimen is None
+            for grasp_check in check_grasps(e, edges_m[e.name])
         ),
     }
 
@@ -401,8 +404,16 @@ def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
     """Return the finding of each body, with the names of its experiments."""
     guesses = problem.parameters.guesses
     names = [tuple(e.name for e in problem.experiments if e.body is b) for b in problem.bodies]
-    pairs = zip(problem.bodies, names, strict=True)
-    return tuple(check_body(body, body.theta_from_values(guesses), own) for body, own in pairs)
+    specimens = {e.name for e in problem.experiments if e.specimen is not None}
+    return tuple(
+        check_body(
+            body,
+            body.theta_from_values(guesses),
+            own,
+            is_homogeneous=specimens.issuperset(own),
+        )
+        for body, own in zip(problem.bodies, names, strict=True)
+    )
 
 
 def _body_concerns(body: BodyCheck, alone: bool) -> tuple[Concern, ...]:

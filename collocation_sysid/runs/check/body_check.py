@@ -202,6 +202,8 @@ class BodyCheck:
     rest_shape_change_m : float
         Largest distance of the mesh from the stress-free shape at the guess; NaN where there is no
         such shape.
+    is_homogeneous : bool
+        Whether it is the cell of specimens without a mesh, whose deformation is homogeneous.
     """
 
     SERIALISED_PROPERTIES: ClassVar = ("warnings",)
@@ -223,6 +225,7 @@ class BodyCheck:
     fields: dict[str, FieldResolution]
     rest_shape: str | None = None
     rest_shape_change_m: float = 0.0
+    is_homogeneous: bool = False
 
     @property
     def diagonal_m(self) -> float:
@@ -235,7 +238,9 @@ class BodyCheck:
         return tuple(concern.message for concern in self.concerns)
 
 
-def check_body(body: Body, theta: Array, experiments: tuple[str, ...]) -> BodyCheck:
+def check_body(
+    body: Body, theta: Array, experiments: tuple[str, ...], *, is_homogeneous: bool = False
+) -> BodyCheck:
     """Return size, mesh and guess of a body.
 
     Parameters
@@ -245,6 +250,8 @@ def check_body(body: Body, theta: Array, experiments: tuple[str, ...]) -> BodyCh
         Constants θ at the guess.
     experiments : tuple of str
         Names of its experiments.
+    is_homogeneous : bool
+        Whether it is the cell of specimens, which has no discretisation error.
     """
     mesh = body.mesh
     fields = {part.field_name: part.field.resolution for part in body.parts if part.field}
@@ -267,13 +274,14 @@ def check_body(body: Body, theta: Array, experiments: tuple[str, ...]) -> BodyCh
         cells_across=shape.cells_across,
         guess=_constants_at_guess(body, theta),
         concerns=(
-            *element_concerns(body, theta, shape, worst[0]),
+            *(() if is_homogeneous else element_concerns(body, theta, shape, worst[0])),
             *rest_stability_concerns(body, theta),
-            *_field_concerns(fields),
+            *(() if is_homogeneous else _field_concerns(fields)),
         ),
         fields=fields,
         rest_shape=_rest_shape(body),
         rest_shape_change_m=_rest_shape_change_m(body, theta),
+        is_homogeneous=is_homogeneous,
     )
 
 

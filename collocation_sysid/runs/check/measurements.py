@@ -62,6 +62,8 @@ class RecordingCheck:
         Other instruments, in words.
     air_density_kg_m3 : float
         Density of the air around the body in the model; zero in a vacuum.
+    test : str
+        Kind of material test of a specimen without a mesh; "" for other recordings.
     """
 
     experiment: str
@@ -75,6 +77,7 @@ class RecordingCheck:
     markers: tuple[MarkerCheck, ...]
     instruments: tuple[str, ...]
     air_density_kg_m3: float = 0.0
+    test: str = ""
 
     @property
     def farthest_marker(self) -> MarkerCheck:
@@ -130,6 +133,7 @@ def check_recording(experiment: Experiment, positions_m: Array | None) -> Record
             *(f"{sum(map(len, d.clouds)):,} points of '{d.name}'" for d in experiment.depths),
         ),
         experiment.air_density_kg_m3,
+        "" if experiment.specimen is None else f"{experiment.specimen.test} specimen",
     )
 
 

@@ -1,0 +1,123 @@
+"""Folders of the datasets: problem files with their tables.
+
+Measured rubber is part of the package. Simulated recordings are in the repository's `problems/`,
+which a wheel contains beside them (`force-include` in pyproject.toml).
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from ..errors import InputError, hint_at
+from ..files import replaced_file, require_possible, write_text_file
+from ..problem import Problem
+from ..problem.editor_schema import SCHEMA_FILE, schema_text, schema_url, with_schema_reference
+
+# Problem file of each dataset.
+DATASETS = {
+    "kawabata_1981": "problem.toml",
+    "treloar_1944": "problem.toml",
+    "diani": "problem.toml",
+    "foam_cylinder": "recording.toml",
+    "laid_block": "problem.toml",
+    "noisy_cylinder": "problem.toml",
+    "poked_block": "problem.toml",
+    "table1": "problem.toml",
+    "wrist_sensor": "problem.toml",
+}
+# Licence of the datasets of others; the other datasets have the licence of this project.
+THIRD_PARTY_LICENCES = dict.fromkeys(
+    ("kawabata_1981", "treloar_1944", "diani"), "LICENSE_Hyperelastics.md"
+)
+# First line of problem files that name a JSON schema for editors.
+_SCHEMA_COMMENT = "#:schema "
+_IN_PACKAGE = Path(__file__).parent
+_IN_CHECKOUT = Path(__file__).parents[2] / "problems"
+
+
+def dataset_folder(name: str) -> Path:
+    """Return the folder of a dataset.
+
+    Raises
+    ------
+    InputError
+        If there is no dataset of this name, or it is not installed.
+    """
+    if name not in DATASETS:
+        raise InputError(
+            f"found {name!r}; expected one of {', '.join(DATASETS)}{hint_at(name, DATASETS)}",
+            where="dataset",
+        )
+    for parent in (_IN_PACKAGE, _IN_CHECKOUT):
+        if (parent / name / DATASETS[name]).is_file():
+            return parent / name
+    raise InputError(
+        f"the dataset {name!r} is not part of this installation; expected its folder in "
+        f"{_IN_PACKAGE} or {_IN_CHECKOUT}",
+        where="dataset",
+    )
+
+
+def dataset_file(name: str, file: str) -> Path:
+    """Return a file of a dataset; raise `InputError` if there is no such dataset."""
+    return dataset_folder(name) / file
+
+
+def read_problem(name: str) -> Problem:
+    """Return the problem of a dataset, one of `DATASETS`, with experiments and parameters.
+
+    Raises
+    ------
+    InputError
+        If there is no dataset of this name, or it is not installed.
+    """
+    folder = dataset_folder(name)
+    return Problem.read(folder / DATASETS[name])
+
+
+def copy_dataset(name: str, folder: Path) -> list[Path]:
+    """Copy the files of a dataset into a folder, which is created if necessary.
+
+    Problem files name the JSON schema for editors like those of `create_problem`. Measured data of
+    others come with their licence.
+
+    Returns
+    -------
+    list of Path
+        The problem file, followed by the other files, the licence and the schema.
+
+    Raises
+    ------
+    InputError
+        If there is no dataset of this name, one of the files exists, or the folder cannot be
+        created.
+    """
+    source = dataset_folder(name)
+    problem_file = source / DATASETS[name]
+    others = sorted(file for file in source.iterdir() if file.is_file() and file != problem_file)
+    if name in THIRD_PARTY_LICENCES:
+        others.append(_IN_PACKAGE / THIRD_PARTY_LICENCES[name])
+    require_possible(folder)
+    url = schema_url()
+    copies = {file: folder / file.name for file in (problem_file, *others)}
+    schema = [] if url else [folder / SCHEMA_FILE]
+    for copy in (*copies.values(), *schema):
+        if copy.exists():
+            raise InputError("it is there already; choose another name", copy)
+    for file, copy in copies.items():
+        _copy_file(file, copy, url or SCHEMA_FILE)
+    for file in schema:
+        write_text_file(file, schema_text())
+    return [*copies.values(), *schema]
+
+
+def _copy_file(file: Path, copy: Path, schema: str) -> None:
+    """Copy a file of a dataset; a problem file names the schema by an address or file name."""
+    if file.suffix == ".toml":
+        text = file.read_text(encoding="utf-8")
+        if text.startswith(_SCHEMA_COMMENT):
+            write_text_file(copy, with_schema_reference(text, schema))
+            return
+    with replaced_file(copy) as draft:
+        shutil.copyfile(file, draft)

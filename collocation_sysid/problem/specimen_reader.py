@@ -1,0 +1,162 @@
+"""Reading of material tests without a mesh: a table and its file become a static `Experiment`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..array_types import Array, Index
+from ..errors import InputError, located
+from ..fem.body import Body
+from ..recording import Experiment, Specimen
+from ..recording.sample_times import TIME_TOLERANCE_S
+from ..recording.specimen_checks import (
+    order_warnings,
+    require_plausible_specimen,
+    rows_after_cycles,
+)
+from ..recording.specimen_files import SpecimenLayout, SpecimenTable, read_specimen
+from .code_loader import existing_file
+from .specimen_schema import SpecimenSection, deviation
+
+# Strain of the first sample, over the largest, above which a memory's unknown past matters.
+UNKNOWN_PAST = 0.05
+
+
+@dataclass
+class SpecimenReader:
+    """Reader of one material test.
+
+    Attributes
+    ----------
+    section : SpecimenSection
+        Table of the experiment.
+    folder : Path
+        Folder that contains the file.
+    body : Body
+        Homogeneous cell of the test.
+    simulation : bool
+        Whether the problem is simulated: then every row is used.
+    notes : list of str
+        Assumptions that were made; reading adds to them.
+    """
+
+    section: SpecimenSection
+    folder: Path
+    body: Body
+    simulation: bool = False
+    notes: list[str] = field(default_factory=list)
+
+    def read(self) -> tuple[Specimen, Experiment]:
+        """Return the measurements, and the experiment of the homogeneous cell.
+
+        Raises
+        ------
+        InputError
+            Names the file and line, or the key within the experiment's table.
+        """
+        section = self.section
+        file = existing_file(self.folder, section.file, "file")
+        table = read_specimen(
+            file,
+            layout_from_section(
+                section, requires_times=self.body.has_memory or section.window_s is not None
+            ),
+        )
+        if table.is_incompressible and section.stress == "true":
+            self._add_note(
+                "true stresses were converted to engineering stresses as those of an "
+                "incompressible material; a lateral stretch in the file would be used instead"
+            )
+        specimen = self._specimen(table)
+        with located(file):
+            require_plausible_specimen(specimen)
+        for warning in order_warnings(specimen):
+            self._add_note(warning)
+        if table.is_displacement and section.area_m2 is None:
+            self._add_note(
+                "the compliance of the test bench is not part of the budget: state area_m2, the "
+                "undeformed area of the specimen, unless an extensometer measured the displacement"
+            )
+        self._note_unknown_past(specimen)
+        experiment = specimen.experiment(
+            name=section.name, validation=section.validation, body=self.body
+        )
+        return specimen, experiment
+
+    def _add_note(self, note: str) -> None:
+        """Add a note that begins with the experiment's name."""
+        self.notes.append(f"experiment '{self.section.name}': {note}")
+
+    def _specimen(self, table: SpecimenTable) -> Specimen:
+        """Return the measurements of the chosen rows, with their uncertainties."""
+        section = self.section
+        rows = self._rows(table)
+        if len(rows) < len(table.t_s):
+            self._add_note(f"{section.file}: {len(rows)} of {len(table.t_s)} rows are used")
+        arguments: dict[str, Any] = table.rows(rows)
+        if table.is_displacement and section.area_m2 is not None:
+            arguments |= {"length_m": section.length_m, "area_m2": section.area_m2}
+        return Specimen(
+            section.test,
+            **arguments,
+            sigma_pa=self._sigma_pa(),
+            lateral_sigma=section.lateral_sigma,
+            strain_zero=deviation(section.strain_zero),
+            area_error=deviation(section.area_error),
+            stress_zero_pa=deviation(section.stress_zero_pa),
+        )
+
+    def _rows(self, table: SpecimenTable) -> Index:
+        """Return the indices of the rows to use; all rows of a simulation."""
+        section = self.section
+        rows = np.arange(len(table.t_s))
+        if self.simulation:
+            return rows
+        first_s, last_s = section.window_s or (-np.inf, np.inf)
+        is_inside = (table.t_s >= first_s - TIME_TOLERANCE_S) & (
+            table.t_s <= last_s + TIME_TOLERANCE_S
+        )
+        rows = rows[is_inside]
+        if not rows.size:
+            raise InputError("no sample is within window_s", where="window_s")
+        if section.skip_cycles:
+            rows = rows[rows_after_cycles(table.strain[rows], section.skip_cycles)]
+        return rows[:: section.every]
+
+    def _sigma_pa(self) -> float:
+        """Return the standard deviation of the noise of the stress [Pa]."""
+        section = self.section
+        if section.sigma_pa is not None:
+            return section.sigma_pa
+        assert section.sigma_n is not None
+        assert section.area_m2 is not None
+        return section.sigma_n / section.area_m2
+
+    def _note_unknown_past(self, specimen: Specimen) -> None:
+        """Add a note if a material with memory is strained already at the first sample."""
+        strain: Array = np.abs(specimen.strain)
+        if self.body.has_memory and strain[0] > UNKNOWN_PAST * strain.max():
+            self._add_note(
+                f"the first sample has a strain of {specimen.strain[0]:.3g}, in which the material "
+                "is taken to have relaxed completely; expected samples from the unloaded state on"
+            )
+
+
+def layout_from_section(
+    section: SpecimenSection, *, requires_times: bool = False
+) -> SpecimenLayout:
+    """Return the meaning of the columns of the file of a specimen."""
+    return SpecimenLayout(
+        test=section.test,
+        columns=section.columns,
+        strain_sign=section.strain_sign,
+        stress_sign=section.stress_sign,
+        stress=section.stress,
+        length_m=section.length_m,
+        area_m2=section.area_m2,
+        requires_times=requires_times,
+    )

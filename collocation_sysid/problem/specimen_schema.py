@@ -1,0 +1,103 @@
+"""Keys of [[experiment]] with kind = "specimen": material tests without a mesh."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from ..recording.homogeneous_deformation import TESTS
+from ..recording.specimen import AREA_ERROR, LATERAL_SIGMA, STRAIN_ZERO
+from ..schema_tables import Among, ByForm, require_one
+from ..validated_types import AtLeastOne, Boundless, Count, Flag, Positive, Text
+from .recording_schema import NamedSection
+
+Prior = Annotated[Literal["none"] | Positive, ByForm(str)]
+
+
+class SpecimenSection(NamedSection):
+    """One material test with a homogeneous deformation, which needs no mesh.
+
+    Columns of the file are recognised by name and unit: a stretch, a strain, or a displacement with
+    length_m; a stress, or a force with area_m2; optionally a lateral stretch or strain.
+
+    Attributes
+    ----------
+    kind : {"specimen"}
+        Homogeneous specimen.
+    test : str
+        Kind of test; stresses across free surfaces vanish.
+    file : str
+        Table with a row for each sample, in the order of time.
+    columns : mapping of name to str
+        Column of the file by quantity (stretch, strain, displacement, stress, force, pressure,
+        lateral_stretch, …, t), where its name is not recognised; with a unit behind, "Load (N)",
+        that the file does not state.
+    strain_sign : {1, -1}
+        -1 where strains or displacements are positive in compression.
+    stress_sign : {1, -1}
+        -1 where stresses or forces are positive in compression.
+    stress : {"engineering", "true"}
+        Area by which the force was divided: that of the undeformed or of the deformed specimen.
+    length_m : float, optional
+        Undeformed length that divides a displacement; of a shear test the gap.
+    area_m2 : float, optional
+        Undeformed area that divides a force.
+    sigma_pa : float, optional
+        Standard deviation of the noise of the stress.
+    sigma_n : float, optional
+        In its place that of the force, which area_m2 divides.
+    lateral_sigma : float
+        Standard deviation of the noise of the lateral stretch.
+    strain_zero : float or "none"
+        Standard deviation of a constant offset of the strains, which is estimated.
+    area_error : float or "none"
+        Standard deviation of the relative error of the area, which is estimated.
+    stress_zero_pa : float or "none"
+        Standard deviation of a constant offset of the stress, which is estimated.
+    skip_cycles : int
+        Number of first loading cycles to leave out, in which rubber softens (Mullins).
+    window_s : list, optional
+        First and last time to use [start, end].
+    every : int
+        Use every n-th row.
+    validation : bool
+        Whether the test is only predicted, not fitted.
+    """
+
+    kind: Literal["specimen"]
+    test: Annotated[str, Among(TESTS)]
+    file: Text
+    columns: dict[str, Text] = Field(default_factory=dict)
+    strain_sign: Literal[1, -1] = 1
+    stress_sign: Literal[1, -1] = 1
+    stress: Literal["engineering", "true"] = "engineering"
+    length_m: Positive | None = None
+    area_m2: Positive | None = None
+    sigma_pa: Positive | None = None
+    sigma_n: Positive | None = None
+    lateral_sigma: Positive = LATERAL_SIGMA
+    strain_zero: Prior = STRAIN_ZERO
+    area_error: Prior = AREA_ERROR
+    stress_zero_pa: Prior = "none"
+    skip_cycles: Count = 0
+    window_s: tuple[Boundless, Boundless] | None = None
+    every: AtLeastOne = 1
+    validation: Flag = False
+
+    @model_validator(mode="after")
+    def _require_consistent(self) -> SpecimenSection:
+        """Raise `ValueError` for keys that exclude or require each other."""
+        require_one(self, "sigma_pa", "sigma_n")
+        if self.sigma_n is not None and self.area_m2 is None:
+            raise ValueError("found sigma_n without area_m2, which divides it; expected both")
+        if self.window_s is not None and not self.window_s[0] < self.window_s[1]:
+            raise ValueError(
+                f"found window_s = {list(self.window_s)}; expected [start, end] with start < end"
+            )
+        return self
+
+
+def deviation(prior: Prior) -> float:
+    """Return the standard deviation of a prior; 0 for "none"."""
+    return 0.0 if prior == "none" else float(prior)

@@ -1,0 +1,145 @@
+"""Homogeneous deformations of standard material tests, and the cell of elements that undergoes
+them.
+
+A linear tetrahedron represents a homogeneous deformation gradient F exactly. Its first node stays
+at the origin; the others, at the distance `CELL_SIZE_M` along the axes x, y and z, are the columns
+of F. Components of F that a test prescribes are prescribed displacements of these nodes; components
+that it leaves free follow from equilibrium, which is the condition that the corresponding stresses
+vanish. The nominal stress P is proportional to the forces on the nodes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from ..array_types import Array
+from ..fem.mesh import TetMesh
+from .grasp import Axes
+
+# Distance of the nodes from the origin [m]: answers do not depend on it.
+CELL_SIZE_M = 0.01
+# Nominal stress P over the force on a node [1/m²]: a node has the force V P ∇N with V = size³ / 6
+# and ∇N = 1 / size.
+STRESS_PER_FORCE = 6.0 / CELL_SIZE_M**2
+AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class HomogeneousDeformation:
+    """Deformation of one kind of material test, F = I + e₁ D₁ + e₂ D₂, apart from its free
+    components.
+
+    Attributes
+    ----------
+    test : str
+        Name of the test.
+    first : tuple of str
+        Components of D₁ that are 1, such as ("zz",): displacement direction, then node.
+    second : tuple of str
+        Components of D₂ that are 1; empty if the test has one strain.
+    free : str
+        Axes along which the normal stress vanishes and the stretch is free.
+    first_stress : str
+        Component of the nominal stress that belongs to e₁: its direction, then the normal.
+    second_stress : str
+        Component of a second nominal stress; empty if there is none.
+    lateral : str
+        Axis of the free stretch that may be measured; empty if there is none.
+    young_ratio : float
+        Initial slope of stress over strain, of an incompressible material, over Young's modulus;
+        NaN if it is not determined by Young's modulus.
+    area_over_length_m : float
+        Undeformed area over undeformed length [m] of a specimen whose strain e₁ is the displacement
+        of a test bench over that length, so that the compliance of the bench adds to it; 0 if the
+        strain was measured on the specimen.
+    """
+
+    test: str
+    first: tuple[str, ...]
+    second: tuple[str, ...] = ()
+    free: str = ""
+    first_stress: str = "zz"
+    second_stress: str = ""
+    lateral: str = ""
+    young_ratio: float = 1.0
+    area_over_length_m: float = 0.0
+
+    @property
+    def is_shear(self) -> bool:
+        """Whether the strain is an amount of shear, and not a change of a stretch."""
+        return self.test == "simple-shear"
+
+    @property
+    def needs_inner_node(self) -> bool:
+        """Whether all components of F are prescribed, so that a free node has to be added inside
+        the cell.
+        """
+        return not self.free
+
+    def displaced_nodes(self) -> dict[int, tuple[Array, Array]]:
+        """Return for each moving node, by its index, its displacements by e₁ and by e₂, each (3,)
+        [m].
+        """
+        directions = np.zeros((2, 4, 3))
+        for k, components in enumerate((self.first, self.second)):
+            for direction, node in components:
+                directions[k, 1 + AXES.index(node), AXES.index(direction)] = CELL_SIZE_M
+        moving = np.flatnonzero(np.abs(directions).max(axis=(0, 2)))
+        return {int(node): (directions[0, node], directions[1, node]) for node in moving}
+
+    def prescribed_axes(self, node: int) -> Axes:
+        """Return the axes along which a node of the cell is prescribed, by its index."""
+        own = AXES[node - 1] if node else ""
+        held = "".join(axis for axis in AXES if not (axis == own and axis in self.free))
+        return cast(Axes, held)
+
+
+DEFORMATIONS = {
+    each.test: each
+    for each in (
+        HomogeneousDeformation("uniaxial", first=("zz",), free="xy", lateral="x"),
+        HomogeneousDeformation(
+            "equibiaxial", first=("zz", "xx"), free="y", lateral="y", young_ratio=2.0
+        ),
+        HomogeneousDeformation(
+            "biaxial",
+            first=("zz",),
+            second=("xx",),
+            free="y",
+            second_stress="xx",
+            lateral="y",
+            young_ratio=np.nan,
+        ),
+        HomogeneousDeformation(
+            "planar",
+            first=("zz",),
+            free="y",
+            second_stress="xx",
+            lateral="y",
+            young_ratio=4.0 / 3.0,
+        ),
+        HomogeneousDeformation(
+            "simple-shear", first=("xz",), first_stress="xz", young_ratio=1.0 / 3.0
+        ),
+        HomogeneousDeformation("confined", first=("zz",), young_ratio=np.nan),
+        HomogeneousDeformation("volumetric", first=("xx", "yy", "zz"), young_ratio=np.nan),
+    )
+}
+TESTS = tuple(DEFORMATIONS)
+
+
+def cell_mesh(*, with_inner_node: bool) -> TetMesh:
+    """Return the cell: one tetrahedron, or four that share a node at its centre.
+
+    The additional node follows the homogeneous deformation and does not change the forces on the
+    others.
+    """
+    points_m = CELL_SIZE_M * np.vstack([np.zeros(3), np.eye(3)])
+    tetrahedra = np.array([[0, 1, 2, 3]])
+    if with_inner_node:
+        points_m = np.vstack([points_m, points_m.mean(axis=0)])
+        tetrahedra = np.array([[4, 1, 2, 3], [0, 4, 2, 3], [0, 1, 4, 3], [0, 1, 2, 4]])
+    return TetMesh(points_m, tetrahedra)

@@ -1,0 +1,340 @@
+"""Homogeneous specimens without a mesh: stretch or strain against engineering stress.
+
+`Specimen` has the measurements; `Specimen.experiment` returns a static `Experiment` of a cell of
+linear tetrahedra, which represents the homogeneous deformation exactly, see
+`homogeneous_deformation`. Everything that works with a static experiment works with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from ..array_types import Array
+from ..declarations import declaration, key
+from ..errors import InputError
+from ..fem.body import Body
+from ..fem.materials import DampingLaw, Energy, Material, Prony
+from ..validated_types import NotNegative, Positive
+from .checked_arrays import float_converter
+from .custom_sensor import Gauge, Look
+from .experiment import Experiment
+from .grasp import Grasp
+from .homogeneous_deformation import (
+    AXES,
+    CELL_SIZE_M,
+    DEFORMATIONS,
+    STRESS_PER_FORCE,
+    TESTS,
+    HomogeneousDeformation,
+    cell_mesh,
+)
+from .nuisance import Nuisance
+from .poses import PoseSequence
+from .specimen_stretches import require_evaluable_law
+
+# Density of a cell [kg/m³], on which no equilibrium without gravity depends.
+CELL_DENSITY_KG_M3 = 1000.0
+# Standard deviation of the zero of the strain: 0.1 mm on a gauge length of 50 mm.
+STRAIN_ZERO = 2e-3
+# Standard deviation of the relative error of the area: 0.02 mm on a thickness of 2 mm.
+AREA_ERROR = 0.01
+# Standard deviation of a measured lateral stretch: 0.1 mm on a width of 20 mm.
+LATERAL_SIGMA = 5e-3
+STRESS_NAME = "stress"
+SECOND_STRESS_NAME = "second stress"
+LATERAL_NAME = "lateral stretch"
+STRESS_UNIT = "Pa"
+
+
+@declaration
+class Specimen:
+    """Measurements of a material test in which the deformation is homogeneous.
+
+    The strain is that of the test: stretch minus one in "uniaxial", "equibiaxial", "biaxial",
+    "planar" (pure shear) and "confined" tests, the amount of shear γ in "simple-shear", and the
+    change of every length, J^(1/3) − 1, in "volumetric" tests. Stresses are engineering (nominal)
+    stresses: force over undeformed area, positive in tension. Stresses across free surfaces vanish.
+
+    Parameters
+    ----------
+    test : str
+        "uniaxial", "equibiaxial", "biaxial", "planar", "simple-shear", "confined" or "volumetric".
+    strain : (T,) array
+        Strain of each sample.
+    stress_pa : (T,) array
+        Engineering stress of each sample; NaN where missing. In "simple-shear" the shear stress
+        P_xz on a plane that keeps its normal; in "volumetric" the normal stress −p J^(2/3) of a
+        pressure p.
+    sigma_pa : float
+        Standard deviation of the noise of the stresses.
+    t_s : (T,) array, optional
+        Times, ascending; rows are numbered in seconds by default, which a material with memory
+        does not accept from files.
+    second_strain : (T,) array, optional
+        Strain along the second axis of a "biaxial" test.
+    second_stress_pa : (T,) array, optional
+        Stress along the second axis of a "biaxial" or "planar" test; NaN where missing.
+    lateral_stretch : (T,) array, optional
+        Stretch of a free direction, which determines Poisson's ratio; NaN where missing.
+    lateral_sigma : float
+        Standard deviation of the noise of the lateral stretch.
+    strain_zero : float
+        Standard deviation of a constant offset of the strains, which is estimated; 0 if exact.
+    area_error : float
+        Standard deviation of the relative error of the area, which is estimated; 0 if exact.
+    stress_zero_pa : float
+        Standard deviation of a constant offset of the stresses, which is estimated; 0 if exact.
+    length_m, area_m2 : float, optional
+        Undeformed length and area of the specimen, if `strain` is the displacement of a test bench
+        over the length: the budget then contains the compliance of the bench. None (both) if the
+        strain was measured on the specimen.
+
+    Raises
+    ------
+    InputError
+        For an unknown test, arrays of different lengths, a stretch that is not positive, a
+        measurement that the test does not have, or a length without an area.
+    """
+
+    test: str
+    strain: Array = key(converter=float_converter((None,), "strain"))
+    stress_pa: Array = key(converter=float_converter((None,), "stress_pa", finite=False))
+    sigma_pa: float = key(Positive)
+    t_s: Array | None = key(converter=float_converter((None,), "t_s"), default=None)
+    second_strain: Array | None = key(
+        converter=float_converter((None,), "second_strain"), default=None
+    )
+    second_stress_pa: Array | None = key(
+        converter=float_converter((None,), "second_stress_pa", finite=False), default=None
+    )
+    lateral_stretch: Array | None = key(
+        converter=float_converter((None,), "lateral_stretch", finite=False), default=None
+    )
+    lateral_sigma: float = key(Positive, default=LATERAL_SIGMA)
+    strain_zero: float = key(NotNegative, default=STRAIN_ZERO)
+    area_error: float = key(NotNegative, default=AREA_ERROR)
+    stress_zero_pa: float = key(NotNegative, default=0.0)
+    length_m: float | None = key(Positive, default=None)
+    area_m2: float | None = key(Positive, default=None)
+
+    def __post_init__(self) -> None:
+        if self.test not in DEFORMATIONS:
+            raise InputError(
+                f"found {self.test!r}; expected one of {', '.join(TESTS)}", None, "test"
+            )
+        times = np.arange(float(len(self.strain))) if self.t_s is None else self.t_s
+        vars(self)["t_s"] = times
+        self._require_measurements_of_test()
+        if (self.length_m is None) != (self.area_m2 is None):
+            raise InputError(
+                "found one of length_m and area_m2; expected both, or neither for a strain that "
+                "was measured on the specimen",
+                None,
+                "length_m",
+            )
+        for name in ("stress_pa", "t_s", "second_strain", "second_stress_pa", "lateral_stretch"):
+            values = getattr(self, name)
+            if values is not None and len(values) != len(self.strain):
+                raise InputError(
+                    f"found {len(values)} values for {len(self.strain)} strains; expected as many",
+                    None,
+                    name,
+                )
+        for name in ("strain", "second_strain"):
+            values = getattr(self, name)
+            if values is None or self.deformation.is_shear:
+                continue
+            if (lowest := values.min(initial=0.0)) <= -1.0:
+                raise InputError(
+                    f"found a strain of {lowest:g} in row {int(values.argmin()) + 1}, in which the "
+                    "length is negative; expected more than −1. If these are percent, divide them "
+                    'by 100, or call the column "strain (%)"',
+                    None,
+                    name,
+                )
+
+    def _require_measurements_of_test(self) -> None:
+        """Raise an `InputError` if a measurement is missing, or not one of the test's."""
+        of = f"a {self.test} test"
+        if (self.second_strain is None) == bool(self.deformation.second):
+            fault = f"{of} needs" if self.second_strain is None else f"{of} does not have"
+            raise InputError(f"{fault} a second strain", None, "second_strain")
+        if self.second_stress_pa is not None and not self.deformation.second_stress:
+            raise InputError(f"{of} does not have a second stress", None, "second_stress_pa")
+        if self.lateral_stretch is not None and not self.deformation.lateral:
+            raise InputError(
+                f"{of} has no free direction, and no lateral stretch", None, "lateral_stretch"
+            )
+
+    @property
+    def deformation(self) -> HomogeneousDeformation:
+        """Components of the deformation gradient that the test prescribes."""
+        deformation = DEFORMATIONS[self.test]
+        if self.length_m is None or self.area_m2 is None:
+            return deformation
+        return replace(deformation, area_over_length_m=self.area_m2 / self.length_m)
+
+    def __repr__(self) -> str:
+        return f"Specimen({self.test!r}: {len(self.strain)} samples)"
+
+    def experiment(
+        self,
+        material: str | Energy | Material = "neo-hookean",
+        name: str = "specimen",
+        *,
+        prony: tuple[str | Prony, ...] = (),
+        validation: bool = False,
+        body: Body | None = None,
+    ) -> Experiment:
+        """Return the test as a static experiment of a homogeneous cell.
+
+        Parameters
+        ----------
+        material : str, Material or callable
+            As of `Body`.
+        name : str
+            Name of the experiment.
+        prony : sequence of str or Prony
+            Branches of the material's memory, as of `Body`.
+        validation : bool
+            Whether the test is only predicted, not fitted.
+        body : Body, optional
+            Cell that another specimen of the same kind of test has; made of `material` and `prony`
+            by default.
+        """
+        cell = cell_body(self.test, material, prony) if body is None else body
+        assert self.t_s is not None
+        require_evaluable_law(cell, self.test, self.strain, self.second_strain)
+        nuisance = Nuisance.none(strain_zero=self.strain_zero or None)
+        return Experiment(
+            cell,
+            self.t_s,
+            self._grasps(),
+            gravity_m_s2=(0.0, 0.0, 0.0),
+            name=name,
+            kind="static",
+            readings=self._sensors(),
+            air_density_kg_m3="none",
+            nuisance=nuisance,
+            validation=validation,
+            specimen=self.deformation,
+        )
+
+    def _grasps(self) -> list[Grasp]:
+        """Return the prescribed displacements of the nodes of the cell."""
+        assert self.t_s is not None
+        moving = self.deformation.displaced_nodes()
+        second = np.zeros_like(self.strain) if self.second_strain is None else self.second_strain
+        grasps = []
+        for node in range(1 + len(AXES)):
+            poses = PoseSequence.fixed()
+            if node in moving:
+                by_first, by_second = moving[node]
+                shifts_m = np.outer(self.strain, by_first) + np.outer(second, by_second)
+                no_rotation = np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1))
+                poses = PoseSequence(self.t_s, shifts_m, no_rotation, interpolation="linear")
+            axes = self.deformation.prescribed_axes(node)
+            grasps.append(Grasp(np.array([node]), poses, axes=axes))
+        return grasps
+
+    def _sensors(self) -> list[Gauge]:
+        """Return the sensors of stresses and of the lateral stretch."""
+        assert self.t_s is not None
+        sensors = []
+        for name, component, values in (
+            (STRESS_NAME, self.deformation.first_stress, self.stress_pa),
+            (SECOND_STRESS_NAME, self.deformation.second_stress, self.second_stress_pa),
+        ):
+            if values is not None and np.isfinite(values).any():
+                sensors.append(self._stress_sensor(name, component, values))
+        if self.lateral_stretch is not None:
+            axis = AXES.index(self.deformation.lateral)
+            point_m = np.zeros(3)
+            point_m[axis] = CELL_SIZE_M
+            sensors.append(
+                Gauge(
+                    LATERAL_NAME,
+                    LateralStretch(axis),
+                    self.t_s,
+                    self.lateral_stretch,
+                    sigma=self.lateral_sigma,
+                    points_m=[point_m],
+                    unit="1",
+                )
+            )
+        return sensors
+
+    def _stress_sensor(self, name: str, component: str, values: Array) -> Gauge:
+        """Return the sensor of one component of the nominal stress: its direction, then the
+        normal.
+        """
+        deviations = {"area_error": self.area_error, "stress_zero_pa": self.stress_zero_pa}
+        direction, normal = (AXES.index(axis) for axis in component)
+        assert self.t_s is not None
+        return Gauge(
+            name,
+            NominalStress(direction),
+            self.t_s,
+            values,
+            sigma=self.sigma_pa,
+            grasp=2 + normal,
+            frame="world",
+            unknowns={unknown: sigma for unknown, sigma in deviations.items() if sigma},
+            unit=STRESS_UNIT,
+        )
+
+
+class NominalStress:
+    """Expression of a component of the nominal stress, measured with a wrong area and zero.
+
+    Attributes
+    ----------
+    direction : int
+        Index of the direction of the force.
+    """
+
+    def __init__(self, direction: int) -> None:
+        self.direction = direction
+
+    def __call__(
+        self, at: Look, area_error: ca.SX | float = 0.0, stress_zero_pa: ca.SX | float = 0.0
+    ) -> ca.SX:
+        """Return the measured stress [Pa] if the area is larger than stated by a share."""
+        stress_pa = STRESS_PER_FORCE * at.force_n[self.direction]
+        return stress_pa * (1 + area_error) + stress_zero_pa
+
+
+class LateralStretch:
+    """Expression of the stretch along a free axis.
+
+    Attributes
+    ----------
+    axis : int
+        Index of the axis.
+    """
+
+    def __init__(self, axis: int) -> None:
+        self.axis = axis
+
+    def __call__(self, at: Look) -> ca.SX:
+        """Return the stretch."""
+        return at.position_m[self.axis, 0] / CELL_SIZE_M
+
+
+def cell_body(
+    test: str,
+    material: str | Energy | Material = "neo-hookean",
+    prony: tuple[str | Prony, ...] = (),
+    damping: str | DampingLaw = "kelvin-voigt",
+) -> Body:
+    """Return the homogeneous cell of a kind of test, one of `TESTS`; other arguments as of `Body`.
+
+    The damping law has no effect on equilibria.
+    """
+    mesh = cell_mesh(with_inner_node=DEFORMATIONS[test].needs_inner_node)
+    return Body(
+        mesh, material, CELL_DENSITY_KG_M3, damping=damping, prony=prony, rest_shape="stress_free"
+    )

@@ -1,0 +1,367 @@
+"""Tables of material tests: stretch or strain against stress, or displacement against force.
+
+All are converted to the strain and the engineering stress of `Specimen`. True stresses are
+converted with the area of the deformed specimen, which follows from the lateral stretch where it is
+measured, else from incompressibility.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ..array_types import Array, Index
+from ..errors import InputError
+from .experiment import Experiment
+from .formats.columns import (
+    DISPLACEMENT,
+    FORCE,
+    LATERAL_STRAIN,
+    LATERAL_STRETCH,
+    PRESSURE,
+    SECOND_STRAIN,
+    SECOND_STRESS,
+    SECOND_STRETCH,
+    STRAIN,
+    STRESS,
+    STRETCH,
+    TIME,
+    TRUE_STRESS,
+    VOLUME_RATIO,
+    Quantity,
+    QuantityTable,
+    read_columns,
+)
+from .formats.text import names_file_in_errors
+from .homogeneous_deformation import AXES, CELL_SIZE_M
+from .specimen import LATERAL_NAME, SECOND_STRESS_NAME, STRESS_NAME
+
+Sign = Literal[1, -1]
+StressMeasure = Literal["engineering", "true"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpecimenLayout:
+    """Meaning of the columns of a table of a material test.
+
+    Attributes
+    ----------
+    test : str
+        Kind of test, see `Specimen`.
+    columns : mapping of str to str
+        Name of the column by quantity, where it is not recognised.
+    strain_sign, stress_sign : {1, -1}
+        Factors on strains or displacements, and on stresses or forces: −1 where compression is
+        positive. Stretches, volume ratios and pressures have none.
+    stress : {"engineering", "true"}
+        Area by which the force was divided: the undeformed or the deformed one.
+    length_m : float or None
+        Undeformed length that divides a displacement.
+    area_m2 : float or None
+        Undeformed area that divides a force.
+    requires_times : bool
+        Whether the table must have times.
+    """
+
+    test: str
+    columns: Mapping[str, str]
+    strain_sign: Sign = 1
+    stress_sign: Sign = 1
+    stress: StressMeasure = "engineering"
+    length_m: float | None = None
+    area_m2: float | None = None
+    requires_times: bool = False
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """Quantities that the table of this kind of test may have."""
+        stresses = (STRESS,) if self.stress == "engineering" else (STRESS, TRUE_STRESS)
+        if self.test == "volumetric":
+            return VOLUME_RATIO, STRETCH, STRAIN, PRESSURE, *stresses
+        quantities = [STRAIN, *stresses, DISPLACEMENT, FORCE]
+        if self.test != "simple-shear":
+            quantities.append(STRETCH)
+        if self.test == "biaxial":
+            quantities += [SECOND_STRETCH, SECOND_STRAIN]
+        if self.test in ("biaxial", "planar"):
+            quantities.append(SECOND_STRESS)
+        if self.test in ("uniaxial", "equibiaxial", "biaxial", "planar"):
+            quantities += [LATERAL_STRETCH, LATERAL_STRAIN]
+        return tuple(quantities)
+
+
+@dataclass(frozen=True, eq=False)
+class SpecimenTable:
+    """Measurements of a material test in the terms of `Specimen`.
+
+    Attributes
+    ----------
+    t_s : (T,) array
+        Times; the number of the row in seconds if the table has none.
+    strain, stress_pa : (T,) array
+    second_strain, second_stress_pa, lateral_stretch : (T,) array or None
+        None if the table has no such column.
+    is_incompressible : bool
+        Whether true stresses were converted as those of an incompressible specimen.
+    is_displacement : bool
+        Whether the strain is a displacement over the length of the specimen.
+    """
+
+    t_s: Array
+    strain: Array
+    stress_pa: Array
+    second_strain: Array | None
+    second_stress_pa: Array | None
+    lateral_stretch: Array | None
+    is_incompressible: bool
+    is_displacement: bool
+
+    def rows(self, chosen: Index) -> dict[str, Array | None]:
+        """Return the arrays at chosen rows, by their indices, as arguments of `Specimen`."""
+        arrays = {
+            "t_s": self.t_s,
+            "strain": self.strain,
+            "stress_pa": self.stress_pa,
+            "second_strain": self.second_strain,
+            "second_stress_pa": self.second_stress_pa,
+            "lateral_stretch": self.lateral_stretch,
+        }
+        return {name: None if each is None else each[chosen] for name, each in arrays.items()}
+
+
+@names_file_in_errors
+def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
+    """Read the table of a material test.
+
+    Raises
+    ------
+    InputError
+        If a column is missing, repeated or in an unknown unit, a cell is not a number, time does
+        not increase, or length or area of the specimen are needed; the line is named.
+    """
+    if layout.test == "simple-shear" and "stretch" in layout.columns:
+        raise InputError("a simple-shear test has a strain and no stretch", where="columns")
+    table = read_columns(
+        path,
+        layout.quantities,
+        layout.columns,
+        blank_allowed=True,
+        requires_times=layout.requires_times,
+    )
+    strain = _strain(table, layout)
+    second_strain = _second_strain(table, layout)
+    lateral = _lateral_stretch(table, layout)
+    areas = _area_ratios(layout, strain, second_strain, lateral)
+    stress_pa = _stress_pa(table, layout)
+    second_pa = table.values.get(SECOND_STRESS.key)
+    if layout.test == "volumetric":
+        stress_pa = stress_pa * (1 + strain) ** 2
+    elif layout.stress == "true":
+        stress_pa = stress_pa * areas[0]
+    if second_pa is not None:
+        second_pa = layout.stress_sign * second_pa
+        second_pa = second_pa * areas[1] if layout.stress == "true" else second_pa
+    return SpecimenTable(
+        table.t_s,
+        strain,
+        stress_pa,
+        second_strain,
+        second_pa,
+        lateral,
+        is_incompressible=layout.stress == "true"
+        and lateral is None
+        and layout.test in ("uniaxial", "equibiaxial", "planar", "biaxial"),
+        is_displacement=DISPLACEMENT.key in table.values,
+    )
+
+
+def _one_of(table: QuantityTable, quantities: tuple[Quantity, ...], what: str) -> Quantity:
+    """Return the only quantity of several that a table has.
+
+    Raises
+    ------
+    InputError
+        If it has none or more than one.
+    """
+    there = [quantity for quantity in quantities if quantity.key in table.values]
+    if len(there) != 1:
+        found = " and ".join(quantity.key for quantity in there) or "no column"
+        expected = ", ".join(quantity.column for quantity in quantities)
+        raise table.grid.error_at(
+            f"the columns are {', '.join(table.grid.columns)}; found {found} of the {what}, "
+            f"expected exactly one of {expected}, in these or other units"
+        )
+    return there[0]
+
+
+def _complete(table: QuantityTable, quantity: Quantity) -> Array:
+    """Return the values (T,) of a column; raise `InputError` if a cell is blank."""
+    values = table.values[quantity.key]
+    if (blank := np.isnan(values)).any():
+        raise table.grid.error_at(
+            f"the {quantity.key} is blank; expected a number in every row", int(blank.argmax())
+        )
+    return values
+
+
+def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
+    """Return the strain (T,) of the test."""
+    known = (STRETCH, STRAIN, DISPLACEMENT, VOLUME_RATIO)
+    possible = tuple(quantity for quantity in known if quantity in layout.quantities)
+    quantity = _one_of(table, possible, "deformation")
+    values = _complete(table, quantity)
+    if quantity == STRETCH:
+        _require_positive(table, quantity, values)
+        return values - 1
+    if layout.test == "volumetric":
+        ratio = values if quantity == VOLUME_RATIO else 1 + layout.strain_sign * values
+        _require_positive(table, quantity, ratio)
+        return np.cbrt(ratio) - 1
+    if quantity == DISPLACEMENT:
+        if layout.length_m is None:
+            raise table.grid.error_at(
+                "a displacement needs length_m, the undeformed length of the specimen, or the gap "
+                "of a shear test"
+            )
+        values = values / layout.length_m
+    strain = layout.strain_sign * values
+    if layout.test != "simple-shear":
+        _require_positive(table, quantity, 1 + strain)
+    return strain
+
+
+def _require_positive(table: QuantityTable, quantity: Quantity, ratio: Array) -> None:
+    """Raise an `InputError` if a ratio (T,) of deformed to undeformed size is not positive."""
+    if (ratio > 0).all():
+        return
+    row = int(np.argmax(ratio <= 0))
+    likely = {
+        STRETCH.key: "a stretch is 1 without load; if the column has strains, call it strain",
+        STRAIN.key: 'if these are percent, call the column "strain (%)"',
+        DISPLACEMENT.key: "check length_m, strain_sign and the unit of the displacement",
+    }.get(quantity.key, "a volume ratio is 1 without load")
+    raise table.grid.error_at(
+        f"the {quantity.key} makes the specimen {ratio[row]:.4g} times as large as without load; "
+        f"expected a positive ratio: {likely}",
+        row,
+    )
+
+
+def _second_strain(table: QuantityTable, layout: SpecimenLayout) -> Array | None:
+    """Return the strain (T,) along the second axis; None unless the test is biaxial."""
+    if layout.test != "biaxial":
+        return None
+    quantity = _one_of(table, (SECOND_STRETCH, SECOND_STRAIN), "deformation of the second axis")
+    values = _complete(table, quantity)
+    strain = values - 1 if quantity == SECOND_STRETCH else layout.strain_sign * values
+    _require_positive(table, STRETCH, 1 + strain)
+    return strain
+
+
+def _lateral_stretch(table: QuantityTable, layout: SpecimenLayout) -> Array | None:
+    """Return the lateral stretch (T,); None if the table has none."""
+    if LATERAL_STRETCH.key in table.values:
+        return table.values[LATERAL_STRETCH.key]
+    if LATERAL_STRAIN.key in table.values:
+        return 1 + layout.strain_sign * table.values[LATERAL_STRAIN.key]
+    return None
+
+
+def _stress_pa(table: QuantityTable, layout: SpecimenLayout) -> Array:
+    """Return the stress (T,) as the table has it, positive in tension [Pa]."""
+    known = (STRESS, TRUE_STRESS, FORCE, PRESSURE)
+    possible = tuple(quantity for quantity in known if quantity in layout.quantities)
+    quantity = _one_of(table, possible, "load")
+    values = table.values[quantity.key]
+    if quantity == PRESSURE:
+        return -values
+    if quantity == FORCE:
+        if layout.stress == "true":
+            raise table.grid.error_at('a force has no area; expected no stress = "true"')
+        if layout.area_m2 is None:
+            raise table.grid.error_at("a force needs area_m2, the undeformed area it acts on")
+        values = values / layout.area_m2
+    return layout.stress_sign * values
+
+
+def _area_ratios(
+    layout: SpecimenLayout, strain: Array, second_strain: Array | None, lateral: Array | None
+) -> tuple[Array, Array]:
+    """Return the deformed over the undeformed area (T,) of the faces of the first and of the
+    second stress.
+    """
+    stretch = 1 + strain
+    if layout.test in ("confined", "simple-shear", "volumetric"):
+        return np.ones_like(stretch), np.ones_like(stretch)
+    second = {
+        "equibiaxial": stretch,
+        "planar": np.ones_like(stretch),
+        "biaxial": stretch if second_strain is None else 1 + second_strain,
+    }.get(layout.test)
+    if second is None:
+        across = np.sqrt(1 / stretch) if lateral is None else lateral
+        return across**2, across**2
+    thickness = 1 / (stretch * second) if lateral is None else lateral
+    return second * thickness, stretch * thickness
+
+
+def specimen_strains(experiment: Experiment) -> tuple[Array, Array]:
+    """Return the first and the second strain (T,) of the experiment of a specimen; the second is
+    zero unless the test is biaxial.
+    """
+    deformation = experiment.specimen
+    assert deformation is not None
+    strains = []
+    for components in (deformation.first, deformation.second):
+        strain = np.zeros(len(experiment.t_s))
+        for direction, node in components[:1]:
+            grasp = experiment.grasps[1 + AXES.index(node)]
+            shifts_m = grasp.poses.at(experiment.t_s)[1]
+            strain = shifts_m[:, AXES.index(direction)] / CELL_SIZE_M
+        strains.append(strain)
+    return strains[0], strains[1]
+
+
+def specimen_columns(
+    experiment: Experiment, values: Mapping[str, Array], layout: SpecimenLayout
+) -> dict[str, Array]:
+    """Return the columns (T,) of the table of a specimen by name, as `read_specimen` reads them.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Experiment of a specimen.
+    values : mapping of str to (T,) array
+        Values of its sensors by name.
+    layout : SpecimenLayout
+        Meaning of the columns, with the names that the user gives them.
+    """
+    strain, second_strain = specimen_strains(experiment)
+    lateral = values.get(LATERAL_NAME)
+    areas = _area_ratios(layout, strain, second_strain, lateral)
+    is_true = layout.stress == "true"
+    columns: dict[Quantity, Array] = {TIME: experiment.t_s}
+    if layout.test == "volumetric":
+        columns[VOLUME_RATIO] = (1 + strain) ** 3
+        columns[PRESSURE] = -values[STRESS_NAME] / (1 + strain) ** 2
+    else:
+        if layout.test == "simple-shear":
+            columns[STRAIN] = layout.strain_sign * strain
+        else:
+            columns[STRETCH] = 1 + strain
+        if layout.test == "biaxial":
+            columns[SECOND_STRETCH] = 1 + second_strain
+        for name, quantity, area in (
+            (STRESS_NAME, STRESS, areas[0]),
+            (SECOND_STRESS_NAME, SECOND_STRESS, areas[1]),
+        ):
+            if name in values:
+                stress_pa = values[name] / area if is_true else values[name]
+                columns[quantity] = layout.stress_sign * stress_pa
+        if lateral is not None:
+            columns[LATERAL_STRETCH] = lateral
+    return {quantity.column: column for quantity, column in columns.items()}

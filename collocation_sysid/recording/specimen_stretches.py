@@ -1,0 +1,75 @@
+"""Principal stretches of material tests, and the range in which laws can be evaluated."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..array_types import Array
+from ..errors import InputError
+from ..fem.body import Body
+from ..fem.ogden import is_power_law
+
+# Smallest principal stretch at which laws in powers of the stretches are accurate to 0.1 %.
+SMALLEST_POWER_STRETCH = 0.05
+
+
+def require_evaluable_law(
+    body: Body, test: str, strain: Array, second_strain: Array | None
+) -> None:
+    """Raise an `InputError` if stretches leave the range in which the law is evaluated accurately.
+
+    Laws in powers of the stretches integrate over invariants, see `fem.power_traces`.
+
+    Parameters
+    ----------
+    body : Body
+        Cell of the specimen.
+    test : str
+        Kind of test, see `Specimen`.
+    strain : (T,) array
+        Strain of the test.
+    second_strain : (T,) array or None
+        Strain along the second axis of a "biaxial" test; None for other tests.
+    """
+    laws = [part.material.name for part in body.parts if is_power_law(part.material.name)]
+    if not laws or not len(strain):
+        return
+    stretches = isochoric_stretches(test, strain, second_strain)
+    row = int(stretches.min(axis=1).argmin())
+    smallest = float(stretches[row].min())
+    if smallest < SMALLEST_POWER_STRETCH:
+        raise InputError(
+            f"row {row + 1} has a strain of {strain[row]:.4g}, at which the smallest principal "
+            f"stretch is {smallest:.3g}; expected at least {SMALLEST_POWER_STRETCH:g}, below which "
+            f"'{laws[0]}' is evaluated with an error above 0.1 %. Leave out these rows, or use "
+            "another law"
+        )
+
+
+def isochoric_stretches(test: str, strain: Array, second_strain: Array | None) -> Array:
+    """Return the principal stretches (T, 3) without their change of volume.
+
+    Free stretches are those of an incompressible material.
+
+    Parameters
+    ----------
+    test, strain, second_strain
+        See `require_evaluable_law`.
+    """
+    first = 1 + strain
+    one = np.ones_like(first)
+    if test == "simple-shear":
+        half = 0.5 * strain
+        larger = np.abs(half) + np.hypot(half, 1)
+        return np.column_stack([larger, one, 1 / larger])
+    if test in ("confined", "volumetric"):
+        across = one if test == "confined" else first
+        stretches = np.column_stack([first, across, across])
+        return stretches / np.cbrt(stretches.prod(axis=1, keepdims=True))
+    second = {
+        "uniaxial": 1 / np.sqrt(first),
+        "equibiaxial": first,
+        "planar": one,
+        "biaxial": one if second_strain is None else 1 + second_strain,
+    }[test]
+    return np.column_stack([first, second, 1 / (first * second)])
