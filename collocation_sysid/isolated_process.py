@@ -86,16 +86,18 @@ READING_MB_PER_MB = 60.0
 def run_isolated(
     code: str, *words: str, limits: ProcessLimits | None = None, **arrays: ArrayLike
 ) -> dict[str, NDArray]:
-    """Arrays that Python code makes in another process.
+    """Run Python code in another process and return the arrays that it makes, by name.
 
     Parameters
     ----------
     code : str
         Reads the `arrays` by name and the words in `sys.argv`, and leaves arrays in `found`.
     words : str
+        Arguments of the process.
     limits : ProcessLimits, optional
-        None by default.
-    given : arrays by name
+        Memory and time of the process; without limits by default.
+    arrays : arrays by name
+        Arrays that the code reads.
 
     Raises
     ------

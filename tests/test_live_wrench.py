@@ -230,7 +230,7 @@ def test_tables_of_frames_have_wrenches_in_their_columns():
         (1, "much", "the wrench of grasp 1: found 'much'; expected 6 numbers"),
         (1, {"t_s": 1}, "a sample of the wrench of grasp 1 has 't_s'; expected t_s and values"),
         (1, {"2": SIX}, "a wrench of grasp '2'; expected 1"),
-        (2, SIX, "one wrench; expected those of the grasps 1 and 2"),
+        (2, SIX, "found one wrench; expected those of the grasps 1 and 2, by number"),
     ],
 )
 def test_wrenches_that_are_none_are_told_with_their_line(sensors, given, said):

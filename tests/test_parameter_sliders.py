@@ -131,7 +131,7 @@ def test_a_run_without_estimates_has_nothing_to_slide():
     hung = hung_cube(20)
     markers = replace(hung.markers, positions_m=cs.simulate(hung, TRUTH).markers_m)
     run = cs.run(cs.Problem([replace(hung, markers=markers)], TRUTH), seek_causes=False)
-    with pytest.raises(cs.InputError, match="nothing to slide"):
+    with pytest.raises(cs.InputError, match="no parameter was estimated"):
         run.interactive()
 
 

@@ -144,7 +144,7 @@ def test_methods_are_listed_once_and_misspelt_ones_recognised():
     )
     with pytest.raises(InputError, match="did you mean 'reduced-space'"):
         parse_methods("interior-point,reduced_space")
-    with pytest.raises(InputError, match="expected some of"):
+    with pytest.raises(InputError, match="found no name; expected some of"):
         parse_methods(" , ")
 
 

@@ -2,9 +2,9 @@
 
 The help text of an option is in the section "Attributes" of its class, as for the options of a
 method. There, in place of the type, names of the option other than the field's can be given, such
-as
--v, and the placeholder that help shows for the value, such as FILE. Options that several commands
-share are annotated with both instead. Help lists the options of a class before those of its bases.
+as -v, and the placeholder that help shows for the value, such as FILE. Options that several
+commands share are annotated with both instead. Help lists the options of a class before those of
+its bases.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def command(group: typer.Typer, *examples: str) -> Callable[[Callable[[Any], Non
     ----------
     group : Typer
         Group of commands, to which the command is added.
-    *shown : str
+    *examples : str
         Examples of arguments, shown below the help.
     """
 
@@ -210,8 +210,7 @@ class ProblemOptions:
         """Read the problem file with the changes of the command line.
 
         Notes are printed on stderr unless the command is quiet. With `simulation`, measurements may
-        be
-        missing.
+        be missing.
         """
         with error_console.status(f"reading {self.problem}"):
             from ..problem import Problem

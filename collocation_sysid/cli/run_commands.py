@@ -158,7 +158,13 @@ def _export_body(options: ExportCommand, destination: ExportDestination) -> None
 
 
 def _export_recording(options: ExportCommand, destination: ExportDestination) -> None:
-    """Write the recording of a run for the Rerun viewer, and print what is missing in it."""
+    """Write the recording of a run for the Rerun viewer, and print what is missing in it.
+
+    Raises
+    ------
+    InputError
+        With the option --verify, because a recording predicts nothing, and as `write_rerun`.
+    """
     from ..result.export.rerun_recording import RECORDING_FILE, write_rerun
 
     if options.verify:

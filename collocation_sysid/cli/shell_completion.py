@@ -186,7 +186,7 @@ def bash_script(commands: Sequence[CompletedCommand], root: Sequence[CompletedOp
 
 
 def zsh_script(commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]) -> str:
-    """Return the script for zsh, to be evaluated, or put into a folder of `fpath`."""
+    """Return the script for zsh, to be evaluated, or put into a folder of ``fpath``."""
     lines = [
         f"#compdef {PROGRAM}",
         f"{FUNCTION}() {{",

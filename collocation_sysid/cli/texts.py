@@ -77,7 +77,7 @@ def schema() -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class ExplainCommand:
-    """Options of `explain_validation_error`.
+    """Options of the command explain.
 
     Attributes
     ----------

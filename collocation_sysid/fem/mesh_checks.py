@@ -45,7 +45,10 @@ def checked_points(points_m: ArrayLike) -> np.ndarray:
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"points_m must have shape (n, 3), not {points.shape}")
     if (np.abs(points) > LARGEST_M).any():
-        raise InputError(f"a node lies {np.nanmax(np.abs(points)):.3g} m away")
+        raise InputError(
+            f"a node lies {np.nanmax(np.abs(points)):.3g} m away from the origin: check the "
+            "file and its unit of length"
+        )
     return points
 
 

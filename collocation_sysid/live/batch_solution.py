@@ -73,7 +73,8 @@ def recording_from_log(
 
 
 def solve_recording(problem: Problem, recording: Experiment) -> Run:
-    """Return the run of a recording, solved as a batch.
+    """Return the run of a recording, solved as a batch by reduced space, without profile
+    likelihoods and search for causes.
 
     Raises
     ------

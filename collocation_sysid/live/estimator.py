@@ -370,7 +370,11 @@ class LiveEstimator:
         )
 
     def _solve_batch(self, track: WindowPass, notes: list[str]) -> Run | None:
-        """Return the run of the batch; None if the window does not hold the whole recording."""
+        """Return the run of the batch solve of the complete recording.
+
+        None if the window does not hold the whole recording, or if the solve is refused, which adds
+        to `notes`.
+        """
         recording = (
             None if track.prior.row_count else recording_from_log(self.model, self.intake, self.log)
         )
@@ -381,9 +385,9 @@ class LiveEstimator:
             return None
 
     def _repeat_until_settled(self, began: float, notes: list[str]) -> int:
-        """Compute the rows in the window again until the estimate stays.
-
-        Return the number of rows.
+        """Compute the rows in the window again, without a time limit, until no further pass is
+        needed or `FINAL_PASSES` passes are done; return the number of rows. `notes` are extended in
+        place.
         """
         rows_per_frame, self.rows = self.rows, FINAL_PASSES * len(self.log)
         try:
@@ -392,7 +396,9 @@ class LiveEstimator:
             self.rows = rows_per_frame
 
     def _checked_frame(self, frame: Frame) -> tuple[Frame, list[str]]:
-        """Return the frame without implausible markers, and notes."""
+        """Return the frame with NaN for markers that are farther from every grasp than the body
+        reaches, and notes; counts are updated.
+        """
         notes = []
         if frame.has_wrench and not self.model.wrenches:
             self.counts["with a wrench"] += 1
@@ -411,7 +417,9 @@ class LiveEstimator:
         return frame, notes
 
     def _note_outliers(self, wild: NDArray[np.bool_]) -> str:
-        """Count outliers given by a mask (M,) of the markers; return a note."""
+        """Add the outliers, given by a mask (M,) of the markers with at least one true value, to
+        the counts; return a note with their names.
+        """
         self.counts["wild"] += int(wild.sum())
         names = ", ".join(self.names[m] for m in np.flatnonzero(wild))
         return f"markers ignored as outliers: {names}"
@@ -419,7 +427,24 @@ class LiveEstimator:
     def _compute_rows(
         self, rows: Sequence[LoggedRow], squares: list[Array]
     ) -> tuple[int, list[str]]:
-        """Compute and log new rows, as many as possible at once; return their number and notes."""
+        """Compute and log new rows with the first pass, as many as possible at once.
+
+        The first row starts the pass. If the initial state cannot be computed, the frames are
+        discarded; if a later row cannot be simulated, the pass is marked as failed, and rows are
+        only logged.
+
+        Parameters
+        ----------
+        rows : sequence of LoggedRow
+            At least one row.
+        squares : list
+            Squared marker residuals [m²] of the frame; extended in place.
+
+        Returns
+        -------
+        tuple of int and list of str
+            Number of rows that are done, at least one, and notes.
+        """
         done = 1
         notes = []
         track = self.first_pass
@@ -442,7 +467,8 @@ class LiveEstimator:
     def _add_samples(
         self, readings: Sequence[Sample], squares: list[Array], rows: int = 0
     ) -> list[str]:
-        """Add samples without outliers to the pass and to the log; return notes.
+        """Add samples to the first pass and to the log, without outliers, which are counted; return
+        notes. Without a pass nothing is added.
 
         Parameters
         ----------
@@ -477,8 +503,9 @@ class LiveEstimator:
         return notes
 
     def _outliers(self, residual: Array) -> NDArray[np.bool_]:
-        """Return a mask (M,) of samples that the estimate does not explain while it explains the
-        others.
+        """Return a mask (M,) of markers whose residuals (M, 3), in standard deviations, are far
+        larger than usual; all false while the estimate has not settled, or if most markers would be
+        outliers.
         """
         if (
             self.linearisation_distance > LARGEST_SETTLED_DISTANCE
@@ -502,11 +529,10 @@ class LiveEstimator:
         return StiffnessSearch(self.model, self.p[self.model.collocation.nq :])
 
     def _warm_up(self) -> tuple[Poses, Array] | None:
-        """Compile the kernels before the first frame.
+        """Compile the kernels before the first frame, and measure computing times for the budget.
 
-        Return poses and positions (3n,) of the start.
-
-        None if the start cannot be computed.
+        Return the poses and the positions (3n,) of the start of the problem's recording; None if it
+        cannot be computed.
         """
         poses = self.model.first_poses
         moving_poses = tuple(poses[k] for k in self.model.moving_grasps)
@@ -524,7 +550,9 @@ class LiveEstimator:
         return poses, trial.blocks[0].stored_rows[0].x
 
     def _measure_times(self, trial: WindowPass, row: LoggedRow) -> TimeBudget:
-        """Return the computing times of repeated rows, the shortest of several measurements."""
+        """Return the measured computing times of one and of many repeated rows, each the shortest
+        of several measurements.
+        """
         took_s: dict[int, float] = {}
         most = min(trial.rows - 1, self.model.rows_per_chunk, self._block_rows - 1)
         for count in (1, most) * TIMING_REPETITIONS:
@@ -565,7 +593,9 @@ class LiveEstimator:
         self._combined = CombinedPasses.from_passes(track, None)
 
     def _restart(self) -> None:
-        """Keep the information so far as a prior, and wait for a new start."""
+        """Keep the information of all samples so far as a prior, discard passes, log and frames,
+        and wait for a new start.
+        """
         if self.first_pass is not None:
             self.prior = self.first_pass.measured_information
         self.first_pass = self.second_pass = None
@@ -586,20 +616,34 @@ class LiveEstimator:
         return self._largest_distance(self.first_pass, self.p, self._combined.points)
 
     def _largest_distance(self, track: WindowPass, p: Array, points: Sequence[Array]) -> float:
-        """Return the largest distance of p from some points, in the standard errors of a pass."""
+        """Return the largest distance of p from some points, in the standard errors of a pass; 0
+        without points.
+
+        Only material parameters count, not those of the recording.
+
+        Parameters
+        ----------
+        track : WindowPass
+            Pass whose standard errors are used.
+        p : (P,)
+        points : sequence of (P,)
+            Points in transformed parameters, see `StreamingModel.transformed`.
+        """
         nq = self.model.collocation.nq
         distances = np.abs(np.array(points) - self.model.transformed(p))[:, :nq]
         return float(np.max(distances / track.information.standard_errors[:nq], initial=0.0))
 
     def _update_estimate(self) -> None:
-        """Update the estimate p from the joint information of both passes."""
+        """Set the estimate p, in place, to the minimum of the joint quadratic loss of the first and
+        the second pass; without effect before the first pass, or if it failed.
+        """
         if self.first_pass is not None and not self.first_pass.has_failed:
             self._combined = CombinedPasses.from_passes(self.first_pass, self.second_pass)
             self.p = self._constrained_minimum(self.first_pass, self._combined.information)
 
     def _constrained_minimum(self, track: WindowPass, known: SquareRootInformation) -> Array:
-        """Return the minimum of a quadratic loss within bounds and the trust region about a
-        pass.
+        """Return the p (P,) that minimises the quadratic loss of `known`, within the bounds and the
+        trust region about the linearisation point of a pass.
         """
         reach = self._trust * self.model.collocation.reach_p
         low = np.maximum(self.lower, track.linearisation_point - reach)
@@ -608,9 +652,11 @@ class LiveEstimator:
         return np.clip(self.model.physical(best), low, high)
 
     def _next_linearisation_point(self, track: WindowPass) -> Array:
-        """Return the next linearisation point.
+        """Return the next linearisation point p (P,) of a pass.
 
-        Poorly determined parameters stay near their last value.
+        It minimises the joint quadratic loss of both passes, with a weak prior at the last
+        linearisation point, which keeps poorly determined parameters there, within bounds and trust
+        region.
         """
         size = self.model.parameter_count
         samples = len(self.log) / self.model.substeps
@@ -622,7 +668,9 @@ class LiveEstimator:
         return self._constrained_minimum(track, information)
 
     def _estimates_and_trust(self, t_s: float) -> tuple[Mapping[str, Estimate], Assessment]:
-        """Return estimates and verdict at a time."""
+        """Return estimates by name and the verdict at the time t_s; without a successful pass the
+        estimates have no intervals.
+        """
         code = ""
         if self.first_pass is None:
             code = "solve/no-start"
@@ -700,9 +748,9 @@ class LiveEstimator:
         return done
 
     def _catch_up(self, began: float, notes: list[str]) -> int:
-        """Complete a second pass that lags by few rows before new rows come.
+        """Complete a second pass that lags by few rows, if there is time, before new rows come.
 
-        Return the number of rows.
+        Return the number of rows that were computed again.
         """
         again = self.second_pass
         if again is None or again.base is None:
@@ -716,9 +764,10 @@ class LiveEstimator:
         return self._advance_second_pass(again, lag, notes)
 
     def _advance_second_pass(self, again: WindowPass, count: int, notes: list[str]) -> int:
-        """Continue a second pass by some rows and judge it if it has caught up.
+        """Compute up to `count` rows of the second pass; if it has caught up or failed, accept or
+        reject it, or record it as a trial of the search.
 
-        Return the number of rows.
+        Return the number of rows that were computed. `notes` are extended in place.
         """
         before = self.clock()
         first_row = again.rows
@@ -736,13 +785,22 @@ class LiveEstimator:
         return again.rows - first_row
 
     def _affordable_rows(self, done: int, elapsed_s: float) -> int:
-        """Return the number of rows that fit into the rest of the budget."""
+        """Return how many rows may be computed again: as many as fit into the rest of the time
+        budget of the frame, or, if `rows` per frame is fixed, these minus `done`.
+
+        `elapsed_s` is the time since the frame began [s].
+        """
         if self.rows is not None:
             return self.rows - done
         return self.budget.affordable_steps(self.budget_s - elapsed_s)
 
     def _start_second_pass(self, track: WindowPass, notes: list[str]) -> WindowPass | None:
-        """Return a new second pass if one is needed, otherwise None."""
+        """Return a new second pass if one is needed, otherwise None.
+
+        One is needed for the next trial of a search for initial values, which begins if the first
+        pass failed at its start, or if the estimate has moved away from the linearisation points of
+        the first pass `track`. `notes` are extended in place.
+        """
         search = self.search
         at_start = track.start[0] is None
         if search is None and track.has_failed and at_start:
@@ -801,7 +859,10 @@ class LiveEstimator:
             self.budget.record_relinearisation(self.clock() - before)
 
     def _accept_or_reject(self, track: WindowPass, again: WindowPass, notes: list[str]) -> None:
-        """Replace the first pass by a second one that has caught up, or reject it."""
+        """Replace the first pass `track` by the second one, `again`, if that fits about as well as
+        expected, and enlarge the trust region; otherwise discard it and shrink the region. `notes`
+        are extended in place.
+        """
         self.second_pass = None
         was_search = self.search is not None
         self.search = None

@@ -83,9 +83,8 @@ class FrameBuffer:
         return self._poses[-1][0] if self._poses else None
 
     def marker_samples(self, log: Sequence[LoggedRow]) -> Iterator[tuple[float, Array]]:
-        """Yield time and positions (M, 3) of all marker samples.
-
-        Times in samples from the first row on.
+        """Yield time and positions (M, 3) of all marker samples; times are in samples from the
+        first row on.
         """
         for of, when, tracks_m in self.all_samples(log):
             if not of:
@@ -108,10 +107,10 @@ class FrameBuffer:
             yield of, (t_s - (self.start_s or 0.0)) / self.interval_s, values
 
     def is_motion_unknown(self, t_s: float) -> bool:
-        """Return whether a time is too long after the last pose for the motion to be known.
+        """Return whether the time t_s is so long after the last pose that the motion is unknown.
 
-        This is also the case after many frames in turn that were too late, because their clock was
-        set back.
+        This is also the case after many frames in turn that were too late, because the sender's
+        clock was set back.
         """
         if self._too_late >= LARGEST_GAP:
             return True
@@ -128,18 +127,20 @@ class FrameBuffer:
         """Add a frame; return the completed rows, the samples after the last row, and notes.
 
         The samples are returned separately only if no row is completed; otherwise the rows contain
-        them.
+        them. A frame with a known time, or one that is too late, is ignored with a note; of a
+        slightly late frame the pose is ignored, and so is a pose that is implausibly far from the
+        last one. Missing poses are interpolated once the next pose arrives.
 
         Parameters
         ----------
         t_s : float
             Time of the frame.
         pose : (positions, quaternions) or None
-            Positions (G, 3) and quaternions (G, 4) of the grasps that move; None if missing.
+            Positions (G, 3) [m] and quaternions (G, 4) of the G grasps that move; None if missing.
         tracks_m : (M, 3)
             Marker positions, NaN where missing.
-        instrument_samples : sequence of OutputOptions
-            Samples of instruments.
+        instrument_samples : sequence of InstrumentSample
+            Samples of custom sensors and wrenches, each with its own time.
         """
         sample_s = self.interval_s
         notes = []
@@ -183,7 +184,9 @@ class FrameBuffer:
         return rows, self._available_samples() if not rows else [], notes
 
     def _is_jump(self, t_s: float, positions_m: Array) -> bool:
-        """Return whether a grasp is farther from its last position than it can have moved."""
+        """Return whether a moving grasp is farther from its last position than it can have moved by
+        the time t_s.
+        """
         if not self._poses:
             return False
         before_s, before_m, _ = self._poses[-1]
@@ -247,8 +250,8 @@ class FrameBuffer:
         return [LoggedRow(*each) for each in zip(poses, readings, strict=True)]
 
     def _pose_at(self, t_s: float) -> tuple[Array, Array]:
-        """Return positions (G, 3) and quaternions (G, 4), not normalised, interpolated at a
-        time.
+        """Return positions (G, 3) and quaternions (G, 4), not normalised, interpolated through the
+        last poses: cubic, or linear across a large gap.
         """
         for at_s, positions_m, quaternions in self._poses:
             if abs(at_s - t_s) <= TIME_TOLERANCE_S:
@@ -266,7 +269,9 @@ class FrameBuffer:
         return position_m, quaternion
 
     def _available_samples(self) -> list[Sample]:
-        """Return and remove the waiting samples that can be evaluated after the rows so far."""
+        """Return the waiting samples that can be evaluated with the rows so far, and remove them
+        from the buffer; samples before the start are discarded.
+        """
         if self.start_s is None or not self.rows:
             return []
         now_s = self._time_s(self.rows - 1)

@@ -1,8 +1,7 @@
 """Frames of a live recording: validation, and reading from JSON lines or rows of a table.
 
 `FrameReader` reads text; `parse_pose`, `parse_markers`, `parse_custom_readings` and
-`parse_wrenches` validate values
-given in Python.
+`parse_wrenches` validate values given in Python.
 """
 
 from __future__ import annotations
@@ -97,7 +96,9 @@ def parse_pose(
     else:
         each = list(pose) if isinstance(pose, Sequence) else [pose]
         if len(each) != len(grasp_numbers):
-            raise InputError(f"{len(each)} poses; expected {len(grasp_numbers)}, one of each grasp")
+            raise InputError(
+                f"found {len(each)} poses; expected {len(grasp_numbers)}, one for each moving grasp"
+            )
     if any(one is None for one in each):
         return None
     parts = [_parse_single_pose(one) for one in each]
@@ -155,7 +156,8 @@ def parse_markers(markers: ArrayLike | Mapping[str, Any] | None, names: Sequence
 def parse_custom_readings(
     readings: Mapping[str, Any] | None, gauges: Sequence[Gauge], t_s: float
 ) -> tuple[InstrumentSample, ...]:
-    """Return samples of custom sensors; a sample without a time has the time of the frame.
+    """Return samples of custom sensors, each as number of the instrument (from 1), time and values;
+    a sample without a time has the time of the frame.
 
     Parameters
     ----------
@@ -190,7 +192,8 @@ def parse_custom_readings(
 def parse_wrenches(
     wrench_data: Any, wrenches: Mapping[int, Wrench], instruments_before: int, t_s: float
 ) -> tuple[InstrumentSample, ...]:
-    """Return samples of the sensors of grasps; a sample without a time has the time of the frame.
+    """Return samples of the sensors of grasps, each as number of the instrument, time and values; a
+    sample without a time has the time of the frame.
 
     Parameters
     ----------
@@ -212,7 +215,9 @@ def parse_wrenches(
     known = {str(number): k for k, number in enumerate(wrenches)}
     if not isinstance(wrench_data, Mapping) or set(wrench_data) & set(_SAMPLE_KEYS):
         if len(known) > 1:
-            raise InputError(f"one wrench; expected those of the grasps {' and '.join(known)}")
+            raise InputError(
+                f"found one wrench; expected those of the grasps {' and '.join(known)}, by number"
+            )
         wrench_data = dict.fromkeys(known, wrench_data)
     if unknown := [name for name in wrench_data if name not in known]:
         expected = ", ".join(known)
@@ -271,7 +276,13 @@ def _parse_samples(
 
 
 def _parse_array(raw_values: Any, shape: tuple[int, ...]) -> Array:
-    """Return an array of floats of the given shape, or raise an `InputError`."""
+    """Return an array of floats of the given shape; None becomes NaN.
+
+    Raises
+    ------
+    InputError
+        For anything else, another shape, or infinite numbers.
+    """
     size = " × ".join(map(str, shape))
     try:
         values = np.array(raw_values, dtype=float)
@@ -340,7 +351,9 @@ class FrameReader:
             raise InputError(f"{where}: {error.message}") from error
 
     def _parse_object(self, json_object: Mapping[str, Any]) -> Frame:
-        """Return the frame of a JSON object."""
+        """Return the frame of a JSON object; raise an `InputError` for unknown keys, and without
+        t_s.
+        """
         if unknown := [key for key in json_object if key not in _KEYS]:
             raise InputError(
                 f"found the key {reprlib.repr(unknown[0])}; expected {', '.join(_KEYS)}"
@@ -432,7 +445,13 @@ def parse_time(time: Any) -> float:
 
 
 def _parse_cell(text: str) -> float:
-    """Return the number of a table cell; NaN for an empty cell."""
+    """Return the number of a table cell; NaN for an empty cell or "nan".
+
+    Raises
+    ------
+    InputError
+        For any other text.
+    """
     if text == "" or text.lower() == "nan":
         return float("nan")
     try:

@@ -61,7 +61,9 @@ def display_of(updates: Sequence[LiveUpdate]) -> list[Shown]:
 
 
 def final_display(updates: Sequence[LiveUpdate], settled: LiveUpdate) -> list[Shown]:
-    """Return the display of the final estimate, and the latency of the frames."""
+    """Return the display of the final estimate `settled`, and the median and 99 % quantile of the
+    latency of the frames, at least one.
+    """
     took_ms = 1e3 * np.array([update.latency_s for update in updates])
     median, late = np.percentile(took_ms, [50, 99])
     latency_text = (

@@ -46,7 +46,12 @@ class ResidualScatter:
 
     @classmethod
     def from_residuals(cls, residuals: Sequence[Array]) -> ResidualScatter:
-        """Return the scatter of residuals (M, 3) of consecutive samples, NaN where missing."""
+        """Return RMS and lag-one autocorrelation of residuals (M, 3) of consecutive samples, in
+        standard deviations, NaN where missing.
+
+        The autocorrelation is zero if it is not significant or there are too few samples; both are
+        zero without residuals.
+        """
         if not residuals:
             return cls()
         values = np.array(residuals)
@@ -76,7 +81,7 @@ def variance_factor(
         Estimate.
     parameter_count : float
         Number of fitted parameters.
-    scatter : RecordingComparison
+    scatter : ResidualScatter
     """
     freedom = max(1.0, known.row_count - parameter_count)
     loss = known.loss(p)
@@ -93,7 +98,7 @@ def data_concerns(scatter: ResidualScatter, counts: Counter[str], samples: int) 
 
     Parameters
     ----------
-    scatter : RecordingComparison
+    scatter : ResidualScatter
     counts : Counter
         Numbers of irregularities, by kind.
     samples : int

@@ -73,7 +73,9 @@ def read_problem(recording: Path, overrides: Sequence[str], allow_code: bool) ->
 
 
 def frames_of_recording(experiment: Experiment, model: StreamingModel) -> Iterator[Frame]:
-    """Yield the frames of an experiment's recording."""
+    """Yield the frames of an experiment's recording in the order of time; samples of instruments
+    come with the first frame that is not earlier.
+    """
     poses = [experiment.grasps[k].poses.at(experiment.t_s) for k in model.moving_grasps]
     quaternion_series = [Rotation.from_matrix(rotations).as_quat() for rotations, _ in poses]
     series = [(gauge.sample_times_s, gauge.measured_values) for gauge in experiment.readings]

@@ -48,13 +48,16 @@ class StiffnessSearch:
         return not self._waiting
 
     def next_trial(self) -> Array | None:
-        """Return the parameters p of the next trial; None if there is none."""
+        """Return the parameters p of the next trial; None if no trial is left. `record_trial`
+        advances to the one after it.
+        """
         return np.concatenate([self._waiting[0], self._phi]) if self._waiting else None
 
     def record_trial(self, track: WindowPass) -> None:
-        """Record the result of a trial.
+        """Record the loss of a pass as the result of the next trial.
 
-        Two failures in a row, after the first one, end the search.
+        After at least one success and at least three trials, two in a row that are far worse than
+        the best end the search.
         """
         self._waiting.pop(0)
         self._tried.append((np.inf if track.has_failed else track.loss, track.linearisation_point))
@@ -65,6 +68,8 @@ class StiffnessSearch:
 
     @property
     def best(self) -> Array | None:
-        """Parameters p with the smallest sum of squares; None if every trial failed."""
+        """Parameters p of the trial with the smallest loss; None if every trial failed. At least
+        one trial must be recorded.
+        """
         loss, p = min(self._tried, key=lambda each: each[0])
         return p if np.isfinite(loss) else None

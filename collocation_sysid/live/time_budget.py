@@ -42,12 +42,16 @@ class TimeBudget:
 
     @classmethod
     def from_times(cls, one_s: float, many_s: float, many: int) -> TimeBudget:
-        """Return the budget from the time of one time step and the time of `many`."""
+        """Return the budget from the times [s] of one time step and of `many` that are computed
+        together.
+        """
         more_s = (many_s - one_s) / (many - 1) if many > 1 else one_s
         return cls(one_s, min(max(more_s, 0.0), one_s))
 
     def affordable_steps(self, remaining_s: float) -> int:
-        """Return how many time steps fit into the remaining time [s]."""
+        """Return how many time steps fit into the remaining time [s] of a frame, after the time for
+        the work that follows; 0 if none.
+        """
         remaining_s -= self.after_s
         spare_s = remaining_s / self.delay - self.first_s
         if remaining_s <= 0 or spare_s < 0:
@@ -55,19 +59,21 @@ class TimeBudget:
         return 1 + int(min(spare_s / self.more_s, 1e6)) if self.more_s else 1
 
     def record_steps(self, rows: int, took_s: float) -> None:
-        """Record how long some time steps took [s]."""
+        """Raise `delay`, in place, if `rows` time steps took longer than expected; took_s is their
+        time [s].
+        """
         expected_s = self.first_s + (rows - 1) * self.more_s
         if expected_s:
             self.delay = max(self.delay, took_s / expected_s)
 
     def record_relinearisation(self, took_s: float) -> None:
-        """Record how long a change of the linearisation point took [s]."""
+        """Record the time of a change of the linearisation point [s], if it is the longest."""
         self.turn_s = max(self.turn_s, took_s)
 
     def record_remainder(self, took_s: float) -> None:
-        """Record how long the work after the time steps took [s].
+        """Record the time of the work after the time steps [s].
 
-        Not every frame needs all of it.
+        The largest one counts, but decays slowly, because not every frame needs all of that work.
         """
         self.after_s = max(REMAINDER_DECAY * self.after_s, took_s)
 

@@ -170,7 +170,9 @@ class WindowPass:
         return self.linearisation_points_from(0)
 
     def linearisation_points_from(self, row: int) -> list[Array]:
-        """Return the transformed parameters at which the rows from an index on are linearised."""
+        """Return the transformed parameters (P,) at which the rows from the index `row` of the
+        window on are linearised, in order of the rows; one for each change.
+        """
         before = [transformed for first, transformed in self._base_changes if first <= row]
         return [
             *before[-1:],
@@ -188,7 +190,9 @@ class WindowPass:
         return [residual for block in self.blocks for residual in block.residuals]
 
     def repeat_rows(self, rows: Sequence[LoggedRow]) -> None:
-        """Compute logged rows and add their samples, as many as possible at once."""
+        """Compute logged rows and add their samples, as many at once as the block allows; raise
+        `SimulationError` if one cannot be solved.
+        """
         done = self.add_rows([row.poses for row in rows[: self.repeatable_rows]])
         pairs = [(each, done - k) for k, row in enumerate(rows[:done], 1) for each in row.samples]
         self.add_residuals(self.sweep.linearise_samples(pairs))
@@ -205,17 +209,17 @@ class WindowPass:
         return max(1, min(rows_of_base, self.remaining_rows_of_block))
 
     def _rows_of_base(self, count: int) -> list[StoredRow]:
-        """Return the next rows of the repeated pass; an empty list if it has too few."""
+        """Return the next `count` rows of the pass that is repeated; none if it has fewer."""
         if self.base is None or self.rows + count > self.base.rows:
             return []
         places = (divmod(self.rows + k, self.block_rows) for k in range(count))
         return [self.base.blocks[block].stored_rows[place] for block, place in places]
 
     def _initial_guesses(self, known: Sequence[StoredRow]) -> list[Array]:
-        """Return initial guesses from rows of the repeated pass.
+        """Return initial guesses of positions, (3n,) each, from rows of the pass that is repeated.
 
-        They are moved along the columns, and by the extrapolated error of this prediction at the
-        last two rows.
+        Each is extrapolated to p with the sensitivities of its row; the error of this prediction at
+        the last two rows is extrapolated and added.
         """
         if not known:
             return []

@@ -518,7 +518,8 @@ class Parameters:
         for name in self.names:
             if name not in used:
                 raise InputError(
-                    "no part of the model uses it, because every region has its own value",
+                    "no part of the model uses it, because every region has its own value; "
+                    "remove it",
                     None,
                     name,
                 )

@@ -52,7 +52,9 @@ class Disagreement:
 
     @property
     def sentence(self) -> str:
-        """Range of the constant over the laws, and what its interval includes, as a sentence."""
+        """Explanation for the user: the range of the parameter, and how the choice of the law
+        widens its interval if that is known.
+        """
         low = min(self.values.values())
         high = max(self.values.values())
         symbol = symbol_of(self.name)
@@ -74,7 +76,7 @@ class Disagreement:
 
 
 def find_disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
-    """Return the parameters in which models disagree.
+    """Return the moduli and damping coefficients whose estimates differ notably between models.
 
     Parameters
     ----------
@@ -97,14 +99,14 @@ def find_disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
 
 
 def _disagreement(
-    name: str, values: Mapping[str, float], known_rows: Mapping[str, object] | None
+    name: str, values: Mapping[str, float], budget_line: Mapping[str, object] | None
 ) -> Disagreement:
-    """Return the disagreement of one parameter, from the chosen model's budget line; None
-    if unknown.
+    """Return the disagreement of one parameter: its values by model, and the chosen model's budget
+    with the choice of the law as a further source; without a budget line the intervals are None.
     """
-    if known_rows is None:
+    if budget_line is None:
         return Disagreement(name, values, None, None, 0.0)
-    line = BudgetLine(**known_rows)  # type: ignore[arg-type]
+    line = BudgetLine(**budget_line)  # type: ignore[arg-type]
     coordinate = IntervalCoordinate.for_estimate(name, (*values.values(), *line.combined95), False)
     coordinates = np.array([coordinate.from_value(value) for value in values.values()])
     with_law = line.with_source(

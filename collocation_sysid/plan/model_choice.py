@@ -15,7 +15,7 @@ Akaike's criterion is −2 ln L + 2k. For n independent normal errors of unknown
 ln(RSS/n), up to a constant that all models of the same data share. Residuals of an imperfect model
 are not independent: ten samples with the same error count as one. n is therefore the equivalent
 number of independent samples: samples over 1 + 2 Σ_k (1 − k/T) ρ_k along time, and observables by
-(tr Σ)²/tr Σ² across, with the ρ and Σ of `process_autocorrelation`.
+(tr Σ)²/tr Σ² across, with the ρ and Σ of `statistics.autocorrelation`.
 """
 
 from __future__ import annotations
@@ -96,7 +96,9 @@ def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> 
 
 
 def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
-    """Return the row of a model from its fits by held-out recording; "" is the fit to all."""
+    """Return the row of a model from its fits by name of the held-out recording; "" is the fit to
+    all. Unknown values are None.
+    """
     complete_fit = fits.get("", {})
     predictions = {name: fit.get("prediction") or {} for name, fit in fits.items() if name}
     evidence = complete_fit.get("evidence")
@@ -131,8 +133,8 @@ def _pooled_rms(predictions: Sequence[Mapping[str, Any]]) -> float | None:
 
 
 def _add_criterion(rows: Sequence[Row]) -> None:
-    """Add ΔAIC to the rows, in place, with the equivalent number of measurements of the
-    best fit.
+    """Add ΔAIC to the rows, in place, and the equivalent number of independent measurements of the
+    best fit; None where they are unknown.
     """
     known = [row for row in rows if row["converged"] and row["evidence"]]
     evidences = [Evidence(**row["evidence"]) for row in known]
@@ -146,8 +148,8 @@ def _add_criterion(rows: Sequence[Row]) -> None:
 
 
 def _add_ratios(rows: Sequence[Row]) -> None:
-    """Add to each row, in place, the logarithmic ratio of its RMS to the best one, with its
-    standard error.
+    """Add to each row, in place, the logarithm of the ratio of its prediction error to the smallest
+    one, with its standard error; None without a prediction.
     """
     best = _best_prediction(rows)
     for row in rows:
@@ -161,9 +163,11 @@ def _add_ratios(rows: Sequence[Row]) -> None:
 
 
 def _log_ratio_error(row: Row, best: Row, logs: Sequence[float]) -> float:
-    """Return the standard error of the logarithmic ratio.
+    """Return the standard error of the logarithmic ratio of a row's prediction error to the best
+    one; 0 for the best.
 
-    It is the larger of those from blocks in time and from recordings.
+    It is the larger of the errors from the scatter between blocks in time and from the scatter
+    `logs` between recordings.
     """
     if row is best:
         return 0.0
@@ -177,13 +181,16 @@ def _log_ratio_error(row: Row, best: Row, logs: Sequence[float]) -> float:
 
 
 def _best_prediction(rows: Sequence[Row]) -> Row | None:
-    """Return the converged model with the smallest prediction error; None if there is none."""
+    """Return the converged model with the smallest prediction error for held-out data; None if
+    nothing was predicted.
+    """
     predicted = [r for r in rows if r["converged"] and r["held_out_rms"]]
     return min(predicted, key=lambda r: r["held_out_rms"], default=None)
 
 
 def chosen_row(rows: Sequence[Row]) -> Row | None:
-    """Return the model to use; None if none could be fitted.
+    """Return the model to use: the one with fewest parameters among those that predict equally
+    well; None if none could be fitted.
 
     Without predictions it is the one with the least AIC.
     """
@@ -196,7 +203,9 @@ def chosen_row(rows: Sequence[Row]) -> Row | None:
 
 
 def _equally_good(rows: Sequence[Row], errors: float) -> list[Row]:
-    """Return the models that predict as well as the best, within so many standard errors."""
+    """Return the converged models whose prediction error is equal to the best one within `errors`
+    standard errors, or practically equal.
+    """
     return [
         row
         for row in rows
@@ -245,7 +254,9 @@ def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
 
 
 def _failed_prediction(row: Row, chosen: Row) -> str:
-    """Return a sentence on a model with which the held-out samples cannot be predicted."""
+    """Return a sentence on a model with which some held-out samples cannot be predicted, and on its
+    AIC if that speaks for it.
+    """
     without = " and ".join(f"'{name}'" for name, rms in row["predictions"].items() if not rms)
     sentence = f"{row['model']} does not predict {without}"
     if (more := chosen["delta_aic"] - row["delta_aic"]) <= NO_SUPPORT:
@@ -273,7 +284,7 @@ def _comparison(chosen: Row, rival: Row) -> str:
 
 
 def _prediction_text(row: Row) -> str:
-    """Return the prediction error of a model as text with its unit."""
+    """Return the prediction error of a model, which must be known, as text with its unit."""
     factor, unit = display_unit(row["unit"])
     return f"{factor * row['held_out_rms']:.3g} {unit}"
 
@@ -294,7 +305,9 @@ def _log_ratio_between(chosen: Row, rival: Row) -> tuple[float, float]:
 
 
 def _certainty(chosen: Row, rival: Row) -> str:
-    """Return a sentence on how certain the choice is."""
+    """Return a sentence on how certain the choice between the chosen model and its closest rival
+    is, by their predictions and AIC.
+    """
     ratio, error = _log_ratio_between(chosen, rival)
     support = rival["delta_aic"] - chosen["delta_aic"]
     if ratio > SURE * error and support > NO_SUPPORT:
@@ -500,7 +513,9 @@ def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
 
 
 def _without_later_wrench(grasp: Grasp, end_s: float) -> Grasp:
-    """Return the grasp without measurements of its sensor after a time [s]."""
+    """Return the grasp with measurements of its sensor after `end_s` [s] replaced by NaN; unchanged
+    without a sensor.
+    """
     wrench = grasp.wrench
     if wrench is None:
         return grasp

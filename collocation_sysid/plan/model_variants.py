@@ -78,7 +78,7 @@ def parse_dampings(text: str) -> tuple[str, ...]:
     return _parse_names(text, DAMPINGS, "--damping")
 
 
-def _parse_names(text: str, known_rows: Iterable[str], option: str) -> tuple[str, ...]:
+def _parse_names(text: str, known_names: Iterable[str], option: str) -> tuple[str, ...]:
     """Return names from text separated by commas, each once.
 
     Raises
@@ -88,7 +88,7 @@ def _parse_names(text: str, known_rows: Iterable[str], option: str) -> tuple[str
     """
     names = unique_items(text)
     for name in names or ("",):
-        require_among(name, known_rows, None, option, "some")
+        require_among(name, known_names, None, option, "some")
     return names
 
 
@@ -116,7 +116,8 @@ def models(
     region: str | None = None,
     dampings: Sequence[str] = (),
 ) -> list[ModelVariant]:
-    """Every problem file with every material, law of damping and number of branches.
+    """Return a model for every problem file with every material, law of damping and number of
+    branches.
 
     Parameters
     ----------
@@ -234,9 +235,8 @@ def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list
     for problem, measured in zip(problems[1:], others, strict=True):
         if measured != first:
             raise InputError(
-                f"it fits {_measured_text(measured)}, but {problems[0].path} "
-                f"{_measured_text(first)}; expected "
-                "the same recordings and samples",
+                f"it fits {_measured_text(measured)}, but {problems[0].path} fits "
+                f"{_measured_text(first)}; expected the same recordings and samples in all files",
                 problem.path,
             )
     paths = [Path(str(problem.path)) for problem in problems]
@@ -343,7 +343,9 @@ def _with_part_material(
 
 
 def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
-    """Return the shear modulus at small strain [Pa] from the guesses of a part; None if unknown."""
+    """Return the shear modulus at small strain [Pa] from the guesses or fixed values of the part
+    whose constants begin with `prefix`, or else those of the body; None if unknown.
+    """
 
     def guess(name: str) -> float:
         """Return the guess or fixed value of a constant; NaN if it has none."""
@@ -371,7 +373,9 @@ def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
 
 
 def _starting_guess(name: str, shear_pa: float | None) -> dict[str, Any]:
-    """Return the table of a constant: with a guess as stiff as the file's, or empty for a scan."""
+    """Return the table of a constant: with a guess that gives the shear modulus `shear_pa`, or
+    empty, for a scan, if that is None or the constant has no usual value.
+    """
     if shear_pa is None:
         return {}
     usual = usual_value(name, 2 * (1 + USUAL_POISSON) * shear_pa, USUAL_POISSON)

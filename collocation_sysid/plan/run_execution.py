@@ -86,7 +86,9 @@ def execute(
 def _attempt(
     planned: dict[str, Any], time_limit_s: float | None, stopped: Callable[[], bool]
 ) -> Record:
-    """Execute a run once and return its record."""
+    """Execute a run once, in a process with one thread, and return its record; after a time limit
+    with the best iterate, if the process wrote one.
+    """
     with tempfile.TemporaryDirectory(prefix="collocation-sysid-") as place:
         file = Path(place) / "record.json"
         with open(Path(place) / "stderr", "w+b") as stderr:
@@ -309,7 +311,9 @@ def run_all(
 
 
 def _result_record(future: Future, planned: PlannedRun, limits: RunOptions) -> Record:
-    """Return the record of a run, also if its worker was lost."""
+    """Return the record of a run from its future; if that raises, a record of a crash, because its
+    worker was lost.
+    """
     try:
         return future.result()
     except Exception as error:
@@ -339,7 +343,9 @@ def _thread_executor(limits: RunOptions) -> Iterator[RunExecutor]:
 
 @contextmanager
 def _cluster_executor(limits: RunOptions) -> Iterator[RunExecutor]:
-    """Context with an executor on the workers of a scheduler."""
+    """Context with an executor on the workers of the scheduler in `limits`; running runs are
+    stopped through an event of the cluster.
+    """
     flag = f"collocation-sysid-stop-{secrets.token_hex(8)}"
     with connected(limits.scheduler) as client:
         stop = distributed().Event(flag, client=client)

@@ -66,8 +66,9 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
 
 
 def _tip_record(finished: Run) -> dict[str, Any] | None:
-    """Return measured and simulated track of the marker farthest from the grasp; None
-    without markers.
+    """Return measured and simulated track of the marker farthest from the grasp in the first fitted
+    experiment, for JSON; None without markers. The simulated track is None if the simulation
+    failed.
     """
     experiment = finished.solution.collocation.transcriptions[0].experiment
     markers = experiment.markers

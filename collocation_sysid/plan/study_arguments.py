@@ -34,7 +34,7 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
     """
     names = unique_items(text)
     if not names:
-        raise InputError(f"expected some of {', '.join(METHODS)}", None, option)
+        raise InputError(f"found no name; expected some of {', '.join(METHODS)}", None, option)
     for name in names:
         require_method(name, option)
     return names
@@ -44,15 +44,15 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
 
 
 def read_truth(
-    sources: Sequence[str], known_rows: Sequence[str], needed: Sequence[str]
+    sources: Sequence[str], known_names: Sequence[str], needed: Sequence[str]
 ) -> dict[str, float]:
-    """Return the true values of parameters, by name.
+    """Return the true values of parameters, by name; empty without sources.
 
     Parameters
     ----------
     sources : sequence of str
         TOML files, or "name=value" separated by commas; later ones override earlier ones.
-    known_rows : sequence of str
+    known_names : sequence of str
         Names of all parameters of the problem.
     needed : sequence of str
         Names of those that are estimated.
@@ -67,7 +67,7 @@ def read_truth(
     for item in sources:
         source, table = _truth_table(item)
         for name, value in table.items():
-            require_among(name, known_rows, source, "--truth")
+            require_among(name, known_names, source, "--truth")
             truth[name] = _positive_value(name, value, source)
     if missing := [name for name in needed if sources and name not in truth]:
         raise InputError(
@@ -79,7 +79,16 @@ def read_truth(
 
 
 def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
-    """Return the file, None for text, and its values by name."""
+    """Return the file, and its values by name, of a source of true values.
+
+    A text with "=" is read as name=value pairs, separated by commas, with values as text; the file
+    is then None.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or has no such table.
+    """
     if "=" in item:
         pairs = [pair.partition("=") for pair in item.split(",") if pair.strip()]
         return None, {name.strip(): value.strip() for name, _, value in pairs}
@@ -103,7 +112,9 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
 
 
 def _positive_value(name: str, value: Any, source: Path | None) -> float:
-    """Return a value as a positive number; raise `InputError` otherwise."""
+    """Return a value, a number or text, as a positive float; raise `InputError` otherwise. `name`
+    and `source` are for the message.
+    """
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
@@ -200,7 +211,9 @@ def _range_values(key: str, text: str) -> Iterable[str]:
 
 
 def _split_values(text: str) -> list[str]:
-    """Split text at the commas that are outside brackets, braces and quotes."""
+    """Split text at the commas that are outside brackets, braces and quotes; items are stripped,
+    empty ones left out.
+    """
     items = [""]
     depth = 0
     quote = ""

@@ -176,7 +176,11 @@ def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
 
 
 def write_report(report: StudyReport, folder: Path) -> None:
-    """Write ``runs.csv``, ``summary.csv``, ``summary.json``, ``summary.md`` and the plots."""
+    """Write ``runs.csv``, ``summary.json``, ``summary.md`` and the plots of a study into a folder.
+
+    A comparison of methods has also ``summary.csv``; a comparison of models has no plots. Earlier
+    files are replaced.
+    """
     rows = report.rows
     write_text_file(folder / "runs.csv", as_csv(rows))
     if report.kind == METHOD_STUDY:
@@ -243,7 +247,7 @@ def report_section(report: StudyReport) -> TitledParts:
 
 
 def _in_words(head: str) -> str:
-    """Return a heading in words from that in the terminal."""
+    """Return the heading in words for a short heading `head` of the terminal."""
     if head.startswith("Δ") and head.endswith(" %"):
         return f"error of {head[1:-2]} [%]"
     symbol, space, unit = head.partition(" ")
@@ -361,14 +365,27 @@ def model_views(rows: Sequence[Row]) -> list[Table]:
 def _transposed_view(
     title: str, names: Mapping[str, Cell], cells: Mapping[str, Cell], rows: Sequence[Row]
 ) -> Table:
-    """Return a table with a line for each cell and a column for each row."""
+    """Return a table with a line for each cell and a column for each row, for many cells and few
+    rows.
+
+    Parameters
+    ----------
+    title : str
+    names : mapping of heading to Cell
+        One cell, which gives the headings of the columns.
+    cells : mapping of heading to Cell
+        Cells of the lines.
+    rows : sequence of Row
+    """
     (name,) = names.values()
     lines = tuple((head, *(cell(row) for row in rows)) for head, cell in cells.items())
     return Table(title, ("", *(name(row) for row in rows)), lines)
 
 
 def _ratio_text(row: Row) -> str:
-    """Return the ratio of a model's prediction error to the best one as text."""
+    """Return the ratio of a model's prediction error to the best one as text, with its standard
+    error; "–" if nothing was predicted.
+    """
     if row["log_ratio"] is None:
         return "–"
     times = exp(row["log_ratio"])
@@ -379,19 +396,21 @@ def _ratio_text(row: Row) -> str:
 def _table_view(
     title: str, names: Mapping[str, Cell], number_columns: Mapping[str, Cell], rows: Sequence[Row]
 ) -> Table:
-    """Return a table of rows, with a column for each cell."""
+    """Return a table with a line for each row and a column for each cell; the first columns are
+    `names`.
+    """
     columns = {**names, **number_columns}
     cells = tuple(tuple(cell(row) for cell in columns.values()) for row in rows)
     return Table(title, tuple(columns), cells, len(names))
 
 
 def _text_cell(name: str) -> Cell:
-    """Return the cell of a text."""
+    """Return the cell of the text that rows have under this name."""
     return lambda row: str(row[name])
 
 
 def _varied_cell(key: str) -> Cell:
-    """Return the cell of a swept value, with numbers shortened."""
+    """Return the cell of the value of a swept key, a number with five digits, or else its text."""
 
     def cell(row: Row) -> str:
         """Return the text of the cell in a row."""
@@ -404,26 +423,40 @@ def _varied_cell(key: str) -> Cell:
 
 
 def _number_cell(name: str, factor: float = 1.0, form: str = ".2g", among: str = "") -> Cell:
-    """Return the cell of a number."""
+    """Return the cell of a number, "–" if unknown.
+
+    Parameters
+    ----------
+    name : str
+        Key of the number.
+    factor : float
+        Multiplies the number.
+    form : str
+        Format.
+    among : str
+        Key of the mapping in the row that contains the number; "" if it is in the row itself.
+    """
     shown = NumberColumn(factor=factor, form=form)
     return lambda row: shown.format(row[among].get(name) if among else row[name])
 
 
 def _error_cells(rows: Sequence[Row]) -> dict[str, Cell]:
-    """Return a cell for each parameter whose true value is known."""
+    """Return a cell of the relative error [%] for each parameter whose true value is known, by
+    heading.
+    """
     names = parameters_in(rows, "error_")
     return {f"Δ{symbol_of(name)} %": _number_cell(f"error_{name}", 100) for name in names}
 
 
 def _number_cells(*names: str) -> dict[str, Cell]:
-    """Return cells of quality and cost."""
+    """Return the cells of the columns with these names in `COLUMNS`, by heading."""
     return {
         COLUMNS[name].head: lambda row, name=name: COLUMNS[name].format(row[name]) for name in names
     }
 
 
 def _estimate_cell(name: str) -> Cell:
-    """Return the cell of an estimate."""
+    """Return the cell of an estimate, with its standard error if that is known."""
 
     def cell(row: Row) -> str:
         """Return the text of the cell in a row."""

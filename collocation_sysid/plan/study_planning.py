@@ -88,7 +88,9 @@ class PlannedRun:
 
 
 def shortened_keys(keys: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield each dotted key with the shortest ending that distinguishes it from the others."""
+    """Yield each dotted key with the shortest ending that distinguishes it from the others; of
+    parameters at least two parts, name and key.
+    """
     for key in keys:
         parts = key.split(".")
         fewest_parts = 2 if parts[0] == "parameters" else 1
@@ -302,7 +304,8 @@ def fitted_recordings(problem: Problem) -> list[str]:
 def _planned_run(
     path: Path, file: ProblemFile, method: str | None, overrides: Sequence[str], **more: Any
 ) -> PlannedRun:
-    """Return the run of a file with its overrides.
+    """Return the run of a file with its overrides, with a key that depends on all that decides its
+    result.
 
     Parameters
     ----------
@@ -341,7 +344,9 @@ def _planned_run(
 
 
 def _file_hashes(content: Any, folder: Path) -> dict[str, str]:
-    """Return hashes of the files that a problem names, so that changed data give another run."""
+    """Return hashes by name of the files that the content of a problem names, so that changed data
+    give another run; names of missing files are left out.
+    """
     hashes = {}
     for text in _texts(content):
         with suppress(OSError, ValueError):  # a text that is no file's name

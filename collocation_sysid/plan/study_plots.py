@@ -56,7 +56,17 @@ PANEL_MM = 32.0
 def comparison_plots(
     rows: Sequence[Row], records: Mapping[str, Record], yardstick: SuccessCriterion
 ) -> dict[str, Figure]:
-    """Return the figures of a comparison by file name; those without data are left out."""
+    """Return the figures of a comparison of methods by file name without suffix; those without data
+    are left out.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        One for each run.
+    records : mapping of key of the run to Record
+    yardstick : SuccessCriterion
+        True values, if known, which are the reference of the starts.
+    """
     figures: dict[str, Figure] = {}
     completed = [row for row in rows if row["rms_m"] is not None]
     if completed:
@@ -74,7 +84,7 @@ def comparison_plots(
 
 
 def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
-    """Return colour and rows of each method."""
+    """Return colour and rows of each method, in the order of their first rows."""
     methods = dict.fromkeys(row["method"] for row in rows)
     return {
         method: (
@@ -118,10 +128,10 @@ def convergence_in_time(rows: Sequence[Row], records: Mapping[str, Record]) -> F
 
 
 def success_by_distance(
-    rows: Sequence[Row], centre: Mapping[str, float], known_rows: bool
+    rows: Sequence[Row], centre: Mapping[str, float], is_truth_known: bool
 ) -> Figure:
-    """Return a figure of the success rate against the largest ratio of guess to reference,
-    in logarithmic bins.
+    """Return a figure of the success rate of each method against the largest ratio of guess to
+    reference `centre`, in logarithmic bins; `is_truth_known` chooses the title.
     """
     figure = new_figure(PAGE_MM / 2, 65)
     axes = figure.subplots()
@@ -146,7 +156,7 @@ def success_by_distance(
         axes.errorbar(
             places, rates, np.abs(np.array(bars)).T, color=colour, label=method, **style
         )  # fmt: skip
-    title = f"Success over distance from the {'true values' if known_rows else 'best estimate'}"
+    title = f"Success over distance from the {'true values' if is_truth_known else 'best estimate'}"
     style_axes(axes, title, "factor by which the worst guess is wrong", "success [%]")
     axes.set_xscale("log")
     axes.set_xticks(edges, [f"{edge:.2g}" for edge in edges])
@@ -156,10 +166,11 @@ def success_by_distance(
     return figure
 
 
-def basins(rows: Sequence[Row], centre: Mapping[str, float], known_rows: bool) -> Figure:
-    """Start points over each pair of parameters, a row of panels for each method.
+def basins(rows: Sequence[Row], centre: Mapping[str, float], is_truth_known: bool) -> Figure:
+    """Return a figure of the start points over each pair of parameters, a row of panels for each
+    method.
 
-    Guesses are drawn relative to the truth, or to the best answer.
+    Guesses are drawn relative to `centre`: the truth, or the best answer.
     """
     names = list(centre)
     pairs = list(itertools.combinations(names, 2)) or [(names[0], names[0])]
@@ -177,13 +188,13 @@ def basins(rows: Sequence[Row], centre: Mapping[str, float], known_rows: bool) -
                     label="success" if success else "failure",
                 )  # fmt: skip
             axes.plot(
-                1, 1, "+", color=BLACK, ms=6, label="truth" if known_rows else "best estimate"
+                1, 1, "+", color=BLACK, ms=6, label="truth" if is_truth_known else "best estimate"
             )
             style_axes(axes, method if axes is line[0] else "", "", symbol_as_mathtext(second))
     for axes, (first, _) in zip(panels[-1], pairs, strict=True):
         axes.set_xlabel(symbol_as_mathtext(first), fontsize=TEXT_PT)
     _ratio_axes(panels[0, 0], max(guess_distance(row, centre) for row in rows))
-    title = f"guesses relative to the {'true values' if known_rows else 'best estimate'}"
+    title = f"guesses relative to the {'true values' if is_truth_known else 'best estimate'}"
     add_figure_legend(
         figure, 3, loc="outside upper right", fontsize=SMALL_PT, title=title,
         title_fontsize=SMALL_PT, alignment="right",
@@ -192,7 +203,7 @@ def basins(rows: Sequence[Row], centre: Mapping[str, float], known_rows: bool) -
 
 
 def _ratio_axes(axes: Axes, factor: float) -> None:
-    """Set logarithmic axes from 1/factor to factor, with three ticks each."""
+    """Set both axes to a logarithmic scale from about 1/factor to factor, with three ticks each."""
     digit = 10 ** np.floor(np.log10(factor))
     tick = max((t for t in (1.5, 2.0, 5.0, 10.0) if t * digit <= factor), default=1.0) * digit
     axes.set(xscale="log", yscale="log")
@@ -206,8 +217,8 @@ def _ratio_axes(axes: Axes, factor: float) -> None:
 
 
 def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
-    """Return a figure of the measured tip, and of its simulation with each method's best
-    solution.
+    """Return a figure of the measured marker farthest from the grasp, and of its simulation with
+    each method's best solution; measurements are those of the first row.
     """
     figure = new_figure(PAGE_MM, 65)
     panels = figure.subplots(1, 3, sharex=True)
@@ -240,7 +251,8 @@ def sweep_plots(rows: Sequence[Row], varied_keys: Sequence[str]) -> dict[str, Fi
 
 
 def estimates_against(rows: Sequence[Row], varied_keys: Sequence[str]) -> Figure:
-    """Estimates with their 95 % intervals: a row for each parameter, a column for each key.
+    """Return a figure of estimates with their 95 % intervals: a row for each parameter, a column
+    for each swept key.
 
     Answers that did not converge are crosses. Values of the first other key have colours.
     """

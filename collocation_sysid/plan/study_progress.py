@@ -71,7 +71,9 @@ class StudyProgress(Watched):
         self.update(Text(line, style="dim"), line)
 
     def _remaining_text(self, worker_count: int) -> str:
-        """Return the estimated remaining time as text; empty if it is unknown."""
+        """Return "; about … left", from the times of finished runs and the number of runs at once;
+        empty if the remaining time is unknown.
+        """
         remaining_s = remaining_time_s(
             [run.method for run in self._waiting.values()], self._walls, worker_count
         )

@@ -37,7 +37,9 @@ OTHER_TIME = "Time (s)"
 
 
 def strain_length_m(table: DisplacementSection, body: Body) -> float | None:
-    """Return the undeformed length [m] by which a strain is multiplied; None for displacements."""
+    """Return the undeformed length [m] by which a strain is multiplied: the stated one, or the
+    extent of the body along the axis of the table; None for displacements.
+    """
     if table.length_m != "body":
         return table.length_m
     return float(np.ptp(body.nodes_m[:, "xyz".index(table.axis)]))
@@ -51,7 +53,11 @@ def has_displacement_table(section: ExperimentSection) -> bool:
 
 
 def table_name(section: ExperimentSection, table: TableSection) -> str:
-    """Return the name of a test bench's table in the folder of a simulation."""
+    """Return the file name of a test bench's table in the folder of a simulation.
+
+    It is the stated path if that is inside the problem's folder, else its last part; without a
+    stated file, the name of the experiment with .csv.
+    """
     path = PurePath(section.file_of(table) or f"{section.name}.csv")
     is_below = not path.is_absolute() and ".." not in path.parts
     return str(path) if is_below else path.name
@@ -74,25 +80,28 @@ class BenchTable:
     columns: dict[str, Array] = field(default_factory=dict)
 
     def add(
-        self, layout: TableSection, values: Mapping[str, Array], known_rows: Sequence[Quantity]
+        self,
+        layout: TableSection,
+        values: Mapping[str, Array],
+        known_quantities: Sequence[Quantity],
     ) -> None:
-        """Add columns of quantities, by key, in the file's units and under the file's names.
+        """Add columns of quantities, in place, in the file's units and under the file's names.
 
         Parameters
         ----------
         layout : TableSection
             The names of its columns.
         values : mapping of key to (T,) array
-            In SI; the time is added to these.
-        known_rows : sequence of Quantity
-            What the keys mean.
+            Quantities in SI units at the times of the table, by key; NaN leaves a cell empty.
+        known_quantities : sequence of Quantity
+            Name and unit of each key.
 
         Raises
         ------
         InputError
-            If a column of that name has other values.
+            If the table already has a column of that name with other values.
         """
-        quantities = {quantity.key: quantity for quantity in (TIME, *known_rows)}
+        quantities = {quantity.key: quantity for quantity in (TIME, *known_quantities)}
         time = {TIME.key: self.t_s}
         for key, column in (time | dict(values)).items():
             quantity = quantities[key]
@@ -112,8 +121,10 @@ class BenchTable:
 def add_displacement(
     table: BenchTable, layout: DisplacementSection, grasp: Grasp, rest_length_m: float | None
 ) -> None:
-    """Add the translations of a grasp at the times of the table, as `read_displacement`
-    reads them.
+    """Add the translations [m] of a grasp at the times of the table, in place, as
+    `read_displacement` reads them.
+
+    If `rest_length_m` is not None, the strain, translation over this length [m], is added instead.
     """
     shifts_m = layout.sign * grasp.poses.at(table.t_s)[1]
     displacement_m = shifts_m[:, "xyz".index(layout.axis)]
@@ -128,16 +139,18 @@ def add_displacement(
 
 
 def add_wrench(table: BenchTable, layout: WrenchSection, at_s: Array, wrench: Array) -> None:
-    """Add a wrench of the modelled part (S, 6), NaN where missing, as `read_wrench` reads it.
+    """Add a wrench to a table, in place, such that `read_wrench` reads it back.
 
     Parameters
     ----------
     table : BenchTable
     layout : WrenchSection
+        Sign, axis and symmetry; the wrench of a body that the problem models in part is multiplied
+        by `symmetry`. The stress is written instead of the force if `area_m2` is stated.
     at_s : (S,) array
-        Times of its samples, each near one of the table's rows; the other rows are left blank.
+        Times of the samples [s]. Each is assigned to the nearest row; other rows are left blank.
     wrench : (S, 6) array
-        fx, fy, fz [N], tx, ty, tz [N m].
+        Wrench on the modelled part: fx, fy, fz [N], tx, ty, tz [N m]; NaN where not measured.
     """
     rows = np.searchsorted((table.t_s[1:] + table.t_s[:-1]) / 2, at_s)
     six_components = np.full((len(table.t_s), 6), np.nan)
@@ -157,14 +170,14 @@ def add_wrench(table: BenchTable, layout: WrenchSection, at_s: Array, wrench: Ar
 
 
 def _named_quantities(layout: TableSection) -> list[str]:
-    """Return the quantities whose columns the problem names."""
+    """Return the keys of the quantities whose columns the table names; empty if it names none."""
     return [key for key in layout.columns if key != TIME.key]
 
 
 def bench_tables(
     section: ExperimentSection, experiment: Experiment, wrenches: Iterable[Array]
 ) -> dict[str, BenchTable]:
-    """The tables of a bench by file name, see `table_name`.
+    """Return the tables of a test bench that a simulation writes, by file name, see `table_name`.
 
     Parameters
     ----------

@@ -23,12 +23,13 @@ from .schema import CodeSection, NodeForceSection
 
 
 def existing_file(folder: Path, name: str, key: str) -> Path:
-    """Return the path of a file, or of a topic of a log, that a key of the problem file names.
+    """Return the path of a file that a key of the problem file names, relative to `folder`; it may
+    also be a topic of a log, as "log#topic".
 
     Raises
     ------
     InputError
-        If it does not exist.
+        At `key`, if it does not exist or is a folder.
     """
     file = folder / name
     require_regular(file, key)
@@ -71,12 +72,13 @@ class CodeLoader:
             return Material.from_energy(cast(Energy, loaded), section.function)
 
     def force(self, section: NodeForceSection, key: str) -> NodeForce:
-        """Return a custom force on nodes.
+        """Return the custom force on nodes that a section names, on its nodes if it states some.
 
         Raises
         ------
         InputError
-            See `function`; also if the function is no force, see `NodeForce.from_law`.
+            See `function`; also if the function is no force, see `NodeForce.from_law`, or `carries`
+            is wrong.
         """
         file, loaded = self.function(section.file, section.function, f"{key}.file")
         nodes = None if section.nodes is None else selection_from_section(section.nodes)
@@ -97,7 +99,9 @@ class CodeLoader:
             )
 
     def nuisance_row(self, section: CustomNuisanceSection) -> NuisanceRow:
-        """Return a custom nuisance parameter; see `function` for the errors."""
+        """Return the `NuisanceRow` that a Python file defines under the name `row` of the section;
+        see `function` for the errors.
+        """
 
         def is_row(value: Any) -> bool:
             """Return whether a value of the file is a nuisance parameter."""
@@ -107,22 +111,24 @@ class CodeLoader:
         return self._load(section.file, section.row, key, "NuisanceRow", is_row)[1]
 
     def function(self, file: str, name: str, key: str) -> tuple[Path, Callable[..., Any]]:
-        """Return the path of a file and a function in it.
+        """Run a Python file, and return its path and the function in it that has a name.
+
+        A force with an energy, `NodeForce`, counts as a function.
 
         Parameters
         ----------
         file : str
-            Name of the file.
+            Name of the file, relative to the folder of the problem.
         name : str
             Name of the function.
         key : str
-            Key of the problem file that names it, for messages.
+            Key of the problem file that names the file, for messages.
 
         Raises
         ------
         InputError
-            If running code is not allowed, the file or the function does not exist, or the file
-            fails.
+            If running code is not allowed, the file or the function does not exist, the name
+            belongs to something else, or the file fails.
         """
 
         def is_function(value: Any) -> bool:

@@ -15,12 +15,13 @@ Sections = Mapping[str, ParameterSection | float]
 
 
 def with_guessed_densities(section: ObjectSection, parameters: Sections) -> ObjectSection:
-    """Return [object] with missing densities taken from guesses of parameters.
+    """Return a copy of [object] in which missing densities of the body and of regions are guesses
+    of parameters.
 
     Raises
     ------
     InputError
-        If neither states the body's mass.
+        Unless exactly one of the body's mass and density is stated or guessed.
     """
     regions = [_with_guessed_density(region, parameters) for region in section.region]
     changes: dict[str, object] = {"region": regions}
@@ -40,7 +41,9 @@ def with_guessed_densities(section: ObjectSection, parameters: Sections) -> Obje
 def with_declared_densities(
     parameters: Sections, body: Body
 ) -> dict[str, ParameterSection | float]:
-    """Return [parameters] with missing guesses of densities taken from the body."""
+    """Return [parameters], where a density or mass that is to be estimated without a guess gets the
+    value that the body states.
+    """
     return {
         name: section.model_copy(update={"guess": _declared_density(body, name)})
         if isinstance(section, ParameterSection)
@@ -54,7 +57,9 @@ def with_declared_densities(
 
 
 def _with_guessed_density(region: RegionSection, parameters: Sections) -> RegionSection:
-    """Return a region with its density; if it has none, the guess of its parameter."""
+    """Return a region with its density [kg/m³]: its own, else the guess of its parameter, else
+    None.
+    """
     if region.density_kg_m3 is not None:
         return region
     guess = _guess(parameters, f"{region.name}.{DENSITY.name}")
@@ -72,8 +77,10 @@ def _guess(parameters: Sections, name: str) -> float | None:
 
 
 def _declared_density(body: Body, name: str) -> float | None:
-    """Return the mass [kg] or density [kg/m³] that the body states for a parameter; None if
-    it has none.
+    """Return the value that the body states for a parameter called `name`; None if it has none.
+
+    The mass [kg] if that is the parameter, else the density [kg/m³] of the region that the name
+    begins with, or of the parts without an own density.
     """
     if without_region(name) == MASS.name:
         return body.mass_kg

@@ -208,7 +208,16 @@ def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
 
 
 def _smallest_size(file: ProblemFile, corners: int, elements: int, *, simulation: bool) -> Size:
-    """Return the size of the problem with one sample, from the corners and elements of its mesh."""
+    """Return the size of the problem with one sample, before a mesh exists.
+
+    Parameters
+    ----------
+    file : ProblemFile
+    corners, elements : int
+        Numbers of corner nodes and elements of the mesh.
+    simulation : bool
+        Whether nothing is estimated, so that there are no sensitivities.
+    """
     # A quadratic element has a node on every edge; a mesh has about 7 edges per corner.
     nodes = corners if file.object.element == "tet4" else 8 * corners
     substeps = file.transcription.substeps
@@ -244,8 +253,9 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
 
 @contextmanager
 def _locate_in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterator[None]:
-    """Context that adds file and table to errors without them, and begins with warnings on
-    the body.
+    """Context that adds file and table to errors that have no file.
+
+    Messages begin with `odd`, warnings on the body that may explain the error.
     """
     try:
         yield
@@ -264,7 +274,16 @@ def _locate_in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterato
 
 
 def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
-    """Return the mesh from a file, a surface, or a shape."""
+    """Return the mesh of [object]: read from a file, meshed from a surface, or generated from a
+    shape.
+
+    Meshes of surfaces are cached in ``.meshes`` in `folder`, the folder of the problem.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or unusable.
+    """
     if section.mesh is not None:
         file = existing_file(folder, section.mesh, "mesh")
         return TetMesh.read(file, section.length_unit)
@@ -277,7 +296,9 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
 
 
 def _generate_mesh(section: ObjectSection, edge_length_m: float) -> TetMesh:
-    """Mesh the cylinder or the box that the section states."""
+    """Return a mesh of the cylinder, or else the box, that the section states, with edges of about
+    this length [m].
+    """
     if (shape := section.cylinder) is not None:
         return cylinder_of_edge(
             shape.diameter_m, shape.height_m, edge_length_m, quarter=shape.quarter
@@ -287,7 +308,9 @@ def _generate_mesh(section: ObjectSection, edge_length_m: float) -> TetMesh:
 
 @contextmanager
 def _lengths_checked(section: ObjectSection) -> Iterator[None]:
-    """Name a length of a generated body that no body has, in place of what follows from it."""
+    """Context that names a length of a generated body that is implausible, in place of the error
+    that follows from it.
+    """
     if (shape := section.cylinder) is not None:
         lengths_m = {"cylinder.diameter_m": shape.diameter_m, "cylinder.height_m": shape.height_m}
     else:
@@ -352,14 +375,18 @@ def _rest_shape(section: ObjectSection) -> UnderGravity | Literal["stress_free"]
 
 
 def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
-    """Return the friction parameters that obstacles name, each once."""
+    """Return the friction parameters that obstacles name, each once; frictions given as numbers are
+    left out.
+    """
     declared = (each.friction for section in file.recordings for each in section.obstacle)
     named = (one for one in declared if isinstance(one, str) and one.endswith(FRICTION.name))
     return tuple(dict.fromkeys(map(constant_named, named)))
 
 
 def _as_parameter(name: str, section: ParameterSection | float) -> Unknown | Tied | float:
-    """Return one parameter from its table, or from its fixed value."""
+    """Return one parameter from its table, or its fixed value; a table with `tied_to` gives a tied
+    parameter.
+    """
     if not isinstance(section, ParameterSection):
         return section
     if section.fixed is not None:

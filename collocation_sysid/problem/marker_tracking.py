@@ -25,8 +25,8 @@ def gripper_markers(section: ExperimentSection) -> set[str]:
 
 
 def read_marker_tracks(section: ExperimentSection, file: Path) -> MarkerTable:
-    """Return the tracks of the markers that an experiment uses, gripper included, in the
-    file's frame.
+    """Return the tracks of the markers that an experiment uses, of gripper and template too, in the
+    file's frame; all of the file if the problem names none.
     """
     markers = section.markers
     names = None

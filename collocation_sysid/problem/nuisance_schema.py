@@ -21,7 +21,9 @@ KEYS = {key: list(rows) for key, rows in groupby(KINDS, key=lambda row: row.key)
 
 
 def _require_scope(word: str) -> str:
-    """Return a scope if it is valid; raise `ValueError` otherwise."""
+    """Return a scope unchanged if it is "recording" or matches `SCOPE`; raise `ValueError`
+    otherwise.
+    """
     if word != "recording" and not re.fullmatch(SCOPE, word):
         raise ValueError(f'found {word!r}; expected "recording", {SCOPE_TEXT}')
     return word
@@ -74,7 +76,11 @@ class NuisancePriorSection(Scoped):
 
 
 def _prior_section(key: str, rows: list[NuisanceRow]) -> type[Section]:
-    """Return the generated table of a key."""
+    """Return the pydantic class of the table [experiment.nuisance.KEY], with a field for the prior
+    standard deviation of each nuisance parameter in `rows`.
+
+    A row that refers to another prior makes all priors of the table mandatory.
+    """
     # What another prior goes with has to be there.
     needed = any(row.reference is not None for row in rows)
     fields: dict[str, Any] = {}
@@ -91,7 +97,9 @@ def _prior_section(key: str, rows: list[NuisanceRow]) -> type[Section]:
 
 
 def _nuisance_section() -> type[Section]:
-    """Return the generated table [experiment.nuisance]."""
+    """Return the pydantic class of the table [experiment.nuisance], with one table, or "none", for
+    each kind of nuisance parameter.
+    """
     fields: dict[str, Any] = {}
     for key, rows in KEYS.items():
         description = " ".join(
@@ -115,7 +123,7 @@ def _nuisance_section() -> type[Section]:
 
 
 def _described_prior(row: NuisanceRow) -> str:
-    """Return the name of a prior, with its default."""
+    """Return the name of a prior, followed by its default if it has one."""
     return row.prior if row.sigma is None else f"{row.prior}, {row.usual} by default"
 
 
@@ -133,7 +141,7 @@ def nuisance_from_section(
 
     Parameters
     ----------
-    section : NuisanceSection or "none"
+    section : Section or "none"
         Table; "none" means no nuisance parameters.
     row_of : callable
         Function that returns the custom nuisance parameter of a table.

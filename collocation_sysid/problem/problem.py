@@ -168,7 +168,9 @@ class Problem:
         return {name: each for body in self.bodies for name, each in body.field_lengths_m.items()}
 
     def with_lengths(self, lengths_m: Mapping[str, float]) -> Problem:
-        """Return the problem with other correlation lengths [m] of spatially varying constants."""
+        """Return the problem with other correlation lengths [m] of spatially varying constants, by
+        name of the constant; itself if nothing changes.
+        """
         if dict(lengths_m) == self.lengths_m:
             return self
         bodies = {id(body): body.with_field_lengths(lengths_m) for body in self.bodies}
@@ -225,7 +227,7 @@ class Problem:
         )
 
     def solver(self, method: str | Method | None = None) -> Method:
-        """Return the method for a name; the problem's own by default.
+        """Return the method for a name, or the method itself; None means the method of the problem.
 
         Raises
         ------
@@ -244,7 +246,11 @@ class Problem:
         return chosen
 
     def _validate(self) -> None:
-        """Raise `InputError` if experiments, parameters and options do not fit together."""
+        """Raise `InputError` if experiments, parameters and options do not fit together.
+
+        Checked are names, steps, constants of the bodies, stress-free shapes, fields, scopes of
+        nuisance parameters, scheme, method, and names of profiles.
+        """
         names = [experiment.name for experiment in self.experiments]
         if not names:
             raise InputError("there is no experiment; expected at least one")
@@ -309,7 +315,9 @@ def _require_equal_fields(bodies: Iterable[Body]) -> None:
 def _with_free_densities(
     experiments: Iterable[Experiment], parameters: Parameters
 ) -> tuple[Experiment, ...]:
-    """Return the experiments with bodies whose densities are free if parameters refer to them."""
+    """Return the experiments; where parameters name a density or the mass, with bodies whose
+    density follows from these parameters.
+    """
     bodies = {}
     experiments = tuple(experiments)
     for body in {id(e.body): e.body for e in experiments}.values():

@@ -98,7 +98,9 @@ def _depth(content: Any) -> int:
 
 
 def _beyond_limits(error: Exception) -> str:
-    """Return the message for a file that exceeds the parser's limits."""
+    """Return the message for a file whose numbers or nesting exceed the limits of the parser that
+    raised `error`.
+    """
     if isinstance(error, RecursionError):
         return "nests tables or lists too deeply; expected a few levels"
     return "contains an integer with too many digits; expected fewer than 4,300"
@@ -148,7 +150,11 @@ def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
 
 
 def _apply_override(content: dict[str, Any], override: str) -> None:
-    """Set one value of the content, in place, from "key=value".
+    """Set one value of the content of a problem file, in place, from "key=value"; missing tables
+    are created.
+
+    If a part of a table that an experiment has from [experiment_defaults] is set, the experiment
+    gets a copy of the complete table.
 
     Raises
     ------
@@ -159,7 +165,10 @@ def _apply_override(content: dict[str, Any], override: str) -> None:
     key = key.strip()
     parts = key.split(".")
     if len(parts) > DEEPEST:
-        raise InputError(f"found a key of {len(parts)} parts; expected a few")
+        raise InputError(
+            f"found a key of {len(parts)} parts; expected one such as parameters.mu_pa.guess, of "
+            f"at most {DEEPEST}"
+        )
     if not equals or not all(parts):
         expected = "expected key=value such as parameters.mu_pa.guess=200"
         raise InputError(f"found {override!r}, {expected}")
@@ -192,29 +201,38 @@ def _join_dotted_names(content: Any, parts: list[str]) -> list[str]:
     return names
 
 
-def _item_key(place: Any, iterate: str, key: str) -> str | int:
+def _item_key(place: Any, part: str, key: str) -> str | int:
     """Return the key in a table, or the index in a list, that a part of a dotted key refers to.
+
+    Parameters
+    ----------
+    place : Any
+        Table or list.
+    part : str
+        Part: a key, an index from 0, or the name of a table in a list.
+    key : str
+        Complete dotted key, for messages.
 
     Raises
     ------
     InputError
-        If the list has no such item, or the value is neither table nor list.
+        If the list has no such item, or `place` is neither table nor list.
     """
     if isinstance(place, dict):
-        return iterate
+        return part
     if not isinstance(place, list):
         raise InputError(
             f"{key} goes beyond the value {place!r}, which is not a table; expected "
             "a key of a table"
         )
     names = [item.get("name") if isinstance(item, dict) else None for item in place]
-    if iterate in names:
-        return names.index(iterate)
-    if iterate.isascii() and iterate.isdecimal() and int(iterate) < len(place):
-        return int(iterate)
+    if part in names:
+        return names.index(part)
+    if part.isascii() and part.isdecimal() and int(part) < len(place):
+        return int(part)
     expected = f"a number from 0 to {len(place) - 1}"
     expected += "".join(f" or {name}" for name in names if name)
-    raise InputError(f"found {iterate!r} in {key}; expected {expected}")
+    raise InputError(f"found {part!r} in {key}; expected {expected}")
 
 
 def _parse_value(text: str, key: str) -> Any:

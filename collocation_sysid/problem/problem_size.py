@@ -76,7 +76,7 @@ class Size:
         return self.samples * self.substeps
 
     def memory_mb(self) -> float:
-        """Memory that it takes at least."""
+        """Lower bound of the memory that the problem needs [MB]."""
         copies = SIMULATION_COPIES
         if self.unknowns:
             copies = SEARCH_COPIES + SENSITIVITY_COPIES * self.unknowns
@@ -89,20 +89,20 @@ class Size:
         return (8 * values + BYTES_PER_ELEMENT * self.elements) / 1e6
 
     def time_s(self) -> float:
-        """Time of a solve in the reduced space, or of a simulation, on one thread."""
+        """Estimated time [s] of a solve in the reduced space, or of a simulation, on one thread."""
         step_s = max(LEAST_STEP_S, STEP_S * (self.nodes / NODES) ** STEP_POWER)
         return (SWEEPS if self.unknowns else 1) * self.timesteps * step_s
 
 
 def require_feasible(size: Size, say: Say | None = None) -> None:
-    """Refuse what this machine's memory cannot hold, and announce what takes long.
+    """Raise an error if this machine's memory cannot hold the problem, and announce long work.
 
     Parameters
     ----------
     size : Size
     say : callable, optional
-        Called with a sentence where the estimate is beyond `ANNOUNCED_SOLVE_S`, or a single sample
-        of a body of more than `ANNOUNCED_NODES` is asked about.
+        Called with a sentence if the estimated time is beyond `ANNOUNCED_SOLVE_S`, or if a single
+        sample has more than `ANNOUNCED_NODES` nodes; None announces nothing.
 
     Raises
     ------
@@ -136,7 +136,9 @@ def require_feasible(size: Size, say: Say | None = None) -> None:
 
 
 def announce_reading(files: Iterable[Path], say: Say) -> None:
-    """Announce how long it takes to read files of text, where that is long."""
+    """Call `say` with an estimate of how long it takes to read text files, if it is long; missing
+    files count as empty.
+    """
     sizes_mb = {
         file: file.stat().st_size / 1e6
         for file in files

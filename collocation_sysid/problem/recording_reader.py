@@ -164,9 +164,7 @@ class RecordingReader:
     # Files ----------------------------------------------------------------------------------------
 
     def _must_read(self, name: str | None) -> bool:
-        """Return whether a file is to be read: always, unless it is missing and the problem
-        is simulated.
-        """
+        """Return whether a file must be read: in a solve always, in a simulation if it exists."""
         return not self.simulation or bool(name and stored_files(self.folder / name))
 
     def _require_existing(self, name: str | None, key: str, what: str = "a file") -> Path:
@@ -176,7 +174,9 @@ class RecordingReader:
         return existing_file(self.folder, name, key)
 
     def _table_file(self, table: TableSection, key: str) -> Path:
-        """Return the file of a displacement or a wrench, its own or that of the experiment."""
+        """Return the existing file of a displacement or a wrench: its own, else that of the
+        experiment; raise `InputError` at `key` if there is none.
+        """
         key = "file" if table.file is None and self.section.file else key
         return self._require_existing(
             self.section.file_of(table), key, "a file here, or a file of the experiment"
@@ -190,14 +190,20 @@ class RecordingReader:
     # Grasps ---------------------------------------------------------------------------------------
 
     def _grasp_key(self, k: int, key: str = "") -> str:
-        """Return the key of grasp or obstacle number k, from 0, in messages."""
+        """Return the key of the grasp or obstacle with index k for messages, followed by `key`
+        unless that is empty.
+        """
         grasps = len(self.section.grasp_list)
         one = f"grasp.{k}" if grasps > 1 else "grasp"
         one = one if k < grasps else f"obstacle.{k - grasps}"
         return f"{one}.{key}" if key else one
 
     def _poses(self, k: int) -> PoseSequence:
-        """Return the poses of grasp or obstacle number k, from 0; constant if none are stated."""
+        """Return the poses of the grasp or obstacle with index k.
+
+        They come from its markers, its displacement table or its file; without any of these they
+        are constant.
+        """
         grasp = self.section.moved_sections[k]
         if grasp.markers is not None:
             return self._poses_from_markers(grasp, self._grasp_key(k, "markers"))
@@ -220,7 +226,13 @@ class RecordingReader:
         return replace(poses, interpolation=grasp.interpolation)
 
     def _poses_from_markers(self, grasp: Moved, key: str) -> PoseSequence:
-        """Return the poses of a grasp fitted to its markers, and add notes on the fit."""
+        """Return the poses of a grasp fitted to its markers, and add notes on the fit.
+
+        Raises
+        ------
+        InputError
+            At `key`, if there are no tracks, or a marker is unknown.
+        """
         if self._marker_tracks is None:
             message = "there are no tracks to fit the poses to; expected markers.file, or poses"
             raise InputError(message, where=key)
@@ -231,7 +243,9 @@ class RecordingReader:
         return poses
 
     def _grasp(self, k: int, poses: PoseSequence, t_s: Array) -> Grasp:
-        """Return grasp or obstacle number k, from 0, on the body."""
+        """Return the grasp or obstacle with index k, with its wrench within the times t_s; a grasp
+        is placed on the nodes of the body.
+        """
         section = self.section.moved_sections[k]
         zero = ""
         if (table := section.displacement) is not None:
@@ -260,8 +274,11 @@ class RecordingReader:
         return read_wrench(file, **layout, symmetry=section.symmetry, timed=self._requires_times)
 
     def _wrench(self, section: WrenchSection, key: str, t_s: Array) -> Wrench:
-        """Return the measured wrench within the experiment's time; zeros if a simulation
-        has no file.
+        """Return the measured wrench within the times t_s of the experiment [s], and note how many
+        samples are used.
+
+        If a simulation has no file, the wrench is zero at t_s. Of equilibria without markers, only
+        measurements at the times t_s are used, if there are any.
         """
         name = self.section.file_of(section)
         arguments: dict[str, Any] = declared_in(section, Wrench, key)
@@ -280,9 +297,10 @@ class RecordingReader:
             return Wrench(at_s[is_used], values[is_used], **arguments)
 
     def _custom_sensor(self, k: int, section: ReadingSection, t_s: Array) -> Gauge:
-        """Return custom sensor number k, from 0, with its values within the experiment's time.
+        """Return the custom sensor with index k and its values within the times t_s [s], and note
+        how many samples are used.
 
-        Values are None if a simulation has no file.
+        If a simulation has no file, the values are None and the times are t_s.
         """
         key = f"reading.{k}"
         arguments: dict[str, Any] = {"name": section.name, **declared_in(section, Gauge, key)}
@@ -302,7 +320,16 @@ class RecordingReader:
             return Gauge(t_s=at_s[is_used], values=values[is_used], **arguments)
 
     def _depth_images(self, k: int) -> tuple[DepthFileContent, Array]:
-        """Return the images or clouds of depth camera number k, from 0, and their times [s]."""
+        """Return the content of the file of the depth camera with index k, and the times [s].
+
+        Times are the stated ones, or those of the file; for equilibria, or a single image, without
+        times they are 0, 1, 2, …
+
+        Raises
+        ------
+        InputError
+            If several images of a motion have no times, or the number of times is wrong.
+        """
         section = self.section.depth[k]
         file = self.folder / section.file
         if not file.is_dir():
@@ -324,8 +351,8 @@ class RecordingReader:
         return depth_file, times
 
     def _depth(self, k: int, t_s: Array) -> Depth:
-        """Return the depth measurements of camera number k, from 0, within the experiment's
-        time.
+        """Return the measurements of the depth camera with index k within the times t_s of the
+        experiment [s].
         """
         section = self.section.depth[k]
         where = f"depth.{k}"
@@ -360,6 +387,9 @@ class RecordingReader:
     def _from_table(self, kind: type, list_key: str, k: int) -> Any:
         """Return the object of a table in a list, such as a tendon or a pressure, on the body.
 
+        Values over time are read from the files that the table names. An object without a name is
+        numbered.
+
         Parameters
         ----------
         kind : type
@@ -368,6 +398,11 @@ class RecordingReader:
             Key of the list.
         k : int
             Index of the table in it.
+
+        Raises
+        ------
+        InputError
+            If a file is missing or unusable, or the object does not fit the body.
         """
         table = getattr(self.section, list_key)[k]
         where = f"{list_key}.{k}"
@@ -384,8 +419,10 @@ class RecordingReader:
 
     @cached_property
     def _marker_tracks(self) -> MarkerTable | None:
-        """Tracks of all markers that are used, in the body's frame; None if a simulation
-        has no file.
+        """Tracks of all markers that the experiment uses, gripper included, in the body's frame.
+
+        None if the experiment has no markers, or if a simulation has no file. The first access
+        reads the file and adds notes.
         """
         markers = self.section.markers
         if not self.section.has_markers or not self._must_read(markers.file):
@@ -400,7 +437,16 @@ class RecordingReader:
         return table
 
     def _fitted_tracks(self, poses: Sequence[PoseSequence]) -> MarkerTable:
-        """Return the tracks to fit; zeros at the times of the poses if a simulation has no file."""
+        """Return the tracks to fit, without those of the gripper alone.
+
+        They have no columns if the experiment has no markers. If a simulation has no file, they are
+        zero at `_sample_times`.
+
+        Raises
+        ------
+        InputError
+            If a marker without a file has no `reference_m`.
+        """
         if not self.section.has_markers:
             times = self._sample_times(poses)
             return MarkerTable(times, (), np.zeros((len(times), 0, 3)))
@@ -420,8 +466,15 @@ class RecordingReader:
         return self._select_tracks(MarkerTable(times, names, np.zeros((len(times), len(names), 3))))
 
     def _sample_times(self, poses: Sequence[PoseSequence]) -> Array:
-        """Return the sample times [s] without a marker file: those of a wrench, a camera,
-        or the poses.
+        """Return the sample times [s] where no marker file gives them.
+
+        They are those of the first wrench file if there are no markers, else for equilibria those
+        of all depth images, else those of the longest sequence of poses.
+
+        Raises
+        ------
+        InputError
+            If nothing is measured, or there are fewer than three times (one for equilibria).
         """
         section = self.section
         wrench_sections = [
@@ -482,7 +535,16 @@ class RecordingReader:
     def _align(
         self, poses: list[PoseSequence]
     ) -> tuple[Array, tuple[PoseSequence, ...], MarkerTable]:
-        """Return times [s], poses and tracks on one clock and time grid."""
+        """Return times [s], poses and tracks on one clock and time grid, and add notes.
+
+        The window, `resample_hz` and `every` are applied.
+
+        Raises
+        ------
+        InputError
+            If the poses do not determine the motion between the samples, or the problem exceeds
+            this machine's memory.
+        """
         section = self.section
         table = self._fitted_tracks(poses)
         static = self._is_static
@@ -533,7 +595,14 @@ class RecordingReader:
         return aligned.t_s, aligned.poses, aligned.table
 
     def _markers(self, t_s: Array, table: MarkerTable) -> Markers:
-        """Return the markers; positions on the body are NaN where they are to be estimated."""
+        """Return the markers at the times t_s; positions on the body are NaN where they are to be
+        estimated.
+
+        Raises
+        ------
+        InputError
+            If a marker has no sigma_m.
+        """
         if not self.section.has_markers:
             return Markers.none(t_s)
         section = self.section.markers
@@ -557,13 +626,15 @@ class RecordingReader:
 
 
 def _by_marker(values: Mapping[str, float] | float, names: Sequence[str], default: float) -> Array:
-    """Return values (M,) of the markers, given for all or by name, with a default."""
+    """Return the values (M,) of the markers with these names: one number for all, or the number of
+    each name, `default` where the mapping has none.
+    """
     by_name = values if isinstance(values, Mapping) else dict.fromkeys(names, values)
     return np.array([by_name.get(name, default) for name in names])
 
 
 def _require_known_markers(requested: Iterable[str], names: Sequence[str], key: str) -> None:
-    """Raise `InputError` if a name is not that of a marker."""
+    """Raise `InputError` at `key` if a requested name is not among `names`."""
     present = set(names)
     for name in requested:
         if name not in present:
@@ -573,7 +644,7 @@ def _require_known_markers(requested: Iterable[str], names: Sequence[str], key: 
 
 def require_plausible_markers(experiment: Experiment, constants: Mapping[str, float]) -> None:
     """Raise `InputError` if the tracks cannot belong to this body, because of a wrong unit or
-    frame.
+    frame; see `_implausible_markers`.
 
     Parameters
     ----------
@@ -592,7 +663,12 @@ def require_plausible_markers(experiment: Experiment, constants: Mapping[str, fl
 
 
 def _implausible_markers(experiment: Experiment) -> str | None:
-    """Return why the tracks cannot belong to this body; None if they can."""
+    """Return why the tracks cannot belong to this body, with the remedy, as text; None if they can.
+
+    The sample with most markers is tested: its extent relative to the body, and the distance of
+    each marker from the position that follows from the poses of a rigid body. Without a grasp only
+    the extent is tested.
+    """
     markers = experiment.markers
     body_m = _diagonal(experiment.body.nodes_m)
     k = int(markers.is_present.sum(axis=1).argmax())

@@ -143,8 +143,8 @@ class MovedSection(Section):
 
     @model_validator(mode="after")
     def _require_one_source(self) -> MovedSection:
-        """Raise `ValueError` for several sources of poses, or keys without the source they
-        belong to.
+        """Raise `ValueError` if more than one of poses, displacement and markers is given, or a key
+        without the source that it belongs to.
         """
         sources = used_keys(self, "poses", "displacement", "markers")
         if len(sources) > 1:
@@ -256,7 +256,9 @@ class MarkersSection(section_of(Markers, "MarkersSection")):
 
     @model_validator(mode="after")
     def _require_template(self) -> MarkersSection:
-        """Raise `ValueError` for an incomplete template."""
+        """Raise `ValueError` unless `template_m` and `template_window_s` are given together, with
+        at least three positions and a window that starts before it ends.
+        """
         present = used_keys(self, "template_m", "template_window_s", "max_template_residual_m")
         if present and not {"template_m", "template_window_s"} <= set(present):
             raise ValueError(
@@ -272,7 +274,9 @@ class MarkersSection(section_of(Markers, "MarkersSection")):
 
 
 def _require_file_name(name: str) -> str:
-    """Return a name that can be part of a file name; raise `ValueError` for others."""
+    """Return a name unchanged if it can be part of a file name on every platform; raise
+    `ValueError` otherwise.
+    """
     if (
         not name.isprintable()
         or name[:1] in ("", ".")
@@ -418,7 +422,7 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
 
     @model_validator(mode="after")
     def _require_window(self) -> ExperimentSection:
-        """Raise `ValueError` if the window does not begin before it ends."""
+        """Raise `ValueError` unless the window is missing or begins before it ends."""
         if self.window_s is not None and not self.window_s[0] < self.window_s[1]:
             raise ValueError(
                 f"found window_s = {list(self.window_s)}; expected [start, end] with start < end"
@@ -427,7 +431,10 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
 
     @model_validator(mode="after")
     def _require_static_keys(self) -> ExperimentSection:
-        """Raise `ValueError` for keys that make no sense for equilibria."""
+        """Raise `ValueError` if a series of equilibria has a key of motions: another `start` than
+        "equilibrium", another `start_rule` than "standard", `resample_hz`, or
+        `nuisance.time_shift`.
+        """
         if self.kind == "dynamic":
             return self
         usual = {"start": "equilibrium", "start_rule": "standard", "resample_hz": None}
@@ -443,7 +450,9 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
 
 
 def _require_three(places: dict[str, Any] | None, key: str) -> None:
-    """Raise `ValueError` for fewer than three positions, which do not determine a rotation."""
+    """Raise `ValueError` for fewer than three positions, which do not determine a rotation; None
+    passes. `key` is for the message.
+    """
     if places is not None and len(places) < 3:
         raise ValueError(
             f"found {len(places)} in {key}; expected at least three, to determine a rotation"

@@ -314,8 +314,16 @@ class ParameterSection(section_of(Unknown, "ParameterSection")):
 
 
 def _flatten_parameters(tables: Any, *, prefix: str = "") -> Any:
-    """Return parameters by their full names, such as ``core.mu_pa``, from tables nested by
-    region.
+    """Return parameters by their full names, such as ``core.mu_pa``, from tables nested by region.
+
+    A table with a key of `ParameterSection`, or an empty one, is a parameter; any other table is a
+    region. `prefix` precedes all names. Anything but a table is returned unchanged, to be refused
+    by the schema.
+
+    Raises
+    ------
+    ValueError
+        If two nested names are equal.
     """
     if not isinstance(tables, dict):
         return tables
@@ -452,8 +460,11 @@ class ProblemFile(Section):
 
 
 def with_experiment_defaults(content: Any) -> Any:
-    """Return the content of a problem file with [experiment_defaults] inserted into each
-    experiment.
+    """Return the content of a problem file with the keys of [experiment_defaults] in each
+    experiment that does not state them.
+
+    Only complete keys are taken over: a table in the experiment replaces that of the defaults. The
+    content itself is not modified, and is returned if there is nothing to insert.
     """
     shared = content.get("experiment_defaults") if isinstance(content, dict) else None
     experiments = content.get("experiment") if isinstance(content, dict) else None

@@ -69,12 +69,12 @@ class MethodSection(Section):
 
 
 def _method_from_table(method: str, table: Any) -> Any:
-    """Return the method with the options of its table.
+    """Return the method called `method` with the options of its table, defaults elsewhere.
 
     Raises
     ------
     InputError
-        For options that the method does not have, or invalid values.
+        If `table` is not a mapping, for options that the method does not have, or invalid values.
     """
     where = f"solver.{method}"
     if not isinstance(table, Mapping):
@@ -94,7 +94,9 @@ def _methods_with(option: str) -> list[str]:
 
 
 def _advice_on_tables(options: Sequence[str], chosen: Any) -> str:
-    """Return advice in words which options belong to which tables."""
+    """Return text that says to which method's table each of the options belongs, preferably that of
+    `chosen`, the method that the file names.
+    """
     options_by_method: dict[str, list[str]] = {}
     for option in options:
         owners = _methods_with(option)

@@ -47,8 +47,8 @@ def explain_validation_error(
 
 
 def _fault_key(fault: Fault, root: type[BaseModel]) -> list[Part]:
-    """Return the key of a fault, without tags of unions and without indices in an array of
-    numbers.
+    """Return the parts of the key of a fault, without tags of unions and without indices in an
+    array of numbers.
     """
     loc = fault["loc"]
     own = len(loc) - 1 if fault["type"] == "extra_forbidden" else len(loc)  # that is the file's
@@ -105,7 +105,11 @@ def _fault_location(fault: Fault, content: dict[str, Any], root: type[BaseModel]
 
 
 def _written_key(key: Sequence[Part], content: dict[str, Any]) -> str:
-    """Return the key as it is written in the file, with experiments by their names."""
+    """Return a key as text, as it is written in the file: "experiment 'swing': markers.file" for a
+    key of an experiment with a name, else its parts joined by dots.
+
+    A value that an experiment has from [experiment_defaults] is located there.
+    """
     value: Any = content
     defaults = _item(content, "experiment_defaults")
     if key[:1] == ["experiment"] and len(key) > 2:
@@ -125,17 +129,17 @@ def _written_key(key: Sequence[Part], content: dict[str, Any]) -> str:
 
 
 def _value_at(key: Sequence[Part], content: dict[str, Any]) -> Any:
-    """Return the value of a key; None if it does not exist."""
+    """Return the value of a key in the content of a file; None if it does not exist."""
     value: Any = content
     for part in key:
         value = _item(value, part)
     return value
 
 
-def _item(container: Any, iterate: Part) -> Any:
+def _item(container: Any, part: Part) -> Any:
     """Return an item of a table or list; None if it does not exist."""
     try:
-        return container[iterate]
+        return container[part]
     except (KeyError, IndexError, TypeError):
         return None
 
@@ -189,7 +193,9 @@ def _table_models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def shortened(value: Any) -> str:
-    """Return a value as text of at most 60 characters."""
+    """Return a value as text of at most 60 characters, booleans as in TOML; a sentence with the
+    type if Python cannot print it.
+    """
     if isinstance(value, bool):
         return str(value).lower()
     try:

@@ -50,15 +50,18 @@ class StreamedWrench(GraspWrench):
     def from_poses(
         cls, channel: GraspWrench, rotations: Array, shifts: Array, step_s: float
     ) -> StreamedWrench:
-        """Return the wrench of a grasp at consecutive time steps.
+        """Return the wrench of a grasp at n consecutive time steps.
 
         Parameters
         ----------
         channel : GraspWrench
             Wrench in the still recording, whose other properties are copied.
         rotations : (n + 2, 3, 3)
+            Rotations of the grasp at these steps, and at the ones before and after.
         shifts : (n + 2, 3)
+            Translations at the same times [m].
         step_s : float
+            Time between two steps [s].
         """
         properties = {name: getattr(channel, name) for name in GraspWrench.__dataclass_fields__}
         properties["reaction_grid"] = ReactionGrid.from_times(
@@ -70,11 +73,15 @@ class StreamedWrench(GraspWrench):
         return wrench
 
     def poses_at(self, rows: Index) -> tuple[Array, Array]:
-        """Return rotations and translations at time steps, given by index."""
+        """Return rotations (k, 3, 3) and translations (k, 3) [m] at k of the n time steps, given by
+        index (k,).
+        """
         return self.rotations[1 + rows], self.shifts[1 + rows]
 
     def pose_accelerations(self, count: int) -> tuple[Array, Array]:
-        """Return the second time derivatives of the first `count` poses, by differences."""
+        """Return the second time derivatives of rotations (count, 3, 3) [1/s²] and translations
+        (count, 3) [m/s²] at the first `count` time steps, by central differences.
+        """
         turn, shift = (
             (each[2:] - 2 * each[1:-1] + each[:-2])[:count] / self.step_s**2
             for each in (self.rotations, self.shifts)
@@ -152,7 +159,8 @@ class GraspReactions:
         self.position_columns[here, :, 1:] = moved[..., 1:]
 
     def moved_to(self, step: Array, grown: Array) -> GraspReactions:
-        """Return the forces at another linearisation point, to first order.
+        """Return a copy with the forces and sensitivities at another linearisation point, to first
+        order.
 
         Parameters
         ----------

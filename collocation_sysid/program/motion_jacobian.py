@@ -219,7 +219,7 @@ class _DroppedForce:
     positions: Index
     evaluation: int
     source: Index
-    complete: Index  # the same in both triangles, as `skew_values` has them
+    complete: Index  # the same in both triangles, as `full_skew_values` has them
     a: float
     b: float
 

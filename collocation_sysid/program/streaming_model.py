@@ -196,15 +196,15 @@ class StreamingModel:
 
     @cached_property
     def _mass_damping(self) -> tuple[Index, Array]:
-        """Indices in p of the logarithms of mass-proportional dampings, and their values at the
-        guess.
+        """Indices in p of the mass-proportional damping coefficients γ_m, and their coordinates in
+        p (logarithms) at the guess.
         """
         free = self.collocation.parameters.free
         places = np.flatnonzero([without_region(item.name) == GAMMA_M.name for item in free])
         return places, self.collocation.guess_p[places]
 
     def transformed(self, p: Array) -> Array:
-        """Return the variables in which residuals are nearly linear.
+        """Return the variables (P,) in which residuals are nearly linear, for parameters p (P,).
 
         For mass-proportional damping γ_m this is its value divided by the guess, otherwise p
         itself.
@@ -222,7 +222,9 @@ class StreamingModel:
         return p
 
     def transformation_derivatives(self, transformed: Array) -> Array:
-        """Return the derivatives (P,) of the transformed variables by p."""
+        """Return the derivatives (P,) of the transformed variables with respect to p, one per entry
+        because each depends on its own parameter only, at `transformed` (P,).
+        """
         places, _ = self._mass_damping
         rates = np.ones(len(transformed))
         rates[places] = transformed[places]
@@ -308,7 +310,7 @@ class StreamingModel:
 
     @cached_property
     def wrench_sensors(self) -> tuple[Sensor, ...]:
-        """Wrenches of grasps that are observed, and the index of the grasp, from 0."""
+        """Wrenches of grasps that sensors observe, each with the index of its grasp."""
         channels = [reading.observable for reading in self.segment.residuals]
         grasps = [id(grasp) for grasp in self.segment.experiment.grasps]
         wrenches = (channel for channel in channels if isinstance(channel, GraspWrench))
@@ -359,7 +361,10 @@ class StreamingModel:
         return float(np.linalg.norm(np.ptp(self.segment.body.nodes_m, axis=0)))
 
     def displaced_nodes(self, phi: Array) -> tuple[Array, Array]:
-        """Return H X (g, 3) of the node of each grasped dof, and its derivatives (g, 3, m) by φ."""
+        """Return the undeformed positions H X (g, 3) [m] of the node of each of the g grasped dofs,
+        H being the body's pose in the gripper, and their derivatives (g, 3, m) with respect to the
+        nuisance parameters φ.
+        """
         return self.segment.prescribed_motion.displaced_nodes(phi)
 
     def prescribed_positions(
@@ -430,7 +435,9 @@ def _still_experiment(experiment: Experiment, collocation: Collocation) -> Exper
 
 
 def _still_wrench(wrench: Wrench, t_s: NDArray) -> Wrench:
-    """Return a wrench sensor with zero measurements at these times."""
+    """Return a wrench sensor with values of zero at the times t_s, NaN for components that it does
+    not measure.
+    """
     values = np.where(wrench.measured_components, np.zeros((len(t_s), 1)), np.nan)
     return replace(wrench, t_s=t_s, values=values)
 

@@ -233,7 +233,9 @@ class StreamingSweep:
     # State ------------------------------------------------------------------------------------
 
     def _initial_state(self) -> SweepState:
-        """Return the state before the first row."""
+        """Return the state before the first row, with all arrays zero; the first row computes the
+        start.
+        """
         rows = self.model.template_rows
         dofs = self.segment.dof_count
         empty = np.zeros((rows, dofs))
@@ -244,7 +246,9 @@ class StreamingSweep:
         return SweepState(0, 0, empty, empty, node_loads, reactions, None, ())
 
     def _moved_state(self, state: SweepState, at: Array) -> SweepState:
-        """Return a state moved from the linearisation point `at` to p, to first order."""
+        """Return `state` extrapolated to first order from the parameters `at` of its linearisation
+        point to those of this pass; unchanged if they are equal.
+        """
         if state.last_rows is None or (at == self.p).all():
             return state
         moving = self.moving
@@ -289,7 +293,7 @@ class StreamingSweep:
         )
 
     def _resume(self, state: SweepState) -> None:
-        """Continue from a state, whose arrays are copied."""
+        """Replace the state of this pass, in place, by a given one, whose arrays are copied."""
         self.row = state.row
         self.end = state.end
         self.x = state.x.copy()
@@ -349,7 +353,7 @@ class StreamingSweep:
 
         Returns
         -------
-        list of Kept
+        list of StoredRow
             The computed rows, at least one.
 
         Raises
@@ -400,12 +404,14 @@ class StreamingSweep:
         return self._store_rows(computed)
 
     def _count_rows(self, count: int) -> None:
-        """Record that rows are done."""
+        """Increase the counters of completed rows by `count`, in place."""
         self.row = self.row + count
         self.end = self.end + count
 
     def _make_room(self, count: int) -> int:
-        """Shift the template if necessary for more rows; return the index of the next row in it."""
+        """Discard the oldest rows of the template, in place, so that `count` more fit; return the
+        index of the next row in it.
+        """
         surplus = self.end + count - self.model.template_rows
         if surplus > 0:
             for each in (self.x, self.force, self.prescribed_columns, *self.reactions.arrays):
@@ -414,8 +420,8 @@ class StreamingSweep:
         return self.end
 
     def _extrapolate(self, t: int, poses: Poses) -> Array:
-        """Return x_t on a cubic polynomial through the last four rows, or through fewer at the
-        start.
+        """Return an initial guess of the positions (3n,) of row t, on a cubic polynomial through
+        the last four rows, or through fewer at the start; row 0 is the initial state for `poses`.
         """
         if t == 0:
             return self._start_positions(poses)
@@ -424,7 +430,9 @@ class StreamingSweep:
         return 4 * (self.x[t - 1] + self.x[t - 3]) - 6 * self.x[t - 2] - self.x[t - 4]
 
     def _start_positions(self, poses: Poses) -> Array:
-        """Return the positions of the start (3n,) with grasps at given poses."""
+        """Return the positions (3n,) of the initial state with grasps at given poses, which a
+        Newton solve computes.
+        """
         goals_m = np.full(self.segment.dof_count, np.nan)
         goals_m[self.grasped] = self.model.prescribed_positions(self.displaced_nodes, [poses])[0][0]
         experiment = self.model.at_start(poses)
@@ -458,11 +466,14 @@ class StreamingSweep:
         return self._rows[t]
 
     def _solve_rows(self, here: range, limit: float) -> tuple[list[Array], float | None]:
-        """Solve rows once; return their columns (3n, 1 + m), and None if all are accepted.
+        """Take one Newton step in each row; return their columns (3n, 1 + m), and None if all
+        corrections are accepted.
 
-        Otherwise the last columns are those of the first row that is not accepted, because its
-        correction is longer than the limit or its matrix is singular, and the second value is the
-        length of that correction or NaN.
+        Column 0 of a row is the correction of its positions [m], the others are sensitivities.
+        Accepted corrections are added to the positions, in place. At the first row that is not
+        accepted, because its correction is longer than the limit or its matrix is singular, the
+        work stops; the last columns are then those of this row, its positions are unchanged, and
+        the second value is the length of the correction [m], or NaN for a singular matrix.
 
         Parameters
         ----------
@@ -515,9 +526,11 @@ class StreamingSweep:
         return solved, None
 
     def _store_rows(self, columns: Sequence[Array]) -> list[StoredRow]:
-        """Return the last rows for later passes, from their columns (3n, 1 + m).
+        """Return the last rows for later passes, from their columns (3n, 1 + m), which
+        `_solve_rows` returns.
 
-        Observed quantities of these rows are stored, too.
+        The reactions are corrected, and observed quantities of these rows are appended to those
+        stored, in place.
         """
         rows = slice(self.end - len(columns), self.end)
         all_columns = np.array(columns)
@@ -537,9 +550,11 @@ class StreamingSweep:
         return stored_rows
 
     def _observed_wrenches(self, here: slice) -> Array:
-        """Return wrenches and their derivatives available at rows, (rows, sensors, 6, 1 + P).
+        """Return wrenches of the sensors and their derivatives (rows, sensors, 6, 1 + P).
 
-        They are zero in the first rows, where they are not known.
+        Index 0 of the last axis has the value [N, N m], the others the derivatives with respect to
+        p. At row k the wrench is that of `DELAY_STEPS` rows before. Rows before the first available
+        wrench are zero.
         """
         sensors = self.model.wrench_sensors
         size = self.model.parameter_count
@@ -562,14 +577,23 @@ class StreamingSweep:
         return wrenches
 
     def _at_points(self, columns: Array) -> Array:
-        """Return the values at observed points (…, 3M + …, k) of columns (…, 3n, k) of the body."""
+        """Interpolate columns (…, 3n, k) of nodal values at the markers and other observed points;
+        return (…, 3M + …, k).
+        """
         nodes, weights = self._observables
         *rows, dofs, count = columns.shape
         at = columns.reshape(*rows, dofs // 3, 3, count)[..., nodes, :, :]
         return np.einsum("ma,...maik->...mik", weights, at).reshape(*rows, -1, count)
 
     def _solve_carefully(self, t: int, poses: Poses) -> Array:
-        """Return x_t, with the displacement of the grasp applied in parts if necessary."""
+        """Return the positions x_t (3n,) of row t by a full Newton solve, with the displacement of
+        the grasp applied in parts if necessary.
+
+        Raises
+        ------
+        SimulationError
+            If the row cannot be solved.
+        """
         if t == 0:
             return self._start_positions(poses)
         equations = RowEquations(self.dynamics, self.x, self.force, t)
@@ -589,12 +613,13 @@ class StreamingSweep:
     # Readings ---------------------------------------------------------------------------------
 
     def linearise_samples(self, pairs: Sequence[tuple[Sample, int]]) -> list[LinearisedResidual]:
-        """Return the linearised residuals of samples.
+        """Return the linearised residuals of samples, in the order of `pairs`.
 
         Parameters
         ----------
         pairs : sequence of (Sample, int)
-            Samples, and the number of rows computed since the row after which each is evaluated.
+            Samples, and for each the number of rows that have been computed since it became
+            available.
         """
         residuals: list[LinearisedResidual | None] = [None] * len(pairs)
         for of in {sample.instrument for sample, _ in pairs}:
@@ -613,9 +638,17 @@ class StreamingSweep:
     def _instrument_residuals(
         self, of: int, pairs: Sequence[tuple[Sample, int]]
     ) -> Iterator[tuple[Array, Array]]:
-        """Yield residuals and derivatives by p of samples of an instrument.
+        """Yield, for each sample of an instrument, residuals and their derivatives with respect to
+        p.
 
-        They are evaluated from the rows around each sample.
+        Residuals are in standard deviations, and NaN where the sample cannot be compared.
+
+        Parameters
+        ----------
+        of : int
+            Number of the instrument, counted from 1.
+        pairs : sequence of (Sample, int)
+            See `linearise_samples`.
         """
         model = self.model
         reading, stencil, observable = self.model.instruments[of - 1]
@@ -647,7 +680,8 @@ class StreamingSweep:
         )
 
     def _marker_residuals(self, reading: Sample, rows: int) -> tuple[Array, Array]:
-        """Return residuals (M, 3) of a marker sample and their derivatives (M, 3, P) by p.
+        """Return residuals (M, 3) of a marker sample, in standard deviations, and their derivatives
+        (M, 3, P) with respect to p.
 
         Residuals of missing markers are NaN.
 
@@ -655,7 +689,7 @@ class StreamingSweep:
         ----------
         reading : Sample
         rows : int
-            Number of rows computed since the row after which the sample is evaluated.
+            Number of rows that have been computed since the sample became available.
         """
         model = self.model
         neighbours = self.model.neighbouring_samples
@@ -676,9 +710,16 @@ class StreamingSweep:
         return residual[0] - reading.values / markers.sigmas[:, None], slope[0]
 
     def _interpolated_row(self, back: float) -> tuple[Array, Array]:
-        """Return positions and observed points at a time, in rows before the last one.
+        """Return positions (3n,) and observed points (3M + …, 1 + m) between stored rows.
 
-        Times before the start give the start.
+        Column 0 has the values, the others the derivatives. Four rows are interpolated by a cubic
+        polynomial; positions before the first stored row are extrapolated.
+
+        Parameters
+        ----------
+        back : float
+            How many rows before the last one, not necessarily a whole number; an integer beyond the
+            stored rows gives the first of them.
         """
         nearest = round(back)
         last = len(self.read) - 1

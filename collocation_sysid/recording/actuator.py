@@ -74,7 +74,10 @@ class Actuator(ABC, Generic[S]):
     def measure(self) -> S:
         """Scalar S of the body's shape; an `InputError` if the actuator is on no body yet."""
         if self.body_measure is None:
-            raise InputError(f"{self.name} is not on a body yet; expected one of an experiment")
+            raise InputError(
+                f"{self.name} has not been placed on a body; use the one in the tendons or "
+                "pressures of an Experiment, which places it"
+            )
         return self.body_measure.measure
 
     @property

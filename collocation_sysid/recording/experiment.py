@@ -571,7 +571,10 @@ class Experiment:
             for name in ("start_positions_m", "start_velocities_m_s"):
                 read_only_floats(getattr(self, name), self.body.nodes_m.shape, name)
         elif has_initial_state:
-            raise InputError(f"a starting state is given, but start is '{self.start}'")
+            raise InputError(
+                f"start_positions_m or start_velocities_m_s is given, but start is '{self.start}'; "
+                "expected start = 'given', or neither of them"
+            )
         if self.start == "equilibrium":
             self._require_unique_equilibrium()
 

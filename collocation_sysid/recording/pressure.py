@@ -104,7 +104,10 @@ class Pressure(Actuator[EnclosedVolume]):
         else:
             rows = np.unique(rows_of_faces(self.faces, mesh.surface))
             if rows[0] < 0:
-                raise InputError(f"{self.name}: not all faces are on the boundary of the body")
+                raise InputError(
+                    f"{self.name}: not all faces are on the boundary of the body; expected faces "
+                    "that have the material on one side only"
+                )
         # Seen from the cavity, the outside of the material is the inside.
         wall = body.nodes.nodes_of_faces(mesh.surface[rows][:, ::-1])
         volume = EnclosedVolume(wall, len(body.nodes_m))

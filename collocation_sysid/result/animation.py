@@ -1,8 +1,7 @@
 """Film of a run: the fitted body, the edges of its forward simulation over it, and the markers.
 
 Beside the body a panel shows the distance of the markers from their measurements over time.
-`animate`
-works from a run folder, `write_film` from a `ReplayCommand`.
+`animate` works from a run folder, `film` from a `MotionRecord`.
 """
 
 from __future__ import annotations
@@ -91,8 +90,7 @@ def animate(
     ------
     InputError
         If `run` is not a run folder or has no such experiment, for another kind of file, if ffmpeg
-        is
-        missing, and for numbers out of range.
+        is missing, and for numbers out of range.
     """
     for name, value in (("--fps", fps), ("--slow", slowdown)):
         if not 0 < value < np.inf:
@@ -122,12 +120,13 @@ def film(
 
     Parameters
     ----------
-    replay : ReplayCommand
+    replay : MotionRecord
         Experiment with at least one trajectory.
     file : Path
         Ends in .mp4 or .gif.
-    fps, slow, progress
-        See `animate`. A static experiment is shown with `STATES_A_SECOND` samples per second.
+    fps, slowdown, progress
+        See `animate`. A static experiment is shown with `STATIC_SAMPLES_PER_SECOND` samples per
+        second.
     names : (str, str)
         Labels of the fitted and of the simulated trajectory.
     headline : str
@@ -187,7 +186,7 @@ def film_samples(t_s: Array, fps: float, slowdown: float) -> NDArray[np.int64]:
     Raises
     ------
     InputError
-        If the film would have more than `MOST_FRAMES` frames.
+        If the film would have more than `MAX_FILM_FRAMES` frames.
     """
     duration = float(t_s[-1] - t_s[0])
     count = round(duration * slowdown * fps) + 1

@@ -89,7 +89,9 @@ def _body_section(body: BodyCheck) -> Table:
 
 
 def _rest_shape(body: BodyCheck) -> str:
-    """Return what is known of the stress-free shape, which is not the mesh."""
+    """Return a text on the stress-free shape: that it is not stated, or how far it differs from the
+    mesh, or that none was found.
+    """
     if body.rest_shape is None:
         return "not stated; set object.rest_shape"
     if np.isnan(body.rest_shape_change_m):
@@ -154,7 +156,9 @@ def _measurements_section(findings: QuickCheck) -> Table:
 
 
 def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
-    """Return a sentence on each grasp of an experiment; several grasps are numbered from 1."""
+    """Return table rows with a sentence on each grasp of an experiment, by label; several grasps
+    are numbered from 1.
+    """
     own = [grasp_sentence(grasp) for grasp in holds if grasp.experiment == experiment]
     if len(own) == 1:
         return {f"grasp of '{experiment}'": own[0]}

@@ -1,7 +1,7 @@
 """Points of depth cameras and outlines of the body's surface, as pictures and films need them.
 
 `surface_rows` is for a fitted or simulated surface, `undeformed_rows` for the undeformed body
-before anything is fitted. Both give the rows of `ReplayCommand.fit_summary`.
+before anything is fitted. Both give the rows of `MotionRecord.visible_points`.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class DepthProjection:
         return np.pad(image, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 2)
 
     def point_rows(self, sample: int, points_m: Array, rays: Array, distances_m: Array) -> Array:
-        """Return rows (P, 8) of `ReplayCommand.fit_summary` for the points of one sample.
+        """Return rows (P, 8) of `MotionRecord.visible_points` for the points of one sample.
 
         Parameters
         ----------
@@ -130,7 +130,7 @@ class DepthProjection:
         return np.column_stack([t_s, self.image_points(points_m, world), distances_m, world])
 
     def outline_rows(self, sample: int, shape_m: Array) -> Array:
-        """Return rows (k, 8) of `ReplayCommand.fit_summary` with the outlines of a shape (n, 3).
+        """Return rows (k, 8) of `MotionRecord.visible_points` with the outlines of a shape (n, 3).
 
         The last row has the time alone, so that the sample is known also if no face is in view.
         """
@@ -153,7 +153,8 @@ def surface_rows(surface: SurfaceComparison, up: Array) -> Array:
     Returns
     -------
     (k, 8) array
-        Rows of `ReplayCommand.fit_summary`, with outlines for at most `OUTLINED` samples.
+        Rows of `MotionRecord.visible_points`, with outlines for at most
+        `MAX_OUTLINED_SAMPLES` samples.
     """
     correspondences = surface.correspondences
     shapes_m = surface.shapes_m
@@ -176,8 +177,8 @@ def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
     """Return the first image of each depth camera with the undeformed body, before anything is
     fitted.
 
-    The arrays (k, 8) have the rows of `ReplayCommand.fit_summary`, by name of the camera; the body
-    is where the grasps carry it rigidly, and distances from it are NaN.
+    The arrays (k, 8) have the rows of `MotionRecord.visible_points`, by name of the camera; the
+    body is where the grasps carry it rigidly, and distances from it are NaN.
     """
     nuisance = NuisanceMap.from_experiment(experiment)
     by_camera = {}

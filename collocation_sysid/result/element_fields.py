@@ -1,15 +1,13 @@
 """Fields in each element: det F, elastic energy density, and von Mises stress.
 
 Each value is the mean over an element, weighted by the volumes of its quadrature points. The stress
-is
-Cauchy's elastic stress, without the damping stress: with P = ∂ψ/∂F,
+is Cauchy's elastic stress, without the damping stress: with P = ∂ψ/∂F,
 
     σ = P Fᵀ / J,   s = σ − ⅓ (tr σ) I,   von Mises: √(3/2 s:s)
 
 (Holzapfel 2000, eqs. 3.9 and 6.4); the von Mises stress of uniaxial stress is that stress itself. F
-is
-the deformation gradient in the constitutive law: where an element averages the dilatation, J is the
-ratio of its volumes at every point.
+is the deformation gradient in the constitutive law: where an element averages the dilatation, J is
+the ratio of its volumes at every point.
 """
 
 from __future__ import annotations
@@ -72,7 +70,7 @@ class ElementFields:
         return cls(body, theta, evaluators, volumes)
 
     def evaluate_at(self, positions_m: ArrayLike) -> dict[str, Array]:
-        """Return the fields at node positions, by `NAMES`.
+        """Return the fields at node positions, by `FIELD_NAMES`.
 
         Parameters
         ----------
@@ -82,8 +80,7 @@ class ElementFields:
         -------
         dict of str to (T, E)
             det F, elastic energy density [J/m³] and von Mises stress [Pa]. In an inverted element,
-            where
-            ln J does not exist, the values that need it are NaN.
+            where ln J does not exist, the values that need it are NaN.
         """
         body = self.body
         x = np.ascontiguousarray(positions_m, dtype=float).reshape(-1, body.nodes_m.size)
@@ -99,8 +96,8 @@ class ElementFields:
 
 
 def field_kernel(element: Element, law: PointLaw) -> ElementKernel:
-    """Return the compiled fields at a quadrature point times its volume; see `expressions` for the
-    inputs.
+    """Return the compiled fields at a quadrature point times its volume; see `ElementKernel` for
+    the inputs.
     """
     point = quadrature_point(element, law, "x")
     fields = ca.vertcat(*_point_fields(law, point.local_constants))
@@ -114,10 +111,10 @@ _DEFORMATION_GRADIENT = ca.SX.sym("F", 9)
 
 
 def _point_fields(law: PointLaw, constants: ca.SX) -> tuple[ca.SX, ...]:
-    """Return det F, the energy density and the von Mises stress as expressions in `_F`.
+    """Return det F, the energy density and the von Mises stress as expressions.
 
-    `_F` has the nine components of the deformation gradient column after column; `constants` are
-    the constants of the law.
+    They depend on the symbol `_DEFORMATION_GRADIENT`, which has the nine components of the
+    deformation gradient column after column, and on `constants`, the constants of the law.
     """
     f = ca.reshape(_DEFORMATION_GRADIENT, 3, 3)
     j = ca.det(f)

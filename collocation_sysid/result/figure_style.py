@@ -169,8 +169,7 @@ def make_log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
     """Make the y axis logarithmic, with plain numbers where these are short.
 
     The limits are widened to span at least the ratio `least_ratio`, so that at least two numbers
-    are
-    shown.
+    are shown.
     """
     axes.set_yscale("log")
     low, high = axes.get_ylim()

@@ -68,12 +68,13 @@ def export_page(
 def field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
     """Return a field (T, F) on the boundary triangles, at each sample that of the nearest frame.
 
-    Point data are averaged over the corners of a triangle; of vectors the norm is taken.
+    Point data are averaged over the corners of a triangle; of vectors the norm is taken. Contact
+    pressure and gap come from `replay` and need no frames.
 
     Raises
     ------
     InputError
-        If the frames have no such field.
+        If the frames have no such field, or there are none.
     """
     if field in CONTACT_FIELDS and (contact_values := getattr(replay, field)) is not None:
         return contact_values
@@ -119,8 +120,7 @@ def view_run(
     ------
     InputError
         If pyvista is missing, `run` is not a run folder, or it has no frames, no such experiment or
-        no
-        such field.
+        no such field.
     """
     if find_spec("pyvista") is None:
         raise InputError(
@@ -178,7 +178,7 @@ class _FrameWindow:
         Time [s] and file of each frame.
     field : str
         Point or cell data that colour the body.
-    replay : ReplayCommand
+    replay : MotionRecord
         The experiment, for markers, grasped nodes and obstacles.
     off_screen : bool
         Draw without a window.

@@ -164,7 +164,7 @@ class ParameterSliders:
 
     @classmethod
     def from_run(cls, run: SolvedProblem, experiment: str | None = None) -> ParameterSliders:
-        """Return the sliders of a run, see `pipeline.Run.interactive`.
+        """Return the sliders of a run, see `Run.interactive`.
 
         Raises
         ------
@@ -180,7 +180,10 @@ class ParameterSliders:
             each.name for each in run.start_parameters.free if not is_field_coefficient(each.name)
         ]
         if not names:
-            raise InputError("no parameter was estimated, so that there is nothing to slide")
+            raise InputError(
+                "no parameter was estimated; expected a run with one that is not fixed, because "
+                "sliders change estimated parameters"
+            )
         ranges = {}
         for each in names:
             linear, bounds = run.start_parameters.scale_and_bounds(each)
@@ -265,7 +268,9 @@ class ParameterSliders:
         return "; ".join(texts) or "no measurement to compare with"
 
     def _figure(self, simulation: ForwardSimulation) -> Figure:
-        """Return the picture of the first kind of measurements that the recording has."""
+        """Return the picture of the first kind of measurements that the recording has: markers, a
+        wrench, a custom sensor; without these, the picture of the shapes.
+        """
         from .pictures.over_time import marker_tracks, sensor_picture
 
         experiment = self._experiment

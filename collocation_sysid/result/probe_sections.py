@@ -86,10 +86,8 @@ def is_deeper_check_worthwhile(result: Result) -> bool:
     """Return whether `solve --probe` may explain the concerns of the verdict.
 
     It may if the residuals, a prediction or a routine probe contradict the model, error bars exist,
-    and
-    nothing else has to be corrected first. A wide combined interval does not count, because its
-    budget
-    already says what to measure.
+    and nothing else has to be corrected first. A wide combined interval does not count, because its
+    budget already says what to measure.
     """
     concerns = result.trust.concerns
     if not result.budget or not is_routine(result):
@@ -100,7 +98,7 @@ def is_deeper_check_worthwhile(result: Result) -> bool:
 
 
 def _shown_estimates(result: Result) -> list[str]:
-    """Return the names of the estimates that the table has as columns, at most `SHOWN`."""
+    """Return the names of the estimates that the table has as columns, at most `MAX_ESTIMATES`."""
     known = [n for n, each in result.values.items() if each.statistical95]
     first = [name for name in known if name in STIFFNESS_NAMES[:1]]
     return [*first, *(n for n in known if n in result.parameters and n not in first)][
@@ -136,8 +134,7 @@ def _conclusions(result: Result) -> Iterator[str]:
     """Yield sentences on the significant probes, or that there is none.
 
     First come windows and recordings that disagree with the rest, then relaxed assumptions, then
-    the most
-    important assumption that the data do not determine.
+    the most important assumption that the data do not determine.
     """
     significant = [probe for probe in result.probes if probe.sentences]
     relaxed = sorted(

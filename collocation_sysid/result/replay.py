@@ -1,6 +1,6 @@
 """Motion of one experiment of a run: measured, fitted and simulated shapes and markers.
 
-Pictures, films and the 3-D view need nothing but a `ReplayCommand`. It can be read from the arrays
+Pictures, films and the 3-D view need nothing but a `MotionRecord`. It can be read from the arrays
 of a run folder (`read_run`), so that they can be drawn again without solving.
 """
 
@@ -116,8 +116,7 @@ class MotionRecord:
         Natural frequencies at the estimate, ascending; None if they are unknown.
     wrenches : sequence of (S, 19)
         For each force sensor: time [s], and six components as measured, fitted and simulated; NaN
-        where
-        one of these is missing.
+        where one of these is missing.
     static : bool
         Whether every sample is an equilibrium of its own.
     tendons_m : (p, 3), or None
@@ -249,8 +248,7 @@ class MotionRecord:
         `sample`.
 
         Of each camera, the image nearest in time counts if it is at most half a timestep away;
-        without one
-        the camera adds no points.
+        without one the camera adds no points.
         """
         tolerance_s = float(np.diff(self.t_s).max(initial=0.0)) / 2 + TIME_TOLERANCE_S
         nearest = [np.zeros((0, 3))]
@@ -295,7 +293,7 @@ class MotionRecord:
     @classmethod
     def from_arrays(cls, name: str, arrays: Mapping[str, Any]) -> MotionRecord:
         """Return the experiment called `name` from the arrays of a run, see
-        `ReplayCommand.to_arrays`.
+        `MotionRecord.to_arrays`.
 
         Raises
         ------
@@ -444,8 +442,8 @@ def read_run(folder: str | Path) -> tuple[Result, list[MotionRecord]]:
 
 
 def run_headline(result: Result) -> str:
-    """Return Young's moduli with their combined standard uncertainties, and the verdict, in one
-    line.
+    """Return Young's moduli, each with its combined standard uncertainty if known, and the verdict,
+    as one line of text.
     """
     moduli = {
         symbol_of(n): each for n, each in result.values.items() if without_region(n) == "young_pa"

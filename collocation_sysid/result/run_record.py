@@ -40,11 +40,9 @@ def write_run(
 
     The folder gets ``result.json``, ``problem.toml`` as it was run if the problem has a file,
     ``trajectory.npz``, and ``frames/`` with ``trajectory.pvd`` for ParaView. With several
-    experiments,
-    the name of the experiment precedes the names of arrays and the folders of frames. `draw_run`
-    adds
-    the pictures after the folder is in its place, so that an error while drawing does not lose the
-    result.
+    experiments, the name of the experiment precedes the names of arrays and the folders of
+    frames. `draw_run` adds the pictures after the folder is in its place, so that an error while
+    drawing does not lose the result.
 
     Parameters
     ----------
@@ -58,7 +56,7 @@ def write_run(
     Raises
     ------
     InputError
-        If the folder holds anything but an earlier run; see `writers.replaced_folder`.
+        If the folder holds anything but an earlier run; see `replaced_folder`.
     """
     result = build_result(solved)
     with replaced_folder(folder) as place:
@@ -143,10 +141,8 @@ def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
     constants.
 
     Each array has one row for each of the E elements. A constant has four: its estimate, the ends
-    of its
-    95 % interval (suffixes ``_lower``, ``_upper``), and its posterior over its prior standard
-    deviation
-    (suffix ``_over_prior``).
+    of its 95 % interval (suffixes ``_lower``, ``_upper``), and its posterior over its prior
+    standard deviation (suffix ``_over_prior``).
     """
     data: dict[str, Any] = {"region": body.part_of_cells} if len(body.parts) > 1 else {}
     for name, values in _field_estimates(finished, body).items():
@@ -188,8 +184,7 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
     files.
 
     The fitted experiments come first, then those for validation. A validation experiment whose
-    forward
-    simulation failed is left out.
+    forward simulation failed is left out.
     """
     fitted = {}
     collected = []
@@ -225,7 +220,7 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
 def _depth_rows(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
     """Return the points of each depth camera on the fitted surface, or else on the simulated one.
 
-    The arrays are as in `ReplayCommand.fit_summary`, by name of the camera; empty where neither
+    The arrays are as in `MotionRecord.visible_points`, by name of the camera; empty where neither
     surface is known.
     """
     part = finished.solution.part_of(experiment.name)
@@ -253,9 +248,10 @@ def _depth_rows(finished: SolvedProblem, experiment: Experiment) -> dict[str, Ar
 def _surface_contact(
     finished: SolvedProblem, experiment: Experiment, positions_m: Array
 ) -> tuple[Array, Array] | None:
-    """Return gap [m] and contact pressure [Pa] on the surface, (T, F) each; None without obstacles.
+    """Return gap [m] and contact pressure [Pa] on the boundary triangles, (T, F) each; None without
+    obstacles.
 
-    `positions_m` are the node positions (T, n, 3).
+    `positions_m` are the node positions (T, n, 3) [m].
     """
     if not experiment.obstacles:
         return None
@@ -270,7 +266,7 @@ def _surface_contact(
 def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
     """Return the estimates (E, 4) of each spatially varying constant, by name of the field.
 
-    The columns are those of `ReplayCommand.fields`. Rows of elements in other regions are NaN.
+    The columns are those of `MotionRecord.fields`. Rows of elements in other regions are NaN.
     """
     estimates = {}
     for part in body.parts:
@@ -285,8 +281,7 @@ def _wrench_columns(finished: SolvedProblem, experiment: Experiment) -> list[Arr
     simulated.
 
     The wrenches are those of the whole specimen also where symmetry reduces the model to a part of
-    it.
-    NaN where the experiment was not fitted or not simulated.
+    it. NaN where the experiment was not fitted or not simulated.
     """
     sensors = experiment.wrenches
     rollout = finished.rollouts[experiment.name]
@@ -323,8 +318,8 @@ def _custom_sensor_columns(finished: SolvedProblem, experiment: Experiment) -> d
 def _comparison_columns(t_s: Array, measured: Array, *models: Array | None) -> Array:
     """Return the columns time, measured values and the values of each model, as one array.
 
-    `t_s` is (S,), `measured` and each of `drawn_models` (S, m); the columns of a model that is None
-    are NaN.
+    `t_s` is (S,), `measured` and each of `models` (S, m); the columns of a model that is None are
+    NaN.
     """
     columns = (np.full_like(measured, np.nan) if each is None else each for each in models)
     return np.column_stack([t_s, measured, *columns])

@@ -326,7 +326,9 @@ def budget_table(result: Result) -> Table:
 
 
 def _estimate_row(result: Result, name: str) -> tuple[str, ...]:
-    """Return the table row of an estimate: value, uncertainties, interval, guess, and a remark."""
+    """Return the cells of an estimate after its name: value, combined uncertainty and interval,
+    statistical and systematic uncertainty, guess, and a remark.
+    """
     each = result.values[name]
     interval = _interval_text(each.combined95)
     remark = each.reason or ""
@@ -449,8 +451,7 @@ def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str
     """Yield lines on how far a forward simulation is from the measurements.
 
     For a validation experiment, the errors of a blind prediction and of copied measurements follow
-    for
-    comparison.
+    for comparison.
 
     Parameters
     ----------
@@ -635,7 +636,9 @@ def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
 
 
 def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
-    """Yield a table of what each marker's residuals suggest, and a table of the largest errors."""
+    """Yield a table with the diagnosis of each marker's residuals, and a headed table of the
+    largest errors in the folder `run`; a table without rows is left out.
+    """
     if result.residuals:
         rows = tuple(
             (
@@ -656,7 +659,7 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
     """Return the largest marker residuals of a run folder as (error [m], time [s], marker), largest
     first.
 
-    Of each marker, two listed errors are more than `LEAST_DISAGREEMENT_RATIO` samples apart.
+    Of each marker, two listed errors are more than `ERROR_SPACING_SAMPLES` samples apart.
 
     Raises
     ------
@@ -688,14 +691,13 @@ def _captioned_pictures(run: Path) -> list[Picture]:
     """Return every PNG picture of the folder with its caption.
 
     A picture that compares measurement and fit is first; then follow the pictures known to
-    `CAPTIONS`
-    in that order, and unknown ones.
+    `PICTURE_CAPTIONS` in that order, and unknown ones.
     """
     order = [*PICTURE_CAPTIONS, ""]
     pictures: list[Picture] = []
 
     def kind(file: Path) -> str:
-        """Return the key of `CAPTIONS` with which the name of a picture begins; "" if none."""
+        """Return the key of `PICTURE_CAPTIONS` with which a name begins; "" if none."""
         return next(k for k in order if file.stem.startswith(k))
 
     for file in sorted(own_pictures(run), key=lambda file: (order.index(kind(file)), file.name)):

@@ -148,8 +148,7 @@ def write_frames(
     """Write a trajectory as frames/frame_0000.vtu, … and trajectory.pvd, and return the latter.
 
     Every frame has `displacement_m` and `velocity_m_s` at the points, and the `fields` in the
-    cells. Of
-    more than `max_frames` samples every second, third, … is written.
+    cells. Of more than `max_frames` samples every second, third, … is written.
 
     Parameters
     ----------
@@ -212,8 +211,7 @@ def replaced_folder(
     """Yield a temporary folder to write into, and rename it to `path` at the end.
 
     An earlier run at `path` is replaced completely, at the end, if this program wrote every file in
-    it
-    and none was changed since. After an exception the temporary folder is removed and `path` is
+    it and none was changed since. After an exception the temporary folder is removed and `path` is
     unchanged. The folder gets a list of its files, see `written_files`.
 
     Parameters
@@ -230,8 +228,7 @@ def replaced_folder(
     ------
     InputError
         If there is anything else at `path`, or a link; this is checked before the temporary folder
-        is
-        given, so that no work is lost, and again at the end.
+        is given, so that no work is lost, and again at the end.
     """
     target = _resolved_parent(Path(path))
     require_replaceable(target, overwrite, marker_file, content_word)

@@ -43,12 +43,12 @@ class Heartbeat:
 
     Parameters
     ----------
-    doing : callable
+    current_activity : callable
         Returns the current activity as text.
-    tell : callable
+    show_line : callable
         Shows a line.
     first_s : float, optional
-        Time of the first line [s]; `FIRST_S` by default.
+        Time of the first line [s]; `FIRST_LINE_S` by default.
     """
 
     NAME = "heartbeat"
@@ -241,7 +241,7 @@ def _remaining_time(elapsed_s: float, share: float) -> str:
 
 
 def _iteration_table(lines: list[Iteration]) -> Shown:
-    """Return the table of the last iterations; "" before the first."""
+    """Return the table of the last iterations; "" if `lines` is empty."""
     if not lines:
         return ""
     heads = ("", "RMS mm", "violation N", *map(symbol_of, lines[-1].parameters), "s")
@@ -249,7 +249,9 @@ def _iteration_table(lines: list[Iteration]) -> Shown:
 
 
 def _iteration_row(line: Iteration) -> tuple[str, ...]:
-    """Return the table row of an iteration."""
+    """Return the table row of an iteration: number, marker error [mm], violation [N], parameters,
+    and time [s].
+    """
     values = (f"{value:.4g}" for value in line.parameters.values())
     rms_mm = f"{line.rms_m * 1e3:.4f}"
     violation = f"{line.violation_n:.1e}"

@@ -112,12 +112,11 @@ def write_data(
     folder : str or Path
         Created if missing; gets ``<experiment>_markers.csv`` if there are markers,
         ``<experiment>_poses.csv`` (``_poses_2`` … by the number of the grasp) for grasps whose
-        poses the
-        problem reads, ``<experiment>_wrench.csv`` (``_wrench_2`` …) for grasps with a force sensor,
-        ``<experiment>_reading_<name>.csv`` for custom sensors, and ``<experiment>/`` with frames if
-        requested. An experiment whose displacements come from a table, as on a test bench, gets its
-        tables of displacement and load under their names in the problem file, in place of poses and
-        wrenches.
+        poses the problem reads, ``<experiment>_wrench.csv`` (``_wrench_2`` …) for grasps with a
+        force sensor, ``<experiment>_reading_<name>.csv`` for custom sensors, and ``<experiment>/``
+        with frames if requested. An experiment whose displacements come from a table, as on a test
+        bench, gets its tables of displacement and load under their names in the problem file, in
+        place of poses and wrenches.
     recipe : Recipe, optional
         Integrator, noise and seed; without noise by default.
     progress : callable, optional
@@ -132,10 +131,8 @@ def write_data(
     ------
     InputError
         Before anything is written: for a parameter without a guess, if the folder has files of
-        others,
-        or if a file would be overwritten that the problem reads or that this program did not write.
-        The
-        problem's own folder may have other files.
+        others, or if a file would be overwritten that the problem reads or that this program did
+        not write. The problem's own folder may have other files.
     SimulationError
         If a simulation fails, before anything is written.
     """
@@ -300,8 +297,7 @@ def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> Non
     """Refuse to write into a folder with files of others, or over a file that the problem reads.
 
     A file that the problem reads may be a measured recording. The problem's own folder may have
-    other
-    files.
+    other files.
 
     Parameters
     ----------

@@ -83,11 +83,11 @@ def write_page(
     """Write the fitted and the simulated motion of an experiment as a stand-alone web page.
 
     The page draws on a plain canvas, in any browser and without a network. Of more than
-    `MOST_FRAMES` samples every second, third, … is kept.
+    `MAX_PAGE_FRAMES` samples every second, third, … is kept.
 
     Parameters
     ----------
-    replay : ReplayCommand
+    replay : MotionRecord
         Experiment with at least one trajectory.
     file : str or Path
         HTML file to write; it is replaced only after the page is complete.
@@ -125,9 +125,7 @@ def _trajectories(replay: MotionRecord) -> dict[str, Array]:
 
 
 def _page_data(replay: MotionRecord, colouring: Colouring) -> dict[str, Any]:
-    """Return the data of the page, ready for JSON; arrays are in base64, see
-    `_pack_without_lifted`.
-    """
+    """Return the data of the page, ready for JSON; arrays are in base64, see `_base64`."""
     samples = np.arange(0, len(replay.t_s), -(-len(replay.t_s) // MAX_PAGE_FRAMES))
     surface_nodes, nodes = np.unique(replay.surface_nodes, return_inverse=True)
     nodes = nodes.reshape(len(replay.surface), -1)
@@ -169,12 +167,11 @@ def surface_strain(replay: MotionRecord, positions_m: Array) -> Array:
     """Return the largest principal strain (T, F) of the elements below the boundary triangles.
 
     The strain is the largest stretch minus one. It is computed from the corners of an element,
-    which
-    for a quadratic element gives an average. NaN where a position is not finite.
+    which for a quadratic element gives an average. NaN where a position is not finite.
 
     Parameters
     ----------
-    replay : ReplayCommand
+    replay : MotionRecord
     positions_m : (T, n, 3)
         Node positions of one of its trajectories.
     """

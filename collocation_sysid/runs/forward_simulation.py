@@ -131,9 +131,12 @@ def simulate_experiment(
     solution: Solution,
     report: Callable[[float], None] | None = None,
 ) -> ForwardSimulation | str:
-    """Simulate an experiment with a solution's parameters; return the reason if that fails.
+    """Simulate an experiment with the parameters of a solution; return the reason as text if that
+    fails.
 
-    `report` is called with the completed share of the simulation, from 0 to 1.
+    The result of a validation experiment has also its nuisance parameters, and the errors of a
+    blind prediction and of a copy of the nearest recording. `report` is called with the completed
+    share of the simulation, from 0 to 1.
     """
     try:
         segment, phi = transcription_and_nuisance(experiment, solution)
@@ -286,7 +289,9 @@ def _predict_instruments(
 def _blind_error(
     problem: Problem, segment: Transcription, solution: Solution
 ) -> PredictionErrors | None:
-    """Predict a recording with the nuisance parameters of the fitted ones; None if that fails."""
+    """Return the errors of a prediction of a recording with the nuisance parameters of the fitted
+    recordings; None if the simulation fails.
+    """
     phi = nuisance_of_fitted_recordings(segment, solution)
     try:
         trajectory = _simulate(problem, segment, phi, solution.parameters)
@@ -301,8 +306,13 @@ def transcription_and_nuisance(
 ) -> tuple[Transcription, Array]:
     """Return an experiment's transcription and its nuisance parameters φ (k,).
 
-    For a fitted experiment φ is the estimate; for validation it is fitted at the estimated
-    material.
+    For a fitted experiment φ is the estimate; for validation φ is fitted to its measurements, with
+    the material at its estimate, which takes a solve.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If that solve is interrupted.
     """
     if (part := solution.part_of(experiment.name)) is not None:
         return part.segment, part.phi
@@ -381,9 +391,8 @@ def step_error(
 def _sensor_differences(
     part: ExperimentIterate, trajectory: Trajectory, share: float
 ) -> list[Array]:
-    """Return a share of the difference between simulated and fitted custom sensors, over σ.
-
-    Of each sensor (S, G, 3).
+    """Return `share` times the difference (simulated − fitted) of each custom sensor, (S, G, 3),
+    over σ; zero where a value is NaN.
     """
     if not (segment := part.segment).custom_sensors:
         return []
@@ -404,9 +413,8 @@ def _sensor_differences(
 def _depth_differences(
     part: ExperimentIterate, trajectory: Trajectory, share: float
 ) -> list[Array]:
-    """Return a share of the difference between simulated and fitted depth residuals.
-
-    Of each camera (S, M, 3), at the correspondences of the fit.
+    """Return the change of each depth camera's residuals, (S, M, 3), for `share` times the
+    difference between simulated and fitted positions, at the correspondences of the fit.
     """
     if not (sights := part.surface_residuals):
         return []
@@ -427,7 +435,19 @@ def _depth_differences(
 def _predict_sensors(
     segment: Transcription, x: Array, reactions: tuple[ReactionGrid, ReactionForces], phi: Array
 ) -> list[Array]:
-    """Return the predictions (S, G, 3) of custom sensors for positions x (T, 3n) at the samples."""
+    """Return the predictions of custom sensors, for each (S, G, 3) at S samples of G points or
+    wrenches.
+
+    Parameters
+    ----------
+    segment : Transcription
+    x : (T, 3n) array
+        Positions at the samples [m].
+    reactions : (ReactionGrid, ReactionForces)
+        Grid and values of the reactions of grasps, for sensors of forces.
+    phi : (k,) array
+        Nuisance parameters of the recording.
+    """
     grid = reactions[0]
 
     def forced() -> ReactionForces:
@@ -441,9 +461,10 @@ def _predict_sensors(
 
 
 def _step_error_share(problem: Problem, segment: Transcription) -> float | None:
-    """Return the share of the difference to a forward simulation that half the step would make.
+    """Return the share of the difference between forward simulation and fit that half the time step
+    would remove.
 
-    None if the simulation is no finer than the fit; 1 for static experiments.
+    None if the simulation is not Newmark's or no finer than the fit; 1 for static experiments.
     """
     experiment = segment.experiment
     options = problem.rollout
@@ -459,9 +480,11 @@ def _step_error_share(problem: Problem, segment: Transcription) -> float | None:
 
 
 def _step_s(problem: Problem, segment: Transcription) -> float:
-    """Return the step of the forward simulation [s]: as stated, or finer than the grid of the fit.
+    """Return the step of the forward simulation [s]: the stated one, by default finer than the grid
+    of the fit.
 
-    By default at most a quarter of the sample interval and half the grid step.
+    The default is at most a quarter of the sample interval and at most half the grid step, unless
+    that makes too many steps.
     """
     count = min(max(4, 2 * segment.substeps), MOST_STEPS - 1)
     return problem.rollout.timestep_s or segment.experiment.timestep_s / count

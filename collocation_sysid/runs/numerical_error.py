@@ -32,8 +32,8 @@ def finer_step(problem: Problem) -> Problem:
 
 
 def finer_mesh(problem: Problem) -> Problem:
-    """Return the problem with every tetrahedron split into eight, except in the cells of specimens,
-    which are exact.
+    """Return the problem with every tetrahedron of its bodies split into eight, and experiments,
+    grasps included, that refer to the new meshes; the cells of specimens are exact and stay.
     """
     meshed = [each.body for each in problem.experiments if each.specimen is None]
     bodies = {id(body): refine_body(body) for body in {id(b): b for b in meshed}.values()}
@@ -131,7 +131,9 @@ def solve_refined(
 def _errors_from_levels(
     levels: Sequence[RefinementLevel], problem: Problem, estimates: Mapping[str, Estimate]
 ) -> Refinement:
-    """Return the numerical errors from the levels solved so far."""
+    """Return the numerical errors of the estimates from the levels solved so far, with these
+    levels.
+    """
     by_step, by_mesh = (
         [each.values for each in levels if each.refined == kind] for kind in REFINEMENTS
     )
@@ -143,8 +145,14 @@ def _errors_from_levels(
 
 
 def _solve_refined_problem(problem: Problem, start: WarmStart, what: str) -> Solution:
-    """Solve a finer problem in reduced space; `what` names it in the message of the
-    `InputError`.
+    """Solve a finer problem in reduced space from an earlier answer.
+
+    Raises
+    ------
+    InputError
+        If it is not solved; `what` names the problem in the message.
+    KeyboardInterrupt
+        If the solve is interrupted.
     """
     solution = solve(problem, ReducedSpace(ladder=(1.0,), tolerance=TOLERANCE), start=start)
     if not solution.unless_interrupted().status.converged:
@@ -156,13 +164,13 @@ def _solve_refined_problem(problem: Problem, start: WarmStart, what: str) -> Sol
 
 
 def _level_summary(kind: str, level: int, solution: Solution) -> RefinementLevel:
-    """Return the summary of a level from its solution.
+    """Return size, cost and estimates of a solved level.
 
     Parameters
     ----------
     kind : {"step", "mesh"}
     level : int
-        How often it was halved.
+        How often the step or the edges were halved.
     solution : Solution
     """
     segments = solution.collocation.transcriptions

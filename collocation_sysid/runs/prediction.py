@@ -108,9 +108,10 @@ class InstrumentPrediction:
 
 
 def prediction_error(experiment: Experiment, predicted: InstrumentPrediction) -> PredictionErrors:
-    """Return the differences between a prediction and the measurements of its recording.
+    """Return RMS and maximum differences between a prediction and the measurements of its
+    recording, for each kind of instrument.
 
-    Values that are not measured, or not predicted, are left out.
+    Values that are not measured, or not predicted, are left out; a kind without values has None.
     """
     distance_m = np.linalg.norm(predicted.markers_m - experiment.markers.positions_m, axis=2)
     present_m = distance_m[experiment.markers.is_present & np.isfinite(distance_m)]
@@ -128,7 +129,10 @@ def prediction_error(experiment: Experiment, predicted: InstrumentPrediction) ->
 def instrument_misfits(
     experiment: Experiment, predicted: InstrumentPrediction
 ) -> list[InstrumentMisfit]:
-    """Return the differences over stated σ of each instrument that measured anything."""
+    """Return the RMS of (prediction − measurement) / σ of each instrument, with the stated σ.
+
+    Markers and depth cameras without measurements are left out.
+    """
     results = []
     markers = experiment.markers
     if markers.is_present.any():
@@ -156,7 +160,19 @@ def instrument_misfits(
 
 
 def _misfit(what: str, declared_size: str, ratio: Array, size: str = "") -> InstrumentMisfit:
-    """Return the misfit of differences over σ, `ratio`, in which NaN is left out."""
+    """Return the misfit of one instrument.
+
+    Parameters
+    ----------
+    what : str
+        The instrument, for messages.
+    declared_size : str
+        Name of its stated σ, for messages.
+    ratio : array
+        Differences over σ; NaN is ignored.
+    size : str
+        RMS with its unit, for messages; "" if there is none.
+    """
     known = ratio[np.isfinite(ratio)]
     sigmas = root_mean(known**2)
     return InstrumentMisfit(what, declared_size, sigmas, sigmas, known.size, size)
@@ -242,7 +258,9 @@ def nearest_recording_error(
 
 
 def _reason_against_copy(experiment: Experiment, other: Experiment) -> str:
-    """Return why another recording's measurements do not predict a recording; "" if they do."""
+    """Return why the measurements of `other` cannot be compared with those of a recording as a
+    prediction, such as other markers; "" if they can.
+    """
     own = experiment.markers
     others = other.markers
     if not (own.sample_count or experiment.wrenches or experiment.readings):

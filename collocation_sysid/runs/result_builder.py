@@ -165,7 +165,10 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
 
 
 def _field_result(estimate: FieldEstimate) -> FieldResult:
-    """Return the summary of a field; its intervals are None if the covariance is not finite."""
+    """Return the summary of a field: its resolution, range of values and number of determined
+    modes. If the covariance is not finite, the share of the determined volume and the number of
+    modes are None.
+    """
     modes = estimate.modes
     volumes_m3 = estimate.modes.volumes_m3
     ends = (float(estimate.value.min()), float(estimate.value.max()))
@@ -180,7 +183,9 @@ def _field_result(estimate: FieldEstimate) -> FieldResult:
 
 
 def _recordings_agreement(answer: SolvedProblem) -> dict[str, RecordingsAgreement] | None:
-    """Return the agreement of the recordings, by parameter; None if it was not evaluated."""
+    """Return the estimates from single recordings, to first order, and their agreement, by
+    parameter, without coefficients of fields; None if this was not evaluated.
+    """
     if answer.uncertainty is None or (scatter := answer.uncertainty.scatter) is None:
         return None
     q = answer.solution.q
@@ -202,7 +207,9 @@ def _recordings_agreement(answer: SolvedProblem) -> dict[str, RecordingsAgreemen
 
 
 def _fit_result(answer: SolvedProblem) -> FitResult:
-    """Return the residuals of the fit of each experiment."""
+    """Return the residuals of the fit of each experiment and of all together, with expected noise
+    and sentences on nuisance parameters.
+    """
     solution = answer.solution
     experiments = {}
     depths: dict[str, dict[str, DepthError]] = {}
@@ -247,7 +254,9 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
 
 
 def _forward_results(answer: SolvedProblem) -> ForwardResult:
-    """Return the errors of the forward simulations of all experiments."""
+    """Return the errors of the forward simulations of all experiments, and RMS and maximum over the
+    markers of fitted ones (None without markers).
+    """
     experiments = {}
     squares = []
     largest = []
@@ -263,12 +272,12 @@ def _forward_results(answer: SolvedProblem) -> ForwardResult:
 
 
 def _sensor_units(experiment: Experiment) -> dict[str, str] | None:
-    """Units of the readings that state one, by name; None where none does."""
+    """Return the units of the custom sensors that state one, by name; None if none does."""
     return {gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit} or None
 
 
 def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedExperiment:
-    """Return the errors of the forward simulation of an experiment."""
+    """Return the errors of the forward simulation of an experiment, or the reason why it failed."""
     fitted = experiment.name in answer.solution.rms_by_experiment_m
     simulated = answer.rollouts[experiment.name]
     if not isinstance(simulated, ForwardSimulation):
@@ -357,7 +366,8 @@ def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Itera
 def _nuisance_sentence(
     part: ExperimentIterate, components: Sequence[int], values: Array, answer: SolvedProblem
 ) -> str:
-    """Return the sentence on a vector, or a number, of nuisance parameters.
+    """Return a sentence with the size of a nuisance parameter, or of a vector of them, its standard
+    error if known, and its prior.
 
     Parameters
     ----------

@@ -477,8 +477,7 @@ class Result:
     `timing_s` is about the iterations of the method alone, `elapsed_s` about the whole run. `basis`
     names what the values refer to: the damping law, and what sets the scale; `budget` has each
     source's share of an estimate's variance; `deep_probes` are refits with an assumption relaxed
-    and,
-    where requested, of parts of the data.
+    and, where requested, of parts of the data.
     """
 
     schema: int

@@ -51,10 +51,10 @@ def has_local_minima(collocation: Collocation) -> bool:
 
 
 def robust_loss(solution: Solution) -> float:
-    """Return the loss with priors, with points beyond the gate counted as at the gate.
+    """Return the loss with priors, in which a point beyond the gate counts like one at the gate.
 
-    The loss leaves out points beyond the gate of a depth camera: compared by it, the solution that
-    loses most points would seem the best.
+    The loss of a solution leaves out points beyond the gate of a depth camera: compared by it, the
+    solution that loses most points would seem the best.
     """
     collocation = solution.collocation
     p, _ = collocation.unpack(solution.z)
@@ -72,11 +72,15 @@ def follow_starts(
 ) -> CompletedStart:
     """Follow the starts of a scan to convergence and return the one with the lowest loss.
 
+    The best start of the scan is returned without a solution if the scan found only one start, if
+    the problem has no local minima, if no start converges, or after an interrupt; an interrupted
+    solution is returned with it if the method is reduced space.
+
     Parameters
     ----------
     solver : Method
         If this is not the reduced-space method, the starts are followed in reduced space, which is
-        much faster, and the solver goes on from the best start.
+        much faster, and the result has no solution: the solver goes on from the best start.
     collocation : Collocation
         With the guesses of the scan's best stiffness.
     scan : Scan

@@ -113,7 +113,9 @@ class SolvedProblem:
         return {name: self._report_estimate(name, each) for name, each in self.optimum.items()}
 
     def _report_estimate(self, name: str, optimum: Estimate) -> ReportedEstimate:
-        """Correct an estimate at the optimum and combine its uncertainties."""
+        """Return the estimate to report: corrected for the known discretisation error and known
+        effects, with combined and statistical uncertainties.
+        """
         item = next((each for each in self.start_parameters.items if each.name == name), None)
         line = self.budget.get(name)
         error = None if is_field_coefficient(name) else self.discretisation_errors.get(name)
@@ -146,7 +148,9 @@ class SolvedProblem:
 
     @cached_property
     def budget(self) -> dict[str, BudgetLine]:
-        """The uncertainty budget of each estimate, by name; empty without error bars."""
+        """The uncertainty budget of each estimate, by name; empty without error bars or systematic
+        effects.
+        """
         if self.uncertainty is None or self.systematic_effects is None:
             return {}
         return budget(
@@ -289,7 +293,7 @@ class SolvedProblem:
         return pandas.DataFrame.from_dict(rows, orient="index")
 
     def _row(self, name: str) -> dict[str, float | str]:
-        """Return the row of a data frame."""
+        """Return the row of an estimate in `to_frame`, by column; NaN for unknown numbers."""
         each = self.estimates[name]
         combined = each.combined95 or (np.nan, np.nan)
         statistical = each.statistical95 or (np.nan, np.nan)
@@ -316,7 +320,9 @@ class SolvedProblem:
 
     @property
     def all_notes(self) -> tuple[str, ...]:
-        """Notes on the solve and its uncertainty, and statements on what the data determine."""
+        """Notes on the solve and its uncertainty, sentences on what the data determine, and the
+        messages of profiles; each note once.
+        """
         if self.uncertainty is None:
             return self.notes
         notes = (*self.notes, *self.uncertainty.notes, *identifiability_sentences(self.uncertainty))
@@ -329,7 +335,9 @@ def _or_nan(value: float | None) -> float:
 
 
 def _estimate_text(estimate: ReportedEstimate) -> str:
-    """Return value, standard uncertainty and combined interval as text."""
+    """Return an estimate as text: the value, " ± " and the standard uncertainty, and the combined
+    interval in brackets, each only if it is known.
+    """
     error = "" if estimate.combined_std_error is None else f" ± {estimate.combined_std_error:.2g}"
     interval = (
         "" if estimate.combined95 is None else " [{:.5g}, {:.5g}]".format(*estimate.combined95)

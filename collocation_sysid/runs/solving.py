@@ -100,7 +100,21 @@ def _solve_with_likeliest_lengths(
 
     The likelihood of each length follows to first order from a solution, see
     `statistics.field_estimates`. The problem is solved again, from there, with the most likely
-    lengths, until these no longer change or were tried before.
+    lengths, until these no longer change or were tried before, or a solve does not converge.
+    Two-phase fields without phases are solved by `solve_two_phases` instead.
+
+    Parameters
+    ----------
+    problem : Problem
+    start : str, Path, WarmStart or None
+        Start of the first solve, see `solve`.
+    solve_once : callable
+        ``solve_once(problem, start)``, the solution with the lengths of the problem.
+
+    Returns
+    -------
+    Solution
+        The last solution.
     """
     if any(not modes.has_phases for modes in problem.two_phase_fields.values()):
         return solve_two_phases(problem, start, solve_once)
@@ -221,8 +235,8 @@ def _depth_notes(solution: Solution) -> Iterator[str]:
 
 
 def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:
-    """Return the method with workers for its experiments; itself without workers or for other
-    methods.
+    """Return the reduced-space method with workers that solve its experiments; any other method,
+    and any without workers, is returned unchanged.
     """
     if workers is None or not isinstance(solver, ReducedSpace):
         return solver
@@ -234,12 +248,20 @@ def _solve_from_scan(
 ) -> tuple[Scan | None, Solution]:
     """Solve from the result of a scan after a search from the guess failed.
 
+    Parameters
+    ----------
+    solver : Method
+    failed : Solution
+        The failed search.
+    watch : callable or None
+        Called with every iteration.
+
     Returns
     -------
     scan : Scan or None
         None if the scan finds no start, or the search from there fails too.
     solution : Solution
-        The new solution, or the failed one.
+        The new solution, also if it was interrupted, or the failed one.
     """
     reason = f"the search from the guess failed ({failed.status.value})"
     needs_complete_start = getattr(solver, "needs_complete_start", False)
@@ -253,9 +275,11 @@ def _solve_from_scan(
 
 
 def _best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -> Solution:
-    """Return the better of a solution and the solution from a second start, if
-    `second_start_parameters` has
-    one.
+    """Return the better of a solution and of the solution from its `second_start_parameters`, with
+    a note if that is the second one.
+
+    Without a second start the first solution is returned; after an interrupt it is returned as
+    interrupted.
     """
     other = second_start_parameters(first)
     if other is None:
@@ -280,7 +304,17 @@ def solve_with_renewed_correspondences(
     """Solve, and repeat while estimates change the correspondences of the measurements.
 
     These are the elements of markers, the points of depth cameras, and the sample intervals of
-    clocks. At most `REREADINGS` repetitions.
+    clocks. There are at most `MOST_REREADINGS` repetitions, and none after a solve that does not
+    converge.
+
+    Parameters
+    ----------
+    solver : Method
+    collocation : Collocation
+    watch : callable or None
+        Called with every iteration.
+    start : (variables,) array, optional
+        Start of the first solve; by default the method chooses it from the guesses.
     """
     solution = solver(collocation, watch, start)
     for _ in range(MOST_REREADINGS):
@@ -327,7 +361,9 @@ def second_start_parameters(solution: Solution) -> Parameters | None:
 
 
 def _usual_modulus(name: str, young_pa: float) -> float:
-    """Return the value of a modulus for the usual Poisson's ratio and a Young's modulus [Pa]."""
+    """Return the starting value of one of the `LAME` constants: `USUAL_POISSON` for a Poisson's
+    ratio, or the modulus [Pa] that follows from it and from Young's modulus.
+    """
     value = (
         USUAL_POISSON
         if without_region(name) == "poisson"

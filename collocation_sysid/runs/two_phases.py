@@ -94,7 +94,9 @@ class _SmoothFitQuality:
     determined: float
 
     def lack_of_fit(self, chi_squared: float) -> float:
-        """Return T of `statistics.phase_sampling`, at least one, of an answer with this χ²."""
+        """Return the temperature T of `statistics.phase_sampling` for an answer with this χ²: its
+        excess over the smooth fit per determined parameter, at least one.
+        """
         return max(1.0, (chi_squared - self.chi_squared) / max(1.0, self.determined))
 
 
@@ -178,14 +180,14 @@ def solve_two_phases(
 
 
 def _phases_of_solution(solution: Solution, search: _PhaseSearch) -> Array:
-    """Return the phases (E,) of a solution."""
+    """Return the phases (E,) of the two-phase field in a solution: 1 in inclusions, 0 elsewhere."""
     modes = _two_phase_body(solution, search).parts[search.number].field
     assert isinstance(modes, TwoPhaseModes)
     return modes.phase
 
 
 def _two_phase_body(solution: Solution, search: _PhaseSearch) -> Body:
-    """Return the body with the two-phase field."""
+    """Return the body, among those of a solution, that has the two-phase field of `search`."""
     segments = solution.collocation.transcriptions
     return next(s.body for s in segments if search.name in s.body.field_lengths_m)
 
@@ -203,8 +205,12 @@ def _solve_with_phases(
 
 
 def _two_phase_search(problem: Problem) -> _PhaseSearch:
-    """Return the two-phase field of a problem; an `InputError` for several, or for too many
-    elements.
+    """Return the two-phase field of a problem, of which there is at least one.
+
+    Raises
+    ------
+    InputError
+        For several fields, or too many elements.
     """
     fields = problem.two_phase_fields
     if len(fields) > 1:
@@ -226,7 +232,9 @@ def _two_phase_search(problem: Problem) -> _PhaseSearch:
 
 
 def _likelier_phases(probability: Array) -> Array:
-    """Return the likelier phase (E,) of every element; neither phase is left empty."""
+    """Return the likelier phase (E,) of every element, from the probability (E,) of an inclusion;
+    each phase has at least `FEWEST_ELEMENTS` elements.
+    """
     phase = is_inclusion(probability).astype(float)
     order = np.argsort(probability)
     if phase.sum() < FEWEST_ELEMENTS:
@@ -274,7 +282,9 @@ class _LinearisedMeasurements:
 def _linearise_in_elements(
     problem: Problem, search: _PhaseSearch, solution: Solution
 ) -> _LinearisedMeasurements:
-    """Return the measurements linearised at a solution in the logarithm of every element."""
+    """Return the measurements linearised at a solution with the logarithm of the constant in every
+    element as a parameter, instead of the shapes of the field.
+    """
     body = _two_phase_body(solution, search)
     part = body.parts[search.number]
     assert part.field is not None
@@ -292,7 +302,7 @@ def _linearise_in_elements(
 
 
 def _columns(fit: LinearisedFit, search: _PhaseSearch) -> Index:
-    """Return the columns of the elements' logarithms in a fit."""
+    """Return the column (E,) of each element's logarithm in a fit."""
     places = {name: k for k, name in enumerate(fit.names)}
     return np.array([places[name] for name in search.elements])
 
@@ -300,7 +310,22 @@ def _columns(fit: LinearisedFit, search: _PhaseSearch) -> Index:
 def _samples(
     draws: PosteriorDraws, fit: LinearisedFit, search: _PhaseSearch, solution: Solution
 ) -> PhaseSamples:
-    """Return draws of the phases as samples of the logarithms in the elements."""
+    """Return draws of the phases as samples of the logarithms in the elements.
+
+    Parameters
+    ----------
+    draws : PosteriorDraws
+    fit : LinearisedFit
+        Fit with the elements' logarithms as further parameters.
+    search : _PhaseSearch
+    solution : Solution
+        Its estimates are the mean of the other parameters.
+
+    Returns
+    -------
+    PhaseSamples
+        `smooth_misfit` is NaN: the caller sets it.
+    """
     others = np.delete(np.arange(len(fit.names)), _columns(fit, search))
     shared = [int(k) for k in others if k < fit.shared_count]
     names = tuple(fit.names[k] for k in shared)
@@ -355,7 +380,11 @@ def _chi_squared_per_measurement(fit: LinearisedFit) -> float:
 def _normal_equations(
     fit: LinearisedFit, of_z: Index, *, base: Array, deviation: float, temperature: float
 ) -> ElementInformation:
-    """Return the normal equations of a linearised fit.
+    """Return the blocks of the normal equations of a linearised fit, for the logarithms of the
+    elements and for all other parameters.
+
+    Nothing is eliminated. Priors of the other parameters are included; the prior of the elements is
+    not, but its deviation is copied to the result.
 
     Parameters
     ----------
@@ -393,7 +422,7 @@ def _normal_equations(
 
 
 def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
-    """Return the solution whose body has the samples of the phases."""
+    """Return the solution with a body whose two-phase fields have these samples."""
     collocation = solution.collocation
     bodies: dict[int, Body] = {}
     for body in dict.fromkeys(segment.body for segment in collocation.transcriptions):
@@ -415,7 +444,9 @@ def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
 def _marker_associations(
     collocation: Collocation, experiments: Sequence[Experiment]
 ) -> dict[str, MarkerAssociation]:
-    """Return the marker–element associations for bodies that differ in their fields only."""
+    """Return the marker–element associations of a program, by experiment, for the bodies of
+    `experiments`, which differ from those of the program in their fields only.
+    """
     bodies = {experiment.name: experiment.body for experiment in experiments}
     return {
         segment.experiment.name: replace(segment.association, body=bodies[segment.experiment.name])

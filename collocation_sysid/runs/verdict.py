@@ -132,7 +132,8 @@ def combined_concerns(
     estimates: Mapping[str, ReportedEstimate],
     shares: Mapping[str, Mapping[str, float]],
 ) -> list[Concern]:
-    """Return a concern for each estimated parameter with a combined interval wider than its value.
+    """Return a concern for each estimated parameter whose combined interval is wider than its
+    value, or that has a budget but no interval.
 
     Derived moduli give none: λ of a nearly incompressible material is rarely determined.
 
@@ -174,7 +175,8 @@ def body_concerns(solution: Solution) -> Iterator[Concern]:
 
 
 def allowance_concerns(solution: Solution) -> Iterator[Concern]:
-    """Yield a concern for each static experiment with a `sigma_m` larger than the noise of cameras.
+    """Yield a concern for each static experiment whose `sigma_m`, relative to the size of the body,
+    is larger than the noise of cameras.
 
     In motions the autocorrelation of the residuals shows this; static experiments have none.
     """
@@ -188,14 +190,18 @@ def allowance_concerns(solution: Solution) -> Iterator[Concern]:
 
 
 def _prediction_concerns(rollouts: Mapping[str, ForwardSimulation | str]) -> Iterator[Concern]:
-    """Yield concerns about simulations with given parameters that differ by more than the noise."""
+    """Yield concerns about forward simulations that differ from the measurements by more than the
+    noise; failed simulations, given by their reason, are ignored.
+    """
     for name, rollout in rollouts.items():
         for misfit in rollout.misfits if isinstance(rollout, ForwardSimulation) else ():
             yield from prediction_concerns(name, **vars(misfit))
 
 
 def _unseen_depth_concerns(name: str, rollout: ForwardSimulation | str) -> Iterator[Concern]:
-    """Yield a concern for each depth camera without a point near the simulated surface."""
+    """Yield a concern for each depth camera without a point within its gate of the simulated
+    surface; none if the simulation failed.
+    """
     for camera, error in rollout.depth.items() if isinstance(rollout, ForwardSimulation) else ():
         if not error.points:
             data = {"experiment": name, "camera": camera, "seen": error.compared_points}
@@ -205,7 +211,8 @@ def _unseen_depth_concerns(name: str, rollout: ForwardSimulation | str) -> Itera
 def _forward_concerns(
     name: str, rollout: ForwardSimulation | str, solution: Solution, noise_m: float
 ) -> list[Concern]:
-    """Return concerns about the forward simulation of an experiment.
+    """Return concerns about the forward simulation of an experiment: that it failed, or that its
+    errors are larger than the noise and the residuals of the fit.
 
     Parameters
     ----------
@@ -244,7 +251,9 @@ def _depth_concerns(name: str, rollout: ForwardSimulation, solution: Solution) -
 
 
 def depth_errors(solution: Solution) -> dict[tuple[str, str], DepthError]:
-    """Distances of depth cameras' points from the fitted surface, by (experiment, camera)."""
+    """Return the distances of depth cameras' points from the fitted surface, by (experiment,
+    camera).
+    """
     return {
         (part.segment.experiment.name, reading.correspondences.camera.depth.name): (
             SurfaceComparison.from_fit(reading, part.x, observation, part.phi).error
@@ -255,7 +264,9 @@ def depth_errors(solution: Solution) -> dict[tuple[str, str], DepthError]:
 
 
 def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float:
-    """RMS distance of the fitted markers that is expected from noise with the stated σ [m]."""
+    """Return the RMS distance [m] of the fitted markers that is expected from noise with the stated
+    σ, less what the fitted parameters absorb; without `uncertainty` they absorb nothing.
+    """
     markers = [segment.experiment.markers for segment in solution.collocation.transcriptions]
     samples = np.concatenate([each.is_present.sum(axis=0) for each in markers]).astype(float)
     sigma_m = np.concatenate([each.sigma_m for each in markers])
@@ -265,7 +276,8 @@ def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float
 
 
 def modes_by_experiment(problem: Problem, solution: Solution) -> dict[str, ModesCheck]:
-    """Natural modes of each body at the estimates, by experiment; empty if the search failed.
+    """Return the natural modes of each body at the estimates, by experiment; empty if the search
+    failed.
 
     Static experiments, and those without an equilibrium, are left out.
     """

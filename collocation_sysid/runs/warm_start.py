@@ -136,8 +136,8 @@ class WarmStart:
         return collocation.with_marker_places(places_m)
 
     def _known_places(self, segment: Transcription) -> dict[int, Array]:
-        """Return earlier places (3,) of those markers of a segment whose places are estimated, by
-        index.
+        """Return the earlier place (3,) [m] of each marker whose place is estimated in a segment,
+        by index of the marker; markers without an earlier place are left out.
         """
         places_m = self.places_m.get(segment.experiment.name, {})
         names = segment.experiment.markers.names

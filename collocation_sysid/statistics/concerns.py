@@ -233,8 +233,8 @@ TOPICS: Mapping[str, Topic] = {
             "at-bound": "{name} is at a bound",
             "not-yet": "{name} is not known yet: {reason}",
             "static": f"{{names}} {{verb}} static: {NO_DAMPING}; {FIX_DAMPING}",
-            "still": f"nothing moves in {{names}}: {NO_DAMPING}, and information on stiffness only "
-            f"from the sag; {FIX_DAMPING}",
+            "still": f"nothing moves in {{names}}: {NO_DAMPING}, and only the deflection under "
+            f"gravity determines the stiffness; {FIX_DAMPING}",
             "rate": f"{MODE} has only {{samples:.1f}} samples per period, too few to resolve it: "
             "record at {needed_hz:.2g} Hz or more",
             "short": f"one period of {MODE} is longer than the {{duration_s:.3g}} s recorded, "

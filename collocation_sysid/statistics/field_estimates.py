@@ -185,16 +185,15 @@ class FieldEstimate:
         Parameters
         ----------
         length_m : float, optional
-            Correlation length; None means the present one. If the present one is given, the result
-            is 0 for any `factor`.
+            Correlation length; None means the present one.
         factor : float
             Factor of the amplitude.
         """
-        if self.phases is not None or self._is_wider_than_prior or length_m == self.modes.length_m:
+        if self.phases is not None or self._is_wider_than_prior:
             return 0.0
         size = len(self.coefficients)
         prior = factor**2 * np.eye(size)
-        if length_m is not None:
+        if length_m is not None and length_m != self.modes.length_m:
             other = np.linalg.lstsq(
                 self.modes.shapes, self.modes.with_length(length_m).shapes, rcond=None
             )

@@ -65,7 +65,7 @@ def write_design(
 
     Parameters
     ----------
-    design : DesignCommand
+    design : Design
         Design.
     folder : str or Path
         Folder, which may contain an earlier design; that is replaced.
@@ -134,7 +134,7 @@ def design_json(design: Design) -> dict[str, Any]:
 
 
 def _error_bars_json(bars: ErrorBars) -> dict[str, Any]:
-    """Return error bars for JSON."""
+    """Return value, error bars and their range over the draws, by parameter, for JSON."""
     return {
         name: {
             "value": value,
@@ -150,8 +150,8 @@ def _error_bars_json(bars: ErrorBars) -> dict[str, Any]:
 
 
 def _gripper_poses(design: Design) -> PoseSequence:
-    """Return the poses of the gripper if the problem states its transform to the body, else
-    of the body.
+    """Return the designed poses: of the gripper if the problem states `gripper_to_body`, else of
+    the body.
     """
     origin = design.recording.problem.origin
     name = design.recording.template.name
@@ -167,8 +167,8 @@ def _gripper_poses(design: Design) -> PoseSequence:
 
 
 def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
-    """Return the problem file for the designed recording, with the existing ones if they
-    are used.
+    """Return the content of a problem file in `folder` for the designed recording, with guesses at
+    the middle draw; existing recordings are kept only if they are used.
     """
     origin = design.recording.problem.origin
     recording = design.recording
@@ -197,7 +197,9 @@ def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
 
 
 def _designed_table(table: dict[str, Any]) -> dict[str, Any]:
-    """Return an experiment's table with the files of the design; the table is modified."""
+    """Return an experiment's table, modified in place, that reads poses, markers and wrench from
+    the files of the design.
+    """
     for key in OF_TIME:
         table.pop(key, None)
     grasp = table["grasp"][0] if isinstance(table["grasp"], list) else table["grasp"]
@@ -214,8 +216,8 @@ def _designed_table(table: dict[str, Any]) -> dict[str, Any]:
 
 
 def _designed_wrench(wrench: dict[str, Any]) -> dict[str, Any]:
-    """Return a wrench's table with the file of the design, which refers to the mesh and is
-    in newtons.
+    """Return a copy of a wrench's table that reads the file of the design, in newtons and for the
+    modelled part of the body.
     """
     parts = wrench.get("symmetry", 1)
     sigmas = {key: wrench[key] / parts for key in ("sigma_n", "sigma_nm") if key in wrench}
@@ -224,7 +226,8 @@ def _designed_wrench(wrench: dict[str, Any]) -> dict[str, Any]:
 
 
 def _relative_to(value: Any, old: Path, new: Path) -> Any:
-    """Return a table of a problem with file names relative to another folder.
+    """Return a copy of nested content of a problem with file names relative to the folder `new`
+    instead of `old`.
 
     Names of columns are not file names.
     """

@@ -68,7 +68,7 @@ def _percent(share: float) -> str:
 
 
 def _column_note(design: Design) -> str:
-    """Return an explanation of the columns."""
+    """Return a sentence that says which recordings the columns "before" and "after" refer to."""
     duration = f"{design.experiment.duration_s:.4g} s"
     after = f"after: the designed motion of {duration}"
     if design.added:
@@ -121,7 +121,9 @@ def motion_picture(design: Design) -> Figure:
 
 
 def error_bars_picture(design: Design) -> Figure:
-    """Draw the relative error bars before and after; lines span those over the draws of θ."""
+    """Draw the relative error bars before, if known, and after; lines show their range over the
+    draws of θ.
+    """
     names = list(design.after.relative)
     figure = new_figure(PAGE_MM / 2, 14 + 9 * len(names))
     axes = figure.subplots()

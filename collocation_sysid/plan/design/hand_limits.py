@@ -150,8 +150,8 @@ class Limits(Section):
 
 
 def _beyond_cone(camera: CameraSection, points_m: Array) -> Array:
-    """Return the angles (…) [rad] by which points (…, 3) are outside a camera's cone;
-    negative inside.
+    """Return the angles (…) [rad] by which points (…, 3) [m] are outside the cone of a camera's
+    field of view; negative inside.
     """
     position_m = np.array(camera.position_m)
     ray = points_m - position_m
@@ -178,8 +178,8 @@ class HandBounds:
 
     @property
     def reach(self) -> tuple[Array, Array, Array]:
-        """Largest values (2,), first and second derivatives, each of translation [m] and
-        rotation [rad].
+        """Largest translation [m] and rotation [rad], (2,), and the same of their first and second
+        derivatives by time.
         """
         limits = self.limits
         farthest = np.maximum(-self.low_m, self.high_m).max()
@@ -197,8 +197,13 @@ class HandBounds:
         return self._translation_shares(*course) | self._rotation_shares(*course)
 
     def _translation_shares(self, *course: Array) -> dict[str, float]:
-        """Return the shares of the translation's limits, from coordinates and derivatives
-        (T, 6).
+        """Return the largest translation, speed and acceleration as shares of their limits, by name
+        of the limit.
+
+        Parameters
+        ----------
+        course : three (T, 6) arrays
+            Coordinates of a motion, their first and their second derivatives, in SI units.
         """
         shift, rate, curvature = (each[:, :3] for each in course)
         limits = self.limits
@@ -209,7 +214,14 @@ class HandBounds:
         }
 
     def _rotation_shares(self, *course: Array) -> dict[str, float]:
-        """Return the shares of the rotation's limits, from coordinates and derivatives (T, 6)."""
+        """Return the largest rotation, angular speed and angular acceleration as shares of their
+        limits, by name of the limit.
+
+        Parameters
+        ----------
+        course : three (T, 6) arrays
+            Coordinates of a motion, their first and their second derivatives, in SI units.
+        """
         turn = course[0][:, 3:]
         limits = self.limits
         largest = map(_largest_norm, (turn, *angular_motion(*(each[:, 3:] for each in course))))
@@ -229,7 +241,9 @@ class HandBounds:
         return motion.scaled(shift, self._rotation_scale(course))
 
     def _rotation_scale(self, course: tuple[Array, Array, Array]) -> float:
-        """Return the factor of the rotations."""
+        """Return the factor, at most 1, of the rotation vectors with which all limits of the
+        rotation are satisfied; `course` has coordinates and derivatives (T, 6).
+        """
         scale = 1.0
         while (
             largest := max(self._rotation_shares(*(scale * c for c in course)).values())

@@ -114,8 +114,8 @@ class HandMotion:
         return OWN + PER_WAVE * 6 * waves
 
     def scaled(self, translation: float = 1.0, rotation: float = 1.0) -> HandMotion:
-        """Return the motion with translations multiplied by `translation` and rotation vectors by
-        `cayley_rotation`.
+        """Return the motion with all translations multiplied by `translation` and all rotation
+        vectors by `rotation`.
         """
         factors = np.repeat([translation, rotation], 3)[:, None]
         return replace(self, amplitude=factors * self.amplitude)
@@ -150,9 +150,10 @@ class HandMotion:
         )
 
     def _window(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return the window (T, 1) and its first two derivatives.
+        """Return the factor (T, 1) of the waves at times t (T,) [s], and its first two derivatives,
+        so that the motion begins and ends at rest.
 
-        It rises as 10 u³ − 15 u⁴ + 6 u⁵ and falls likewise.
+        With u from 0 to 1 it rises as 10 u³ − 15 u⁴ + 6 u⁵, and falls likewise.
         """
         rising = t <= self.active_s / 2
         u = np.clip(np.where(rising, t, self.active_s - t) / self.rise_s, 0.0, 1.0)
@@ -164,8 +165,8 @@ class HandMotion:
 
 
 def angular_motion(r: Array, rate: Array, curvature: Array) -> tuple[Array, Array]:
-    """Return angular velocity and acceleration (T, 3) of exp(r), from r and its derivatives
-    (T, 3).
+    """Return angular velocity [rad/s] and acceleration [rad/s²] (T, 3), in the fixed frame, of the
+    rotation exp(r), from the rotation vector r (T, 3) and its first two derivatives.
     """
     angle = np.linalg.norm(r, axis=1)
     a, b, a_slope, b_slope = (each[:, None] for each in _jacobian_factors(angle))
@@ -179,7 +180,11 @@ def angular_motion(r: Array, rate: Array, curvature: Array) -> tuple[Array, Arra
 
 
 def _jacobian_factors(angle: Array) -> tuple[Array, Array, Array, Array]:
-    """Return a and b of the left Jacobian, and (da/dθ)/θ and (db/dθ)/θ, at angles (T,) [rad]."""
+    """Return the factors a = (1 − cos θ)/θ² and b = (θ − sin θ)/θ³ of the left Jacobian, and
+    (da/dθ)/θ and (db/dθ)/θ, (T,) each, at angles θ (T,) [rad].
+
+    Series are used near zero.
+    """
     small = angle < 1e-2
     x = np.where(small, 1.0, angle)
     sine = np.sin(x)

@@ -95,7 +95,9 @@ class ErrorBars:
 
     @classmethod
     def from_draws(cls, errors: list[PredictedErrors]) -> ErrorBars:
-        """Return the error bars from those at the draws, the middle first."""
+        """Return the error bars at the first draw, the middle, with the lowest and the highest over
+        all draws.
+        """
         each = [error.relative for error in errors]
         lowest, highest = ({n: pick(e[n] for e in each) for n in each[0]} for pick in (min, max))
         return cls(errors[0].values, each[0], lowest, highest)
@@ -199,7 +201,7 @@ class MotionObjective:
         return ThetaMap(recording.problem.parameters, recording.template.body)
 
     def motion(self, coefficients: Array) -> HandMotion:
-        """Return the motion of any coefficients, scaled to the limits."""
+        """Return the motion for coefficients (d,), scaled so that it satisfies all limits."""
         recording = self.recording
         free = HandMotion.from_coefficients(
             coefficients,
@@ -210,8 +212,8 @@ class MotionObjective:
         return self.bounds.scale_to_limits(free)
 
     def errors(self, information: Array | float, q: Array) -> PredictedErrors:
-        """Return the error bars at q with the existing recordings and additional
-        information (nq, nq).
+        """Return the error bars at the parameters q (nq,) from existing recordings, priors, and
+        additional information (nq, nq), or 0 for none.
         """
         parameters = self.recording.problem.parameters
         return PredictedErrors.from_information(
@@ -219,10 +221,11 @@ class MotionObjective:
         )
 
     def first_guess(self, options: DesignOptions, say: Say) -> SearchResult:
-        """Return the best motion to first order, as a start of the search.
+        """Return the motion with the smallest error bars to first order in the motion, as a start
+        of the search.
 
         The result has no coefficients if a wrench is measured too, the memory would be too large,
-        or the simulation fails.
+        or the simulation fails. `say` is called with the progress.
         """
         sensed = self.recording.template.grasps[0].wrench is not None
         if sensed or LinearRecording.gigabytes(self.recording) > MOST_GIGABYTES:
@@ -252,10 +255,11 @@ class MotionObjective:
         return minimise(value, size, count, options.seed, report)
 
     def value(self, coefficients: Array, bound: float) -> float:
-        """Return the logarithm of the error bar; `FORBIDDEN` or more if a simulation fails or a
-        view is left.
+        """Return the logarithm of the error bar of a motion; `FORBIDDEN` or more if a simulation
+        fails or a marker leaves the views.
 
-        If the value at the middle of the prior exceeds `bound`, the other draws are not simulated.
+        If the value at the middle of the prior exceeds `bound`, it is returned, and the other draws
+        are not simulated.
 
         Parameters
         ----------
@@ -363,7 +367,9 @@ def design_motion(
 
 
 def _evaluate_design(judge: MotionObjective, best: SearchResult, add: bool) -> Design:
-    """Return the design with the best motion and its error bars."""
+    """Return the design with the best motion, its error bars and its simulation; `best` must have
+    coefficients.
+    """
     assert best.coefficients is not None
     recording = judge.recording
     motion = judge.motion(best.coefficients)
@@ -390,7 +396,10 @@ def _evaluate_design(judge: MotionObjective, best: SearchResult, add: bool) -> D
 
 
 def _before(judge: MotionObjective, add: bool) -> ErrorBars | None:
-    """Error bars of the recordings there are, or of the motion that the problem has."""
+    """Return the error bars to compare with: those of the existing recordings if the new one is
+    added, else those of the motion in the problem; None if that has no motion or cannot be
+    simulated.
+    """
     if add:
         return ErrorBars.from_draws([judge.errors(0.0, q) for q in judge.draws])
     recording = judge.recording
@@ -406,13 +415,27 @@ def _before(judge: MotionObjective, add: bool) -> ErrorBars | None:
 
 
 def _error_bars(judge: MotionObjective, results: list[SimulatedMotion]) -> ErrorBars:
-    """Return the error bars from the motion's information at all draws."""
+    """Return the error bars of a motion, together with existing recordings and priors, from its
+    information at all draws of q.
+    """
     pairs = zip(results, judge.draws, strict=True)
     return ErrorBars.from_draws([judge.errors(each.information, q) for each, q in pairs])
 
 
 def _draws_from_recordings(problem: Problem, options: DesignOptions) -> tuple[list[Array], Array]:
-    """Return draws of q around the estimate, and the information (nq, nq) of the recordings."""
+    """Solve the existing recordings; return draws (nq,) of the parameters q around the estimate,
+    the estimate first, and the information (nq, nq) of the recordings.
+
+    q are the solver's coordinates: logarithms, or values of linear parameters. Poorly determined
+    parameters are drawn no wider than `options.spread`.
+
+    Raises
+    ------
+    InputError
+        If the solve does not converge.
+    KeyboardInterrupt
+        If it is interrupted.
+    """
     solution = solve(problem)
     solution.unless_interrupted()
     if not solution.status.converged:

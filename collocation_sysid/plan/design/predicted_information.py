@@ -78,7 +78,10 @@ class DesignCriterion:
         require_among(self.over, get_args(Over), None, "--over")
 
     def log_size(self, errors: PredictedErrors) -> float:
-        """Return the logarithm of the error bar that is minimised."""
+        """Return the logarithm of the error bar of the named parameters that is minimised: the
+        largest, for "A" the root mean square, for "D" the geometric mean over the axes of the
+        confidence ellipsoid.
+        """
         slopes = errors.slopes_of(self.names)
         covariance = slopes @ errors.covariance @ slopes.T
         if self.kind == "D":
@@ -87,7 +90,9 @@ class DesignCriterion:
         return 0.5 * float(np.log(variances.max() if self.kind == "worst" else variances.mean()))
 
     def combine_draws(self, sizes: Sequence[float]) -> float:
-        """Return one value from those at several θ."""
+        """Return the mean, or the largest value if `over` is "worst", of those at several draws of
+        θ.
+        """
         return float(np.max(sizes) if self.over == "worst" else np.mean(sizes))
 
     def require_known(self, errors: PredictedErrors) -> None:
@@ -166,7 +171,9 @@ class PredictedErrors:
         return cls(covariance, values, slopes, estimated_count)
 
     def slopes_of(self, names: Sequence[str]) -> Array:
-        """Return the slopes (k, nq) of names; of all estimated parameters if names is empty."""
+        """Return the relative change (k, nq) with q of the parameters with these names; of all
+        estimated parameters if `names` is empty.
+        """
         chosen = names or list(self.slopes)[: self.estimated_count]
         return np.array([self.slopes[name] for name in chosen])
 
@@ -332,12 +339,13 @@ class FutureRecording:
         return limits.bounds_from(rotation @ self.hand_m + translation)
 
     def highest_hz(self, limits: Limits) -> float:
-        """Return the highest frequency of a wave.
+        """Return the highest frequency of a wave [Hz]: the stated limit, or a tenth of the sampling
+        rate.
 
         Raises
         ------
         InputError
-            If it exceeds half the sampling rate.
+            If the stated limit exceeds half the sampling rate.
         """
         rate_hz = 1 / self.template.timestep_s
         if (limits.frequency_hz or 0.0) > rate_hz / 2:
@@ -383,7 +391,8 @@ class FutureRecording:
         )
 
     def simulate_motion(self, experiment: Experiment, q: Array) -> SimulatedMotion:
-        """Return information and marker positions of an experiment simulated at q.
+        """Return information and marker positions of an experiment simulated at the parameters q
+        (nq,), in the solver's coordinates.
 
         Raises
         ------
@@ -403,7 +412,8 @@ class FutureRecording:
         return Collocation([fitted], problem.parameters, problem.scheme, problem.first_substeps)
 
     def linearise(self, experiment: Experiment, q: Array) -> tuple[LinearisedFit, Array]:
-        """Return the linearised fit of an experiment simulated at q, and its positions (N, 3n) [m].
+        """Return the linearised fit of an experiment simulated at the parameters q (nq,), and its
+        positions (N, 3n) [m] at the time steps.
 
         Raises
         ------
@@ -426,8 +436,8 @@ class FutureRecording:
 
 
 def _resampled(wrench: Wrench | None, t_s: Array) -> Wrench | None:
-    """Return the sensor with its own rate over other times; zeros where it measures. None
-    for None.
+    """Return the sensor with its own rate over the duration of t_s, with zeros as values, NaN for
+    components that it does not measure; None for None.
     """
     if wrench is None:
         return None

@@ -58,7 +58,7 @@ def write_export(body: IdentifiedBody, target_name: str, folder: str | Path) -> 
 
     Returns
     -------
-    Exported
+    ExportedFiles
         The files, and what the target cannot express.
 
     Raises

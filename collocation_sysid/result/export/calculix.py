@@ -260,8 +260,8 @@ def _power_law_card(region: IdentifiedRegion, volume: float) -> str:
 
 
 def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
-    """Run CalculiX (`ccx`), and compare the largest displacement at rest and the forces of
-    obstacles.
+    """Run CalculiX (the program ``ccx``), and compare the largest displacement at rest and the
+    forces of obstacles.
 
     Parameters
     ----------
@@ -272,7 +272,7 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     Raises
     ------
     InputError
-        If it is not installed, fails, or takes longer than `LONGEST_S`.
+        If it is not installed, fails, or takes longer than `TIME_LIMIT_S`.
     """
     program = shutil.which("ccx")
     if program is None:
@@ -283,7 +283,11 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
             job, cwd=folder, capture_output=True, text=True, timeout=TIME_LIMIT_S, check=False
         )
     except subprocess.TimeoutExpired:
-        raise InputError(f"CalculiX took more than {TIME_LIMIT_S:g} s", folder / DECK) from None
+        raise InputError(
+            f"CalculiX took more than {TIME_LIMIT_S:g} s and was stopped; verify with a coarser "
+            "mesh or fewer samples",
+            folder / DECK,
+        ) from None
     times = _step_times_s(body)
     theirs, their_forces = _read_final_state(folder / "body.dat", len(body.nodes_m), len(times))
     if theirs is None:

@@ -90,8 +90,7 @@ class ExportTarget:
         Returns the files for a body.
     verify : callable, optional
         Runs the files of a folder in the simulator, and compares predictions; None if it cannot be
-        run
-        from here.
+        run from here.
     """
 
     name: str
@@ -111,14 +110,12 @@ class TargetCapabilities:
         `other_materials` states.
     other_materials, stiffness_damping, mass_damping : str
         Sentences on other materials, and on the two kinds of damping; they may contain `{material}`
-        and
-        the names of constants of a region. Empty if the simulator expresses the damping.
+        and the names of constants of a region. Empty if the simulator expresses the damping.
     damping_law : str
         Name of the damping law that the simulator has, for which no sentence is needed.
     has_viscoelasticity, has_moving_grasps, has_moving_obstacles, has_quadratic_elements : bool
         Whether it has viscoelastic branches, moving grasps, moving obstacles, and elements with
-        nodes on
-        their edges (which are split otherwise).
+        nodes on their edges (which are split otherwise).
     node_forces : str
         Sentence for forces on nodes; empty if the simulator has them.
     obstacle_shapes : tuple of str
@@ -218,7 +215,7 @@ def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
 
 def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
     """Return the equilibria of this package at the first samples, without the loads that exports
-    omit.
+    omit: tendons, pressures and air.
 
     Parameters
     ----------
@@ -232,6 +229,11 @@ def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
         Displacements of the nodes from `IdentifiedBody.nodes_m`.
     forces_n : (T, o, 3)
         Forces of each obstacle on the body.
+
+    Raises
+    ------
+    SimulationError
+        If an equilibrium cannot be found.
     """
     experiment = replace(
         body.experiment_with_obstacles or body.experiment,

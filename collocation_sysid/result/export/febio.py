@@ -72,8 +72,8 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 
 
 def _material_xml(number: int, region: IdentifiedRegion, limits: list[str]) -> str:
-    """Return the XML of the material numbered `number` from 1; limitations are appended to
-    `limits`.
+    """Return the XML of the material numbered `number` from 1, with its viscoelastic branches;
+    sentences on what it does not express are appended to `limits`, in place.
     """
     kind, values, uncoupled = _elastic_law(region, limits)
     inner = "".join(f"<{tag}>{value!r}</{tag}>" for tag, value in values.items())
@@ -125,9 +125,7 @@ def _elastic_law(region: IdentifiedRegion, limits: list[str]) -> tuple[str, dict
 
 
 def _mesh_xml(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) -> str:
-    """Return the XML of nodes, elements, sets and prescribed displacements of the body and the
-    obstacles.
-    """
+    """Return the XML of nodes, elements, sets and prescribed displacements, also of obstacles."""
     solids, facets = _obstacle_mesh_xml(body, obstacles)
     xml = '<Mesh>\n<Nodes name="nodes">\n'
     for k, point in enumerate(body.nodes_m, 1):

@@ -1,8 +1,7 @@
 """Identified body of a run folder, the input of every export.
 
 The body is undeformed and placed rigidly as its grasp holds it at the first sample. Simulators keep
-the
-grasped nodes there, or move them on from there.
+the grasped nodes there, or move them on from there.
 """
 
 from __future__ import annotations

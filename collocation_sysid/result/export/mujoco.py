@@ -137,7 +137,7 @@ def _obstacle_xml(body: IdentifiedBody, step_s: float) -> str:
 
 
 def _geom_attributes(solid: Solid) -> str:
-    """Return the XML attributes of a solid: type, size and placement."""
+    """Return the XML attributes of a solid in MuJoCo: type, size, position and rotation."""
     shape = Primitive.from_solid(solid)
     turn = values_as_text(shape.rotation.as_quat(scalar_first=True))
     size = values_as_text(shape.size_m) if len(shape.size_m) else "0 0 1"
@@ -263,7 +263,7 @@ def _import_mujoco() -> ModuleType:
     Raises
     ------
     InputError
-        If it is missing or older than version `SINCE`.
+        If it is missing or older than version `OLDEST_VERSION`.
     """
     try:
         import mujoco  # pyright: ignore[reportMissingImports]
@@ -321,7 +321,7 @@ def _compare_motion(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> Pre
     Raises
     ------
     InputError
-        If more than `MOST_STEPS` steps are needed.
+        If more than `MAX_STEPS` steps are needed.
     """
     e = body.experiment
     free = ~body.is_node_prescribed
@@ -331,8 +331,8 @@ def _compare_motion(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> Pre
     steps = round(e.timestep_s / model.opt.timestep)
     if steps * len(e.t_s) > MAX_STEPS:
         raise InputError(
-            f"the prediction of the motion would need {steps * len(e.t_s)} time "
-            "steps, which are too many"
+            f"the prediction of the motion would need {steps * len(e.t_s)} time steps; expected at "
+            f"most {MAX_STEPS}: verify with a shorter recording or a coarser mesh"
         )
     first = 7 * len(e.grasps)
     shapes = [data.qpos[first:].reshape(-1, 3).copy()]

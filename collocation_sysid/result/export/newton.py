@@ -96,8 +96,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     The module reads the JSON file with its own name, so that both can be renamed together.
 
     The elastic constants are those of Newton's `SolverVBD`, whose energy is the stable neo-Hookean
-    one of
-    λ and μ (Smith, de Goes & Kim 2018).
+    one of λ and μ (Smith, de Goes & Kim 2018).
     """
     cells = []
     constants = []
@@ -137,7 +136,9 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 
 
 def _obstacle_data(obstacle: Obstacle, t_s: float) -> dict[str, Any]:
-    """Return the data of an obstacle at time `t_s` for the JSON file."""
+    """Return shape, size, position and rotation of an obstacle at time `t_s`, and its friction, for
+    the JSON file.
+    """
     shape = Primitive.from_solid(obstacle.shape)
     place_m, turn = shape.pose_at(obstacle, t_s)
     sizes = shape.size_m if len(shape.size_m) else np.zeros(2)

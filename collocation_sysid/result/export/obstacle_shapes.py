@@ -113,8 +113,8 @@ class Facets:
         """Return the facets of a solid; of a plane a square.
 
         On round surfaces the middles of facets are as deep below the surface as their corners are
-        above it,
-        by `max_penetration_m` or as the allowed facet widths `FACET_RAD` permit.
+        above it: by `depth_m`, unless the facets would then be narrower or wider than
+        `FACET_WIDTH_LIMITS_RAD`.
 
         Parameters
         ----------
@@ -168,7 +168,9 @@ class Facets:
 
 
 def _unit_normals(corners: Array) -> Array:
-    """Return the unit normals (f, 3) of triangles with corners (f, 3, 3)."""
+    """Return the unit normals (f, 3) of triangles with corners (f, 3, 3); NaN for a triangle
+    without area.
+    """
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normals / np.linalg.norm(normals, axis=1)[:, None]
 
@@ -213,8 +215,7 @@ class FacetedObstacle:
     """Obstacle as facets whose contact pressure is proportional to the penetration.
 
     To match the pressure law of this package inside the obstacle, the surface is half of its width
-    δ
-    further out, and twice as stiff.
+    δ further out, and twice as stiff.
 
     Attributes
     ----------

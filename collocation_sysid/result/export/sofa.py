@@ -95,8 +95,7 @@ def _contact_xml(body: IdentifiedBody) -> str:
     """Return the XML of contact penalties on the nodes, proportional to the penetration.
 
     The surface of the obstacle is moved outwards by half the width δ of the pressure law, so that
-    the
-    force is about the same at a given gap.
+    the force is about the same at a given gap.
     """
     lines = ""
     for wall in faceted_obstacles(body):

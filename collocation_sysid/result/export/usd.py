@@ -151,7 +151,7 @@ def _import_usd() -> Any:
 def _add_mesh(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Array) -> None:
     """Add the tetrahedra, masses, materials and simulated motion of the body to the stage.
 
-    `pxr` are the modules of `_emit_library_call`; `start_positions_m` (n, 3) are the initial node
+    `pxr` are the modules of `_import_usd`; `start_positions_m` (n, 3) are the initial node
     positions.
     """
     body_prim = pxr.UsdGeom.Xform.Define(stage, "/World/Body").GetPrim()
@@ -192,9 +192,9 @@ def _add_mesh(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Arr
 
 
 def _cell_masses_kg(body: IdentifiedBody, cells: list[Index]) -> Array:
-    """Return the mass of each tetrahedron, region after region.
+    """Return the mass of each tetrahedron [kg], region after region.
 
-    `cells` are the tetrahedra (k, 4) of each region.
+    `cells` are the corner nodes of the tetrahedra (k, 4) of each region.
     """
     edges = [np.diff(body.nodes_m[each], axis=1) for each in cells]
     volumes = [np.abs(np.linalg.det(each)) / 6 for each in edges]

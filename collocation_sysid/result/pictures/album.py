@@ -34,7 +34,7 @@ def all_pictures(
 
     Parameters
     ----------
-    replays : sequence of ReplayCommand
+    replays : sequence of MotionRecord
         The experiments; the mesh is drawn with grasps and markers of the first.
     result : Result
     truth : mapping, optional

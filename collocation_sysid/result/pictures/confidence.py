@@ -102,10 +102,8 @@ def confidence_ellipses(confidence: Confidence) -> Figure:
     """Draw the joint 95 % region of every pair of parameters.
 
     Axes are deviations from the estimate, in percent, or factors where these are large; the cross
-    is the
-    95 % interval of each parameter alone. A narrow slanted region means that the data determine
-    only a
-    combination of the two parameters.
+    is the 95 % interval of each parameter alone. A narrow slanted region means that the data
+    determine only a combination of the two parameters.
 
     Parameters
     ----------

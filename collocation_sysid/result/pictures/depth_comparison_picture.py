@@ -37,13 +37,12 @@ def depth_picture(rows: Array) -> Figure:
     surface.
 
     The samples that have outlines are shown side by side. Without a fit there is no second row; if
-    no
-    point counts, the picture has only a sentence about that.
+    no point counts, the picture has only a sentence about that.
 
     Parameters
     ----------
     rows : (k, 8)
-        Rows of `ReplayCommand.fit_summary`.
+        Rows of `MotionRecord.visible_points`.
     """
     times = np.unique(rows[np.isnan(rows[:, 3]), 0])
     points = rows[np.isfinite(rows[:, 3])]
@@ -102,7 +101,7 @@ def _new_panels(points: Array, times: Array, rows: int) -> tuple[NDArray[np.obje
     Parameters
     ----------
     points : (P, 8)
-        Points of `ReplayCommand.fit_summary`.
+        Points of `MotionRecord.visible_points`.
     times : (m,)
         Times of the samples, one column each.
     rows : int
@@ -111,7 +110,7 @@ def _new_panels(points: Array, times: Array, rows: int) -> tuple[NDArray[np.obje
     -------
     axes : (rows, m) array of Axes
     dot : float
-        Area of a dot [pt²], such that dots cover the share `COVERED` of the extent.
+        Area of a dot [pt²], such that dots cover the share `COVERED_SHARE` of the extent.
     """
     inch = PAGE_MM / MM_PER_INCH
     count = len(times)

@@ -44,12 +44,12 @@ def field_picture(replay: MotionRecord, name: str, values: Array) -> Figure:
 
     Parameters
     ----------
-    replay : ReplayCommand
+    replay : MotionRecord
         An experiment with this body.
     name : str
         Name of the constant.
     values : (E, 4)
-        Its values in each element, see `ReplayCommand.fields`.
+        Its values in each element, see `MotionRecord.fields`.
     """
     nodes_m = replay.undeformed_m
     cells = np.asarray(replay.tetrahedra, dtype=np.int64)

@@ -22,7 +22,9 @@ RELATIVE_AMPLITUDE = 0.08
 
 
 def instability_picture(instability: StabilityLoss) -> Figure:
-    """Draw the body displaced along the unstable mode, coloured by the mode's amplitude."""
+    """Draw the body displaced along its unstable mode, coloured by the mode's amplitude, with its
+    stretches and wavelength as the title.
+    """
     extent_m = float(np.ptp(instability.positions_m, axis=0).max())
     shown_m = instability.positions_m + RELATIVE_AMPLITUDE * extent_m * instability.mode
     camera = ParallelCamera.facing_motion(shown_m[None], np.array([0.0, 0.0, 1.0]))

@@ -32,9 +32,8 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     magnitude.
 
     At the left are the dense columns of the parameters, in the middle the block band of the
-    positions, at
-    the right the last shown block on the diagonal. Entries are scaled as in the nonlinear program;
-    structural entries that are zero or tiny have the lightest colour.
+    positions, at the right the last shown block on the diagonal. Entries are scaled as in the
+    nonlinear program; structural entries that are zero or tiny have the lightest colour.
 
     Parameters
     ----------

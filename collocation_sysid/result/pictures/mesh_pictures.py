@@ -56,8 +56,7 @@ def mesh_picture(replay: MotionRecord) -> Figure:
     """Draw the undeformed body from the front and from behind, with names of its markers.
 
     Tendons are drawn through the body. A cross is the stated place of a marker whose estimated
-    place
-    differs; a frame surrounds a marker whose place was not stated.
+    place differs; a frame surrounds a marker whose place was not stated.
     """
     nodes_m = replay.undeformed_m
     surface = replay.surface
@@ -127,7 +126,7 @@ def _draw_declared_positions(
     Parameters
     ----------
     axes : Axes
-    view : DepthCameraModel
+    view : SheetView
     places_m, declared_m : (M, 3)
         Estimated and stated places; stated ones are NaN where there is none.
 
@@ -228,8 +227,7 @@ def elements_picture(nodes_m: Array, tetrahedra: NDArray[np.integer]) -> Figure:
     """Draw histograms of the size and the quality of the elements.
 
     The size is the root mean square edge, the quality the mean ratio 12 (3V)^(2/3) / Σ l², which is
-    1 for
-    the regular tetrahedron and near 0 for a flat one.
+    1 for the regular tetrahedron and near 0 for a flat one.
 
     Parameters
     ----------

@@ -223,6 +223,8 @@ def sensor_picture(samples: Array, names: Sequence[str], units: Sequence[str] = 
     """Draw the numbers of a sensor over time, three in a row, as the force above the torque of a
     wrench.
 
+    A row of three numbers without any measurement is left out; at least one must be measured.
+
     Parameters
     ----------
     samples : (S, 1 + 3m)

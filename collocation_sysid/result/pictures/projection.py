@@ -52,7 +52,7 @@ class ParallelCamera:
     def facing_motion(cls, positions_m: Array, up: ArrayLike) -> ParallelCamera:
         """Return a camera that faces the plane in which a body moves most, or is widest.
 
-        The direction is horizontal, then turned by `TURN_DEG` and raised by `ELEVATION_DEG`.
+        The direction is horizontal, then turned by `AZIMUTH_DEG` and raised by `ELEVATION_DEG`.
 
         Parameters
         ----------
@@ -110,7 +110,7 @@ class ParallelCamera:
         polygons : (k, 3, 2)
             Corners in the picture [m].
         brightness : (k,)
-            From `AMBIENT` to 1.
+            From `AMBIENT_BRIGHTNESS` to 1.
         chosen : (k,)
             Indices of these triangles in `surface`.
         """
@@ -126,6 +126,9 @@ class ParallelCamera:
         self, points_m: Array, positions_m: Array, surface: Triangles
     ) -> NDArray[np.bool_]:
         """Return for each point (k, 3) whether it is behind the surface; False for NaN.
+
+        Points less than 5 % of the body's largest dimension below the surface count as visible,
+        because noise moves markers on the surface into the body.
 
         Parameters
         ----------

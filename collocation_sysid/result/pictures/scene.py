@@ -89,7 +89,7 @@ class SheetView:
 
 
 def aspect_ratio(camera: ParallelCamera, points_m: Array) -> float:
-    """Return the aspect ratio of points (…, 3) as the camera shows them."""
+    """Return width over height of points (…, 3) in the picture of a camera."""
     low, high = _projected_extent(camera, points_m)
     return float((high - low)[0] / (high - low)[1])
 
@@ -104,8 +104,7 @@ def with_nearby_outlines(points_m: Array, outlines_m: Array | None) -> Array:
     """Return points (T, n, 3) of a body joined with outlines (T, o, 3) of obstacles near it.
 
     Outline points further away than half the body's extent are moved to that distance. Without
-    outlines
-    (None) the points alone are returned.
+    outlines (None) the points alone are returned.
     """
     if outlines_m is None:
         return points_m
@@ -181,8 +180,7 @@ class BodyDrawing:
         """Update the drawing.
 
         Markers hidden by the body are drawn as rings. Grasped nodes on faces turned away are left
-        out, and so
-        are points of depth cameras that the body hides.
+        out, and so are points of depth cameras that the body hides.
 
         Parameters
         ----------
@@ -249,9 +247,7 @@ def draw_scale(axes: Axes, mm_per_m: float, corner_mm: ArrayLike, longest_mm: fl
 
 
 def round_length(longest: float) -> float:
-    """Return the largest of 1, 2, 5 · 10ᵏ that is not above `longest_displacement_m`, a positive
-    number.
-    """
+    """Return the largest of 1, 2, 5 · 10ᵏ that is not above `longest`, a positive number."""
     decade = 10.0 ** np.floor(np.log10(longest))
     return float(max(f * decade for f in (1, 2, 5) if f * decade <= longest * (1 + 1e-9)))
 
@@ -259,8 +255,8 @@ def round_length(longest: float) -> float:
 def draw_directions(
     axes: Axes, camera: ParallelCamera, origin_mm: ArrayLike, length_mm: float = 5.0
 ) -> None:
-    """Draw arrows along x, y and z from `origin_mm` (2,), except an axis that points along the
-    view.
+    """Draw arrows along x, y and z from `origin_mm` (2,); an axis nearly along the viewing
+    direction is left out.
     """
     start = np.asarray(origin_mm, dtype=float)
     for letter, direction in zip("xyz", camera.project(np.eye(3)), strict=True):

@@ -72,12 +72,11 @@ def shapes_picture(
     """Draw the body at evenly spaced samples, side by side in one scale.
 
     Heights are true; horizontally the shapes are moved together. Samples that are not finite, as in
-    a
-    simulation that diverged, are left out.
+    a simulation that diverged, are left out.
 
     Parameters
     ----------
-    replay : ReplayCommand
+    replay : MotionRecord
         An experiment with at least one trajectory.
     count : int
         Number of samples.
@@ -171,12 +170,14 @@ def contact_pictures(replay: MotionRecord) -> dict[str, Figure]:
 def _camera_facing_weights(
     replay: MotionRecord, positions_m: Array, weights: Array
 ) -> ParallelCamera:
-    """Return the camera, of four directions around the body, from which most of the weights are
-    visible.
+    """Return the camera, of four directions around the body, that faces most of the weights.
+
+    The weight of a triangle counts in proportion to its projected area, whether or not another
+    part of the body hides it. Samples with NaN are ignored.
 
     Parameters
     ----------
-    replay : ReplayCommand
+    replay : MotionRecord
     positions_m : (T, n, 3)
         Positions of the nodes.
     weights : (T, F)
@@ -210,14 +211,14 @@ def field_shapes(
 
     Parameters
     ----------
-    replay : ReplayCommand
+    replay : MotionRecord
     body : Body
     constants : mapping of name to value
         Constants of the body, for stresses and energies.
     field : str or None
-        One of `FIELDS`; None for the colours of the body's parts.
+        One of `FIELD_TITLES`; None for the colours of the body's parts.
     count : int
-        Number of shapes, at most `MOST_SHAPES`.
+        Number of shapes, at most `MAX_SHAPES`.
 
     Raises
     ------
@@ -236,7 +237,7 @@ def field_shapes(
 def _surface_field(
     replay: MotionRecord, body: Body, constants: Mapping[str, float], field: str
 ) -> SurfaceField:
-    """Return a field of the elements, see `FIELDS`, as values on the boundary triangles."""
+    """Return a field of the elements, a key of `FIELD_TITLES`, on the boundary triangles."""
     elements = ElementFields.from_body(body, body.theta_from_values(constants))
     cells = body.mesh.surface_cells
 

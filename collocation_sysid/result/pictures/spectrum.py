@@ -68,10 +68,8 @@ def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
     """Return frequencies [Hz] and the power spectral density [mm²/Hz] of the markers' mean motion.
 
     Linear trends are removed and a Hann window is applied; the densities of x, y and z are added,
-    those of
-    markers averaged. Gaps are interpolated linearly, and markers present in less than the share
-    `TRIAL_SAMPLES` of
-    the samples are left out.
+    those of markers averaged. Gaps are interpolated linearly, and markers present in less than
+    the share `MIN_PRESENT_SHARE` of the samples are left out.
 
     Parameters
     ----------

@@ -1,9 +1,8 @@
 """Check of a problem before it is solved: contents, cost, and likely mistakes.
 
 `check_problem` does everything, `quick_check` what takes no simulation. The modules contribute
-`body_check`
-(meshes and grasps), `measurements`, `modes_check` (natural modes and the time grid), `cost` and
-`derivatives`. Every warning is one sentence that ends with the remedy.
+`body_check` (meshes and grasps), `measurements`, `modes_check` (natural modes and the time grid),
+`cost` and `derivatives`. Every warning is one sentence that ends with the remedy.
 """
 
 from __future__ import annotations
@@ -174,7 +173,7 @@ class CheckResult(QuickCheck):
 
 
 def quick_check(problem: Problem) -> QuickCheck:
-    """Return what needs no simulation: bodies, recordings and grasps.
+    """Return a check of bodies, recordings and grasps without a simulation.
 
     Parameters without a guess get usual values.
     """
@@ -183,7 +182,7 @@ def quick_check(problem: Problem) -> QuickCheck:
 
 
 def _quick_fields(problem: Problem, positions_m: Mapping[str, Array]) -> dict[str, Any]:
-    """Return the fields of `QuickCheck`.
+    """Return the arguments of `QuickCheck` by name.
 
     Parameters
     ----------
@@ -417,8 +416,8 @@ def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
 
 
 def _body_concerns(body: BodyCheck, alone: bool) -> tuple[Concern, ...]:
-    """Return the concerns of a body, with the names of its experiments unless it is the only
-    body.
+    """Return the concerns of a body; unless it is the only body (`alone`), with the names of its
+    experiments.
     """
     of = f"in the body of {', '.join(map(repr, body.experiments))}"
     named = (replace(each, data={"of": of, **each.data}) for each in body.concerns)

@@ -157,7 +157,7 @@ def element_concerns(
 
 
 def _covariance(mesh: TetMesh) -> Array:
-    """Mean of (x − x̄)(x − x̄)ᵀ over the volume, (3, 3) [m²]."""
+    """Return the mean of (x − x̄)(x − x̄)ᵀ over the volume of a mesh, (3, 3) [m²]."""
     shares = mesh.volumes_m3 / mesh.volume_m3
     corners = mesh.points_m[mesh.tetrahedra]
     corners = corners - shares @ corners.mean(axis=1)
@@ -168,7 +168,7 @@ def _covariance(mesh: TetMesh) -> Array:
 
 
 def _areas(triangles: Array) -> Array:
-    """Return the areas (k,) of triangles (k, 3, 3)."""
+    """Return the areas (k,) [m²] of triangles given by their corners (k, 3, 3) [m]."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     return np.linalg.norm(normals, axis=1) / 2
 
@@ -241,7 +241,7 @@ class BodyCheck:
 def check_body(
     body: Body, theta: Array, experiments: tuple[str, ...], *, is_homogeneous: bool = False
 ) -> BodyCheck:
-    """Return size, mesh and guess of a body.
+    """Return a summary of size, mesh and guess of a body, with concerns.
 
     Parameters
     ----------
@@ -303,7 +303,9 @@ def _rest_shape_change_m(body: Body, theta: Array) -> float:
 
 
 def _field_concerns(fields: Mapping[str, FieldResolution]) -> Iterator[Concern]:
-    """Yield a concern for each field with too few shapes for its correlation length."""
+    """Yield a concern for each field whose shapes represent too little of the prior variance; keys
+    are names of constants.
+    """
     for name, field in fields.items():
         if field.share < LEAST_FIELD_VARIANCE:
             yield Concern("field/shapes", data={"name": name, **vars(field)})
@@ -360,7 +362,9 @@ class GraspCheck:
 
 
 def check_grasps(experiment: Experiment, mean_edge_m: float) -> tuple[GraspCheck, ...]:
-    """Return the held nodes of each grasp; `mean_edge_m` is the mean edge length of the mesh."""
+    """Return a summary of the grasped nodes for each grasp of an experiment, see `GraspCheck`;
+    `mean_edge_m` is the mean edge length of the mesh [m].
+    """
     points_m = experiment.body.nodes.points_m
     return tuple(
         _check_grasp(experiment.name, points_m, g, mean_edge_m) for g in experiment.body_grasps
@@ -368,7 +372,20 @@ def check_grasps(experiment: Experiment, mean_edge_m: float) -> tuple[GraspCheck
 
 
 def _check_grasp(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -> GraspCheck:
-    """Return the held nodes of one grasp."""
+    """Return number and bounding box of the nodes that a grasp prescribes, and how many nodes are
+    so close to a face of the box that rounding may decide.
+
+    Parameters
+    ----------
+    name : str
+        Name of the experiment.
+    points_m : (n, 3) array
+        Nodes of the undeformed body.
+    grasp : Grasp
+        Grasp with its nodes selected.
+    mean_edge_m : float
+        Mean edge length of the mesh.
+    """
     nodes = grasp.nodes
     grasped_m = points_m[nodes]
     free_m = np.delete(points_m, nodes, axis=0)
@@ -396,7 +413,7 @@ def _check_grasp(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -
 
 
 def grasp_sentence(grasp_check: GraspCheck) -> str:
-    """Return a description of the held nodes of a grasp."""
+    """Return number, share, bounding box [mm] and axes of the grasped nodes as text."""
     size = " × ".join(
         f"{1e3 * (b - a):.4g}" for a, b in zip(grasp_check.low_m, grasp_check.high_m, strict=True)
     )

@@ -128,15 +128,15 @@ class MethodCost:
 def method_costs(
     collocation: Collocation, short: Collocation, z: Array, nonzeros: int, factorisation: Choice
 ) -> tuple[MethodCost, ...]:
-    """Return the costs of reduced space and of interior point.
+    """Return the estimated memory and time of reduced space and of interior point.
 
     Parameters
     ----------
     collocation : Collocation
     short : Collocation
-        First samples of the same experiments.
+        First samples of the same experiments, in which sweeps are timed.
     z : (variables,) array
-        Start of `shortened`.
+        Start of `short`.
     nonzeros : int
         Of the Jacobian and the Hessian of interior point, together.
     factorisation : {"auto", "band", "sparse", "supernodal"}
@@ -158,7 +158,9 @@ def method_costs(
 
 
 def unknowns_of_a_timestep(collocation: Collocation) -> list[int]:
-    """Return the unknowns per time step of each experiment in interior point, with overstresses."""
+    """Return, for each experiment, the number of unknowns per time step in interior point: free
+    dofs and overstresses.
+    """
     return [
         len(segment.free_dofs)
         + sum(b.columns.stop - b.columns.start for b in segment.body.memory.branches)
@@ -167,7 +169,9 @@ def unknowns_of_a_timestep(collocation: Collocation) -> list[int]:
 
 
 def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
-    """Return a note if another method is far quicker."""
+    """Return a note if the quickest of the other methods is far quicker than the chosen one, which
+    takes long; none if a time is unknown.
+    """
     quickest = min(others, key=lambda cost: cost.time_s or np.inf)
     if chosen.time_s is None or quickest.time_s is None:
         return []
@@ -180,7 +184,9 @@ def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
 
 
 def cost_concerns(chosen: MethodCost, others: Sequence[MethodCost]) -> list[Concern]:
-    """Return a concern if the chosen method needs more memory than there is."""
+    """Return a concern if the chosen method needs more memory than this machine has; none if that
+    is unknown.
+    """
     available = machine_memory_mb()
     if available is None or chosen.memory_mb < available:
         return []
@@ -193,9 +199,11 @@ def cost_concerns(chosen: MethodCost, others: Sequence[MethodCost]) -> list[Conc
 def _estimated_sweeps_s(
     collocation: Collocation, short: Collocation, z: Array, factorisation: Choice
 ) -> float | None:
-    """Return the time of all sweeps [s], from one over the first rows of each experiment.
+    """Return the estimated time of all sweeps of a solve [s], from one timed sweep over the first
+    rows of each experiment.
 
-    None if the equations cannot be solved.
+    None if the equations cannot be solved. `z` has the variables of the program `short` at the
+    start.
     """
     total = 0.0
     for segment, part in zip(collocation.transcriptions, short.iterates(z), strict=True):

@@ -46,6 +46,9 @@ def shortened_problem(problem: Problem) -> Problem:
 def shortened_experiment(experiment: Experiment, samples: int) -> Experiment:
     """Return the experiment with its first samples, and more if cameras begin to see later.
 
+    If no marker is measured in these samples, their positions are set to zero. Sensors of grasps
+    without enough measurements there are removed.
+
     Parameters
     ----------
     experiment : Experiment
@@ -130,8 +133,8 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
 
 
 def _difference_step(collocation: Collocation) -> float:
-    """Return the step of the differences, which is small against the gap in which contact
-    begins.
+    """Return the step of the differences: `STEP`, or less if the gap range in which a contact
+    begins is narrow.
     """
     touching = (t for s in collocation.transcriptions for t in contact_terms(s.experiment))
     return min(
@@ -140,15 +143,17 @@ def _difference_step(collocation: Collocation) -> float:
 
 
 def _slope_error(function, gradient, z: Array, rng: np.random.Generator, step: float) -> float:
-    """Return the relative error of a gradient along a random direction."""
+    """Return the relative error of a gradient along a random direction, at a point near z, with
+    central differences of `function`.
+    """
     point = z + 1e-3 * rng.normal(size=len(z))
     direction = rng.normal(size=len(z))
     return _deviation(function, gradient(point) @ direction, point, direction, step)
 
 
 def _deviation(function, exact: Array, point: Array, direction: Array, step: float) -> float:
-    """Return the largest deviation of `exact` from differences along `direction`, relative to
-    `exact`.
+    """Return the largest deviation of `exact` from fourth-order central differences of `function`
+    along `direction` at `point`, relative to the largest entry of `exact`.
     """
     after, before, two_after, two_before = (
         function(point + k * step * direction) for k in (1, -1, 2, -2)

@@ -98,17 +98,18 @@ class ModesCheck:
 
 
 def check_modes(experiment: Experiment, scheme: Scheme, step_s: float, theta: Array) -> ModesCheck:
-    """Return the natural modes of an experiment when fewest dofs are held, and errors of the
-    scheme.
+    """Return the natural modes of an experiment about the sample with fewest prescribed dofs, and
+    the errors of the scheme.
 
-    Of several such samples the last counts, when all point masses have joined.
+    Of several such samples the last counts, when all point masses have joined. The state is the
+    equilibrium if it can be found, else the undeformed shape.
 
     Parameters
     ----------
     experiment : Experiment
     scheme : Scheme
     step_s : float
-        Step of the time grid.
+        Step of the time grid [s].
     theta : array
         Constants θ of the body.
     """
@@ -157,7 +158,9 @@ def _reference_state(
 def _mode_findings(
     modes: Modes, experiment: Experiment, scheme: Scheme, step_s: float
 ) -> tuple[ModeCheck, ...]:
-    """Return the findings of each mode."""
+    """Return frequency, samples and steps per period, damping ratio, and the errors of the scheme
+    in period and damping, for each mode, lowest first.
+    """
     findings = []
     for frequency, ratio in zip(modes.frequencies_hz, modes.damping_ratios, strict=True):
         omega = 2 * np.pi * frequency
@@ -185,12 +188,16 @@ def _oscillating_damping_ratio(damping_ratio: float) -> float:
 
 
 def _damping_limit(mode: ModeCheck) -> float:
-    """Return the largest numerical damping ratio that is accepted for a mode."""
+    """Return the largest numerical damping ratio that is accepted for a mode: a share of its own
+    damping ratio, or a small absolute value if that is larger.
+    """
     return max(DAMPING_SHARE * mode.damping_ratio, LEAST_DAMPING_LIMIT)
 
 
 def mode_concerns(motion: ModesCheck) -> list[Concern]:
-    """Return concerns about too few steps, too few samples or a recording shorter than a period."""
+    """Return concerns about too few steps or samples per period of the first mode, or a recording
+    shorter than its period; none without a mode.
+    """
     mode = motion.first_mode
     if mode is None:
         return []
@@ -230,7 +237,7 @@ def _grid_concerns(motion: ModesCheck, mode: ModeCheck) -> list[Concern]:
 
 
 def _first_mode_data(motion: ModesCheck, mode: ModeCheck) -> dict[str, Any]:
-    """Return experiment and frequency of the first mode, as data of a concern."""
+    """Return the name of the experiment and the first mode's frequency, as data of a concern."""
     return {"experiment": motion.experiment, "frequency_hz": mode.frequency_hz}
 
 
