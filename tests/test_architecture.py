@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from collections import Counter
 from functools import cache
 from graphlib import TopologicalSorter
@@ -85,6 +87,59 @@ def test_a_module_imports_nothing_from_above(name):
 def test_no_imports_go_in_circles():
     graph = {name: {other for other in imports(name) if other} for name in MODULES}
     assert len([*TopologicalSorter(graph).static_order()]) >= len(MODULES)
+
+
+# Packages with the mathematics of an identification, and those that use it; see docs/core.md.
+CORE = ("fem", "recording", "model", "program", "methods", "statistics")
+OUTER = ("runs", "result", "live", "plan", "cli", "testing", "pipeline", "installation_check")
+# The module of `program` that live estimation imports, and the largest number of its names.
+STREAMING = "program.streaming"
+STREAMING_NAMES = 12
+
+
+def test_the_core_is_loaded_without_the_packages_that_use_it():
+    """Also without imports at run time, which no statement of a module shows."""
+    core = [name for name in MODULES if name.split(".")[0] in CORE]
+    code = (
+        "import importlib, sys\n"
+        f"for name in {core}: importlib.import_module('collocation_sysid.' + name)\n"
+        "ours = [name for name in sys.modules if name.startswith('collocation_sysid.')]\n"
+        "print(*{name.split('.')[1] for name in ours})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert set(CORE) <= loaded
+    assert not loaded & {*OUTER, "problem"}
+
+
+def test_no_module_imports_the_package_by_its_name():
+    """Imports are relative, so that the other tests of this file see them."""
+    for name in MODULES:
+        for statement in ast.walk(tree_of(name)):
+            if isinstance(statement, ast.Import):
+                assert not any(
+                    each.name.startswith("collocation_sysid") for each in statement.names
+                )
+            if isinstance(statement, ast.ImportFrom) and not statement.level:
+                assert not (statement.module or "").startswith("collocation_sysid"), name
+
+
+def test_live_estimation_uses_a_small_interface_of_the_program():
+    used = set()
+    for name in MODULES:
+        if name.split(".")[0] != "live":
+            continue
+        assert {each for each in imports(name) if each.startswith("program")} <= {STREAMING}, name
+        for statement in ast.walk(tree_of(name)):
+            if not isinstance(statement, ast.ImportFrom):
+                continue
+            assert statement.module != "program", (
+                f"{name} does not name what it uses of {STREAMING}"
+            )
+            if statement.module == STREAMING:
+                used |= {each.name for each in statement.names}
+    assert "StreamingSweep" in used
+    assert len(used) <= STREAMING_NAMES
 
 
 def test_the_contribution_guide_names_the_layers():

@@ -28,8 +28,6 @@ from collocation_sysid.live import (
     LiveOptions,
     LiveUpdate,
     estimator,
-    live_model,
-    streaming_sweep,
 )
 from collocation_sysid.live.frame_buffer import FrameBuffer
 from collocation_sysid.live.sources import (
@@ -42,6 +40,7 @@ from collocation_sysid.live.time_budget import TimeBudget
 from collocation_sysid.live.window_pass import WindowPass
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.program import streaming_model, streaming_sweep
 from collocation_sysid.program.least_squares import SquareRootInformation
 from collocation_sysid.recording import Markers, Nuisance, PoseSequence
 from collocation_sysid.statistics.uncertainty import uncertainty_at
@@ -122,7 +121,7 @@ def test_frames_one_by_one_say_what_the_batch_says(nuisance, air_density_kg_m3, 
     live = streamed(problem, count)
     collocation = problem.collocation()
     horizon, p = (
-        Horizon(collocation, [count], prior=live_model.WEAK_PRIOR_DEVIATION),
+        Horizon(collocation, [count], prior=streaming_model.WEAK_PRIOR_DEVIATION),
         collocation.guess_p,
     )
     reached, failure = horizon.simulate(p)
@@ -628,7 +627,7 @@ def test_readings_of_ones_own_say_what_they_say_to_the_batch(monkeypatch):
     whole = cs.Problem([cs.with_readings(seen, taken)], GUESS)
     collocation = whole.collocation()
     horizon, p = (
-        Horizon(collocation, [count], prior=live_model.WEAK_PRIOR_DEVIATION),
+        Horizon(collocation, [count], prior=streaming_model.WEAK_PRIOR_DEVIATION),
         collocation.guess_p,
     )
     reached, _ = horizon.simulate(p)

@@ -12,7 +12,7 @@ from test_live import NO_TIME, frames_of
 
 import collocation_sysid as cs
 from collocation_sysid.live.estimator import LiveEstimator
-from collocation_sysid.live.live_model import LiveModel
+from collocation_sysid.live.live_model import model_from_problem
 
 TRUTH = {"young_pa": 1e4, "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 0.3}
 UNKNOWN = {"young_pa": cs.Unknown(8e3), "gamma_r_s": cs.Unknown(0.015)}
@@ -88,4 +88,4 @@ def test_an_obstacle_whose_delay_is_estimated_is_refused():
     with pytest.raises(
         cs.InputError, match="live estimates do not support an obstacle whose delay is estimated"
     ):
-        LiveModel.from_problem(problem)
+        model_from_problem(problem)

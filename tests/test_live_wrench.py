@@ -22,10 +22,11 @@ from wrenches_small import POINT_M, SIGMA_N, SIGMA_NM, sensing
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.live import Frame, FrameReader, LiveEstimator, live_model, streaming_sweep
+from collocation_sysid.live import Frame, FrameReader, LiveEstimator
 from collocation_sysid.live.sources import frames_of_recording
 from collocation_sysid.live.window_pass import WindowPass
 from collocation_sysid.methods.horizon import Horizon
+from collocation_sysid.program import streaming_model, streaming_sweep
 from collocation_sysid.recording import Nuisance, Wrench
 
 # What may be unknown of a load cell that live takes.
@@ -78,7 +79,7 @@ def test_load_cells_say_what_they_say_to_the_batch(scheme, frame, unknown, monke
     seen = without(problem.experiments[0], waiting)
     collocation = replace(problem, experiments=[seen]).collocation()
     horizon, p = (
-        Horizon(collocation, [len(live.log)], prior=live_model.WEAK_PRIOR_DEVIATION),
+        Horizon(collocation, [len(live.log)], prior=streaming_model.WEAK_PRIOR_DEVIATION),
         collocation.guess_p,
     )
     point = horizon.evaluate(p, horizon.simulate(p)[0])

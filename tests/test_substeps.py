@@ -10,7 +10,7 @@ import pytest
 from problems_small import TRUTH, hung_cube
 
 import collocation_sysid as cs
-from collocation_sysid.live.live_model import LiveModel
+from collocation_sysid.live.live_model import model_from_problem
 from collocation_sysid.methods.solution import Method
 from collocation_sysid.pipeline import Run, run
 from collocation_sysid.problem import Problem
@@ -237,8 +237,8 @@ def test_an_interrupt_at_finer_steps_leaves_the_first_answer_and_says_so(how):
 
 
 def test_live_estimates_take_one_step_where_none_are_stated():
-    assert LiveModel.from_problem(twin(3e-4)).substeps == 1
-    assert LiveModel.from_problem(twin(3e-4, 2)).substeps == 2
+    assert model_from_problem(twin(3e-4)).substeps == 1
+    assert model_from_problem(twin(3e-4, 2)).substeps == 2
 
 
 @pytest.mark.parametrize("given", ["some", 0, -1])

@@ -14,11 +14,7 @@ from collocation_sysid.testing import check_material
 CASES = [(name, "tet4") for name in COMPILED] + [("neo-hookean", name) for name in ELEMENTS]
 CASES += [("gent", "tet10-p0"), ("yeoh", "tet10")]
 # Laws with other numbers of terms: the compiled forces contain no more than their energy.
-OTHERS = [
-    pytest.param(name, marks=[pytest.mark.long] * (name[-1] in "34"))
-    for name in MATERIALS
-    if name not in COMPILED
-]
+OTHERS = [name for name in MATERIALS if name not in COMPILED]
 # Exponents of which a term vanishes. The energy of foam with α = 0 is exact to 1e-6 without the
 # chain rule; `test_ogden` compares the chain rule with its closed form.
 LIMITS = [("ogden-2", {"alpha_2": 0.0}), ("hyperfoam-1", {"beta_1": 0.0})]

@@ -6,13 +6,11 @@ Use `LiveEstimator`: `LiveEstimator.update` takes one frame and returns estimate
 - `estimator`: the estimator, its options and its output.
 - `frames`: frames as Python values, JSON lines or rows of a table; `sources`: streams of frames.
 - `frame_buffer`: buffer that turns frames into time steps with interpolated poses.
-- `live_model`: the problem, prepared for streaming; `streaming_sweep`: time marching with
-  sensitivities; `window_pass`: the window of recent time steps, with its information and prior.
-- `grasp_reactions`: reaction forces of grasps with a sensor.
+- `live_model`: the model of a problem's recording; `window_pass`: the window of recent time steps,
+  with its information and prior. Time marching with sensitivities is `program.streaming`.
 - `time_budget`: computing time per frame; `stiffness_search`: initial values without a guess.
 - `live_trust`: verdict of a live estimate; `batch_solution`: batch solution at the end;
-  `live_display`: terminal and
-film.
+  `live_display`: terminal and film.
 """
 
 from .estimator import LiveEstimator, LiveOptions, LiveUpdate

@@ -10,20 +10,19 @@ import numpy as np
 from ..methods.reduced_space import ReducedSpace
 from ..pipeline import Run, run
 from ..problem import Problem
+from ..program.streaming import LoggedRow, StreamingModel
 from ..recording.custom_sensor import Gauge
 from ..recording.experiment import Experiment
 from ..recording.poses import PoseSequence
 from ..recording.sample_times import STEP_TOLERANCE
 from .frame_buffer import FrameBuffer
-from .live_model import LiveModel
-from .streaming_sweep import LoggedRow
 
 # Smallest number of samples of a motion.
 FEWEST = 3
 
 
 def recording_from_log(
-    model: LiveModel, intake: FrameBuffer, log: Sequence[LoggedRow]
+    model: StreamingModel, intake: FrameBuffer, log: Sequence[LoggedRow]
 ) -> Experiment | None:
     """Return the experiment with the poses, markers and samples of all rows, from the first frame
     on.
@@ -32,7 +31,7 @@ def recording_from_log(
 
     Parameters
     ----------
-    model : LiveModel
+    model : StreamingModel
     intake : FrameBuffer
     log : sequence of LoggedRow
         All rows, with their samples.

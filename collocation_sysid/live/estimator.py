@@ -27,8 +27,8 @@ from ..errors import InputError, SimulationError
 from ..fem.constants import is_field_coefficient
 from ..pipeline import Run
 from ..problem import Problem
-from ..program.lapack import one_blas_thread
-from ..program.least_squares import SquareRootInformation
+from ..program.streaming import LoggedRow, Sample, SquareRootInformation, one_blas_thread
+from ..recording.poses import Poses
 from ..statistics.assessment import GROSS_MISFIT, Assessment
 from ..statistics.concerns import concern_if
 from ..statistics.estimates import Estimate, user_estimates
@@ -45,7 +45,7 @@ from .frames import (
     parse_time,
     parse_wrenches,
 )
-from .live_model import ROWS_PER_CHUNK, LiveModel, Poses
+from .live_model import model_from_problem
 from .live_trust import (
     LARGEST_SETTLED_DISTANCE,
     ResidualScatter,
@@ -54,7 +54,6 @@ from .live_trust import (
     variance_factor,
 )
 from .stiffness_search import TRIAL_SAMPLES, StiffnessSearch
-from .streaming_sweep import LoggedRow, Sample
 from .time_budget import TimeBudget
 from .window_pass import CombinedPasses, WindowPass
 
@@ -204,7 +203,7 @@ class LiveEstimator:
         self.options = options
         self.clock = clock
         _require_phases(problem)
-        self.model = LiveModel.from_problem(problem)
+        self.model = model_from_problem(problem)
         model = self.model
         self.names = self.model.experiment.markers.names
         most_motion_m = REACH_BODY_SIZES * model.body_size_m
@@ -574,7 +573,7 @@ class LiveEstimator:
         of several measurements.
         """
         took_s: dict[int, float] = {}
-        most = min(trial.rows - 1, ROWS_PER_CHUNK, self._block_rows - 1)
+        most = min(trial.rows - 1, self.model.rows_per_chunk, self._block_rows - 1)
         for count in (1, most) * TIMING_REPETITIONS:
             again = WindowPass(
                 self.model, self.p, prior=self.prior, block_rows=self._block_rows, base=trial
@@ -649,7 +648,7 @@ class LiveEstimator:
             Pass whose standard errors are used.
         p : (P,)
         points : sequence of (P,)
-            Points in transformed parameters, see `LiveModel.transformed`.
+            Points in transformed parameters, see `StreamingModel.transformed`.
         """
         nq = self.model.collocation.nq
         distances = np.abs(np.array(points) - self.model.transformed(p))[:, :nq]
@@ -870,7 +869,7 @@ class LiveEstimator:
         """
         current_point = [pass_to_move.sweep.transformed]
         if (
-            pass_to_move.rows < pass_to_move.last_relinearised_row + ROWS_PER_CHUNK
+            pass_to_move.rows < pass_to_move.last_relinearised_row + self.model.rows_per_chunk
             or self._largest_distance(track, self.p, current_point) <= distance
         ):
             return

@@ -18,11 +18,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..array_types import Array
-from ..program.measurement_residual import lagrange_weights
+from ..program.streaming import (
+    LARGEST_SAMPLE_DELAY,
+    LoggedRow,
+    Sample,
+    StreamStencil,
+    lagrange_weights,
+)
 from ..recording.sample_times import TIME_TOLERANCE_S
 from .frames import InstrumentSample
-from .live_model import StreamStencil
-from .streaming_sweep import LARGEST_SAMPLE_DELAY, LoggedRow, Sample
 
 # Largest difference, in samples, of two times that count as equal.
 TIME_TOLERANCE_SAMPLES = 0.1

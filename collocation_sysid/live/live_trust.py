@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..array_types import Array
-from ..program.least_squares import SquareRootInformation
+from ..program.streaming import SquareRootInformation
 from ..statistics.assessment import GROSS_MISFIT, HARDLY_TAME, MISFIT, PERSISTENT, WILD
 from ..statistics.concerns import Concern, concern_if
 from ..statistics.distributions import chi2_sf, student_ppf

@@ -14,12 +14,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..problem import Problem
+from ..program.streaming import StreamingModel
 from ..recording.experiment import Experiment
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..runs.result_content import Result
 from .estimator import LiveUpdate
 from .frames import Frame
-from .live_model import LiveModel
 
 # Largest accepted datagram [bytes].
 DATAGRAM_BYTES = 65536
@@ -72,7 +72,7 @@ def read_problem(recording: Path, overrides: Sequence[str], allow_code: bool) ->
     return Problem.read(recording / "problem.toml", overrides, allow_code, folder=home)
 
 
-def frames_of_recording(experiment: Experiment, model: LiveModel) -> Iterator[Frame]:
+def frames_of_recording(experiment: Experiment, model: StreamingModel) -> Iterator[Frame]:
     """Yield the frames of an experiment's recording in the order of time; samples of instruments
     come with the first frame that is not earlier.
     """

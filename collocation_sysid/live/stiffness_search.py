@@ -9,7 +9,7 @@ import numpy as np
 
 from ..array_types import Array
 from ..methods.stiffness_scan import STIFFEST_PA, typical_parameters, without_guesses
-from .live_model import LiveModel
+from ..program.streaming import StreamingModel
 from .window_pass import WindowPass
 
 # Number of samples that decide which stiffness to start from.
@@ -25,7 +25,7 @@ class StiffnessSearch:
 
     Parameters
     ----------
-    model : LiveModel
+    model : StreamingModel
     phi : (k,)
         Nuisance parameters of every trial.
 
@@ -35,7 +35,7 @@ class StiffnessSearch:
         Number of rows of every trial.
     """
 
-    def __init__(self, model: LiveModel, phi: Array) -> None:
+    def __init__(self, model: StreamingModel, phi: Array) -> None:
         self.rows = (TRIAL_SAMPLES - 1) * model.substeps + 1
         forgotten = without_guesses(model.collocation).parameters
         self._waiting = [typical_parameters(forgotten, young).guess_q for young in TRIED_PA]

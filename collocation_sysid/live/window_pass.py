@@ -19,10 +19,17 @@ from typing import NamedTuple
 import numpy as np
 
 from ..array_types import Array
-from ..program.least_squares import SquareRootInformation
-from .live_model import ROWS_PER_CHUNK, LiveModel, Poses
+from ..program.streaming import (
+    LinearisedResidual,
+    LoggedRow,
+    SquareRootInformation,
+    StoredRow,
+    StreamingModel,
+    StreamingSweep,
+    SweepState,
+)
+from ..recording.poses import Poses
 from .live_trust import ResidualScatter
-from .streaming_sweep import LinearisedResidual, LoggedRow, StoredRow, StreamingSweep, SweepState
 
 # Largest number of samples that a second pass may lag behind for its residuals to be used.
 LARGEST_LAG = 20
@@ -55,7 +62,7 @@ class WindowPass:
 
     Parameters
     ----------
-    model : LiveModel
+    model : StreamingModel
     linearisation_point : (P,)
         Linearisation point.
     prior : SquareRootInformation
@@ -75,7 +82,7 @@ class WindowPass:
 
     def __init__(
         self,
-        model: LiveModel,
+        model: StreamingModel,
         p: Array,
         prior: SquareRootInformation,
         block_rows: int,
@@ -197,7 +204,7 @@ class WindowPass:
     @property
     def remaining_rows_of_block(self) -> int:
         """Largest number of rows that can be computed at once: those left in the block."""
-        return min(ROWS_PER_CHUNK, self.block_rows - self.rows % self.block_rows)
+        return min(self.model.rows_per_chunk, self.block_rows - self.rows % self.block_rows)
 
     @property
     def repeatable_rows(self) -> int:

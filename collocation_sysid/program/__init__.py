@@ -24,6 +24,10 @@ Linear algebra
     `sweep` solves the linearised equations of motion forward and backward in time, `factorisation`
     factorises one time step (with `lapack` and `supernodal`), `least_squares` accumulates normal
     equations in square-root form, `stopwatch` measures time.
+Streaming
+    `streaming` is the interface of time marching along a recording that arrives frame by frame:
+    `streaming_model` is its program, `streaming_sweep` marches with sensitivities, and
+    `grasp_reactions` are the reaction forces of grasps with a sensor.
 Simulation
     `simulation` simulates an experiment by `scheme_simulation` (collocation schemes) or `newmark`,
     with Newton's method of `newton_solver`, `retraction` and `step_contact`, from the equilibrium
@@ -34,5 +38,5 @@ Analyses of a motion
     while the stiffness is unknown).
 
 Methods use `Collocation`; statistics use `Transcription`, `ExperimentIterate` and `Sweep`;
-predictions use `simulate`.
+predictions use `simulate`; live estimation uses `streaming`.
 """

@@ -24,6 +24,8 @@ from .checked_arrays import float_converter, read_only_floats
 from .sample_times import TIME_TOLERANCE_S, first_unordered_time
 
 Interpolation = Literal["smooth", "linear", "hold"]
+# Rotation (3, 3) and translation (3,) of each grasp at one time.
+Poses = tuple[tuple[Array, Array], ...]
 
 # Largest deviation of a quaternion's norm from one: files print four digits or more.
 QUATERNION_NORM_TOLERANCE = 1e-3

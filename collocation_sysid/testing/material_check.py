@@ -253,7 +253,7 @@ def _check_derivatives(check: PropertyCheck, law: EnergyDerivatives, F: Array, w
         psi, law.evaluate_plain(F), statement=f"the energy differs from its function {where}"
     )
     check.require_derivative(
-        law.evaluate_plain, stress, F, statement=f"P is not ∂ψ/∂F {where}", scale=0.1
+        lambda at: law.evaluate(at)[0], stress, F, statement=f"P is not ∂ψ/∂F {where}", scale=0.1
     )
     check.require_derivative(
         lambda at: law.evaluate(at)[1], tangent, F, statement=f"∂P/∂F is wrong {where}", scale=0.1

@@ -14,15 +14,14 @@ import numpy as np
 
 from ..array_types import Array, Index
 from ..model.equations_at_parameters import EquationsAtParameters
-from ..program.observables import ReactionForces
-from ..program.reaction_forces import GraspForces
-from ..program.wrench_observable import GraspWrench, ReactionGrid
+from ..recording.poses import Poses
+from .observables import ReactionForces
+from .reaction_forces import GraspForces
+from .wrench_observable import GraspWrench, ReactionGrid
 
 # Number of time steps after which the wrench of a time is available.
 DELAY_STEPS = 1
 
-# Rotation (3, 3) and translation (3,) of each grasp.
-Poses = tuple[tuple[Array, Array], ...]
 # Wrench of a grasp, and the index of the grasp.
 Sensor = tuple[GraspWrench, int]
 # Weights of the forces and of the positions: two matrices (rows, rows) of the template.

@@ -21,21 +21,22 @@ from numpy.typing import NDArray
 from ..array_types import Array
 from ..fem.body import Linearisation
 from ..model.dynamics import StencilRow
-from ..program.initial_equilibrium import initial_state
-from ..program.least_squares import SquareRootInformation
-from ..program.measurement_residual import huber_as_least_squares, lagrange_weights
-from ..program.newton_solver import NewtonFailure, simulation_error
-from ..program.observables import ObservableDerivatives, ObservedMotion
-from ..program.scheme_simulation import RowEquations, extrapolate, solve_row
-from ..program.sweep import (
+from ..recording.poses import Poses
+from .grasp_reactions import DELAY_STEPS, GraspReactions
+from .initial_equilibrium import initial_state
+from .least_squares import SquareRootInformation
+from .measurement_residual import huber_as_least_squares, lagrange_weights
+from .newton_solver import NewtonFailure, simulation_error
+from .observables import ObservableDerivatives, ObservedMotion
+from .scheme_simulation import RowEquations, extrapolate, solve_row
+from .streaming_model import ROW_TOLERANCE, ROWS_PER_CHUNK, StreamingModel
+from .sweep import (
     FactorisedStep,
     ForwardState,
     ForwardSubstitution,
     PrescribedColumns,
     SweepColumns,
 )
-from .grasp_reactions import DELAY_STEPS, GraspReactions, Poses
-from .live_model import ROW_TOLERANCE, ROWS_PER_CHUNK, LiveModel
 
 # Largest correction of a row, divided by the size of the body, after which the row is not
 # linearised again: the next correction would be about its square.
@@ -85,7 +86,7 @@ class StoredRow(NamedTuple):
     Attributes
     ----------
     transformed : (P,)
-        Transformed parameters of the pass, see `LiveModel.transformed`.
+        Transformed parameters of the pass, see `StreamingModel.transformed`.
     x : (3n,)
         Positions [m].
     columns : (3n, m) float32
@@ -98,7 +99,7 @@ class StoredRow(NamedTuple):
 
 
 class LinearisedResidual(NamedTuple):
-    """Residuals of a sample, linear in the transformed parameters, see `LiveModel.transformed`.
+    """Residuals of a sample, linear in the parameters of `StreamingModel.transformed`.
 
     Attributes
     ----------
@@ -161,7 +162,7 @@ class StreamingSweep:
 
     Parameters
     ----------
-    model : LiveModel
+    model : StreamingModel
     p : (P,)
         Linearisation point.
     known : SquareRootInformation
@@ -187,7 +188,7 @@ class StreamingSweep:
 
     def __init__(
         self,
-        model: LiveModel,
+        model: StreamingModel,
         p: Array,
         prior_information: SquareRootInformation,
         start: SweepState | None = None,

@@ -1,0 +1,459 @@
+"""Program of a recording that arrives frame by frame, for time marching without an end.
+
+A short still recording with the same body, grasps and markers represents recordings of any length:
+its first rows have the stencils of the start, and its last row has those of all later rows.
+`StreamingModel` holds this recording and everything that does not depend on the parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..array_types import Array, Index
+from ..fem.constants import GAMMA_M, without_region
+from ..model.dynamics import StencilRow
+from ..recording.experiment import Experiment
+from ..recording.measured_wrench import Wrench
+from ..recording.poses import Poses, PoseSequence
+from .collocation import Collocation
+from .custom_sensor_residual import NEIGHBOURS as GAUGE_NEIGHBOURS
+from .custom_sensor_residual import observed_points
+from .grasp_reactions import DELAY_STEPS, Sensor
+from .least_squares import SquareRootInformation
+from .marker_residual import NEIGHBOURS, MarkerResidual
+from .measurement_residual import MeasurementResidual
+from .newton_solver import NewtonOptions, NewtonSolver
+from .observables import PointPositions
+from .sweep import Sweep
+from .transcription import Transcription
+from .wrench_observable import GraspWrench
+from .wrench_residual import NEIGHBOURS as WRENCH_NEIGHBOURS
+
+if TYPE_CHECKING:
+    from ..fem.kernels.skyline import FactorMemory
+
+# Largest number of rows that are linearised together; limits memory.
+ROWS_PER_CHUNK = 8
+# Standard deviation of a weak prior on the logarithm of each parameter, a factor of 10: it keeps
+# parameters finite that the first frames do not determine, and is negligible later.
+WEAK_PRIOR_DEVIATION = 2.3
+# Accuracy of rows whose grasp displacement has to be applied in parts.
+CAREFUL_OPTIONS = NewtonOptions(tolerance=1e-6)
+# Largest distance of a sample from a row, in rows, at which no interpolation is needed.
+ROW_TOLERANCE = 1e-3
+
+
+class StreamStencil(NamedTuple):
+    """Rows that samples of an instrument need, in a recording that continues.
+
+    Attributes
+    ----------
+    neighbours : int
+        Number of rows around a sample if its clock is right.
+    clock_error : float
+        Largest error of its clock, in rows.
+    first : int
+        Index of the first row at which the observed quantity exists.
+    delay : int
+        Number of rows after which it is available.
+    """
+
+    neighbours: int
+    clock_error: float = 0.0
+    first: int = 0
+    delay: int = 0
+
+    def rows_of_sample(self, at: float) -> range:
+        """Return the rows that a sample at a position `at`, in rows, needs."""
+        begins, ends = (
+            max(int(np.floor(at + off + ROW_TOLERANCE)) - (self.neighbours - 1) // 2, self.first)
+            for off in (-self.clock_error, self.clock_error)
+        )
+        return range(begins, ends + self.neighbours)
+
+
+class StreamInstrument(NamedTuple):
+    """Instrument whose samples come with frames: a custom sensor, or the sensor of a grasp.
+
+    Attributes
+    ----------
+    reading : MeasurementResidual
+        Sensor model.
+    stencil : StreamStencil
+        Rows that its samples need.
+    observable : slice or int
+        Slice of its points among all observed points, or the index of the grasp sensor.
+    """
+
+    reading: MeasurementResidual
+    stencil: StreamStencil
+    observable: slice | int
+
+
+@dataclass(frozen=True, eq=False)
+class StreamingModel:
+    """Program whose recording arrives frame by frame.
+
+    Attributes
+    ----------
+    experiment : Experiment
+        Fitted experiment, as declared in the problem.
+    collocation : Collocation
+        Program of the still recording.
+    """
+
+    experiment: Experiment
+    collocation: Collocation
+
+    @classmethod
+    def from_collocation(cls, experiment: Experiment, collocation: Collocation) -> StreamingModel:
+        """Return the model of an experiment that is fitted by a program.
+
+        Parameters
+        ----------
+        experiment : Experiment
+            Fitted experiment. Its grasps hold throughout, and its loads are constant.
+        collocation : Collocation
+            Program of this experiment, in which every parameter has a guess.
+        """
+        still = replace(collocation, experiments=[_still_experiment(experiment, collocation)])
+        return cls(experiment, still)
+
+    def at_start(self, poses: Poses) -> Experiment:
+        """Return the experiment that begins with its grasps at these poses."""
+        still = self.segment.experiment
+        return replace(still, grasps=_grasps_at(still, poses))
+
+    def with_marker_places(self, tracks_m: Array, x: Array) -> StreamingModel:
+        """Return the model with unknown marker places set from the first frame.
+
+        Self if all are known.
+
+        Parameters
+        ----------
+        tracks_m : (M, 3)
+            Marker positions of the first frame, NaN where missing.
+        x : (3n,)
+            Node positions of the start [m].
+        """
+        unknown = ~self.segment.experiment.markers.located & np.isfinite(tracks_m).all(axis=1)
+        if not unknown.any():
+            return self
+        places_m = self.segment.marker_places_m(self.segment.guess_phi)
+        nodes_m = x.reshape(-1, 3)
+        places_m[unknown] = self.segment.association.places_of_points(nodes_m, tracks_m[unknown])
+        return replace(self, collocation=self.collocation.with_marker_places([places_m]))
+
+    @cached_property
+    def segment(self) -> Transcription:
+        """Transcription of the still recording."""
+        return self.collocation.transcriptions[0]
+
+    @cached_property
+    def solver(self) -> Sweep:
+        """Solver of the rows of the template."""
+        return Sweep(self.segment, self.template_rows)
+
+    @cached_property
+    def newton(self) -> NewtonSolver:
+        """Newton solver for the start, and for rows whose grasp displacement is applied in
+        parts.
+        """
+        return NewtonSolver(self.segment.experiment, CAREFUL_OPTIONS)
+
+    @cached_property
+    def template_rows(self) -> int:
+        """Number of rows of the template: those of the start, and those that are linearised
+        together.
+        """
+        return 2 * self.segment.dynamics.largest_lag + 2 + ROWS_PER_CHUNK
+
+    @cached_property
+    def parameter_count(self) -> int:
+        """Number P of parameters p."""
+        return self.collocation.nq + self.collocation.nphi
+
+    @property
+    def rows_per_chunk(self) -> int:
+        """Largest number of rows that are linearised together."""
+        return ROWS_PER_CHUNK
+
+    @property
+    def substeps(self) -> int:
+        """Number of rows per sample."""
+        return self.collocation.substeps
+
+    @property
+    def interval_s(self) -> float:
+        """Time between two samples [s]."""
+        return self.experiment.timestep_s
+
+    @cached_property
+    def _mass_damping(self) -> tuple[Index, Array]:
+        """Indices in p of the mass-proportional damping coefficients γ_m, and their coordinates in
+        p (logarithms) at the guess.
+        """
+        free = self.collocation.parameters.free
+        places = np.flatnonzero([without_region(item.name) == GAMMA_M.name for item in free])
+        return places, self.collocation.guess_p[places]
+
+    def transformed(self, p: Array) -> Array:
+        """Return the variables (P,) in which residuals are nearly linear, for parameters p (P,).
+
+        For mass-proportional damping γ_m this is its value divided by the guess, otherwise p
+        itself.
+        """
+        places, guesses = self._mass_damping
+        transformed_values = p.copy()
+        transformed_values[places] = np.exp(p[places] - guesses)
+        return transformed_values
+
+    def physical(self, transformed: Array) -> Array:
+        """Return the parameters p of transformed variables: the inverse of `transformed`."""
+        places, guesses = self._mass_damping
+        p = transformed.copy()
+        p[places] = guesses + np.log(transformed[places])
+        return p
+
+    def transformation_derivatives(self, transformed: Array) -> Array:
+        """Return the derivatives (P,) of the transformed variables with respect to p, one per entry
+        because each depends on its own parameter only, at `transformed` (P,).
+        """
+        places, _ = self._mass_damping
+        rates = np.ones(len(transformed))
+        rates[places] = transformed[places]
+        return rates
+
+    def prior_information(self, p: Array) -> SquareRootInformation:
+        """Return the information before the first frame, linearised about p: priors and a weak
+        prior.
+        """
+        residual, slopes = self.collocation.prior_residuals(p)
+        nq = self.collocation.nq
+        transformed_values = self.transformed(p)
+        from_guess = (p[:nq] - self.collocation.parameters.guess_q) / WEAK_PRIOR_DEVIATION
+        rows = np.vstack(
+            [np.diag(slopes), np.eye(nq, self.parameter_count) / WEAK_PRIOR_DEVIATION]
+        ) / self.transformation_derivatives(transformed_values)
+        empty = SquareRootInformation.empty(self.parameter_count)
+        return empty.with_rows(np.concatenate([residual, from_guess]), rows, transformed_values)
+
+    @cached_property
+    def neighbouring_samples(self) -> int:
+        """Number of samples before and after one that its evaluation needs.
+
+        0 if no clock is estimated.
+        """
+        return NEIGHBOURS // 2 if len(self.segment.nuisance.clock_indices) else 0
+
+    @cached_property
+    def marker_model(self) -> MarkerResidual:
+        """Sensor model of one marker sample, in the middle of its neighbours, measured at the
+        origin.
+        """
+        neighbours = self.neighbouring_samples
+        markers = self.segment.experiment.markers
+        origin = replace(
+            markers, t_s=markers.t_s[:1], positions_m=np.zeros((1, len(markers.names), 3))
+        )
+        rows = np.arange(2 * neighbours + 1)
+        segment = self.segment
+        return MarkerResidual.from_markers(
+            origin, rows, segment.nuisance, segment.association, preceding_times=neighbours
+        )
+
+    @cached_property
+    def instruments(self) -> tuple[StreamInstrument, ...]:
+        """Custom sensors, then the sensors of grasps."""
+        instruments = []
+        place = len(self.experiment.markers.names)
+        step_s = self.segment.dynamics.step_s
+        points = iter(self.observed_points)
+        for reading in (*self.segment.custom_sensors, *self.segment.sensors):
+            channel = reading.observable
+            is_custom = reading in self.segment.custom_sensors
+            stencil = StreamStencil(GAUGE_NEIGHBOURS)
+            if isinstance(channel, GraspWrench):
+                observable = [other for other, _ in self.wrench_sensors].index(channel)
+                stencil = stencil._replace(first=int(channel.known_rows[0]), delay=DELAY_STEPS)
+                if not is_custom:
+                    clock_error = channel.clock_limit_s / step_s
+                    stencil = stencil._replace(
+                        neighbours=WRENCH_NEIGHBOURS, clock_error=clock_error
+                    )
+            else:
+                points_of_sensor = next(points)
+                reading = replace(reading, observable=points_of_sensor)
+                observable = slice(place, place + points_of_sensor.vector_count)
+                place += points_of_sensor.vector_count
+            instruments.append(StreamInstrument(reading, stencil, observable))
+        return tuple(instruments)
+
+    @cached_property
+    def largest_delay_rows(self) -> int:
+        """Largest number of rows that instruments need in addition to those of the markers."""
+        spans = (2 * each.stencil.clock_error + each.stencil.delay for each in self.instruments)
+        return int(np.ceil(max(spans, default=0.0)))
+
+    @cached_property
+    def observed_points(self) -> tuple[PointPositions, ...]:
+        """Points that custom sensors of points observe."""
+        still = self.segment.experiment
+        gauges = [gauge for gauge in still.readings if gauge.grasp is None]
+        return tuple(observed_points(still, gauge, GAUGE_NEIGHBOURS) for gauge in gauges)
+
+    @cached_property
+    def wrench_sensors(self) -> tuple[Sensor, ...]:
+        """Wrenches of grasps that sensors observe, each with the index of its grasp."""
+        channels = [reading.observable for reading in self.segment.residuals]
+        grasps = [id(grasp) for grasp in self.segment.experiment.grasps]
+        wrenches = (channel for channel in channels if isinstance(channel, GraspWrench))
+        return tuple((channel, grasps.index(id(channel.grasp))) for channel in wrenches)
+
+    @cached_property
+    def wrenches(self) -> dict[int, Wrench]:
+        """Wrench sensors of the problem's recording, by the number of their grasp, from 1 on."""
+        pairs = enumerate(self.experiment.grasps, 1)
+        return {number: grasp.wrench for number, grasp in pairs if grasp.wrench is not None}
+
+    @cached_property
+    def moving_grasps(self) -> Index:
+        """Indices, from 0, of the grasps whose poses come with the frames; others never move."""
+        grasps = self.experiment.grasps
+        return np.flatnonzero([len(grasp.poses.t_s) > 1 for grasp in grasps])
+
+    @cached_property
+    def first_poses(self) -> Poses:
+        """Poses of all grasps at the start of the problem's recording."""
+        return _first_poses(self.experiment)
+
+    def all_poses(self, moved: Poses) -> Poses:
+        """Return the poses of all grasps from those of the moving ones."""
+        still = list(self.first_poses)
+        for number, pose in zip(self.moving_grasps, moved, strict=True):
+            still[number] = pose
+        return tuple(still)
+
+    @cached_property
+    def cached_rows(self) -> dict[int, StencilRow]:
+        """Cached coefficients of rows with constant masses, by index; filled on demand."""
+        return {}
+
+    @cached_property
+    def factor_memory(self) -> FactorMemory | None:
+        """Memory for the factor of a row, shared by all passes; None without native code."""
+        return self.solver.factoriser.allocate(1 + self.segment.body.is_unsymmetric)
+
+    @cached_property
+    def linearisation_memory(self) -> Array:
+        """Memory for rows that are linearised together."""
+        return np.empty((ROWS_PER_CHUNK, self.segment.dynamics.forces.linearisation_width))
+
+    @cached_property
+    def body_size_m(self) -> float:
+        """Diagonal of the body [m]."""
+        return float(np.linalg.norm(np.ptp(self.segment.body.nodes_m, axis=0)))
+
+    def displaced_nodes(self, phi: Array) -> tuple[Array, Array]:
+        """Return the undeformed positions H X (g, 3) [m] of the node of each of the g grasped dofs,
+        H being the body's pose in the gripper, and their derivatives (g, 3, m) with respect to the
+        nuisance parameters φ.
+        """
+        return self.segment.prescribed_motion.displaced_nodes(phi)
+
+    def prescribed_positions(
+        self, displaced_nodes: tuple[Array, Array], poses: Sequence[Poses]
+    ) -> tuple[Array, Array]:
+        """Return the prescribed positions (K, g) at K poses, and their derivatives by φ (K, g, m).
+
+        Parameters
+        ----------
+        displaced_nodes : tuple
+            Result of `displaced_nodes`.
+        poses : sequence of Poses
+            K poses of all grasps.
+        """
+        rotations = np.array([[turn for turn, _ in each] for each in poses])[:, *self._axes]
+        shifts = np.array([[shift for _, shift in each] for each in poses])[:, *self._axes]
+        goal = np.einsum("kgj,gj->kg", rotations, displaced_nodes[0]) + shifts
+        return goal, np.einsum("kgj,gjm->kgm", rotations, displaced_nodes[1])
+
+    @cached_property
+    def _axes(self) -> tuple[Index, Index]:
+        """Index of the grasp and axis of each grasped dof, (g,) each."""
+        dofs = self.segment.prescribed_motion.dofs
+        grasp = np.zeros_like(dofs)
+        for k, each in enumerate(self.experiment.grasps):
+            grasp[np.searchsorted(dofs, each.prescribed_dofs)] = k
+        return grasp, dofs % 3
+
+    @cached_property
+    def stencils(self) -> tuple[Array, Array, Array, Array]:
+        """Coefficients p, q, w and s of all rows, as (rows, rows) matrices.
+
+        q and s include the time step.
+        """
+        dynamics = self.segment.dynamics.truncated_to(self.template_rows)
+        tables = dynamics.tables
+        step_s = dynamics.step_s
+        p, q, w, s = (
+            np.sum([np.diag(each[lag:, lag], -lag) for lag in range(each.shape[1])], axis=0)
+            for each in (tables.p, tables.q, tables.w, tables.s)
+        )
+        return p, q / step_s, w, s / step_s**2
+
+
+def _still_experiment(experiment: Experiment, collocation: Collocation) -> Experiment:
+    """Return the experiment as a few samples in which nothing moves."""
+    reach = collocation.transcriptions[0].dynamics.largest_lag
+    # The rows of the start, and room for a reading.
+    count = max(2 * reach + 2 + ROWS_PER_CHUNK, NEIGHBOURS, 3)
+    t_s = experiment.timestep_s * np.arange(count)
+    markers = experiment.markers
+    first, _ = markers.first_samples
+    tracks = np.tile(np.nan_to_num(first), (count, 1, 1))
+    gauges = [
+        replace(g, t_s=t_s, values=np.zeros((count, g.measured_values.shape[1])))
+        for g in experiment.readings
+    ]
+    return replace(
+        experiment,
+        t_s=t_s,
+        grasps=[
+            replace(grasp, wrench=grasp.wrench and _still_wrench(grasp.wrench, t_s))
+            for grasp in _grasps_at(experiment, _first_poses(experiment))
+        ],
+        markers=replace(markers, t_s=t_s, positions_m=tracks),
+        readings=gauges,
+    )
+
+
+def _still_wrench(wrench: Wrench, t_s: NDArray) -> Wrench:
+    """Return a wrench sensor with values of zero at the times t_s, NaN for components that it does
+    not measure.
+    """
+    values = np.where(wrench.measured_components, np.zeros((len(t_s), 1)), np.nan)
+    return replace(wrench, t_s=t_s, values=values)
+
+
+def _first_poses(experiment: Experiment) -> Poses:
+    """Return the poses of all grasps at the start of a recording."""
+    poses = (grasp.poses.at(grasp.poses.t_s[:1]) for grasp in experiment.grasps)
+    return tuple((rotations[0], shifts[0]) for rotations, shifts in poses)
+
+
+def _grasps_at(experiment: Experiment, poses: Poses) -> list:
+    """Return the grasps of an experiment, at rest at given poses."""
+    grasps = []
+    for grasp, (turn, shift) in zip(experiment.grasps, poses, strict=True):
+        matrix = np.eye(4)
+        matrix[:3, :3] = turn
+        matrix[:3, 3] = shift
+        grasps.append(replace(grasp, poses=PoseSequence.from_matrices([0.0], matrix[None])))
+    return grasps
