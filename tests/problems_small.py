@@ -215,6 +215,8 @@ def driven_bar(steps: int = 8) -> Experiment:
     body = Body(TetMesh(whole.points_m, whole.tetrahedra[~inside]), density_kg_m3=30.0)
     points = [(x, 0.05, 0.03 + 0.1 * x) for x in (0.0, 0.05, 0.08, 0.118)]
     tip = nodes_where(body, 0, 0.12)
+    cavity = Box((0.02, 0.015, 0.015), (0.1, 0.045, 0.045))
+    rising = Pressure(cavity, [15.0, 25.0], t_s[[0, -1]], lag_s=0.02)
     return Experiment(
         body,
         t_s,
@@ -222,12 +224,13 @@ def driven_bar(steps: int = 8) -> Experiment:
         vertex_markers(body, tip, t_s),
         name="driven bar",
         tendons=[Tendon(points, 0.02 + 0.5 * t_s, t_s)],
-        pressures=[Pressure(Box((0.02, 0.015, 0.015), (0.1, 0.045, 0.045)), 20.0)],
+        pressures=[rising],
         nuisance=Nuisance.none(
             tension_factor=0.1,
             tension_lost_n=0.01,
             pressure_factor=0.1,
             pressure_lost_pa=5.0,
+            pressure_lag=0.5,
             gravity_rad=0.03,
         ),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from actuation_small import hollow_octant
-from scipy.integrate import solve_bvp
+from scipy.integrate import solve_bvp, solve_ivp
 from scipy.optimize import brentq
 
 from collocation_sysid.errors import InputError
@@ -148,3 +148,40 @@ def test_tensions_are_applied_in_parts_where_newton_fails_at_once():
     forces = Forces.from_experiment(experiment, [0.0], theta).total(x[None], np.zeros((1, x.size)))
     assert np.abs(forces[0, NewtonSolver(experiment).free]).max() < 1e-8
     assert np.linalg.norm(x.reshape(-1, 3)[-1] - body.nodes_m[-1]) > 0.05
+
+
+def lagging_pressure(lag_s: float) -> Pressure:
+    """A pressure that rises from 5 to 20 Pa, rests, and falls."""
+    return Pressure(
+        Named("cavity"), [5.0, 5.0, 20.0, 20.0, 12.0], [0, 0.1, 0.11, 0.3, 0.5], lag_s=lag_s
+    )
+
+
+def test_a_lagging_pressure_solves_its_differential_equation():
+    """Integrated by scipy, piece by piece between the corners of the stated pressure."""
+    pressure = lagging_pressure(0.04)
+    t_s = np.linspace(0, 0.5, 51)
+    found = solve_ivp(
+        lambda t, p: (np.interp(t, pressure.t_s, pressure.pressure_pa) - p) / 0.04,
+        (0.0, 0.5),
+        [5.0],
+        t_eval=t_s,
+        max_step=1e-3,
+        rtol=1e-10,
+        atol=1e-10,
+    )
+    np.testing.assert_allclose(-pressure.energy_amplitude_at(t_s), found.y[0], rtol=1e-5)
+
+
+def test_a_vanishing_lag_leaves_the_stated_pressure():
+    t_s = np.linspace(0, 0.5, 51)
+    np.testing.assert_allclose(
+        lagging_pressure(1e-7).energy_amplitude_at(t_s),
+        lagging_pressure(0.0).energy_amplitude_at(t_s),
+        rtol=1e-3,
+    )
+
+
+def test_a_constant_pressure_with_a_lag_is_refused():
+    with pytest.raises(InputError, match=r"lag_s of 0\.1 s; expected a table"):
+        Pressure(Named("cavity"), 5.0, lag_s=0.1)

@@ -137,7 +137,7 @@ def test_tendons_and_pressures_are_lengths_and_volumes_times_what_drives_them(rn
     xi = states(Collocation([BAR], GUESS).transcriptions[0], rng)[0][:2]
     tendon, pressure = BAR.actuators
     expected = -tension_n(FROM_S)[:, None] * tendon.measure.gradient(xi)
-    expected += 20.0 * pressure.measure.gradient(xi)
+    expected -= pressure.energy_amplitude_at(FROM_S)[:, None] * pressure.measure.gradient(xi)
     given = States(xi, np.zeros_like(xi), np.zeros(0))
     found = sum(term.force(given) for term in Forces.from_experiment(BAR, FROM_S).external_terms)
     np.testing.assert_allclose(found, expected, atol=1e-12)
@@ -147,14 +147,17 @@ def test_what_is_lost_and_a_factor_count_and_a_tendon_only_pulls():
     tendon, pressure = BAR.actuators
     stated = tension_n(FROM_S)
     np.testing.assert_allclose(
-        tendon.with_factor_and_offset(1.2, 0.003).energy_amplitude_at(FROM_S), 1.2 * stated - 0.003
+        tendon.with_calibration(1.2, 0.003, 0.0).energy_amplitude_at(FROM_S), 1.2 * stated - 0.003
     )
     np.testing.assert_array_equal(
-        tendon.with_factor_and_offset(1.0, 1.0).energy_amplitude_at(FROM_S), 0.0
+        tendon.with_calibration(1.0, 1.0, 0.0).energy_amplitude_at(FROM_S), 0.0
     )
+    in_chamber = -pressure.energy_amplitude_at(FROM_S)
     np.testing.assert_allclose(
-        pressure.with_factor_and_offset(0.9, 2.0).energy_amplitude_at(FROM_S), -(0.9 * 20.0 - 2.0)
+        pressure.with_calibration(0.9, 2.0, 0.0).energy_amplitude_at(FROM_S),
+        -(0.9 * in_chamber - 2.0),
     )
+    assert pressure.with_calibration(1.0, 0.0, np.log(2)).lag_s == pytest.approx(2 * pressure.lag_s)
 
 
 def test_forces_on_the_way_to_other_times_lie_between_them(segment, rng):

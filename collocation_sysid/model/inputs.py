@@ -178,14 +178,14 @@ def inputs_from_experiment(
         declared_calibration = nuisance.declared_calibration[number].tolist()
         places = nuisance.actuator_calibration_indices(number)
 
-        def driven(p: ca.SX, course: ca.SX) -> ca.SX:
+        def driven(p: ca.SX, data: ca.SX) -> ca.SX:
             calibration = (
                 nominal + value(p, phi)
                 for nominal, phi in zip(declared_calibration, places, strict=True)
             )
-            return actuator.energy_amplitude(course, *calibration)
+            return actuator.calibrated_amplitude(data, *calibration)
 
-        return Input(1, driven, actuator.declared_values.values_at(evaluated_s)[None])
+        return Input(1, driven, actuator.input_data(evaluated_s))
 
     groups = [Input(len(experiment.body.constants), theta, no_data)]
     if len(nuisance.gravity_indices):

@@ -45,6 +45,7 @@ from ..recording.nuisance import (
     OBSTACLE_TIME,
     PLACE,
     POSE_TURN,
+    PRESSURE_LAG,
     PRESSURE_OFFSET,
     STRAIN_ZERO,
     TARE,
@@ -146,8 +147,9 @@ class NuisanceMap:
         Pivot c of the rigid motion in the frame of the markers.
     grasp_pivot_m : (3,)
         Pivot c_h of the motion of the body in its grasp.
-    declared_calibration : (A, 2)
-        Factor f and loss b of each tension and pressure, as stated.
+    declared_calibration : (A, 3)
+        Factor f, loss b and logarithm of the lag over the stated lag of each tension and pressure,
+        as stated.
     timed_loads : tuple of TimedLoad
         Loads with an estimated time, in the order of their parameters.
     recorded_s : (float, float)
@@ -209,7 +211,7 @@ class NuisanceMap:
             np.array(experiment.gravity_m_s2),
             middle_m if pivot_m is None else pivot_m,
             body.nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(axis=0),
-            np.array([a.factor_and_offset for a in experiment.actuators]).reshape(-1, 2),
+            np.array([a.calibration for a in experiment.actuators]).reshape(-1, 3),
             tuple(timed for _, timed in _timed_loads(experiment)),
             (float(experiment.t_s[0]), float(experiment.t_s[-1])),
             _strain_shifts_m(experiment),
@@ -286,19 +288,20 @@ class NuisanceMap:
         """Indices in φ of the calibration of tensions and pressures."""
         return self._indices_where(lambda e: "drives" in e.row.changes)
 
-    def actuator_calibration_indices(self, number: int) -> tuple[int, int]:
-        """Return the indices in φ of factor and offset of the actuator with index `number`; −1 for
-        one that is not estimated.
+    def actuator_calibration_indices(self, number: int) -> tuple[int, int, int]:
+        """Return the indices in φ of factor, offset and logarithm of the lag of the actuator with
+        index `number`; −1 for one that is not estimated.
         """
-        indices = [-1, -1]
+        columns = {TENSION_OFFSET.name: 1, PRESSURE_OFFSET.name: 1, PRESSURE_LAG.name: 2}
+        indices = [-1, -1, -1]
         for k in self.actuator_indices:
             if self.entries[k].number == number:
-                indices[self.entries[k].row in (TENSION_OFFSET, PRESSURE_OFFSET)] = int(k)
-        return indices[0], indices[1]
+                indices[columns.get(self.entries[k].row.name, 0)] = int(k)
+        return indices[0], indices[1], indices[2]
 
     def actuator_calibration(self, phi: Array) -> Array:
-        """Return factor f and offset b (A, 2) of each tendon and pressure at φ, the stated ones
-        where they are not estimated.
+        """Return factor f, offset b and logarithm of the lag over the stated lag (A, 3) of each
+        tendon and pressure at φ, the stated ones where they are not estimated.
         """
         calibration = self.declared_calibration.copy()
         values = phi * self.scales

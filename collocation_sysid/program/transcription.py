@@ -583,7 +583,7 @@ class Transcription:
             grasps = self.nuisance.with_grasps(grasps, phi)
         drive_errors = iter(self.nuisance.actuator_calibration(phi))
         tendons, pressures = (
-            tuple(actuator.with_factor_and_offset(*next(drive_errors)) for actuator in actuators)
+            tuple(actuator.with_calibration(*next(drive_errors)) for actuator in actuators)
             for actuators in (self.experiment.tendons, self.experiment.pressures)
         )
         changed = replace(

@@ -1,5 +1,8 @@
 """Actuators inside a body: energies c(t) S(x) of an amplitude c and a scalar S of the body's
 shape.
+
+The calibration of an actuator is three numbers: the factor on the stated tension or pressure, its
+offset (the part that is lost), and the logarithm of the ratio of its lag to the stated lag.
 """
 
 from __future__ import annotations
@@ -7,6 +10,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar
+
+import casadi as ca
 
 from ..array_types import Array
 from ..errors import InputError
@@ -81,13 +86,27 @@ class Actuator(ABC, Generic[S]):
         return self.body_measure.measure
 
     @property
-    def factor_and_offset(self) -> tuple[float, float]:
-        """Factor on the stated tension or pressure, and its offset (the part that is lost)."""
-        return self.factor, getattr(self, self.offset_field)
+    def calibration(self) -> tuple[float, float, float]:
+        """Factor, offset, and logarithm of the lag over the stated lag, as stated: zero."""
+        return self.factor, getattr(self, self.offset_field), 0.0
 
-    def with_factor_and_offset(self, factor: float, offset: float) -> Self:
-        """Return the actuator with another factor and another offset."""
+    def with_calibration(self, factor: float, offset: float, log_lag_ratio: float) -> Self:
+        """Return the actuator with another calibration; without a lag, `log_lag_ratio` has no
+        effect.
+        """
         return replace(self, factor=factor, **{self.offset_field: offset})
+
+    def input_data(self, t_s: Array) -> Array:
+        """Return the data (d, T) of which `calibrated_amplitude` is a function at the times `t_s`
+        (T,).
+        """
+        return self.declared_values.values_at(t_s)[None]
+
+    def calibrated_amplitude(
+        self, data: ca.SX, factor: Any, offset: Any, log_lag_ratio: Any
+    ) -> ca.SX:
+        """Return the amplitude c for a calibration, as an expression of `input_data` (d,)."""
+        return self.energy_amplitude(data, factor, offset)
 
     @abstractmethod
     def energy_amplitude(self, declared_value: Any, factor: Any, offset: Any) -> Any:
@@ -97,4 +116,5 @@ class Actuator(ABC, Generic[S]):
 
     def energy_amplitude_at(self, t_s: Array) -> Array:
         """Return the amplitude c at the times `t_s` (T,), as (T,)."""
-        return self.energy_amplitude(self.declared_values.values_at(t_s), *self.factor_and_offset)
+        factor, offset, _ = self.calibration
+        return self.energy_amplitude(self.declared_values.values_at(t_s), factor, offset)

@@ -505,6 +505,18 @@ PRESSURE_OFFSET = NuisanceRow(
     sentence="{which} {signed}",
     description="offset by which each pressure is lower than stated",
 )
+PRESSURE_LAG = NuisanceRow(
+    "pressure_lag",
+    "1",
+    None,
+    key="pressure_lag",
+    of="pressure",
+    changes=("drives",),
+    applies=lambda experiment: any(each.lag_s for each in experiment.pressures),
+    label="{which}, log of lag over stated lag",
+    sentence="{which}: log of lag over stated lag {signed}",
+    description="lag of each pressure: the logarithm of its ratio to the stated lag_s",
+)
 JOINING = NuisanceRow(
     "joining_s",
     "s",

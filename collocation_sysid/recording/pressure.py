@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -14,7 +15,7 @@ from ..errors import InputError
 from ..fem.refinement import split_faces_in_four
 from ..fem.selection import Indices, Selection, rows_of_faces
 from ..fem.shape import EnclosedVolume
-from ..validated_types import Finite, Text
+from ..validated_types import Finite, NotNegative, Text
 from .actuator import Actuator, BodyMeasure
 from .loads import TimeSeries
 from .node_selection import Nodes, selection_from_section
@@ -70,6 +71,9 @@ class Pressure(Actuator[EnclosedVolume]):
         recording.
     name : str
         Name; pressure_1, pressure_2 and so on by default.
+    lag_s : float
+        Time constant τ of the pressure p in the chamber behind valve and tube,
+        τ dp/dt = stated pressure − p, beginning at the first stated pressure; zero for no lag.
     factor, loss_pa : float
         Pressure in the body: factor · stated pressure − loss_pa.
     """
@@ -79,6 +83,7 @@ class Pressure(Actuator[EnclosedVolume]):
     t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
     name: str = key(Text | None, default="pressure")
     _: KW_ONLY
+    lag_s: float = key(NotNegative, default=0.0)
     factor: float = 1.0
     loss_pa: float = 0.0
     body_measure: BodyMeasure[EnclosedVolume] | None = None
@@ -89,6 +94,11 @@ class Pressure(Actuator[EnclosedVolume]):
     def __post_init__(self) -> None:
         pressure = TimeSeries(self.pressure_pa, self.t_s, f"pressure_pa of {self.name}")
         vars(self).update(pressure_pa=pressure.values, t_s=pressure.t_s, declared_values=pressure)
+        if self.lag_s and self.t_s is None:
+            raise InputError(
+                f"{self.name} is constant and has a lag_s of {self.lag_s:g} s; expected a table of "
+                "pressures, which a lag delays, or no lag_s"
+            )
 
     def _measure_on(self, body: Body) -> EnclosedVolume:
         """Return the volume behind the faces of a body.
@@ -132,6 +142,48 @@ class Pressure(Actuator[EnclosedVolume]):
     def energy_amplitude(self, declared_value: Any, factor: Any, offset: Any) -> Any:
         """Return the amplitude of the energy: minus the pressure in the body."""
         return offset - factor * declared_value
+
+    def with_calibration(self, factor: float, offset: float, log_lag_ratio: float) -> Self:
+        """Return the pressure with another calibration."""
+        lag_s = self.lag_s * float(np.exp(log_lag_ratio))
+        return replace(self, factor=factor, loss_pa=offset, lag_s=lag_s)
+
+    def input_data(self, t_s: Array) -> Array:
+        """Return the times (1, T) if the pressure lags, else the stated pressures (1, T)."""
+        return t_s[None] if self.lag_s else super().input_data(t_s)
+
+    def calibrated_amplitude(
+        self, data: ca.SX, factor: Any, offset: Any, log_lag_ratio: Any
+    ) -> ca.SX:
+        """Return minus the pressure for a calibration, as an expression of `input_data` (1,)."""
+        if not self.lag_s:
+            return self.energy_amplitude(data, factor, offset)
+        pressure_pa = self._lagging_pressure(data, self.lag_s * ca.exp(log_lag_ratio))
+        return self.energy_amplitude(pressure_pa, factor, offset)
+
+    def energy_amplitude_at(self, t_s: Array) -> Array:
+        """Return minus the pressure in the body at the times `t_s` (T,), as (T,)."""
+        if not self.lag_s:
+            return super().energy_amplitude_at(t_s)
+        pressure_pa = self._lagging_pressure(ca.DM(t_s), ca.DM(self.lag_s)).full().ravel()
+        return self.energy_amplitude(pressure_pa, self.factor, self.loss_pa)
+
+    def _lagging_pressure(self, t_s: Any, lag_s: Any) -> Any:
+        """Return the solution of τ dp/dt = stated pressure − p at the times, for τ = `lag_s`.
+
+        The stated pressure is a sum of ramps, one for each change of its slope; the response to a
+        ramp that begins at zero is t − τ (1 − exp(−t/τ)).
+        """
+        assert self.t_s is not None
+        slopes = np.diff(self.pressure_pa) / np.diff(self.t_s)
+        changes = np.diff(slopes, prepend=0.0, append=0.0)
+        pressure_pa = ca.DM(self.pressure_pa[0])
+        for begin_s, change in zip(self.t_s, changes, strict=True):
+            if change:
+                since_s = ca.fmax(t_s - begin_s, 0.0)
+                response = since_s - lag_s * (1 - ca.exp(-since_s / lag_s))
+                pressure_pa = pressure_pa + change * response
+        return pressure_pa
 
     def with_fixed_rim(self, is_prescribed: NDArray[np.bool_], prescribed_m: Array) -> Pressure:
         """Return the pressure with a volume that does not depend on the motion of a held rim.
