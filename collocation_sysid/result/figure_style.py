@@ -90,7 +90,7 @@ def framed_figure(
     left_mm, right_mm, foot_mm, top_mm : float
         Margins around the axes.
     """
-    figure = NotebookFigure(figsize=(width_mm / 25.4, height_mm / 25.4))
+    figure = NotebookFigure(figsize=(width_mm / 25.4, height_mm / 25.4), layout="none")
     figure.subplots_adjust(
         left_mm / width_mm,
         foot_mm / height_mm,
