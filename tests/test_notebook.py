@@ -52,10 +52,8 @@ def internal_names(source: str) -> set[str]:
     for node in ast.walk(ast.parse(source)):
         match node:
             case ast.Import(names=names):
-                modules = [each for each in names if each.name.split(".")[0] == PACKAGE]
-                found |= {
-                    each.name for each in modules if (each.name, each.asname) != (PACKAGE, "cs")
-                }
+                imported = {(each.name, each.asname) for each in names} - {(PACKAGE, "cs")}
+                found |= {module for module, _ in imported if module.split(".")[0] == PACKAGE}
             case ast.ImportFrom(module=str(module)) if module.split(".")[0] == PACKAGE:
                 found.add(module)
             case ast.Attribute(value=ast.Name(id="cs"), attr=name):

@@ -23,6 +23,7 @@ from ..figure_style import (
     NotebookFigure,
     add_figure_legend,
     add_legend_above,
+    fixed_figure,
     framed_figure,
     make_log_axis,
     style_axes,
@@ -88,7 +89,7 @@ def marker_tracks(
     title = some if len(shown) < len(names) else ""
     head = LEGEND_MM + (5.0 if title else 0.0)
     height = head + len(shown) * (ROW_MM + GAP_MM) - GAP_MM + FOOT_MM
-    figure = NotebookFigure(figsize=(PAGE_MM / 25.4, height / 25.4), layout="none")
+    figure = fixed_figure(PAGE_MM, height)
     errors = [1e3 * (model - measured_m)[:, shown] for _, model, _ in drawn]
     reach = max((float(np.nanmax(np.abs(e), initial=0.0)) for e in errors), default=0.0) or 1.0
     margin = 0.03 * (t_s[-1] - t_s[0]) or 1.0
