@@ -33,7 +33,7 @@
 # **Prerequisites:** calculus, linear algebra, Newton's second law, NumPy.
 #
 # **Time:** about 45 minutes of reading; the cells run in about half a minute (measured:
-# 26 s on two cores that other programs used too).
+# 23 to 37 s on two cores that other programs used too).
 
 # %%
 # %matplotlib inline

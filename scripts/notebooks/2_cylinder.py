@@ -32,7 +32,7 @@
 #
 # **Prerequisites:** part 1, or familiarity with direct collocation and finite elements.
 #
-# **Time:** about 30 minutes of reading; the cells run in about one minute (measured: 60 s on
+# **Time:** about 30 minutes of reading; the cells run in about one minute (measured: 49 to 63 s on
 # two cores that other programs used too; the first run also compiles kernels).
 
 # %%

@@ -30,7 +30,7 @@
 # **Prerequisites:** part 2; normal distribution, covariance matrix, linear least squares.
 #
 # **Time:** about 30 minutes of reading; the cells run in about one and a half minutes (measured:
-# 75 to 96 s on two cores that other programs used too).
+# 71 to 96 s on two cores that other programs used too).
 
 # %%
 # %matplotlib inline
