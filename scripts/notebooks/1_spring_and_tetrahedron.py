@@ -361,7 +361,7 @@ axes.legend()
 plt.show()
 
 # %% [markdown]
-# The predicted covariance is correct, but the mean of $k$ differs from the true value by several
+# The predicted covariance is correct, but the mean of $k$ differs from the true value by about ten
 # standard errors. **The standard error describes the effect of the noise, not that of model
 # errors.** Here the model error is the time discretisation: the midpoint rule lowers the
 # frequency by the relative amount $(\omega\Delta t)^2/12$, and the fit compensates with a
