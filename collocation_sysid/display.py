@@ -205,7 +205,12 @@ def on_terminal(parts: Shown | Iterable[Shown]) -> RenderableType:
 def plain_text(parts: Shown | Iterable[Shown], width: int = WIDE) -> str:
     """Return parts as plain text without colours; each row of a table is one line."""
     file = StringIO()
-    PlainConsole(file=file, width=width).print(on_terminal(parts), crop=False)
+    # Without these options rich would display the text in a Jupyter notebook, instead of writing
+    # it to the file, and FORCE_COLOR would add colours.
+    console = PlainConsole(
+        file=file, width=width, force_jupyter=False, force_terminal=False, color_system=None
+    )
+    console.print(on_terminal(parts), crop=False)
     return "\n".join(line.rstrip() for line in file.getvalue().splitlines())
 
 

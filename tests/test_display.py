@@ -53,6 +53,16 @@ def test_a_terminal_shows_numbers_to_the_right_and_texts_to_the_left():
     assert lines[-4:] == ["- one", "- two", "The file", "a = 1"]
 
 
+def test_plain_text_is_returned_also_in_jupyter_and_where_colours_are_forced(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    expected = plain_text(REPORT)
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    assert expected
+    assert plain_text(REPORT) == expected
+
+
 ADDRESS = "trial.mcap#/a/topic/with/a/long/name/of_its_own#a_base_frame>a_tool_frame"
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
@@ -31,7 +32,13 @@ from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.result.figure_style import COLOUR_CYCLE, COLUMN_MM, RESOLUTION_DPI, SMALL_PT
+from collocation_sysid.result.figure_style import (
+    COLOUR_CYCLE,
+    COLUMN_MM,
+    RESOLUTION_DPI,
+    SMALL_PT,
+    framed_figure,
+)
 from collocation_sysid.result.pictures import (
     Confidence,
     all_pictures,
@@ -100,6 +107,16 @@ def rasters(figure):
 
 
 # Convergence
+
+
+@pytest.mark.parametrize("option", ["figure.constrained_layout.use", "figure.autolayout"])
+def test_margins_do_not_depend_on_the_layout_that_matplotlib_is_configured_with(option: str):
+    with mpl.rc_context({option: True}):
+        framed = framed_figure(80, 60, left_mm=10, right_mm=5, foot_mm=10, top_mm=5)
+        bare, _ = sheet(80, 60)
+    assert framed.get_layout_engine() is None
+    assert bare.get_layout_engine() is None
+    assert framed.subplotpars.left == pytest.approx(10 / 80)
 
 
 def test_convergence_draws_errors_in_millimetres_and_newtons_on_logarithmic_axes():

@@ -78,6 +78,14 @@ def new_figure(width_mm: float, height_mm: float) -> Figure:
     return figure
 
 
+def fixed_figure(width_mm: float, height_mm: float) -> Figure:
+    """Return an empty figure whose axes stay in place, also if matplotlib is configured to arrange
+    axes automatically.
+    """
+    size = (width_mm / 25.4, height_mm / 25.4)
+    return NotebookFigure(figsize=size, layout="none")  # type: ignore[arg-type]
+
+
 def framed_figure(
     width_mm: float,
     height_mm: float,
@@ -95,7 +103,7 @@ def framed_figure(
     left_mm, right_mm, foot_mm, top_mm : float
         Margins around the axes.
     """
-    figure = NotebookFigure(figsize=(width_mm / 25.4, height_mm / 25.4))
+    figure = fixed_figure(width_mm, height_mm)
     figure.subplots_adjust(
         left_mm / width_mm,
         foot_mm / height_mm,

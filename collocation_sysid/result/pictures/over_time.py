@@ -24,6 +24,7 @@ from ..figure_style import (
     NotebookFigure,
     add_figure_legend,
     add_legend_above,
+    fixed_figure,
     framed_figure,
     make_log_axis,
     style_axes,
@@ -115,7 +116,7 @@ def marker_tracks(
     head = TRACK_LAYOUT.legend_mm + (5.0 if title else 0.0)
     rows_mm = len(shown) * (TRACK_LAYOUT.row_mm + TRACK_LAYOUT.row_gap_mm)
     height = head + rows_mm - TRACK_LAYOUT.row_gap_mm + TRACK_LAYOUT.foot_mm
-    figure = NotebookFigure(figsize=(PAGE_MM / 25.4, height / 25.4))
+    figure = fixed_figure(PAGE_MM, height)
     errors = [1e3 * (model - measured_m)[:, shown] for _, model, _ in drawn]
     reach = max((float(np.nanmax(np.abs(e), initial=0.0)) for e in errors), default=0.0) or 1.0
     margin = 0.03 * (t_s[-1] - t_s[0]) or 1.0

@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
 from ...array_types import Array
-from ..figure_style import BLACK, BLUE, SMALL_PT, VERMILION, NotebookFigure
+from ..figure_style import BLACK, BLUE, SMALL_PT, VERMILION, fixed_figure
 from .projection import ParallelCamera, Triangles
 
 EDGE_COLOUR = "#5A6B7B"
@@ -33,7 +33,7 @@ _GRASPED_STYLE = {"ls": "", "marker": "s", "ms": 2.2, "mfc": BLACK, "mec": "none
 
 def sheet(width_mm: float, height_mm: float) -> tuple[Figure, Axes]:
     """Return a figure with one invisible pair of axes [mm], from the lower left corner."""
-    figure = NotebookFigure(figsize=(width_mm / 25.4, height_mm / 25.4))
+    figure = fixed_figure(width_mm, height_mm)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0, width_mm), ylim=(0, height_mm))
     axes.set_axis_off()
