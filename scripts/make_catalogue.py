@@ -36,6 +36,7 @@ import collocation_sysid as cs
 from collocation_sysid.array_types import Array
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.constants import is_damping, unit_of
+from collocation_sysid.fem.regions import BodyPart
 from collocation_sysid.files import RESULT_FILE, write_text_file
 from collocation_sysid.result.replay import MotionRecord, read_run
 from collocation_sysid.runs.result_content import ReportedEstimate, Result
@@ -144,7 +145,7 @@ def entry_of(
         source=source.source,
         licence=source.licence,
         is_measured=source.is_measured,
-        law=tuple(_law_name(part.material.name, len(part.prony)) for part in parts),
+        law=tuple(_law_name(part) for part in parts),
         damping=() if is_static else tuple(part.damping.name for part in parts),
         constants=constants_of(result, _truth(source), is_static=is_static),
         stretch=stretch_range(bodies, fitted),
@@ -157,9 +158,11 @@ def entry_of(
     )
 
 
-def _law_name(material: str, branches: int) -> str:
-    """Return the name of a law with the number of its memory branches."""
-    return f"{material} with {branches} branch of memory" if branches else material
+def _law_name(part: BodyPart) -> str:
+    """Return the name of the law of a part, with its memory branches and its region."""
+    memory = f" with {len(part.prony)} branch of memory" if part.prony else ""
+    region = f" ({part.name})" if part.name else ""
+    return f"{part.material.name}{memory}{region}"
 
 
 def _truth(source: CatalogueSource) -> dict[str, float]:
