@@ -29,7 +29,8 @@ source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = ["_build", "gallery"]
 html_theme = "furo"
 html_static_path, html_css_files = ["_static"], ["pages.css"]
-html_extra_path = [f"generated/{PUBLISHED}"]  # the schema of the problem file
+# The schema of the problem file, and the catalogue of identified materials.
+html_extra_path = [f"generated/{PUBLISHED}", "catalogue.json"]
 
 # Scripts with a recorded object in them run where its data have been fetched.
 _measured = {
