@@ -407,7 +407,7 @@ def test_an_interrupt_of_a_second_start_keeps_the_first_answer(tiny, monkeypatch
 def test_a_real_process_keeps_its_streams_apart(tiny):
     program = [sys.executable, "-c", "from collocation_sysid.cli import main; main()"]
     done = subprocess.run(
-        [*program, "check", "problem.toml", "--json"],
+        [*program, "check", "problem.toml", "--json", "--quiet"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")
