@@ -10,7 +10,7 @@ from ..errors import InputError
 from ..fem.constants import Scale
 from ..fem.elements import ELEMENTS
 from ..fem.materials import DAMPINGS, MATERIALS
-from ..fem.spatial_field import Field as MaterialField
+from ..fem.spatial_field import ALL_MODULI, SMOOTH, Lengths, Prior
 from ..model.schemes import MOST_STEPS, SCHEMES
 from ..recording.environment import usual_air_density
 from ..recording.node_selection import Nodes
@@ -21,11 +21,10 @@ from ..schema_tables import (
     Unit,
     Vector,
     require_one,
-    section_of,
     used_keys,
 )
 from ..statistics.systematic_effects import Assumptions
-from ..validated_types import Count, Finite, Flag, NotNegative, Positive, Text
+from ..validated_types import AtLeastOne, Count, Finite, Flag, NotNegative, Positive, Text
 from .problem_options import RolloutOptions, UncertaintyOptions
 from .recording_schema import ExperimentSection
 from .solver_schema import SolverSection
@@ -35,10 +34,6 @@ MaterialName = Annotated[str, Among(tuple(MATERIALS))]
 DampingName = Annotated[str, Among(tuple(DAMPINGS))]
 ElementName = Annotated[str, Among(tuple(ELEMENTS))]
 SchemeName = Annotated[str, Among(tuple(SCHEMES))]
-if TYPE_CHECKING:
-    FieldSection = Section
-else:
-    FieldSection = section_of(MaterialField, "FieldSection")
 
 
 class CodeSection(Section):
@@ -76,6 +71,35 @@ class NodeForceSection(CodeSection):
     nodes: Nodes | None = None
     on: Literal["nodes", "faces"] = "nodes"
     carries: Count = 0
+
+
+class FieldSection(Section):
+    """Stiffness, density or another constant that varies in space within a material.
+
+    Attributes
+    ----------
+    length_m : float or list
+        Correlation length: places at this distance have the correlation 1/e. Of several lengths the
+        most likely one is used.
+    parameter : str
+        Constant that varies: one of the material or of its damping law, young_pa for all moduli of
+        a material together, or density_kg_m3.
+    modes : int
+        Number of shapes of the field; one more costs as much as one more right-hand side.
+    amplitude : float, optional
+        Prior standard deviation of the logarithm, 0.5 by default; for a density that of the ratio
+        to its stated value, 0.3 by default. With prior = "two-phase", the prior standard deviation
+        of the logarithm of the contrast, 1 by default.
+    prior : {"smooth", "two-phase"}
+        "smooth": the logarithm is a normal field. "two-phase": two materials with a boundary
+        between them; the parameter contrast is the ratio of inclusions to surroundings.
+    """
+
+    length_m: Lengths
+    parameter: Text = ALL_MODULI
+    modes: AtLeastOne = 40
+    amplitude: Positive | None = None
+    prior: Prior = SMOOTH
 
 
 Material = Annotated[MaterialName | CodeSection, ByForm(str)]
