@@ -25,7 +25,14 @@ from collocation_sysid.recording import (
     Wrench,
     solid_sections,
 )
-from collocation_sysid.recording.obstacle_solids import KINDS
+from collocation_sysid.recording.obstacle_solids import (
+    KINDS,
+    Capsule,
+    Cuboid,
+    Cylinder,
+    Plane,
+    Sphere,
+)
 from collocation_sysid.schema_tables import Section
 from collocation_sysid.statistics.systematic_effects import Assumptions
 
@@ -40,7 +47,11 @@ SECTIONS: dict[type, type[Section]] = {
     DepthCamera: recording_schema.DepthCameraSection,
     Experiment: recording_schema.ExperimentSection,
     **{kind: getattr(load_schema, f"{kind.__name__}Section") for *_, kind in load_schema.LOADS},
-    **{kind: getattr(solid_sections, f"{kind.__name__}Section") for kind in KINDS.values()},
+    Plane: solid_sections.PlaneSection,
+    Sphere: solid_sections.SphereSection,
+    Cylinder: solid_sections.SolidCylinderSection,
+    Capsule: solid_sections.CapsuleSection,
+    Cuboid: solid_sections.CuboidSection,
 }
 # The nodes of an obstacle are those of its frame, which no file states.
 NOT_IN_FILES = {Obstacle: {"nodes"}}

@@ -37,7 +37,7 @@ class SphereSection(Section):
     centre_m: Vector = (0.0, 0.0, 0.0)
 
 
-class CylinderSection(Section):
+class SolidCylinderSection(Section):
     """A cylinder with flat ends, whose edges may be rounded.
 
     Attributes
@@ -94,7 +94,7 @@ class SolidSection(Section):
         The half-space behind a plane: normal, point_m.
     sphere_m : SphereSection, optional
         A ball: radius_m, centre_m.
-    cylinder_m : CylinderSection, optional
+    cylinder_m : SolidCylinderSection, optional
         A cylinder: radius_m, ends_m, rounding_m.
     capsule_m : CapsuleSection, optional
         A cylinder with a half-ball at each end: radius_m, ends_m.
@@ -104,7 +104,7 @@ class SolidSection(Section):
 
     plane: PlaneSection | None = None
     sphere_m: SphereSection | None = None
-    cylinder_m: CylinderSection | None = None
+    cylinder_m: SolidCylinderSection | None = None
     capsule_m: CapsuleSection | None = None
     box_m: CuboidSection | None = None
 
