@@ -65,7 +65,9 @@ class Section(BaseModel):
         for name, (_, description) in attributes(cls).items():
             if name in cls.model_fields:
                 cls.model_fields[name].description = description
-        cls.__doc__ = inspect.cleandoc(cls.__doc__ or "").partition("\n\nAttributes\n")[0]
+        text = inspect.cleandoc(cls.__doc__ or "").partition("\n\nAttributes\n")[0]
+        summary, gap, details = text.partition("\n\n")
+        cls.__doc__ = " ".join(summary.split("\n")) + gap + details
 
 
 def declared_in(section: Section, kind: type, where: str) -> dict[str, Any]:
