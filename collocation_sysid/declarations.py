@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields, replace
+from dataclasses import Field, dataclass, field, fields
 from functools import cache, partial
 from typing import Any, TypeVar, dataclass_transform, get_args
 
@@ -25,7 +25,7 @@ S = TypeVar("S")
 
 @dataclass(frozen=True)
 class Key:
-    """Form of a field in a problem file; the description is that of the class docstring.
+    """Form of a field in a problem file.
 
     Attributes
     ----------
@@ -38,21 +38,12 @@ class Key:
         values of a table.
     constant : str, optional
         For a key that names a file with a table: the field whose key states a constant instead.
-    description : str, optional
-        Description, if it differs from that of the field.
-    default : object
-        Value if the file does not state the key; the key is required if there is none.
-    tables : type, optional
-        For an array of [[tables]]: the class that each table states.
     """
 
     name: str
     form: Any
     read: Callable[[Any], Any] | None = None
     constant: str | None = None
-    description: str | None = None
-    default: Any = None
-    tables: type | None = None
 
 
 def identity(value: Any) -> Any:
@@ -146,36 +137,12 @@ def _adapter(form: Any) -> TypeAdapter[Any]:
 
 def keys_of(kind: type) -> Iterator[tuple[str, Key]]:
     """Yield the name of each field that a problem file may state, with its key."""
-    descriptions = documented(kind)
     for each in fields(kind):
         form = each.metadata.get("form")
         if isinstance(form, Key):
-            text = form.description or descriptions.get(each.name, "")
-            if form.tables is not None:
-                word = f"{kind.__name__.lower()}.{form.name}"
-                text = f"[[{word}]] tables: {text[:1].lower()}{text[1:]}"
-            yield each.name, replace(form, description=text)
+            yield each.name, form
         elif form is not None:
-            usual = ... if each.default is MISSING else each.default
-            usual = usual if each.default_factory is MISSING else each.default_factory()
-            default = None if type(None) in get_args(form) else usual
-            yield (
-                each.name,
-                Key(
-                    each.name,
-                    form,
-                    read=each.metadata["read"],
-                    description=descriptions.get(each.name),
-                    default=default,
-                ),
-            )
-
-
-def tables_of(kind: type) -> Iterator[tuple[str, str, type]]:
-    """Yield field, key and class of each field that is stated by [[tables]] of a problem file."""
-    for name, key in keys_of(kind):
-        if key.tables is not None:
-            yield name, key.name, key.tables
+            yield each.name, Key(each.name, form, each.metadata["read"])
 
 
 def attributes(kind: type) -> dict[str, tuple[str, str]]:

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
-from typing import Annotated, Any, Literal, Union, get_args, get_type_hints
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Union, get_args
 
 from pydantic import (
     BaseModel,
     ConfigDict,
     Discriminator,
-    Field,
     GetCoreSchemaHandler,
     Tag,
-    create_model,
-    model_validator,
 )
 
-from .declarations import Key, attributes, documented, keys_of
+from .declarations import attributes, keys_of
 from .errors import located
 from .validated_types import Boundless, Finite
 
@@ -69,56 +65,9 @@ class Section(BaseModel):
         for name, (_, description) in attributes(cls).items():
             if name in cls.model_fields:
                 cls.model_fields[name].description = description
-        cls.__doc__ = inspect.cleandoc(cls.__doc__ or "").partition("\n\nAttributes\n")[0]
-
-
-def section_of(kind: type, title: str, base: type[Section] = Section) -> Any:
-    """Return the pydantic model of a table that states an instance of a class.
-
-    Parameters
-    ----------
-    kind : type
-        A class decorated with `declaration`, whose keys are used, or a dataclass of options, all of
-        whose
-        fields become keys. Its docstring provides the descriptions.
-    title : str
-        Name of the model.
-    base : type
-        Base model with further keys of the table.
-    """
-    declared_keys = [key for _, key in keys_of(kind)]
-    keys: dict[str, Any] = {
-        key.name: (key.form, Field(key.default, description=key.description))
-        for key in declared_keys
-    }
-    checks: dict[str, Any] = {
-        f"_{key.name}_or": model_validator(mode="after")(_either(key.constant, key.name))
-        for key in declared_keys
-        if key.constant is not None
-    }
-    doc = inspect.cleandoc(kind.__doc__ or "").partition("\n")[0]
-    made = keys or _options(kind)
-    return create_model(title, __base__=base, __doc__=doc, __validators__=checks, **made)
-
-
-def tables(name: str, kind: type) -> Key:
-    """Return the key of an array of tables [[name]], each of which states an instance of `kind`."""
-    form = list[section_of(kind, f"{kind.__name__}Section")]
-    return Key(name, form, default=[], tables=kind)
-
-
-def _options(kind: Any) -> dict[str, Any]:
-    types = get_type_hints(kind, include_extras=True)
-    descriptions = documented(kind)
-    keys: dict[str, Any] = {}
-    for each in fields(kind):
-        form = types[each.name]
-        default = each.default
-        if isinstance(form, type) and is_dataclass(form):
-            form = section_of(form, f"{form.__name__}Section")
-            default = form()
-        keys[each.name] = (form, Field(default, description=descriptions.get(each.name)))
-    return keys
+        text = inspect.cleandoc(cls.__doc__ or "").partition("\n\nAttributes\n")[0]
+        summary, gap, details = text.partition("\n\n")
+        cls.__doc__ = " ".join(summary.split("\n")) + gap + details
 
 
 def declared_in(section: Section, kind: type, where: str) -> dict[str, Any]:
@@ -140,18 +89,10 @@ def declared_in(section: Section, kind: type, where: str) -> dict[str, Any]:
     fields: dict[str, Any] = {}
     for name, key in keys_of(kind):
         value = getattr(section, key.name)
-        if value is not None and key.constant is None and key.tables is None:
+        if value is not None and key.constant is None:
             with located(where=f"{where}.{key.name}"):
                 fields[name] = key.read(value) if key.read else value
     return fields
-
-
-def _either(*names: str) -> Callable[[Any], Any]:
-    def check(section: Any) -> Any:
-        require_one(section, *names)
-        return section
-
-    return check
 
 
 def used_keys(section: Section, *names: str) -> list[str]:

@@ -37,6 +37,11 @@ def test_the_schema_tells_what_the_method_does_by_default(method: str):
     assert table["additionalProperties"] is False
 
 
+def test_every_method_has_a_key():
+    methods = solver_of("").methods
+    assert {name: type(method) for name, method in methods.items()} == METHODS
+
+
 @each_method
 def test_without_a_table_a_method_has_its_defaults(method: str):
     assert solver_of("").methods[method] == METHODS[method]()

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from ..declarations import keys_of, tables_of
+from ..declarations import keys_of
 from ..errors import InputError, located
 from ..fem.body import Body
 from ..fem.constants import FRICTION, GAMMA_M, GAMMA_R, Constant, constant_named
@@ -23,7 +23,7 @@ from ..fem.structured import (
     cylinder_of_edge,
 )
 from ..model.parameters import Parameters, Tied, Unknown
-from ..recording import Experiment, Specimen
+from ..recording import Specimen
 from ..recording.homogeneous_deformation import DEFORMATIONS
 from ..recording.node_selection import selection_from_section
 from ..recording.specimen import cell_body
@@ -32,6 +32,7 @@ from ..schema_tables import Section, declared_in
 from ..statistics.plausibility import SIZES_M, size_and_density_hypotheses
 from .code_loader import CodeLoader, existing_file
 from .density_guesses import with_declared_densities, with_guessed_densities
+from .load_schema import LOADS
 from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 from .problem_reading import read_problem_file
 from .problem_size import Say, Size, announce_reading, require_feasible
@@ -245,7 +246,7 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
             displacement_file = section.file_of(grasp.displacement)
             wrench_file = section.file_of(grasp.wrench)
             names += [grasp.poses or displacement_file, wrench_file]
-        for _, word, kind in tables_of(Experiment):
+        for _, word, kind in LOADS:
             keys = [key.name for _, key in keys_of(kind) if key.constant is not None]
             names += [getattr(table, key) for table in getattr(section, word) for key in keys]
     return tuple(folder / name for name in names if name is not None)
@@ -394,8 +395,14 @@ def _as_parameter(name: str, section: ParameterSection | float) -> Unknown | Tie
     if section.tied_to is not None:
         return Tied(section.tied_to, 1.0 if section.ratio is None else section.ratio)
     linear = (section.scale or constant_named(name).scale) == "linear"
-    values = section.model_dump(include={each.name for each in fields(Unknown)})
-    return Unknown(**values | {"prior": section.prior and _prior(section.prior, linear)})
+    return Unknown(
+        guess=section.guess,
+        lower=section.lower,
+        upper=section.upper,
+        prior=section.prior and _prior(section.prior, linear),
+        scale=section.scale,
+        typical=section.typical,
+    )
 
 
 def _prior(section: PriorSection, linear: bool) -> tuple[float, float]:

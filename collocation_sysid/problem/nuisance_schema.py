@@ -1,46 +1,49 @@
-"""Keys of [experiment.nuisance], generated from the table of nuisance parameters.
-
-A key contains the priors of one or more nuisance parameters.
-"""
+"""Keys of [experiment.nuisance], each for the priors of one or more nuisance parameters."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from itertools import groupby
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Optional
+from typing import Annotated, Literal, TypeVar
 
-from pydantic import AfterValidator, Field, create_model, model_validator
+from pydantic import Field
 
 from ..recording import Nuisance
-from ..recording.nuisance import KINDS, SCOPE, SCOPE_TEXT, NuisanceRow
-from ..schema_tables import ByForm, Section, used_keys
-from ..validated_types import Positive, Text
+from ..recording.nuisance import KINDS, NuisanceRow
+from ..schema_tables import ByForm, Section
+from ..validated_types import Text
+from .nuisance_priors import (
+    CalibrationDistortionPrior,
+    CalibrationScalePrior,
+    CameraOffsetsPrior,
+    ClockRatePrior,
+    DepthBiasPrior,
+    DepthEdgePrior,
+    DepthPosePrior,
+    DepthScalePrior,
+    DepthTimePrior,
+    DisplacementZeroPrior,
+    GravityPrior,
+    HandEyePrior,
+    JoiningPrior,
+    MarkerOffsetsPrior,
+    NuisancePriorSection,
+    ObstaclePrior,
+    PosePrior,
+    PressureFactorPrior,
+    PressureLostPrior,
+    Scoped,
+    SensorLagPrior,
+    SensorTimePrior,
+    StrainZeroPrior,
+    TarePrior,
+    TensionFactorPrior,
+    TensionLostPrior,
+    TimeShiftPrior,
+    ToolPrior,
+)
 
 KEYS = {key: list(rows) for key, rows in groupby(KINDS, key=lambda row: row.key)}
-
-
-def _require_scope(word: str) -> str:
-    """Return a scope unchanged if it is "recording" or matches `SCOPE`; raise `ValueError`
-    otherwise.
-    """
-    if word != "recording" and not re.fullmatch(SCOPE, word):
-        raise ValueError(f'found {word!r}; expected "recording", {SCOPE_TEXT}')
-    return word
-
-
-class Scoped(Section):
-    """Something of a recording, or of several.
-
-    Attributes
-    ----------
-    scope : str
-        Which recordings have the same value: "recording" for a value of each recording, "shared"
-        for one value of all recordings that say "shared", or "shared" and a word for each of
-        several groups.
-    """
-
-    scope: Annotated[str, AfterValidator(_require_scope)] = "recording"
 
 
 class CustomNuisanceSection(Scoped):
@@ -58,90 +61,130 @@ class CustomNuisanceSection(Scoped):
     row: Text
 
 
-class NuisancePriorSection(Scoped):
-    """Standard deviations of nuisance parameters; of several, those that are missing mean
-    exact values.
+T = TypeVar("T", bound=NuisancePriorSection)
+PriorOrNone = Annotated[Literal["none"] | T, ByForm(str)]
+
+
+class NuisanceSection(Section):
+    """Nuisance parameters of this recording, each with a prior whose mean is zero.
+
+    A parameter that has a default prior is estimated unless it is "none".
+
+    Attributes
+    ----------
+    marker_offsets : MarkerOffsetsPrior or "none", optional
+        Errors of the positions in reference_m without a reference_sigma_m; they rotate with the
+        body: prior_m, 1 mm by default.
+    camera_offsets : CameraOffsetsPrior or "none", optional
+        A constant offset of each marker in the cameras' frame: prior_m.
+    calibration_scale : CalibrationScalePrior or "none", optional
+        Scale error of all lengths that the cameras measure: the factor minus one: prior.
+    calibration_distortion : CalibrationDistortionPrior or "none", optional
+        Radial distortion of first order about the body's middle: a factor 1 + k r²: prior_1_m2.
+    time_shift : TimeShiftPrior or "none", optional
+        How much later than stated the markers were measured, on the grasps' clock: prior_s, 5 ms by
+        default.
+    clock_rate : ClockRatePrior or "none", optional
+        How much slower than the grasps' clock that of the markers runs: prior.
+    pose : PosePrior or "none", optional
+        A constant rotation of grasps and body in the cameras' frame, which rotates gravity in the
+        body's frame: prior_rad. A constant translation of grasps and body in the cameras' frame:
+        prior_m.
+    gravity : GravityPrior or "none", optional
+        A tilt of the direction of gravity: prior_rad, 1° by default.
+    hand_eye : HandEyePrior or "none", optional
+        A constant rotation of the body in its grasps: prior_rad, 0.5° by default. A constant
+        translation of the body in its grasps; both if the start is an equilibrium and markers
+        measure it: prior_m, 1 mm by default.
+    strain_zero : StrainZeroPrior or "none", optional
+        A constant offset of the strains of a specimen: prior.
+    displacement_zero : DisplacementZeroPrior or "none", optional
+        A constant offset of each displacement along each of its axes: prior_m, 0.1 mm by default.
+    obstacle : ObstaclePrior or "none", optional
+        A constant offset of each obstacle along its normal, or along the axis of its displacement,
+        which changes the beginning of the contact: prior_m, 0.1 mm by default. A constant tilt of
+        each obstacle that is a plane or a box, about its point or middle: prior_rad. Delay of each
+        obstacle's motion, to first order: prior_s.
+    tension_factor : TensionFactorPrior or "none", optional
+        Scale error of the tension of each tendon: the factor minus one: prior.
+    tension_lost : TensionLostPrior or "none", optional
+        Tension of each tendon that is lost by friction: prior_n.
+    pressure_factor : PressureFactorPrior or "none", optional
+        Scale error of each pressure: the factor minus one: prior.
+    pressure_lost : PressureLostPrior or "none", optional
+        Offset by which each pressure is lower than stated: prior_pa.
+    joining : JoiningPrior or "none", optional
+        Delay with which each point mass or force begins or ends, if it does so within the
+        recording: prior_s, 10 ms by default.
+    tare : TarePrior or "none", optional
+        A constant offset of each component of a wrench, in multiples of its sigma: prior_sigmas, 10
+        by default.
+    sensor_time : SensorTimePrior or "none", optional
+        Delay of the measured wrenches; at most three standard deviations: prior_s, 5 ms by default.
+    sensor_lag : SensorLagPrior or "none", optional
+        Time constant of a first-order low-pass in the sensor; from zero to three standard
+        deviations: prior_s.
+    tool : ToolPrior or "none", optional
+        Mass of the tool between a sensor and the body: prior_kg. Centre of the tool relative to the
+        sensor's point; in the world's frame, relative to that of the grasped nodes: prior_m.
+    depth_pose : DepthPosePrior or "none", optional
+        Rotation of each depth camera about the middle of the body, along the camera's axes:
+        prior_rad, 5° by default. Translation of each depth camera; if neither is given, the first
+        image is first aligned with the body: prior_m, 20 mm by default.
+    depth_bias : DepthBiasPrior or "none", optional
+        Offset that is added to each depth of an image: prior_m, 5 mm by default.
+    depth_scale : DepthScalePrior or "none", optional
+        Scale error of each depth of an image: the factor minus one: prior, 0.5 % by default.
+    depth_time : DepthTimePrior or "none", optional
+        Delay of a depth camera; at most three standard deviations: prior_s, 5 ms by default.
+    depth_edge : DepthEdgePrior or "none", optional
+        Distance by which silhouettes in the images of each depth camera end inside the outline of
+        the body, in pixels: prior_px, 2 px by default.
+    own : list of CustomNuisanceSection
+        [[experiment.nuisance.own]] tables: custom nuisance parameters, defined in Python files.
     """
 
-    usual: ClassVar[bool] = False
-
-    @model_validator(mode="after")
-    def _require_one_prior(self) -> NuisancePriorSection:
-        """Raise `ValueError` if no prior is given and the scope alone is not sufficient."""
-        priors = [key for key in type(self).model_fields if key != "scope"]
-        if not used_keys(self, *priors) and (self.scope == "recording" or not self.usual):
-            expected = "one or both" if len(priors) > 1 else "it"
-            raise ValueError(f"found no {' and no '.join(priors)}; expected {expected}")
-        return self
-
-
-def _prior_section(key: str, rows: list[NuisanceRow]) -> type[Section]:
-    """Return the pydantic class of the table [experiment.nuisance.KEY], with a field for the prior
-    standard deviation of each nuisance parameter in `rows`.
-
-    A row that refers to another prior makes all priors of the table mandatory.
-    """
-    # What another prior goes with has to be there.
-    needed = any(row.reference is not None for row in rows)
-    fields: dict[str, Any] = {}
-    for row in rows:
-        known = row.reference or (... if needed else None)
-        kind: Any = Positive if needed else Optional[Positive]  # noqa: UP045
-        description = f"Standard deviation [{row.unit}]."
-        fields[row.prior] = (kind, Field(known, description=description))
-    name = "".join(word.title() for word in key.split("_")) + "Prior"
-    description = f"Prior of a nuisance parameter: {rows[0].description}."
-    section = create_model(name, __base__=NuisancePriorSection, __doc__=description, **fields)
-    section.usual = any(row.sigma is not None for row in rows)
-    return section
+    marker_offsets: PriorOrNone[MarkerOffsetsPrior] | None = None
+    camera_offsets: PriorOrNone[CameraOffsetsPrior] | None = None
+    calibration_scale: PriorOrNone[CalibrationScalePrior] | None = None
+    calibration_distortion: PriorOrNone[CalibrationDistortionPrior] | None = None
+    time_shift: PriorOrNone[TimeShiftPrior] | None = None
+    clock_rate: PriorOrNone[ClockRatePrior] | None = None
+    pose: PriorOrNone[PosePrior] | None = None
+    gravity: PriorOrNone[GravityPrior] | None = None
+    hand_eye: PriorOrNone[HandEyePrior] | None = None
+    strain_zero: PriorOrNone[StrainZeroPrior] | None = None
+    displacement_zero: PriorOrNone[DisplacementZeroPrior] | None = None
+    obstacle: PriorOrNone[ObstaclePrior] | None = None
+    tension_factor: PriorOrNone[TensionFactorPrior] | None = None
+    tension_lost: PriorOrNone[TensionLostPrior] | None = None
+    pressure_factor: PriorOrNone[PressureFactorPrior] | None = None
+    pressure_lost: PriorOrNone[PressureLostPrior] | None = None
+    joining: PriorOrNone[JoiningPrior] | None = None
+    tare: PriorOrNone[TarePrior] | None = None
+    sensor_time: PriorOrNone[SensorTimePrior] | None = None
+    sensor_lag: PriorOrNone[SensorLagPrior] | None = None
+    tool: PriorOrNone[ToolPrior] | None = None
+    depth_pose: PriorOrNone[DepthPosePrior] | None = None
+    depth_bias: PriorOrNone[DepthBiasPrior] | None = None
+    depth_scale: PriorOrNone[DepthScalePrior] | None = None
+    depth_time: PriorOrNone[DepthTimePrior] | None = None
+    depth_edge: PriorOrNone[DepthEdgePrior] | None = None
+    own: list[CustomNuisanceSection] = Field(default_factory=list)
 
 
-def _nuisance_section() -> type[Section]:
-    """Return the pydantic class of the table [experiment.nuisance], with one table, or "none", for
-    each kind of nuisance parameter.
-    """
-    fields: dict[str, Any] = {}
-    for key, rows in KEYS.items():
-        description = " ".join(
-            f"{row.description[0].upper()}{row.description[1:]}: {_described_prior(row)}."
-            for row in rows
-        )
-        kind: Any = Annotated[Literal["none"] | _prior_section(key, rows), ByForm(str)]
-        fields[key] = (kind | None, Field(None, description=description))
-    description = (
-        "[[experiment.nuisance.own]] tables: custom nuisance parameters, defined in Python files."
-    )
-    fields["own"] = (
-        list[CustomNuisanceSection],
-        Field(default_factory=list, description=description),
-    )
-    description = (
-        "Nuisance parameters of this recording, each with a prior whose mean is zero.\n\nA "
-        'parameter that has a default prior is estimated unless it is "none".'
-    )
-    return create_model("NuisanceSection", __base__=Section, __doc__=description, **fields)
-
-
-def _described_prior(row: NuisanceRow) -> str:
-    """Return the name of a prior, followed by its default if it has one."""
-    return row.prior if row.sigma is None else f"{row.prior}, {row.usual} by default"
-
-
-NuisanceSection = _nuisance_section()
-if TYPE_CHECKING:
-    NuisanceOrNone = Section | Literal["none"]
-else:
-    NuisanceOrNone = Annotated[Literal["none"] | NuisanceSection, ByForm(str)]
+NuisanceOrNone = Annotated[Literal["none"] | NuisanceSection, ByForm(str)]
 
 
 def nuisance_from_section(
-    section: Section | Literal["none"], row_of: Callable[[CustomNuisanceSection], NuisanceRow]
+    section: NuisanceSection | Literal["none"],
+    row_of: Callable[[CustomNuisanceSection], NuisanceRow],
 ) -> Nuisance:
     """Return the nuisance parameters of a recording: the defaults with the changes of the table.
 
     Parameters
     ----------
-    section : Section or "none"
+    section : NuisanceSection or "none"
         Table; "none" means no nuisance parameters.
     row_of : callable
         Function that returns the custom nuisance parameter of a table.
@@ -150,7 +193,6 @@ def nuisance_from_section(
         return Nuisance.none()
     deviations: dict[str, float | None] = {}
     scope: dict[str, str] = {}
-    assert isinstance(section, NuisanceSection)
     for key, rows in KEYS.items():
         prior = getattr(section, key)
         if prior == "none":
@@ -161,8 +203,9 @@ def nuisance_from_section(
             deviations |= known if any(known.values()) else {}
             if prior.scope != "recording":
                 scope |= {row.name: prior.scope for row in rows}
-    tables: list[CustomNuisanceSection] = vars(section)["own"]
-    custom_rows = [row_of(each) for each in tables]
-    scopes_by_name = {row.name: each.scope for row, each in zip(custom_rows, tables, strict=True)}
+    custom_rows = [row_of(each) for each in section.own]
+    scopes_by_name = {
+        row.name: each.scope for row, each in zip(custom_rows, section.own, strict=True)
+    }
     scope |= {name: word for name, word in scopes_by_name.items() if word != "recording"}
     return Nuisance(**deviations, scope=scope, own=custom_rows)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..array_types import Array
-from ..declarations import keys_of, tables_of
+from ..declarations import keys_of
 from ..errors import InputError, hint_at, located
 from ..fem.body import Body
 from ..methods.stiffness_scan import typical_constants
@@ -48,6 +48,7 @@ from ..schema_tables import declared_in
 from ..statistics.modal_misspecifications import find_misspecifications_by_modes
 from .bench_files import strain_length_m
 from .code_loader import CodeLoader, existing_file
+from .load_schema import LOADS
 from .marker_tracking import (
     gripper_markers,
     poses_from_markers,
@@ -133,7 +134,7 @@ class RecordingReader:
             raise InputError(message, where="grasp")
         loads: dict[str, Any] = {
             name: [self._from_table(kind, word, k) for k in range(len(getattr(section, word)))]
-            for name, word, kind in tables_of(Experiment)
+            for name, word, kind in LOADS
         }
         experiment = Experiment(
             name=section.name,

@@ -6,9 +6,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from ..recording import Depth, DepthCamera, Experiment, Gauge, Grasp, Markers, Obstacle, Wrench
-from ..schema_tables import ByForm, Section, Unit, Vector, section_of, used_keys
-from ..validated_types import AtLeastOne, Boundless, Finite, NotNegative, Positive, Text
+from ..recording.depth_camera import Background, PoseMatrix
+from ..recording.experiment import EARTH_M_S2, Kind, StartRule
+from ..recording.grasp import Axes
+from ..recording.markers import Places
+from ..recording.measured_wrench import Frame
+from ..recording.node_selection import Nodes
+from ..recording.placement import AttachmentRule
+from ..recording.solid_sections import SolidSection
+from ..schema_tables import ByForm, Section, Unit, Vector, used_keys
+from ..validated_types import AtLeastOne, Boundless, Finite, Flag, NotNegative, Positive, Text
+from .load_schema import ForceSection, PointMassSection, PressureSection, TendonSection
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
 
 
@@ -70,7 +78,7 @@ class DisplacementSection(TableSection):
     length_m: Annotated[Literal["body"] | Positive, ByForm(str)] | None = None
 
 
-class WrenchSection(section_of(Wrench, "WrenchSection", TableSection)):
+class WrenchSection(TableSection):
     """The measured force and torque that the grasp exerts on the body.
 
     Columns t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, in these or other units, at their
@@ -78,6 +86,16 @@ class WrenchSection(section_of(Wrench, "WrenchSection", TableSection)):
 
     Attributes
     ----------
+    sigma_n : float
+        Standard deviation of the noise of each force [N].
+    sigma_nm : float, optional
+        Standard deviation of the noise of each torque [N m]; needed if torques are measured.
+    frame : {"world", "grasp"}
+        Axes of the components: those of the poses' world, or "grasp" for those of the undeformed
+        body as the grasp carries it.
+    point_m : list
+        Point [x, y, z] of the torque: fixed in the world, or, in the frame "grasp", on the
+        undeformed body and carried by the grasp.
     area_m2 : float, optional
         Undeformed area by which an engineering stress is multiplied [m²].
     symmetry : int
@@ -86,8 +104,12 @@ class WrenchSection(section_of(Wrench, "WrenchSection", TableSection)):
         whole specimen.
     """
 
-    area_m2: Positive | None = None
+    sigma_n: Positive
+    sigma_nm: Positive | None = None
+    frame: Frame = "world"
+    point_m: Vector = (0.0, 0.0, 0.0)
     symmetry: AtLeastOne = 1
+    area_m2: Positive | None = None
 
 
 def _as_table(value: str | DisplacementSection) -> DisplacementSection:
@@ -172,27 +194,93 @@ class MovedSection(Section):
         return self
 
 
-class GraspSection(section_of(Grasp, "GraspSection", MovedSection)):
+class GraspSection(MovedSection):
     """Nodes held by a gripper or a test bench, and how it moves.
 
     Attributes
     ----------
+    nodes : Nodes
+        Selection: a table of box_m, ball_m, face or indices, or the name of a point array or
+        physical group.
+    from_s : float, optional
+        First time [s] of the grasp or contact; the start of the recording by default.
+    until_s : float, optional
+        Last time [s] of the grasp or contact; the end of the recording by default. If a grasp ends
+        at the first sample, the body is released from its equilibrium in this grasp.
+    sigma_m : float, optional
+        Standard deviation of the noise in each position of the poses [m]; estimated from their
+        roughness by default.
+    sigma_rad : float, optional
+        Standard deviation of the noise in each rotation, about each axis [rad]; estimated from the
+        roughness of the poses by default.
+    axes : {"x", "y", "z", "xy", "xz", "yz", "xyz"}
+        Axes of the world along which the nodes are prescribed; they slide along the others.
     wrench : WrenchSection, optional
         Measured force and torque on the body: file, sigma_n, sigma_nm, …
     """
 
+    nodes: Nodes
+    from_s: Finite | None = None
+    until_s: Finite | None = None
+    sigma_m: NotNegative | None = None
+    sigma_rad: NotNegative | None = None
+    axes: Axes = "xyz"
     wrench: WrenchSection | None = None
 
 
-class ObstacleSection(section_of(Obstacle, "ObstacleSection", MovedSection)):
+class ObstacleSection(MovedSection):
     """A rigid solid that the body may touch, and how it moves.
 
     Attributes
     ----------
+    from_s : float, optional
+        First time [s] of the grasp or contact; the start of the recording by default.
+    until_s : float, optional
+        Last time [s] of the grasp or contact; the end of the recording by default. If a grasp ends
+        at the first sample, the body is released from its equilibrium in this grasp.
+    sigma_m : float, optional
+        Standard deviation of the noise in each position of the poses [m]; estimated from their
+        roughness by default.
+    sigma_rad : float, optional
+        Standard deviation of the noise in each rotation, about each axis [rad]; estimated from the
+        roughness of the poses by default.
+    axes : {"x", "y", "z", "xy", "xz", "yz", "xyz"}
+        Axes of the world along which the nodes are prescribed; they slide along the others.
+    shape : SolidSection
+        Plane, Sphere, Cylinder, Capsule or Cuboid.
+    name : str, optional
+        Name in messages and pictures.
+    friction : float or str
+        Coefficient of friction; or the name of a parameter, whose bounds are 0 and 2.
+    faces : Nodes, optional
+        Faces of the body that may touch the obstacle: those whose corners are all selected. All by
+        default.
+    stiffness_pa_m : float, optional
+        Contact stiffness κ [Pa/m] in the pressure κ (⟨δ − g⟩² − ⟨−g⟩²)/δ at the gap g; by default
+        100 times Young's modulus at the current parameters over the mean edge of the face at each
+        point.
+    width_m : float, optional
+        Gap δ at which the pressure begins [m]; by default the mean edge of the face over 5000, or
+        over 500 with friction.
+    slip : float, optional
+        Sliding speed [m/s], or slip from sample to sample [m] of a static experiment, at which
+        friction is 0.7 of its limit.
     force : WrenchSection, optional
         Measured force on the body: file, sigma_n, …
     """
 
+    from_s: Finite | None = None
+    until_s: Finite | None = None
+    sigma_m: NotNegative | None = None
+    sigma_rad: NotNegative | None = None
+    axes: Axes = "xyz"
+    shape: SolidSection
+    name: Text | None = None
+    friction: NotNegative | Text = 0.0
+    faces: Nodes | None = None
+    stiffness_pa_m: Positive | None = None
+    width_m: Positive | None = None
+    slip: Positive | None = None
     force: WrenchSection | None = None
 
     @property
@@ -206,11 +294,19 @@ Sigma = Annotated[dict[str, Positive] | Positive, ByForm(dict)]
 ReferenceSigma = Annotated[dict[str, NotNegative] | NotNegative, ByForm(dict)]
 
 
-class MarkersSection(section_of(Markers, "MarkersSection")):
+class MarkersSection(Section):
     """Tracked points.
 
     Attributes
     ----------
+    places : {"free", "surface"}
+        Estimated positions on the undeformed body: anywhere in it, or on its surface.
+    attach : {"auto", "vertex", "embedded"}
+        Nodes that carry a marker. "vertex": the nearest node. "embedded": the nodes of the
+        tetrahedron that contains the marker or is nearest to it. "auto": the nearest node if it
+        lies within 5 % of the mean edge length, otherwise "embedded".
+    max_distance_m : float, optional
+        Largest distance of a marker from the body; the mean edge length by default.
     file : str, optional
         Marker tracks: C3D, TRC, Qualisys TSV, Motive CSV or plain CSV; only `simulate` can do
         without.
@@ -241,6 +337,9 @@ class MarkersSection(section_of(Markers, "MarkersSection")):
         positions. That of nuisance.marker_offsets by default.
     """
 
+    places: Places = "free"
+    attach: AttachmentRule = "auto"
+    max_distance_m: Positive | None = None
     file: Text | None = None
     sigma_m: Sigma = 0.001
     names: list[str] | None = None
@@ -298,13 +397,29 @@ class NamedSection(Section):
     name: Annotated[str, AfterValidator(_require_file_name)]
 
 
-class ReadingSection(section_of(Gauge, "ReadingSection", NamedSection)):
+class ReadingSection(NamedSection):
     """A custom sensor: a Python function of positions or forces and of its own unknowns.
 
     Attributes
     ----------
     name : str
         Name in error bars, and of the file that `simulate` writes.
+    sigma : float
+        Standard deviation of the noise of each number, in its unit.
+    points_m : list
+        Places [x, y, z] on the undeformed body whose motion the sensor measures.
+    unknowns : mapping of name to float
+        Prior standard deviation of each unknown of the sensor, about zero, by the argument's name.
+    grasp : int, optional
+        Instead of points: the number of the grasp, from 1, whose force and torque the sensor
+        measures.
+    frame : {"world", "grasp"}
+        Axes and origin of force and torque: those of the undeformed body as the grasp carries it,
+        or the poses' world.
+    columns : list of str
+        Columns of the numbers in the file, in their order; all besides t_s by default.
+    unit : str
+        Unit of the numbers, for the terminal, reports and figures.
     code : str
         Python file; it is run, which needs --allow-code.
     function : str
@@ -313,31 +428,69 @@ class ReadingSection(section_of(Gauge, "ReadingSection", NamedSection)):
         Measured values: a column t_s, and one for each number; only `simulate` can do without.
     """
 
+    sigma: Positive
+    points_m: list[Vector] = Field([])
+    unknowns: dict[str, Positive] = Field({})
+    grasp: AtLeastOne | None = None
+    frame: Frame = "grasp"
+    columns: list[Text] = Field([])
+    unit: str = ""
     code: Text
     function: Text
     file: Text | None = None
 
 
-class DepthCameraSection(section_of(DepthCamera, "DepthCameraSection")):
+class DepthCameraSection(Section):
     """A depth camera, or the frame of a scanner; keys that an .npz or a log contains may be left
     out.
 
     Attributes
     ----------
+    matrix : list, optional
+        Pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs none; with it
+        a bias and a scale of the depth are estimated, and surfaces that face away are left out.
+    distortion : list
+        k1, k2, p1, p2, k3 of the model of Brown and Conrady.
+    pose : list, optional
+        From the camera's frame to the world, or, with `poses`, to the frame that these move
+        (hand–eye transform).
     poses : str, optional
         File of poses of the body that carries the camera; it is at rest by default.
     """
 
+    matrix: tuple[Vector, Vector, Vector] | None = None
+    distortion: list[Finite] = Field([])
+    pose: PoseMatrix | None = None
     poses: Text | None = None
 
 
-class DepthSection(section_of(Depth, "DepthSection", NamedSection)):
+class DepthSection(NamedSection):
     """Depth images or point clouds of the body from a camera or a scanner, without labels.
 
     Attributes
     ----------
     name : str
         Name in messages, error bars and pictures.
+    sigma_m : float
+        Standard deviation of the noise along the normal of the surface.
+    spacing_m : float
+        Points are thinned to about this distance, as the noise of neighbouring pixels is
+        correlated.
+    gate_m : float
+        Points farther than this from the surface are taken to belong to something else and are left
+        out.
+    faces : Nodes, optional
+        Faces that may be visible: those whose corners are all selected. All by default.
+    background : {"auto", "empty", "unknown"}
+        Meaning of a pixel without a depth. "empty": nothing is there, so that the body cannot be
+        there. "unknown": anything may be there, as where the sensor gets no echo from dark or steep
+        surfaces. "auto": "empty" in images where hardly any pixel shows something far behind the
+        body, otherwise "unknown". A measured depth well behind the body shows in either case that
+        the body is not there.
+    outline_sigma_px : float
+        Standard deviation [pixels] of the distance between the body's outline and the edge of its
+        silhouette in an image, at points of the outline that are `spacing_m` apart. Rounding to
+        pixels alone gives 0.3.
     file : str
         Depth images (.npz, .png of 16 bits, .exr) or clouds of points (.ply, .pcd, .npy, .xyz), or
         a folder of these in the order of their names, with times.csv or t_s; or a topic of a log,
@@ -354,6 +507,12 @@ class DepthSection(section_of(Depth, "DepthSection", NamedSection)):
     """
 
     name: Annotated[str, AfterValidator(_require_file_name)] = "depth"
+    sigma_m: Positive
+    spacing_m: Positive = 0.004
+    gate_m: Positive = 0.01
+    faces: Nodes | None = None
+    background: Background = "auto"
+    outline_sigma_px: Positive = 0.5
     file: Text
     camera: DepthCameraSection = Field(default_factory=lambda: DepthCameraSection.model_construct())
     t_s: list[Finite] | None = None
@@ -361,11 +520,31 @@ class DepthSection(section_of(Depth, "DepthSection", NamedSection)):
     length_unit: Unit = "m"
 
 
-class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection)):
+class ExperimentSection(NamedSection):
     """One recording.
 
     Attributes
     ----------
+    gravity_m_s2 : list
+        Acceleration of gravity [x, y, z].
+    kind : {"dynamic", "static"}
+        A motion ("dynamic"); or samples each of which is an equilibrium of its own ("static"), at
+        any times (with memory, quasi-static in time).
+    start_rule : {"standard", "paper"}
+        Inertia of the first step: from the starting velocity, or zero acceleration.
+    loaded_since_s : float, optional
+        How long a body with memory has been in the shape of its equilibrium; by default it has
+        relaxed completely.
+    validation : bool
+        Whether the recording is only predicted, not fitted.
+    mass : list of PointMassSection
+        [[experiment.mass]] tables: point masses tied to the body.
+    force : list of ForceSection
+        [[experiment.force]] tables: forces besides gravity.
+    tendon : list of TendonSection
+        [[experiment.tendon]] tables: tendons in the body.
+    pressure : list of PressureSection
+        [[experiment.pressure]] tables: pressures in cavities, or on patches whose rim is held.
     file : str, optional
         Table of displacements and wrenches that name no file of their own: CSV as a test bench
         writes it.
@@ -389,11 +568,20 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
         What is estimated of this recording alone, as a table; or "none".
     """
 
+    gravity_m_s2: Vector = EARTH_M_S2
+    kind: Kind = "dynamic"
+    start: Literal["equilibrium", "undeformed"] = "equilibrium"
+    start_rule: StartRule = "standard"
+    loaded_since_s: NotNegative | None = None
+    validation: Flag = False
+    mass: list[PointMassSection] = Field([])
+    force: list[ForceSection] = Field([])
+    tendon: list[TendonSection] = Field([])
+    pressure: list[PressureSection] = Field([])
     file: Text | None = None
     grasp: Grasps = Field(default_factory=list)
     obstacle: list[ObstacleSection] = Field(default_factory=list)
     markers: MarkersSection = Field(default_factory=lambda: MarkersSection.model_construct())
-    start: Literal["equilibrium", "undeformed"] = "equilibrium"
     window_s: tuple[Boundless, Boundless] | None = None
     resample_hz: Positive | None = None
     every: AtLeastOne = 1

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from ..errors import InputError
+from ..fem.constants import Scale
 from ..fem.elements import ELEMENTS
 from ..fem.materials import DAMPINGS, MATERIALS
-from ..fem.spatial_field import Field as MaterialField
-from ..model.parameters import Unknown
+from ..fem.spatial_field import ALL_MODULI, SMOOTH, Lengths, Prior
 from ..model.schemes import MOST_STEPS, SCHEMES
 from ..recording.environment import usual_air_density
 from ..recording.node_selection import Nodes
@@ -21,10 +21,10 @@ from ..schema_tables import (
     Unit,
     Vector,
     require_one,
-    section_of,
     used_keys,
 )
-from ..validated_types import Count, Finite, Flag, NotNegative, Positive, Text
+from ..statistics.systematic_effects import Assumptions
+from ..validated_types import AtLeastOne, Count, Finite, Flag, NotNegative, Positive, Text
 from .problem_options import RolloutOptions, UncertaintyOptions
 from .recording_schema import ExperimentSection
 from .solver_schema import SolverSection
@@ -34,12 +34,6 @@ MaterialName = Annotated[str, Among(tuple(MATERIALS))]
 DampingName = Annotated[str, Among(tuple(DAMPINGS))]
 ElementName = Annotated[str, Among(tuple(ELEMENTS))]
 SchemeName = Annotated[str, Among(tuple(SCHEMES))]
-if TYPE_CHECKING:
-    FieldSection = RolloutSection = UncertaintySection = Section
-else:
-    FieldSection = section_of(MaterialField, "FieldSection")
-    RolloutSection = section_of(RolloutOptions, "RolloutSection")
-    UncertaintySection = section_of(UncertaintyOptions, "UncertaintySection")
 
 
 class CodeSection(Section):
@@ -77,6 +71,35 @@ class NodeForceSection(CodeSection):
     nodes: Nodes | None = None
     on: Literal["nodes", "faces"] = "nodes"
     carries: Count = 0
+
+
+class FieldSection(Section):
+    """Stiffness, density or another constant that varies in space within a material.
+
+    Attributes
+    ----------
+    length_m : float or list
+        Correlation length: places at this distance have the correlation 1/e. Of several lengths the
+        most likely one is used.
+    parameter : str
+        Constant that varies: one of the material or of its damping law, young_pa for all moduli of
+        a material together, or density_kg_m3.
+    modes : int
+        Number of shapes of the field; one more costs as much as one more right-hand side.
+    amplitude : float, optional
+        Prior standard deviation of the logarithm, 0.5 by default; for a density that of the ratio
+        to its stated value, 0.3 by default. With prior = "two-phase", the prior standard deviation
+        of the logarithm of the contrast, 1 by default.
+    prior : {"smooth", "two-phase"}
+        "smooth": the logarithm is a normal field. "two-phase": two materials with a boundary
+        between them; the parameter contrast is the ratio of inclusions to surroundings.
+    """
+
+    length_m: Lengths
+    parameter: Text = ALL_MODULI
+    modes: AtLeastOne = 40
+    amplitude: Positive | None = None
+    prior: Prior = SMOOTH
 
 
 Material = Annotated[MaterialName | CodeSection, ByForm(str)]
@@ -274,11 +297,20 @@ class PriorSection(Section):
         return self
 
 
-class ParameterSection(section_of(Unknown, "ParameterSection")):
+class ParameterSection(Section):
     """One parameter: estimated within bounds, fixed, or tied to another; {} is estimated.
 
     Attributes
     ----------
+    guess : float, optional
+        Value at which the search starts; found by a scan of the stiffness by default.
+    lower, upper : float, optional
+        Bounds of the estimate; those of the constant by default.
+    scale : {"log", "linear"}, optional
+        Whether the logarithm of a positive parameter is estimated, or the value of any sign.
+    typical : float, optional
+        Typical change of a linear parameter in one step of the solver; by default that of its
+        constant, or else the guess.
     fixed : float, optional
         Value that is not estimated.
     tied_to : str, optional
@@ -287,8 +319,13 @@ class ParameterSection(section_of(Unknown, "ParameterSection")):
         Ratio of this parameter to that of `tied_to`, 1 by default.
     """
 
+    guess: Finite | None = None
+    lower: Finite | None = None
+    upper: Finite | None = None
+    prior: PriorSection | None = None
+    scale: Scale | None = None
+    typical: Positive | None = None
     fixed: Finite | None = None
-    prior: PriorSection | None = Field(None, description=None)
     tied_to: Text | None = None
     ratio: Finite | None = None
 
@@ -378,6 +415,21 @@ class EnvironmentSection(Section):
     """
 
     air_density_kg_m3: AirDensity = Field(default_factory=usual_air_density)
+
+
+# Pyright does not read `model_config`, and takes a section for a class that is not frozen.
+class RolloutSection(Section, RolloutOptions):  # pyright: ignore[reportGeneralTypeIssues]
+    """The forward simulation that checks the answer."""
+
+
+class AssumptionsSection(Section, Assumptions):  # pyright: ignore[reportGeneralTypeIssues]
+    """Standard deviations of systematic effects; "none" for what is exact."""
+
+
+class UncertaintySection(Section, UncertaintyOptions):  # pyright: ignore[reportGeneralTypeIssues]
+    """Intervals of the estimates."""
+
+    assumptions: AssumptionsSection = AssumptionsSection()
 
 
 def _kind_tag(value: Any) -> str:

@@ -7,18 +7,23 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, create_model, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core.core_schema import no_info_plain_validator_function
 
 from ..errors import InputError
 from ..methods import METHODS, method_options_schema
-from ..methods.comparison.casadi_nlp import refusal_reason
+from ..methods.comparison.casadi_nlp import Sleqp, SqpMethod, refusal_reason
+from ..methods.comparison.penalty import AugmentedLagrangian, Penalty
+from ..methods.comparison.shooting import Shooting
+from ..methods.continuation import Continuation
+from ..methods.interior_point import InteriorPoint
 from ..methods.method_options import method_from_options
+from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Method
 from ..schema_tables import Among, Section
-from ..validated_types import Positive
+from ..validated_types import Options, Positive
 
 OPTIONS = {method: [field.name for field in fields(kind)] for method, kind in METHODS.items()}
 DEFAULT = "reduced-space"
@@ -37,7 +42,31 @@ def _require_offered(name: Any) -> Any:
 MethodName = Annotated[str, Among(tuple(METHODS)), BeforeValidator(_require_offered)]
 
 
-class MethodSection(Section):
+@dataclass(frozen=True)
+class OptionTable:
+    """Annotation of a key whose value is the table of a method's options.
+
+    Attributes
+    ----------
+    kind : type
+        Class of the method.
+    """
+
+    kind: type[Options]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        return no_info_plain_validator_function(partial(_method_from_table, self.kind.name))
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        return method_options_schema(self.kind.name)
+
+
+def _method_key(kind: type[Options]) -> Any:
+    """Return the key of a method: its name in the file, and its defaults."""
+    return Field(default_factory=kind, alias=kind.name)
+
+
+class SolverSection(Section):
     """The method, the loss, and a table of options for each method.
 
     Attributes
@@ -45,10 +74,38 @@ class MethodSection(Section):
     huber : float, optional
         Threshold in standard deviations beyond which residuals count linearly, not squared (Huber's
         loss).
+    interior_point : InteriorPoint
+        Interior-point method (IPOPT) for parameters and trajectories together.
+    reduced_space : ReducedSpace
+        Gauss–Newton method for the parameters; the equations of motion give the trajectories.
+    penalty : Penalty
+        Penalty method: violations of the equations of motion are penalised, as in the paper.
+    augmented_lagrangian : AugmentedLagrangian
+        Augmented Lagrangian: a penalty with multipliers, so that ρ need not become large.
+    shooting : Shooting
+        Single shooting: simulate with trial parameters, and improve them.
+    casadi_sqpmethod : SqpMethod
+        Sequential quadratic programming (SQP) with convex quadratic programs.
+    casadi_sleqp : Sleqp
+        SLP-EQP in a trust region: steps of QPs with the active constraints of linear programs.
+    continuation : Continuation
+        Continuation over the horizon: another method on growing parts of every recording.
     """
 
     method: MethodName = DEFAULT
     huber: Positive | None = None
+    interior_point: Annotated[InteriorPoint, OptionTable(InteriorPoint)] = _method_key(
+        InteriorPoint
+    )
+    reduced_space: Annotated[ReducedSpace, OptionTable(ReducedSpace)] = _method_key(ReducedSpace)
+    penalty: Annotated[Penalty, OptionTable(Penalty)] = _method_key(Penalty)
+    augmented_lagrangian: Annotated[AugmentedLagrangian, OptionTable(AugmentedLagrangian)] = (
+        _method_key(AugmentedLagrangian)
+    )
+    shooting: Annotated[Shooting, OptionTable(Shooting)] = _method_key(Shooting)
+    casadi_sqpmethod: Annotated[SqpMethod, OptionTable(SqpMethod)] = _method_key(SqpMethod)
+    casadi_sleqp: Annotated[Sleqp, OptionTable(Sleqp)] = _method_key(Sleqp)
+    continuation: Annotated[Continuation, OptionTable(Continuation)] = _method_key(Continuation)
 
     @model_validator(mode="before")
     @classmethod
@@ -65,7 +122,11 @@ class MethodSection(Section):
     @property
     def methods(self) -> dict[str, Method]:
         """Methods by name, with the options of their tables."""
-        return {name: getattr(self, name) for name in METHODS}
+        return {
+            field.alias: getattr(self, name)
+            for name, field in type(self).model_fields.items()
+            if field.alias is not None
+        }
 
 
 def _method_from_table(method: str, table: Any) -> Any:
@@ -109,34 +170,3 @@ def _advice_on_tables(options: Sequence[str], chosen: Any) -> str:
 def table_heading(method: str) -> str:
     """Return the heading of a method's table in the file."""
     return f'[solver."{method}"]' if ":" in method else f"[solver.{method}]"
-
-
-@dataclass(frozen=True)
-class _MethodType:
-    """Pydantic type of a method's key."""
-
-    method: str
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        return no_info_plain_validator_function(partial(_method_from_table, self.method))
-
-    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
-        return method_options_schema(self.method)
-
-
-def _method_field(method: str) -> tuple[Any, Any]:
-    """Return type and default of a method's key."""
-    return Annotated[Any, _MethodType(method)], Field(
-        default_factory=partial(_method_from_table, method, {})
-    )
-
-
-if TYPE_CHECKING:
-    SolverSection = MethodSection
-else:
-    SolverSection = create_model(
-        "SolverSection",
-        __base__=MethodSection,
-        __doc__=MethodSection.__doc__,
-        **{method: _method_field(method) for method in METHODS},
-    )

@@ -73,7 +73,7 @@ def _fault_message(fault: Fault, content: dict[str, Any], root: type[BaseModel])
         inside = _table_model(table.annotation) if table else None
         if SPECIMEN_TAG in fault["loc"] and inside is not None and len(key) == 3:
             inside = SpecimenSection
-        known = list((inside or root).model_fields)
+        known = list(_fields_by_key(inside or root))
         hint = hint_at(str(key[-1]), known)
         return f"unknown key{hint or '; expected one of ' + ', '.join(known)}"
     if kind == "value_error":
@@ -86,7 +86,9 @@ def _fault_message(fault: Fault, content: dict[str, Any], root: type[BaseModel])
     if expected and (in_array or kind in ("tuple_type", "list_type", "too_long", "too_short")):
         return f"{finding}; expected {expected}"
     if kind in ("model_type", "model_attributes_type") and model is not None:
-        return f"{finding}; expected a table with some of the keys {', '.join(model.model_fields)}"
+        return (
+            f"{finding}; expected a table with some of the keys {', '.join(_fields_by_key(model))}"
+        )
     if kind == "literal_error":
         choices = fault["ctx"]["expected"]
         hint = hint_at(str(fault["input"]), re.findall("'(.*?)'", choices))
@@ -163,16 +165,21 @@ def _schema_field(key: Sequence[Part], root: type[BaseModel]) -> tuple[FieldInfo
         if field is not None and get_origin(field.annotation) is dict and not named:
             named = True  # a name of the user's, such as a parameter's
             continue
-        if field is not None and model is not None and part not in model.model_fields:
+        if field is not None and model is not None and part not in _fields_by_key(model):
             others = _table_models(field.annotation)
-            model = next((each for each in others if part in each.model_fields), None)
-        if model is None or part not in model.model_fields:
+            model = next((each for each in others if part in _fields_by_key(each)), None)
+        if model is None or part not in _fields_by_key(model):
             break
-        field = model.model_fields[part]
+        field = _fields_by_key(model)[part]
         depth = count
         named = False
         model = _table_model(field.annotation)
     return field, depth
+
+
+def _fields_by_key(model: type[BaseModel]) -> dict[str, FieldInfo]:
+    """Return the fields of a model by their keys in the file."""
+    return {field.alias or name: field for name, field in model.model_fields.items()}
 
 
 def _table_model(annotation: Any) -> type[BaseModel] | None:

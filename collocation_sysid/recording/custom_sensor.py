@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import Array
-from ..declarations import Key, declaration, identity, key
+from ..declarations import declaration, identity, key
 from ..errors import InputError
 from ..files import reason
 from ..schema_tables import Vector
@@ -48,16 +48,6 @@ class Look:
 
 POINT_INPUTS = ("position_m", "velocity_m_s", "acceleration_m_s2")
 GRASP_INPUTS = ("force_n", "torque_nm")
-
-
-_POINTS = Key("points_m", list[Vector], default=[])
-_COLUMNS = Key("columns", list[Text], default=[])
-_GRASP = Key(
-    "grasp",
-    AtLeastOne | None,
-    description="Instead of points: the number of the grasp, from 1, whose force and torque the "
-    "sensor measures.",
-)
 
 
 @declaration
@@ -105,11 +95,11 @@ class Gauge:
     t_s: ArrayLike
     values: ArrayLike | None
     sigma: float = key(Positive)
-    points_m: ArrayLike = key(_POINTS, converter=identity, default=())
+    points_m: ArrayLike = key(list[Vector], converter=identity, default=())
     unknowns: Mapping[str, float] = key(dict[str, Positive], default_factory=dict)
-    grasp: int | None = key(_GRASP, converter=identity, default=None)
+    grasp: int | None = key(AtLeastOne | None, converter=identity, default=None)
     frame: Frame = key(Frame, default="grasp")
-    columns: Sequence[str] = key(_COLUMNS, converter=identity, default=())
+    columns: Sequence[str] = key(list[Text], converter=identity, default=())
     unit: str = key(str, default="")
 
     def __post_init__(self) -> None:

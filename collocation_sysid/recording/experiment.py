@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..array_types import Array, Index
 from ..declarations import declaration, identity, key
 from ..errors import InputError
-from ..schema_tables import Vector, tables
+from ..schema_tables import Vector
 from ..validated_types import Flag, NotNegative
 from .actuator import Actuator
 from .checked_arrays import float_converter, read_only_floats
@@ -129,10 +129,10 @@ class Experiment:
     start_velocities_m_s: Array | None = key(converter=_state("velocities_m_s"), default=None)
     loaded_since_s: float = key(NotNegative | None, default=np.inf)
     validation: bool = key(Flag, default=False)
-    masses: tuple[PointMass, ...] = key(tables("mass", PointMass), converter=tuple, default=())
-    forces: tuple[Force, ...] = key(tables("force", Force), converter=tuple, default=())
-    tendons: tuple[Tendon, ...] = key(tables("tendon", Tendon), converter=tuple, default=())
-    pressures: tuple[Pressure, ...] = key(tables("pressure", Pressure), converter=tuple, default=())
+    masses: tuple[PointMass, ...] = key(converter=tuple, default=())
+    forces: tuple[Force, ...] = key(converter=tuple, default=())
+    tendons: tuple[Tendon, ...] = key(converter=tuple, default=())
+    pressures: tuple[Pressure, ...] = key(converter=tuple, default=())
     readings: tuple[Gauge, ...] = key(converter=tuple[Gauge, ...], default=())
     depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=())
     nuisance: Nuisance = DEFAULT_NUISANCE

@@ -168,9 +168,7 @@ class PointMass(Load):
         return mass
 
 
-_TABLE = Key(
-    "file", Text | None, read_forces, "force_n", "CSV with the columns t_s, fx_n, fy_n, fz_n."
-)
+_TABLE = Key("file", Text | None, read_forces, "force_n")
 
 
 @declaration

@@ -29,14 +29,8 @@ MOST_NAMES_SHOWN = 4
 UndeformedPlaces = Callable[[Array, Array], Array]
 
 
-_FARTHEST = Key("max_distance_m", Positive | None)
-_PLACES = Key(
-    "places",
-    Literal["free", "surface"],
-    lambda word: word == "surface",
-    description="Estimated positions on the undeformed body: anywhere in it, or on its surface.",
-    default="free",
-)
+Places = Literal["free", "surface"]
+_PLACES = Key("places", Places, lambda word: word == "surface")
 
 
 @declaration
@@ -90,7 +84,7 @@ class Markers:
     on_surface: bool = key(_PLACES, converter=bool, default=False)
     located: NDArray[np.bool_] = key(converter=np.asarray, default=None)
     attach: AttachmentRule = key(AttachmentRule, default="auto")
-    max_distance_m: float | None = key(_FARTHEST, converter=identity, default=None)
+    max_distance_m: float | None = key(Positive | None, converter=identity, default=None)
 
     def __post_init__(self) -> None:
         shape = len(self.t_s), None, 3

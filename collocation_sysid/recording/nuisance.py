@@ -1,15 +1,15 @@
 """Nuisance parameters: unknowns of a single recording, which are estimated with a prior.
 
-`KINDS` declares each kind once: the fields of `Nuisance`, the keys of the problem file, limits,
-tables and texts follow from it.
+`KINDS` declares each kind: limits, tables and texts follow from it. `Nuisance` has a field for
+each kind, and [experiment.nuisance] of the problem file a key.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, make_dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import KW_ONLY, dataclass, field
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -713,11 +713,129 @@ KINDS = tuple(row for row in [*vars().values()] if isinstance(row, NuisanceRow))
 GAUGE = NuisanceRow("reading", "", None, of="gauge", changes=())
 
 
-class _NuisanceBase:
-    """Checks and look-ups of `Nuisance`, whose fields are made from the table `KINDS`."""
+@dataclass(frozen=True, kw_only=True)
+class Nuisance:
+    """Standard deviations of an experiment's nuisance parameters; None: not estimated.
 
-    scope: Mapping[str, str]
-    own: Sequence[NuisanceRow]
+    Every one has a normal prior around zero with its deviation. The defaults are those of a careful
+    laboratory; `none` is for ideal data. There is a field for each row of `KINDS`.
+
+    Attributes
+    ----------
+    marker_offset_m : float or None
+        Errors of the positions in reference_m without a reference_sigma_m; they rotate with the
+        body.
+    camera_offset_m : float or None
+        A constant offset of each marker in the cameras' frame.
+    calibration_scale : float or None
+        Scale error of all lengths that the cameras measure: the factor minus one.
+    calibration_distortion_1_m2 : float or None
+        Radial distortion of first order about the body's middle: a factor 1 + k r².
+    time_shift_s : float or None
+        How much later than stated the markers were measured, on the grasps' clock.
+    clock_rate : float or None
+        How much slower than the grasps' clock that of the markers runs.
+    pose_turn_rad : float or None
+        A constant rotation of grasps and body in the cameras' frame, which rotates gravity in the
+        body's frame.
+    pose_shift_m : float or None
+        A constant translation of grasps and body in the cameras' frame.
+    gravity_rad : float or None
+        A tilt of the direction of gravity.
+    hand_eye_rad : float or None
+        A constant rotation of the body in its grasps.
+    hand_eye_m : float or None
+        A constant translation of the body in its grasps; both if the start is an equilibrium and
+        markers measure it.
+    strain_zero : float or None
+        A constant offset of the strains of a specimen.
+    displacement_zero_m : float or None
+        A constant offset of each displacement along each of its axes.
+    obstacle_offset_m : float or None
+        A constant offset of each obstacle along its normal, or along the axis of its displacement,
+        which changes the beginning of the contact.
+    obstacle_tilt_rad : float or None
+        A constant tilt of each obstacle that is a plane or a box, about its point or middle.
+    obstacle_time_s : float or None
+        Delay of each obstacle's motion, to first order.
+    tension_factor : float or None
+        Scale error of the tension of each tendon: the factor minus one.
+    tension_lost_n : float or None
+        Tension of each tendon that is lost by friction.
+    pressure_factor : float or None
+        Scale error of each pressure: the factor minus one.
+    pressure_lost_pa : float or None
+        Offset by which each pressure is lower than stated.
+    joining_s : float or None
+        Delay with which each point mass or force begins or ends, if it does so within the
+        recording.
+    tare : float or None
+        A constant offset of each component of a wrench, in multiples of its sigma.
+    sensor_time_s : float or None
+        Delay of the measured wrenches; at most three standard deviations.
+    sensor_lag_s : float or None
+        Time constant of a first-order low-pass in the sensor; from zero to three standard
+        deviations.
+    tool_kg : float or None
+        Mass of the tool between a sensor and the body.
+    tool_m : float or None
+        Centre of the tool relative to the sensor's point; in the world's frame, relative to that of
+        the grasped nodes.
+    depth_turn_rad : float or None
+        Rotation of each depth camera about the middle of the body, along the camera's axes.
+    depth_shift_m : float or None
+        Translation of each depth camera; if neither is given, the first image is first aligned with
+        the body.
+    depth_bias_m : float or None
+        Offset that is added to each depth of an image.
+    depth_scale : float or None
+        Scale error of each depth of an image: the factor minus one.
+    depth_time_s : float or None
+        Delay of a depth camera; at most three standard deviations.
+    depth_edge_px : float or None
+        Distance by which silhouettes in the images of each depth camera end inside the outline of
+        the body, in pixels.
+    scope : mapping of name to str
+        "shared", or "shared" and a word, for parameters with the same value in all recordings that
+        have the word, by field; other parameters have a value of each recording.
+    own : sequence of NuisanceRow
+        Custom parameters, which change the predicted positions or the times of markers.
+    """
+
+    marker_offset_m: float | None = PLACE.sigma
+    camera_offset_m: float | None = OFFSET.sigma
+    calibration_scale: float | None = CALIBRATION_SCALE.sigma
+    calibration_distortion_1_m2: float | None = CALIBRATION_DISTORTION.sigma
+    time_shift_s: float | None = TIME.sigma
+    clock_rate: float | None = CLOCK_RATE.sigma
+    pose_turn_rad: float | None = POSE_TURN.sigma
+    pose_shift_m: float | None = POSE_SHIFT.sigma
+    gravity_rad: float | None = TILT.sigma
+    hand_eye_rad: float | None = GRASP_TURN.sigma
+    hand_eye_m: float | None = GRASP_SHIFT.sigma
+    strain_zero: float | None = STRAIN_ZERO.sigma
+    displacement_zero_m: float | None = ZERO.sigma
+    obstacle_offset_m: float | None = OBSTACLE_OFFSET.sigma
+    obstacle_tilt_rad: float | None = OBSTACLE_TILT.sigma
+    obstacle_time_s: float | None = OBSTACLE_TIME.sigma
+    tension_factor: float | None = TENSION_FACTOR.sigma
+    tension_lost_n: float | None = TENSION_OFFSET.sigma
+    pressure_factor: float | None = PRESSURE_FACTOR.sigma
+    pressure_lost_pa: float | None = PRESSURE_OFFSET.sigma
+    joining_s: float | None = JOINING.sigma
+    tare: float | None = TARE.sigma
+    sensor_time_s: float | None = SENSOR_TIME.sigma
+    sensor_lag_s: float | None = SENSOR_LAG.sigma
+    tool_kg: float | None = TOOL_MASS.sigma
+    tool_m: float | None = TOOL_CENTRE.sigma
+    depth_turn_rad: float | None = DEPTH_TURN.sigma
+    depth_shift_m: float | None = DEPTH_SHIFT.sigma
+    depth_bias_m: float | None = DEPTH_BIAS.sigma
+    depth_scale: float | None = DEPTH_SCALE.sigma
+    depth_time_s: float | None = DEPTH_TIME.sigma
+    depth_edge_px: float | None = DEPTH_EDGE.sigma
+    scope: Mapping[str, str] = field(default_factory=dict, hash=False)
+    own: Sequence[NuisanceRow] = field(default=(), hash=False)
 
     def __post_init__(self) -> None:
         for row in self.own:
@@ -761,48 +879,3 @@ def _check_custom_kind(row: NuisanceRow) -> None:
         raise InputError(f"{row.name} has no sigma; expected the standard deviation of its prior")
     if (row.reading is None) == (row.clock is None):
         raise InputError(f"{row.name} has to have a reading or a clock, one of both")
-
-
-_DOCSTRING = """Standard deviations of an experiment's nuisance parameters; None: not estimated.
-
-Every one has a normal prior around zero with its deviation. The defaults are those of a careful
-laboratory; `none` is for ideal data.
-
-Attributes
-----------
-"""
-
-_SCOPE_DOCSTRING = """
-scope : mapping of the name of a field to "shared", or "shared" and a word
-    Those that are the same in all recordings that have the word; each recording has its own else.
-own : sequence of NuisanceRow
-    More of them, that change what markers read or when.
-"""
-
-if TYPE_CHECKING:
-
-    @dataclass(frozen=True, init=False)
-    class Nuisance(_NuisanceBase):
-        """Type stub of the class that is made from `KINDS` below: one field for each kind."""
-
-        def __init__(self, **deviations: Any) -> None: ...
-        def __getattr__(self, name: str) -> float | None: ...
-
-else:
-    Nuisance = make_dataclass(
-        "Nuisance",
-        [
-            *((row.name, "float | None", field(default=row.sigma)) for row in KINDS),
-            ("scope", "Mapping[str, str]", field(default_factory=dict, hash=False)),
-            ("own", "Sequence[NuisanceRow]", field(default=(), hash=False)),
-        ],
-        bases=(_NuisanceBase,),
-        frozen=True,
-        kw_only=True,
-        namespace={
-            "__module__": __name__,
-            "__doc__": _DOCSTRING
-            + "\n".join(f"{row.name} : float or None\n    {row.description}." for row in KINDS)
-            + _SCOPE_DOCSTRING,
-        },
-    )

@@ -21,8 +21,9 @@ from ..fem.selection import Selection
 from ..validated_types import NotNegative, Positive, Text
 from .grasp import Grasp
 from .node_selection import Nodes, selection_from_section
-from .obstacle_solids import KINDS, Solid, SolidSection, orthogonal_axes, solid_from_section
+from .obstacle_solids import KINDS, Solid, orthogonal_axes
 from .poses import PoseSequence
+from .solid_sections import SolidSection, solid_from_section
 
 if TYPE_CHECKING:
     from ..fem.body import Body

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
-from pydantic import model_validator
 
 from ..array_types import Array
 from ..declarations import declaration, key
 from ..errors import InputError
-from ..schema_tables import Section, Vector, declared_in, require_one, section_of
+from ..schema_tables import Vector
 from ..validated_types import NotNegative, Positive
 from .checked_arrays import float_converter
 
@@ -293,46 +292,6 @@ def _corner_distance(beyond: ca.SX) -> ca.SX:
     return _length(ca.fmax(beyond, 0)) + ca.fmin(ca.mmax(beyond), 0)
 
 
-if TYPE_CHECKING:
-    PlaneSection = SphereSection = CylinderSection = CapsuleSection = CuboidSection = Section
-else:
-    PlaneSection, SphereSection, CylinderSection, CapsuleSection, CuboidSection = (
-        section_of(kind, f"{kind.__name__}Section")
-        for kind in (Plane, Sphere, Cylinder, Capsule, Cuboid)
-    )
-
-
-class SolidSection(Section):
-    """Rigid solid, described by exactly one of these keys in the frame of its poses.
-
-    Without poses the frame is that of the undeformed body.
-
-    Attributes
-    ----------
-    plane : PlaneSection, optional
-        The half-space behind a plane: normal, point_m.
-    sphere_m : SphereSection, optional
-        A ball: radius_m, centre_m.
-    cylinder_m : CylinderSection, optional
-        A cylinder: radius_m, ends_m, rounding_m.
-    capsule_m : CapsuleSection, optional
-        A cylinder with a half-ball at each end: radius_m, ends_m.
-    box_m : CuboidSection, optional
-        A box: corners_m, rounding_m.
-    """
-
-    plane: PlaneSection | None = None
-    sphere_m: SphereSection | None = None
-    cylinder_m: CylinderSection | None = None
-    capsule_m: CapsuleSection | None = None
-    box_m: CuboidSection | None = None
-
-    @model_validator(mode="after")
-    def _one(self) -> SolidSection:
-        require_one(self, *type(self).model_fields)
-        return self
-
-
 KINDS: dict[str, type[Solid]] = {
     "plane": Plane,
     "sphere_m": Sphere,
@@ -345,9 +304,3 @@ KINDS: dict[str, type[Solid]] = {
 def solid_key(solid: Solid) -> str:
     """Key of a solid's kind in a problem file, such as "sphere_m"."""
     return next(name for name, kind in KINDS.items() if isinstance(solid, kind))
-
-
-def solid_from_section(section: SolidSection) -> Solid:
-    """Return the solid that a `SolidSection` states."""
-    ((name, own),) = ((name, own) for name, own in section if own is not None)
-    return KINDS[name](**declared_in(own, KINDS[name], name))

@@ -43,13 +43,7 @@ def _checked_faces(faces: Selection | ArrayLike) -> Selection | Index:
     return faces
 
 
-_TABLE = Key(
-    "pressure",
-    Text | None,
-    read_pressure,
-    "pressure_pa",
-    "CSV with the columns t_s and pressure_pa, over all of the recording.",
-)
+_TABLE = Key("pressure", Text | None, read_pressure, "pressure_pa")
 
 
 @declaration

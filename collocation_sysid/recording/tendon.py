@@ -27,13 +27,7 @@ if TYPE_CHECKING:
 FARTHEST_POINT_EDGES = 1.0
 
 
-_TABLE = Key(
-    "tension",
-    Text | None,
-    read_tension,
-    "tension_n",
-    "CSV with the columns t_s and tension_n, over all of the recording.",
-)
+_TABLE = Key("tension", Text | None, read_tension, "tension_n")
 
 
 @declaration

@@ -10,10 +10,10 @@ state standard deviations.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, make_dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ from ..program.contact_summary import surface_gaps_and_pressures
 from ..program.reaction_forces import forces_on_dofs, reaction_forces
 from ..recording.grasp import free_rigid_motions
 from ..recording.homogeneous_deformation import STRESS_PER_FORCE, HomogeneousDeformation
-from ..recording.nuisance import KINDS
+from ..recording.nuisance import DEGREE
 from ..schema_tables import ByForm, Section
 from ..validated_types import Options, Positive
 from .shape_error import (
@@ -785,20 +785,181 @@ Deviation = Annotated[Literal["none"] | Positive, ByForm(str)]
 KnownDeviation = Annotated[KnownEffect | Deviation, ByForm((dict, KnownEffect))]
 # Rows that are never negative, of which a mean may be stated: what gives way does not push.
 OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n")
-_DOCUMENTATION = """Standard deviations of systematic effects; "none" for what is exact.
-
-An effect that is known to exist, such as the compliance of a machine, has a table of mean and
-deviation. Nuisance parameters of recordings, by their names, count if they are not estimated.
-
-Attributes
-----------
-"""
-_FIELDS = [(row.name, row.sigma, f"{row.description} [{row.unit or 1}]") for row in ASSUMPTIONS]
-_FIELDS += [(row.name, row.considered, f"{row.description} [{row.unit}]") for row in KINDS]
 
 
-class _AssumptionsBase(Options):
-    """Methods of the table of standard deviations."""
+@dataclass(frozen=True, kw_only=True)
+class Assumptions(Options):
+    """Standard deviations of systematic effects; "none" for what is exact.
+
+    An effect that is known to exist, such as the compliance of a machine, has a table of mean and
+    deviation. Nuisance parameters of recordings, by their names, count if they are not estimated.
+    There is a field for each row of `ASSUMPTIONS` and of `recording.nuisance.KINDS`.
+
+    Attributes
+    ----------
+    body_scale
+        Size of the mesh [1].
+    rest_shape
+        Weight under which the mesh was deformed when it was made, along each axis, if
+        object.rest_shape is not stated [1].
+    surface
+        Displacement of the surface along its normal, relative to the thickness [1].
+    mass
+        Mass of the body, if it is not estimated [1].
+    density_gradient
+        Density at one end of the body relative to that in its middle [1].
+    anisotropy
+        Stiffness along one axis relative to that across it [1].
+    stiffness_drift
+        Stiffness at the end of a recording relative to that at its beginning [1].
+    time_scale
+        Rate of all clocks [1].
+    poisson
+        Poisson's ratio, if it is stated [1].
+    damping_law
+        Damping force of another objective law, as a fraction of its difference from the stated law
+        [1].
+    rayleigh_damping
+        Damping force of the Rayleigh law, as a fraction of its difference from the stated law [1].
+    grip_layer_m
+        Compliance of grip and skin, as the thickness of a layer of the body's material [m].
+    machine_compliance_m_n
+        Compliance of the test bench [m/N].
+    platen_friction
+        Coefficient of friction of platens between which nodes slide [1].
+    contact_stiffness
+        Compliance of the contact with obstacles, as a fraction of that of the pressure law [1].
+    buoyancy
+        Buoyancy relative to that of the model, because of the density of the air [1].
+    added_mass
+        Added mass of the air relative to that of the model [1].
+    air_drag
+        Drag of the air relative to that of the model [1].
+    marker_offset_m
+        Errors of the positions in reference_m without a reference_sigma_m; they rotate with the
+        body [m].
+    camera_offset_m
+        A constant offset of each marker in the cameras' frame [m].
+    calibration_scale
+        Scale error of all lengths that the cameras measure: the factor minus one [1].
+    calibration_distortion_1_m2
+        Radial distortion of first order about the body's middle: a factor 1 + k r² [1/m²].
+    time_shift_s
+        How much later than stated the markers were measured, on the grasps' clock [s].
+    clock_rate
+        How much slower than the grasps' clock that of the markers runs [1].
+    pose_turn_rad
+        A constant rotation of grasps and body in the cameras' frame, which rotates gravity in the
+        body's frame [rad].
+    pose_shift_m
+        A constant translation of grasps and body in the cameras' frame [m].
+    gravity_rad
+        A tilt of the direction of gravity [rad].
+    hand_eye_rad
+        A constant rotation of the body in its grasps [rad].
+    hand_eye_m
+        A constant translation of the body in its grasps; both if the start is an equilibrium and
+        markers measure it [m].
+    strain_zero
+        A constant offset of the strains of a specimen [1].
+    displacement_zero_m
+        A constant offset of each displacement along each of its axes [m].
+    obstacle_offset_m
+        A constant offset of each obstacle along its normal, or along the axis of its displacement,
+        which changes the beginning of the contact [m].
+    obstacle_tilt_rad
+        A constant tilt of each obstacle that is a plane or a box, about its point or middle [rad].
+    obstacle_time_s
+        Delay of each obstacle's motion, to first order [s].
+    tension_factor
+        Scale error of the tension of each tendon: the factor minus one [1].
+    tension_lost_n
+        Tension of each tendon that is lost by friction [N].
+    pressure_factor
+        Scale error of each pressure: the factor minus one [1].
+    pressure_lost_pa
+        Offset by which each pressure is lower than stated [Pa].
+    joining_s
+        Delay with which each point mass or force begins or ends, if it does so within the recording
+        [s].
+    tare
+        A constant offset of each component of a wrench, in multiples of its sigma [σ].
+    sensor_time_s
+        Delay of the measured wrenches; at most three standard deviations [s].
+    sensor_lag_s
+        Time constant of a first-order low-pass in the sensor; from zero to three standard
+        deviations [s].
+    tool_kg
+        Mass of the tool between a sensor and the body [kg].
+    tool_m
+        Centre of the tool relative to the sensor's point; in the world's frame, relative to that of
+        the grasped nodes [m].
+    depth_turn_rad
+        Rotation of each depth camera about the middle of the body, along the camera's axes [rad].
+    depth_shift_m
+        Translation of each depth camera; if neither is given, the first image is first aligned with
+        the body [m].
+    depth_bias_m
+        Offset that is added to each depth of an image [m].
+    depth_scale
+        Scale error of each depth of an image: the factor minus one [1].
+    depth_time_s
+        Delay of a depth camera; at most three standard deviations [s].
+    depth_edge_px
+        Distance by which silhouettes in the images of each depth camera end inside the outline of
+        the body, in pixels [px].
+    """
+
+    body_scale: Deviation = 0.01
+    rest_shape: Deviation = 0.58
+    surface: Deviation = 0.005
+    mass: Deviation = 0.01
+    density_gradient: Deviation = 0.05
+    anisotropy: Deviation = 0.05
+    stiffness_drift: Deviation = 0.02
+    time_scale: Deviation = 0.0001
+    poisson: Deviation = 0.02
+    damping_law: Deviation = 1.0
+    rayleigh_damping: Deviation = "none"
+    grip_layer_m: KnownDeviation = 0.0002
+    machine_compliance_m_n: KnownDeviation = 1e-06
+    platen_friction: Deviation = 0.1
+    contact_stiffness: Deviation = 1.0
+    buoyancy: Deviation = AIR_DENSITY_DEVIATION
+    added_mass: Deviation = AIR_COEFFICIENT_DEVIATION
+    air_drag: Deviation = AIR_COEFFICIENT_DEVIATION
+    marker_offset_m: Deviation = "none"
+    camera_offset_m: Deviation = "none"
+    calibration_scale: Deviation = 0.002
+    calibration_distortion_1_m2: Deviation = 0.02
+    time_shift_s: Deviation = "none"
+    clock_rate: Deviation = 0.0001
+    pose_turn_rad: Deviation = "none"
+    pose_shift_m: Deviation = "none"
+    gravity_rad: Deviation = "none"
+    hand_eye_rad: Deviation = "none"
+    hand_eye_m: Deviation = "none"
+    strain_zero: Deviation = "none"
+    displacement_zero_m: Deviation = "none"
+    obstacle_offset_m: Deviation = "none"
+    obstacle_tilt_rad: Deviation = 0.2 * DEGREE
+    obstacle_time_s: Deviation = 0.001
+    tension_factor: Deviation = "none"
+    tension_lost_n: Deviation = "none"
+    pressure_factor: Deviation = "none"
+    pressure_lost_pa: Deviation = "none"
+    joining_s: Deviation = "none"
+    tare: Deviation = "none"
+    sensor_time_s: Deviation = "none"
+    sensor_lag_s: Deviation = "none"
+    tool_kg: Deviation = "none"
+    tool_m: Deviation = "none"
+    depth_turn_rad: Deviation = "none"
+    depth_shift_m: Deviation = "none"
+    depth_bias_m: Deviation = "none"
+    depth_scale: Deviation = "none"
+    depth_time_s: Deviation = "none"
+    depth_edge_px: Deviation = "none"
 
     @classmethod
     def exact(cls) -> Assumptions:
@@ -827,37 +988,3 @@ class _AssumptionsBase(Options):
             for name, deviation in vars(self).items()
             if isinstance(deviation, KnownEffect)
         }
-
-
-if TYPE_CHECKING:
-
-    @dataclass(frozen=True, init=False)
-    class Assumptions(_AssumptionsBase):
-        """Standard deviations of all assumptions and nuisance parameters, one field per row
-        of `ASSUMPTIONS` and of `recording.nuisance.KINDS`.
-        """
-
-        def __init__(
-            self, **deviations: float | Literal["none"] | KnownEffect | Mapping[str, float]
-        ) -> None: ...
-
-else:
-    Assumptions = make_dataclass(
-        "Assumptions",
-        [
-            (
-                name,
-                KnownDeviation if name in OF_KNOWN_SIGN else Deviation,
-                field(default=sigma or "none"),
-            )
-            for name, sigma, _ in _FIELDS
-        ],
-        bases=(_AssumptionsBase,),
-        frozen=True,
-        kw_only=True,
-        namespace={
-            "__module__": __name__,
-            "__doc__": _DOCUMENTATION
-            + "\n".join(f"{name}\n    {description}." for name, _, description in _FIELDS),
-        },
-    )

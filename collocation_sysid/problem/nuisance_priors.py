@@ -1,0 +1,428 @@
+"""Tables of [experiment.nuisance] that state priors of nuisance parameters.
+
+The description of each table is that of its first parameter in `recording.nuisance.KINDS`.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, ClassVar
+
+from pydantic import AfterValidator, model_validator
+
+from ..recording.nuisance import SCOPE, SCOPE_TEXT
+from ..schema_tables import Section, used_keys
+from ..validated_types import Positive
+
+
+def _require_scope(word: str) -> str:
+    """Return a scope unchanged if it is "recording" or matches `SCOPE`; raise `ValueError`
+    otherwise.
+    """
+    if word != "recording" and not re.fullmatch(SCOPE, word):
+        raise ValueError(f'found {word!r}; expected "recording", {SCOPE_TEXT}')
+    return word
+
+
+class Scoped(Section):
+    """Something of a recording, or of several.
+
+    Attributes
+    ----------
+    scope : str
+        Which recordings have the same value: "recording" for a value of each recording, "shared"
+        for one value of all recordings that say "shared", or "shared" and a word for each of
+        several groups.
+    """
+
+    scope: Annotated[str, AfterValidator(_require_scope)] = "recording"
+
+
+class NuisancePriorSection(Scoped):
+    """Standard deviations of nuisance parameters; of several, those that are missing mean
+    exact values.
+    """
+
+    # Whether the parameter has a default prior, so that a scope alone is sufficient.
+    has_default: ClassVar[bool] = False
+
+    @model_validator(mode="after")
+    def _require_one_prior(self) -> NuisancePriorSection:
+        """Raise `ValueError` if no prior is given and the scope alone is not sufficient."""
+        priors = [key for key in type(self).model_fields if key != "scope"]
+        if not used_keys(self, *priors) and (self.scope == "recording" or not self.has_default):
+            expected = "one or both" if len(priors) > 1 else "it"
+            raise ValueError(f"found no {' and no '.join(priors)}; expected {expected}")
+        return self
+
+
+class MarkerOffsetsPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: errors of the positions in reference_m without a
+    reference_sigma_m; they rotate with the body.
+
+    Attributes
+    ----------
+    prior_m : float, optional
+        Standard deviation [m].
+    """
+
+    has_default: ClassVar[bool] = True
+
+    prior_m: Positive | None = None
+
+
+class CameraOffsetsPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: a constant offset of each marker in the cameras' frame.
+
+    Attributes
+    ----------
+    prior_m : float, optional
+        Standard deviation [m].
+    """
+
+    prior_m: Positive | None = None
+
+
+class CalibrationScalePrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: scale error of all lengths that the cameras measure: the
+    factor minus one.
+
+    Attributes
+    ----------
+    prior : float, optional
+        Standard deviation [1].
+    """
+
+    prior: Positive | None = None
+
+
+class CalibrationDistortionPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: radial distortion of first order about the body's middle: a
+    factor 1 + k r².
+
+    Attributes
+    ----------
+    prior_1_m2 : float, optional
+        Standard deviation [1/m²].
+    """
+
+    prior_1_m2: Positive | None = None
+
+
+class TimeShiftPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: how much later than stated the markers were measured, on the
+    grasps' clock.
+
+    Attributes
+    ----------
+    prior_s : float, optional
+        Standard deviation [s].
+    """
+
+    has_default: ClassVar[bool] = True
+
+    prior_s: Positive | None = None
+
+
+class ClockRatePrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: how much slower than the grasps' clock that of the markers
+    runs.
+
+    Attributes
+    ----------
+    prior : float, optional
+        Standard deviation [1].
+    """
+
+    prior: Positive | None = None
+
+
+class PosePrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: a constant rotation of grasps and body in the cameras' frame,
+    which rotates gravity in the body's frame.
+
+    Attributes
+    ----------
+    prior_rad : float, optional
+        Standard deviation [rad].
+    prior_m : float, optional
+        Standard deviation [m].
+    """
+
+    prior_rad: Positive | None = None
+    prior_m: Positive | None = None
+
+
+class GravityPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: a tilt of the direction of gravity.
+
+    Attributes
+    ----------
+    prior_rad : float, optional
+        Standard deviation [rad].
+    """
+
+    has_default: ClassVar[bool] = True
+
+    prior_rad: Positive | None = None
+
+
+class HandEyePrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: a constant rotation of the body in its grasps.
+
+    Attributes
+    ----------
+    prior_rad : float, optional
+        Standard deviation [rad].
+    prior_m : float, optional
+        Standard deviation [m].
+    """
+
+    has_default: ClassVar[bool] = True
+
+    prior_rad: Positive | None = None
+    prior_m: Positive | None = None
+
+
+class StrainZeroPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: a constant offset of the strains of a specimen.
+
+    Attributes
+    ----------
+    prior : float, optional
+        Standard deviation [1].
+    """
+
+    prior: Positive | None = None
+
+
+class DisplacementZeroPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: a constant offset of each displacement along each of its axes.
+
+    Attributes
+    ----------
+    prior_m : float, optional
+        Standard deviation [m].
+    """
+
+    has_default: ClassVar[bool] = True
+
+    prior_m: Positive | None = None
+
+
+class ObstaclePrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: a constant offset of each obstacle along its normal, or along
+    the axis of its displacement, which changes the beginning of the contact.
+
+    Attributes
+    ----------
+    prior_m : float, optional
+        Standard deviation [m].
+    prior_rad : float, optional
+        Standard deviation [rad].
+    prior_s : float, optional
+        Standard deviation [s].
+    """
+
+    has_default: ClassVar[bool] = True
+
+    prior_m: Positive | None = None
+    prior_rad: Positive | None = None
+    prior_s: Positive | None = None
+
+
+class TensionFactorPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: scale error of the tension of each tendon: the factor minus
+    one.
+
+    Attributes
+    ----------
+    prior : float, optional
+        Standard deviation [1].
+    """
+
+    prior: Positive | None = None
+
+
+class TensionLostPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: tension of each tendon that is lost by friction.
+
+    Attributes
+    ----------
+    prior_n : float, optional
+        Standard deviation [N].
+    """
+
+    prior_n: Positive | None = None
+
+
+class PressureFactorPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: scale error of each pressure: the factor minus one.
+
+    Attributes
+    ----------
+    prior : float, optional
+        Standard deviation [1].
+    """
+
+    prior: Positive | None = None
+
+
+class PressureLostPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: offset by which each pressure is lower than stated.
+
+    Attributes
+    ----------
+    prior_pa : float, optional
+        Standard deviation [Pa].
+    """
+
+    prior_pa: Positive | None = None
+
+
+class JoiningPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: delay with which each point mass or force begins or ends, if
+    it does so within the recording.
+
+    Attributes
+    ----------
+    prior_s : float, optional
+        Standard deviation [s].
+    """
+
+    has_default: ClassVar[bool] = True
+
+    prior_s: Positive | None = None
+
+
+class TarePrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: a constant offset of each component of a wrench, in multiples
+    of its sigma.
+
+    Attributes
+    ----------
+    prior_sigmas : float, optional
+        Standard deviation [σ].
+    """
+
+    has_default: ClassVar[bool] = True
+
+    prior_sigmas: Positive | None = None
+
+
+class SensorTimePrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: delay of the measured wrenches; at most three standard
+    deviations.
+
+    Attributes
+    ----------
+    prior_s : float, optional
+        Standard deviation [s].
+    """
+
+    has_default: ClassVar[bool] = True
+
+    prior_s: Positive | None = None
+
+
+class SensorLagPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: time constant of a first-order low-pass in the sensor; from
+    zero to three standard deviations.
+
+    Attributes
+    ----------
+    prior_s : float, optional
+        Standard deviation [s].
+    """
+
+    prior_s: Positive | None = None
+
+
+class ToolPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: mass of the tool between a sensor and the body.
+
+    Attributes
+    ----------
+    prior_kg : float
+        Standard deviation [kg].
+    prior_m : float
+        Standard deviation [m].
+    """
+
+    prior_kg: Positive
+    prior_m: Positive = 0.05
+
+
+class DepthPosePrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: rotation of each depth camera about the middle of the body,
+    along the camera's axes.
+
+    Attributes
+    ----------
+    prior_rad : float, optional
+        Standard deviation [rad].
+    prior_m : float, optional
+        Standard deviation [m].
+    """
+
+    has_default: ClassVar[bool] = True
+
+    prior_rad: Positive | None = None
+    prior_m: Positive | None = None
+
+
+class DepthBiasPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: offset that is added to each depth of an image.
+
+    Attributes
+    ----------
+    prior_m : float, optional
+        Standard deviation [m].
+    """
+
+    has_default: ClassVar[bool] = True
+
+    prior_m: Positive | None = None
+
+
+class DepthScalePrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: scale error of each depth of an image: the factor minus one.
+
+    Attributes
+    ----------
+    prior : float, optional
+        Standard deviation [1].
+    """
+
+    has_default: ClassVar[bool] = True
+
+    prior: Positive | None = None
+
+
+class DepthTimePrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: delay of a depth camera; at most three standard deviations.
+
+    Attributes
+    ----------
+    prior_s : float, optional
+        Standard deviation [s].
+    """
+
+    has_default: ClassVar[bool] = True
+
+    prior_s: Positive | None = None
+
+
+class DepthEdgePrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: distance by which silhouettes in the images of each depth
+    camera end inside the outline of the body, in pixels.
+
+    Attributes
+    ----------
+    prior_px : float, optional
+        Standard deviation [px].
+    """
+
+    has_default: ClassVar[bool] = True
+
+    prior_px: Positive | None = None
