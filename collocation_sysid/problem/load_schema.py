@@ -108,12 +108,16 @@ class PressureSection(Section):
         CSV with the columns t_s and pressure_pa, over all of the recording.
     name : str, optional
         Name; pressure_1, pressure_2 and so on by default.
+    lag_s : float
+        Time constant τ of the pressure p in the chamber behind valve and tube,
+        τ dp/dt = stated pressure − p, beginning at the first stated pressure; zero for no lag.
     """
 
     faces: Nodes
     pressure_pa: Finite | None = None
     pressure: Text | None = None
     name: Text | None = None
+    lag_s: NotNegative = 0.0
 
     @model_validator(mode="after")
     def _require_one_pressure(self) -> PressureSection:

@@ -280,6 +280,19 @@ class PressureLostPrior(NuisancePriorSection):
     prior_pa: Positive | None = None
 
 
+class PressureLagPrior(NuisancePriorSection):
+    """Prior of a nuisance parameter: lag of each pressure: the logarithm of its ratio to the stated
+    lag_s.
+
+    Attributes
+    ----------
+    prior : float, optional
+        Standard deviation [1].
+    """
+
+    prior: Positive | None = None
+
+
 class JoiningPrior(NuisancePriorSection):
     """Prior of a nuisance parameter: delay with which each point mass or force begins or ends, if
     it does so within the recording.

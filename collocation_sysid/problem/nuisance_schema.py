@@ -31,6 +31,7 @@ from .nuisance_priors import (
     ObstaclePrior,
     PosePrior,
     PressureFactorPrior,
+    PressureLagPrior,
     PressureLostPrior,
     Scoped,
     SensorLagPrior,
@@ -113,6 +114,8 @@ class NuisanceSection(Section):
         Scale error of each pressure: the factor minus one: prior.
     pressure_lost : PressureLostPrior or "none", optional
         Offset by which each pressure is lower than stated: prior_pa.
+    pressure_lag : PressureLagPrior or "none", optional
+        Lag of each pressure: the logarithm of its ratio to the stated lag_s: prior.
     joining : JoiningPrior or "none", optional
         Delay with which each point mass or force begins or ends, if it does so within the
         recording: prior_s, 10 ms by default.
@@ -160,6 +163,7 @@ class NuisanceSection(Section):
     tension_lost: PriorOrNone[TensionLostPrior] | None = None
     pressure_factor: PriorOrNone[PressureFactorPrior] | None = None
     pressure_lost: PriorOrNone[PressureLostPrior] | None = None
+    pressure_lag: PriorOrNone[PressureLagPrior] | None = None
     joining: PriorOrNone[JoiningPrior] | None = None
     tare: PriorOrNone[TarePrior] | None = None
     sensor_time: PriorOrNone[SensorTimePrior] | None = None

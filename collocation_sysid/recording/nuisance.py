@@ -766,6 +766,8 @@ class Nuisance:
         Scale error of each pressure: the factor minus one.
     pressure_lost_pa : float or None
         Offset by which each pressure is lower than stated.
+    pressure_lag : float or None
+        Lag of each pressure: the logarithm of its ratio to the stated lag_s.
     joining_s : float or None
         Delay with which each point mass or force begins or ends, if it does so within the
         recording.
@@ -822,6 +824,7 @@ class Nuisance:
     tension_lost_n: float | None = TENSION_OFFSET.sigma
     pressure_factor: float | None = PRESSURE_FACTOR.sigma
     pressure_lost_pa: float | None = PRESSURE_OFFSET.sigma
+    pressure_lag: float | None = PRESSURE_LAG.sigma
     joining_s: float | None = JOINING.sigma
     tare: float | None = TARE.sigma
     sensor_time_s: float | None = SENSOR_TIME.sigma

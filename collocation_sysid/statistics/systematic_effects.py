@@ -879,6 +879,8 @@ class Assumptions(Options):
         Scale error of each pressure: the factor minus one [1].
     pressure_lost_pa
         Offset by which each pressure is lower than stated [Pa].
+    pressure_lag
+        Lag of each pressure: the logarithm of its ratio to the stated lag_s [1].
     joining_s
         Delay with which each point mass or force begins or ends, if it does so within the recording
         [s].
@@ -948,6 +950,7 @@ class Assumptions(Options):
     tension_lost_n: Deviation = "none"
     pressure_factor: Deviation = "none"
     pressure_lost_pa: Deviation = "none"
+    pressure_lag: Deviation = "none"
     joining_s: Deviation = "none"
     tare: Deviation = "none"
     sensor_time_s: Deviation = "none"
