@@ -43,7 +43,13 @@ if TYPE_CHECKING:
     from .pipeline import Run, run, solve
     from .problem import Problem, RolloutOptions, UncertaintyOptions
     from .program.collocation import Collocation
-    from .program.simulation import Trajectory, simulate, with_markers, with_readings, with_wrenches
+    from .program.simulation import (
+        Trajectory,
+        simulate,
+        with_markers,
+        with_readings,
+        with_wrenches,
+    )
     from .recording import (
         Capsule,
         Cuboid,
@@ -161,14 +167,24 @@ __all__ = [
 def _modules_of_names() -> dict[str, str]:
     """Return the module of each public name, from the imports for type checkers above."""
     tree = _ast.parse(_Path(__file__).read_text(encoding="utf-8"))
-    (block,) = (each for each in tree.body if isinstance(each, _ast.If) and _is_for_types(each))
+    (block,) = (
+        each
+        for each in tree.body
+        if isinstance(each, _ast.If) and _is_for_types(each)
+    )
     imports = (each for each in block.body if isinstance(each, _ast.ImportFrom))
-    return {a.name: f".{each.module or a.name}" for each in imports for a in each.names}
+    return {
+        a.name: f".{each.module or a.name}"
+        for each in imports
+        for a in each.names
+    }
 
 
 def _is_for_types(block: _ast.If) -> bool:
     """Return whether a block is executed by type checkers alone."""
-    return isinstance(block.test, _ast.Name) and block.test.id == "TYPE_CHECKING"
+    return (
+        isinstance(block.test, _ast.Name) and block.test.id == "TYPE_CHECKING"
+    )
 
 
 # Type checkers do not see the function, so that they report misspelt names.
@@ -180,9 +196,13 @@ if not TYPE_CHECKING:
         if name == "__version__":
             return _version("collocation-sysid")
         if name not in _MODULES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+            raise AttributeError(
+                f"module {__name__!r} has no attribute {name!r}"
+            )
         module = _import_module(_MODULES[name], __name__)
-        attribute = module if _MODULES[name] == f".{name}" else getattr(module, name)
+        attribute = (
+            module if _MODULES[name] == f".{name}" else getattr(module, name)
+        )
         return globals().setdefault(name, attribute)
 
 

@@ -23,7 +23,9 @@ LARGEST_COMPRESSION = 250
 # Part of the memory that one array may take; what is made of it takes several times as much.
 MEMORY_SHARE = 0.25
 
-_HEADERS: dict[tuple[int, int], Callable[[Any], tuple[tuple[int, ...], bool, np.dtype]]] = {
+_HEADERS: dict[
+    tuple[int, int], Callable[[Any], tuple[tuple[int, ...], bool, np.dtype]]
+] = {
     (1, 0): npy.read_array_header_1_0,
     (2, 0): npy.read_array_header_2_0,
 }
@@ -44,7 +46,9 @@ def load_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
             if member.filename.endswith(".npy"):
                 with archive.open(member) as content:
                     name = member.filename.removesuffix(".npy")
-                    _require_size(content, member.file_size, member.compress_size, name)
+                    _require_size(
+                        content, member.file_size, member.compress_size, name
+                    )
     with np.load(path, allow_pickle=False) as stored:
         return {name: np.asarray(stored[name]) for name in stored.files}
 
@@ -65,16 +69,22 @@ def load_array(path: str | Path) -> NDArray[Any]:
     return np.load(path, allow_pickle=False)
 
 
-def _require_size(content: IO[bytes], size: int, compressed: int, name: str) -> None:
+def _require_size(
+    content: IO[bytes], size: int, compressed: int, name: str
+) -> None:
     """Refuse an array that its header states too large; `size` and `compressed` are in bytes."""
     version = npy.read_magic(content)
     if version not in _HEADERS:  # for names of columns that are not Latin
         return
     shape, _, dtype = _HEADERS[version](content)
     stored_bytes = math.prod(shape) * dtype.itemsize
-    array = f"the array {name or 'in it'} {shape} takes {stored_bytes / 1e9:.3g} GB"
+    array = (
+        f"the array {name or 'in it'} {shape} takes {stored_bytes / 1e9:.3g} GB"
+    )
     if stored_bytes > size:
-        raise InputError(f"{array} by its header, but the file has {size:,} bytes of it")
+        raise InputError(
+            f"{array} by its header, but the file has {size:,} bytes of it"
+        )
     if stored_bytes <= SMALL_BYTES:
         return
     if stored_bytes > LARGEST_COMPRESSION * compressed:

@@ -26,7 +26,11 @@ class PlainConsole(Console):
     ) -> Iterable[Segment]:
         """Return rich's segments with visible marks in place of control characters."""
         for segment in super().render(renderable, options):
-            yield segment if segment.control else segment._replace(text=printable(segment.text))
+            yield (
+                segment
+                if segment.control
+                else segment._replace(text=printable(segment.text))
+            )
 
 
 class Watched:
@@ -34,11 +38,17 @@ class Watched:
     `quiet`.
     """
 
-    def __init__(self, console: Console, quiet: bool = False, live: bool = True) -> None:
+    def __init__(
+        self, console: Console, quiet: bool = False, live: bool = True
+    ) -> None:
         self.console = console
         self.quiet = quiet
         shown = console.is_terminal and live and not quiet
-        self._live = Live(console=console, refresh_per_second=8, transient=True) if shown else None
+        self._live = (
+            Live(console=console, refresh_per_second=8, transient=True)
+            if shown
+            else None
+        )
 
     def __enter__(self) -> Self:
         if self._live is not None:

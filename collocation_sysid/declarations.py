@@ -73,10 +73,15 @@ def key(
     **field_options
         See `dataclasses.field`.
     """
-    return field(metadata={"converter": converter, "form": form, "read": read}, **field_options)
+    return field(
+        metadata={"converter": converter, "form": form, "read": read},
+        **field_options,
+    )
 
 
-@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(key, field))
+@dataclass_transform(
+    frozen_default=True, eq_default=False, field_specifiers=(key, field)
+)
 def declaration(kind: type[T]) -> type[T]:
     """Return the class as a frozen dataclass that converts its fields before ``__post_init__``.
 
@@ -122,11 +127,19 @@ def _converted(field: Field[Any], instance: Any, value: Any) -> Any:
             if isinstance(value, Mapping) and part in value:
                 what = f"{what}.{part}"
                 value = value[part]
-        whose = f"the {word} {instance.name!r}" if hasattr(instance, "name") else f"a {word}"
+        whose = (
+            f"the {word} {instance.name!r}"
+            if hasattr(instance, "name")
+            else f"a {word}"
+        )
         of = what if hasattr(instance, "description") else f"{what} of {whose}"
         shown = f"{value:g}" if isinstance(value, float) else repr(value)
-        choices = fault["type"] == "literal_error" and get_args(field.metadata["form"])
-        expectation = f"one of {', '.join(choices)}" if choices else expected(fault)
+        choices = fault["type"] == "literal_error" and get_args(
+            field.metadata["form"]
+        )
+        expectation = (
+            f"one of {', '.join(choices)}" if choices else expected(fault)
+        )
         raise InputError(f"{of} is {shown}; expected {expectation}") from error
 
 
@@ -150,11 +163,15 @@ def attributes(kind: type) -> dict[str, tuple[str, str]]:
     descriptions: dict[str, tuple[str, str]] = {}
     for base in reversed(kind.__mro__):
         text = inspect.cleandoc(base.__doc__ or "")
-        section = re.split("^(?:Attributes|Parameters)\n-+\n", text, maxsplit=1, flags=re.M)[-1]
+        section = re.split(
+            "^(?:Attributes|Parameters)\n-+\n", text, maxsplit=1, flags=re.M
+        )[-1]
         for names, form, text in re.findall(
             r"^(\w[\w, ]*) : (.*)\n((?: +.*(?:\n|$))+)", section, re.M
         ):
-            descriptions |= dict.fromkeys(names.split(", "), (form, " ".join(text.split())))
+            descriptions |= dict.fromkeys(
+                names.split(", "), (form, " ".join(text.split()))
+            )
     return descriptions
 
 
@@ -162,5 +179,7 @@ def documented(kind: type) -> dict[str, str]:
     """Return the descriptions of the fields of a class, or of the options of a method, by name."""
     descriptions = attributes(kind)
     return {
-        each.name: descriptions[each.name][1] for each in fields(kind) if each.name in descriptions
+        each.name: descriptions[each.name][1]
+        for each in fields(kind)
+        if each.name in descriptions
     }

@@ -14,8 +14,12 @@ def hint_at(name: str, known: Iterable[str]) -> str:
     """Return "; did you mean …?" for a misspelt or abbreviated name; "" if no known name is
     similar.
     """
-    names = [other for other in known if len(other) > 2]  # each of two letters is near another
-    longer = [other for other in names if len(name) > 1 and other.startswith(name)]
+    names = [
+        other for other in known if len(other) > 2
+    ]  # each of two letters is near another
+    longer = [
+        other for other in names if len(name) > 1 and other.startswith(name)
+    ]
     close = longer or difflib.get_close_matches(name, names, n=1)
     return f"; did you mean {close[0]!r}?" if close else ""
 
@@ -25,7 +29,10 @@ def hint_at(name: str, known: Iterable[str]) -> str:
 _MARKS = (
     {code: 0x2400 + code for code in range(0x20) if code not in (0x09, 0x0A)}
     | {0x7F: 0x2421}
-    | dict.fromkeys((*range(0x80, 0xA0), *range(0x202A, 0x202F), *range(0x2066, 0x206A)), 0xFFFD)
+    | dict.fromkeys(
+        (*range(0x80, 0xA0), *range(0x202A, 0x202F), *range(0x2066, 0x206A)),
+        0xFFFD,
+    )
     | dict.fromkeys((*range(0xD800, 0xE000), 0xFFFE, 0xFFFF), 0xFFFD)
 )
 # Longest message, and longest quotation of a file in it [characters].
@@ -65,7 +72,10 @@ class InputError(ValueError):
     """
 
     def __init__(
-        self, message: str, source: str | Path | None = None, where: str | None = None
+        self,
+        message: str,
+        source: str | Path | None = None,
+        where: str | None = None,
     ) -> None:
         self.message = message
         self.source = source
@@ -74,12 +84,18 @@ class InputError(ValueError):
         line = printable(text).replace("\n", "␊")
         super().__init__(excerpt(_ENDLESS_WORD.sub(r"\1…", line), LONGEST))
 
-    def __reduce__(self) -> tuple[type[InputError], tuple[str, str | Path | None, str | None]]:
+    def __reduce__(
+        self,
+    ) -> tuple[type[InputError], tuple[str, str | Path | None, str | None]]:
         return type(self), (self.message, self.source, self.where)
 
-    def located(self, source: str | Path | None = None, where: str | None = None) -> InputError:
+    def located(
+        self, source: str | Path | None = None, where: str | None = None
+    ) -> InputError:
         """Return a copy of the error with file and key filled in where they are missing."""
-        return InputError(self.message, self.source or source, self.where or where)
+        return InputError(
+            self.message, self.source or source, self.where or where
+        )
 
 
 def require_among(
@@ -107,12 +123,16 @@ def require_among(
     """
     names = list(known)
     if name not in names:
-        expected = f"expected {count} of {', '.join(names)}{hint_at(name, names)}"
+        expected = (
+            f"expected {count} of {', '.join(names)}{hint_at(name, names)}"
+        )
         raise InputError(f"found {name!r}; {expected}", source, where)
 
 
 @contextmanager
-def located(source: str | Path | None = None, where: str | None = None) -> Iterator[None]:
+def located(
+    source: str | Path | None = None, where: str | None = None
+) -> Iterator[None]:
     """Add file and key to input errors raised in the context, where they are missing."""
     try:
         yield
@@ -154,9 +174,18 @@ class SimulationError(RuntimeError):
         self.message = message
         self.time_s = time_s
         self.element = element
-        at = f"t = {time_s:.6g} s" + (f", element {element}" if element is not None else "")
+        at = f"t = {time_s:.6g} s" + (
+            f", element {element}" if element is not None else ""
+        )
         super().__init__(f"{message} ({at})")
 
-    def __reduce__(self) -> tuple[type[SimulationError], tuple[str, float, int | None, Any]]:
+    def __reduce__(
+        self,
+    ) -> tuple[type[SimulationError], tuple[str, float, int | None, Any]]:
         # Else a process would hand on the text alone, from which the other cannot build it anew.
-        return type(self), (self.message, self.time_s, self.element, self.state_m)
+        return type(self), (
+            self.message,
+            self.time_s,
+            self.element,
+            self.state_m,
+        )

@@ -63,7 +63,9 @@ def require_regular(path: str | Path, where: str | None = None) -> None:
 def is_own(folder: Path, file: Path) -> bool:
     """Whether this is a regular file of the folder, not one elsewhere that a link leads to."""
     try:
-        return file.is_file() and file.resolve().is_relative_to(folder.resolve())
+        return file.is_file() and file.resolve().is_relative_to(
+            folder.resolve()
+        )
     except (OSError, RuntimeError):  # links in a circle
         return False
 
@@ -78,7 +80,10 @@ def require_own(file: Path) -> None:
     """
     require_regular(file)
     if file.is_file() and not is_own(file.parent, file):
-        raise InputError("is a link to elsewhere; expected a file of this folder itself", file)
+        raise InputError(
+            "is a link to elsewhere; expected a file of this folder itself",
+            file,
+        )
 
 
 def require_run_folder(path: Path) -> None:
@@ -93,7 +98,9 @@ def require_run_folder(path: Path) -> None:
         raise _file_instead_of_folder(path, "a run folder", RESULT_FILE)
 
 
-def _file_instead_of_folder(path: Path, what: str, expected_file: str) -> InputError:
+def _file_instead_of_folder(
+    path: Path, what: str, expected_file: str
+) -> InputError:
     """Return the error for a file where `what` is expected, a folder with `expected_file`."""
     is_within = (path.parent / expected_file).is_file()
     likely = f", likely {path.parent}" if is_within else ""
@@ -120,15 +127,19 @@ def read_json(file: Path, what: str) -> dict[str, Any]:
     except NotADirectoryError:
         raise _file_instead_of_folder(file.parent, what, file.name) from None
     except FileNotFoundError:
-        raise InputError(f"this is not {what}: it has no {file.name}", file.parent) from None
+        raise InputError(
+            f"this is not {what}: it has no {file.name}", file.parent
+        ) from None
     except (OSError, ValueError, RecursionError, MemoryError) as error:
-        raise InputError(f"{file.name} is damaged ({reason(error)}){AGAIN}", file.parent) from error
+        raise InputError(
+            f"{file.name} is damaged ({reason(error)}){AGAIN}", file.parent
+        ) from error
     if not isinstance(content, dict):
-        raise InputError(f"{file.name} is damaged: it holds no object{AGAIN}", file.parent)
-    if (schema := content.get("schema")) != SCHEMA:
-        message = (
-            f"{file.name} has schema {str(schema)[:20]}; expected {SCHEMA}, this version's{AGAIN}"
+        raise InputError(
+            f"{file.name} is damaged: it holds no object{AGAIN}", file.parent
         )
+    if (schema := content.get("schema")) != SCHEMA:
+        message = f"{file.name} has schema {str(schema)[:20]}; expected {SCHEMA}, this version's{AGAIN}"
         raise InputError(message, file.parent)
     return content
 
@@ -147,7 +158,9 @@ def damage_refused(folder: Path, files: str, remedy: str) -> Iterator[None]:
     except InputError:
         raise
     except DAMAGE as error:
-        raise InputError(f"{files} is damaged ({reason(error)}); {remedy}", folder) from error
+        raise InputError(
+            f"{files} is damaged ({reason(error)}); {remedy}", folder
+        ) from error
 
 
 def safe_name(text: str) -> str:
@@ -169,7 +182,9 @@ def replaced_file(path: str | Path) -> Iterator[Path]:
         Naming the path, where the disk is full or it cannot be written in.
     """
     target = Path(path)
-    draft = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.partial{target.suffix}")
+    draft = target.with_name(
+        f".{target.stem}.{secrets.token_hex(4)}.partial{target.suffix}"
+    )
     try:
         with naming(target, draft):
             if target.exists() and not target.is_file():
@@ -213,12 +228,20 @@ def naming(target: Path, draft: Path) -> Iterator[None]:
 def reason(error: BaseException) -> str:
     """The error on one line that is not too long."""
     text = " ".join(f"{type(error).__name__}: {error}".split())
-    return text if len(text) <= LONGEST_REASON else f"{text[: LONGEST_REASON - 1]}…"
+    return (
+        text
+        if len(text) <= LONGEST_REASON
+        else f"{text[: LONGEST_REASON - 1]}…"
+    )
 
 
 def run_name(problem: Path) -> str:
     """Name of a problem file's runs: its folder's where it is called problem.toml, else its own."""
-    return problem.resolve().parent.name if problem.stem == "problem" else problem.stem
+    return (
+        problem.resolve().parent.name
+        if problem.stem == "problem"
+        else problem.stem
+    )
 
 
 def require_possible(folder: Path) -> None:
@@ -226,7 +249,11 @@ def require_possible(folder: Path) -> None:
     for place in (folder, *folder.parents):
         if place.is_dir():
             if not os.access(place, os.W_OK):
-                raise InputError("this folder cannot be written in; choose another", place)
+                raise InputError(
+                    "this folder cannot be written in; choose another", place
+                )
             return
         if place.exists():
-            raise InputError("this is a file; expected a folder to write in", place)
+            raise InputError(
+                "this is a file; expected a folder to write in", place
+            )

@@ -234,7 +234,9 @@ class InstallationReport:
     @property
     def is_working(self) -> bool:
         """Whether all required packages are suitable and the self test passed."""
-        return self.self_test.is_passed and all(each.is_suitable for each in self.dependencies)
+        return self.self_test.is_passed and all(
+            each.is_suitable for each in self.dependencies
+        )
 
 
 def check_installation() -> InstallationReport:
@@ -332,7 +334,9 @@ def available_solvers() -> Solvers | None:
     except ImportError:
         return None
     return Solvers(
-        nonlinear=tuple(name for name in NONLINEAR_SOLVERS if ca.has_nlpsol(name)),
+        nonlinear=tuple(
+            name for name in NONLINEAR_SOLVERS if ca.has_nlpsol(name)
+        ),
         ipopt_linear=tuple(_working_linear_solvers(IPOPT_LINEAR_SOLVERS)),
         supernodal=load_mkl() is not None,
     )
@@ -357,9 +361,15 @@ def _working_linear_solvers(names: Sequence[str]) -> Iterator[str]:
         except subprocess.TimeoutExpired:
             return
         statuses = dict(
-            line.split(maxsplit=1) for line in done.stdout.splitlines() if len(line.split()) == 2
+            line.split(maxsplit=1)
+            for line in done.stdout.splitlines()
+            if len(line.split()) == 2
         )
-        yield from (name for name in remaining if statuses.get(name) == "Solve_Succeeded")
+        yield from (
+            name
+            for name in remaining
+            if statuses.get(name) == "Solve_Succeeded"
+        )
         tried = [name for name in remaining if name in statuses]
         remaining = remaining[len(tried) + 1 :]
 
@@ -377,7 +387,9 @@ def kernel_state() -> Kernels | None:
     except ImportError:
         return None
     folder = cache_folder()
-    files = [file.stat() for file in folder.glob("*.o")] if folder.is_dir() else []
+    files = (
+        [file.stat() for file in folder.glob("*.o")] if folder.is_dir() else []
+    )
     llvm_version = ".".join(map(str, llvm.llvm_version_info))
     compilers = (shutil.which(name) for name in C_COMPILERS)
     return Kernels(
@@ -408,7 +420,10 @@ def thread_state() -> Threads:
         count = 1
         source = f"{variable} = {override!r} is not a whole number"
     return Threads(
-        count=count, cores=os.cpu_count() or 1, source=source, memory_mb=machine_memory_mb()
+        count=count,
+        cores=os.cpu_count() or 1,
+        source=source,
+        memory_mb=machine_memory_mb(),
     )
 
 
@@ -416,7 +431,9 @@ def _self_test_unless_missing(dependencies: Sequence[Dependency]) -> SelfTest:
     """Return the outcome of the self test; it fails without an attempt if packages are missing."""
     missing = [each.name for each in dependencies if each.installed is None]
     if missing:
-        return SelfTest(False, f"not attempted: {', '.join(missing)} missing", 0.0)
+        return SelfTest(
+            False, f"not attempted: {', '.join(missing)} missing", 0.0
+        )
     began_s = time.perf_counter()
     try:
         message, is_passed = _identify_small_body()
@@ -450,14 +467,23 @@ def _identify_small_body() -> tuple[str, bool]:
     poses[:, 0, 3] = 0.03 * (1 - np.cos(25 * t_s))
     hand = Grasp(Box((-1, -1, 0.079), (1, 1, 1)), poses)
     places_m = [(0.0, 0.0, 0.0), (0.04, 0.04, 0.0)]
-    markers = Markers(t_s, np.zeros((len(t_s), 2, 3)), sigma_m=1e-3, places_m=places_m)
+    markers = Markers(
+        t_s, np.zeros((len(t_s), 2, 3)), sigma_m=1e-3, places_m=places_m
+    )
     body = Body(box_mesh((0.04, 0.04, 0.08), (1, 1, 2)), density_kg_m3=100.0)
     swing = Experiment(
-        body, t_s, [hand], markers, nuisance=Nuisance.none(), air_density_kg_m3="none"
+        body,
+        t_s,
+        [hand],
+        markers,
+        nuisance=Nuisance.none(),
+        air_density_kg_m3="none",
     )
     fixed = {"poisson": 0.3, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5}
     truth_pa = 2000.0
-    tracks_m = simulate(swing, {**fixed, "mu_pa": truth_pa}, "midpoint", substeps=1).markers_m
+    tracks_m = simulate(
+        swing, {**fixed, "mu_pa": truth_pa}, "midpoint", substeps=1
+    ).markers_m
     problem = Problem(
         [with_markers(swing, tracks_m)],
         {**fixed, "mu_pa": Unknown(1000.0)},
@@ -466,7 +492,10 @@ def _identify_small_body() -> tuple[str, bool]:
     )
     solution = solve(problem, "reduced-space")
     if not solution.status.converged:
-        return f"the search did not converge ({solution.status.value}: {solution.message})", False
+        return (
+            f"the search did not converge ({solution.status.value}: {solution.message})",
+            False,
+        )
     deviation = abs(solution.parameters["mu_pa"] / truth_pa - 1)
     message = f"relative error of an identified shear modulus {deviation:.1e}"
     return message, deviation < SELF_TEST_TOLERANCE

@@ -88,7 +88,10 @@ READING_MB_PER_MB = 60.0
 
 
 def run_isolated(
-    code: str, *words: str, limits: ProcessLimits | None = None, **arrays: ArrayLike
+    code: str,
+    *words: str,
+    limits: ProcessLimits | None = None,
+    **arrays: ArrayLike,
 ) -> dict[str, NDArray]:
     """Run Python code in another process and return the arrays that it makes, by name.
 
@@ -112,7 +115,8 @@ def run_isolated(
         ""
         if limits is None
         else _LIMIT.format(
-            memory_bytes=int(1e6 * limits.memory_mb), time_s=math.ceil(limits.time_s)
+            memory_bytes=int(1e6 * limits.memory_mb),
+            time_s=math.ceil(limits.time_s),
         )
     )
     with tempfile.TemporaryDirectory(prefix="collocation-sysid-") as place:
@@ -120,7 +124,12 @@ def run_isolated(
         np.savez(folder / "given.npz", allow_pickle=False, **arrays)
         try:
             done = subprocess.run(
-                [sys.executable, "-c", _WRAPPER.format(limit=limit, code=code), *words],
+                [
+                    sys.executable,
+                    "-c",
+                    _WRAPPER.format(limit=limit, code=code),
+                    *words,
+                ],
                 cwd=folder,
                 capture_output=True,
                 text=True,
@@ -128,10 +137,16 @@ def run_isolated(
                 timeout=None if limits is None else limits.waiting_s,
             )
         except subprocess.TimeoutExpired as late:
-            raise Failed(f"it was not finished after {late.timeout:.3g} s") from None
+            raise Failed(
+                f"it was not finished after {late.timeout:.3g} s"
+            ) from None
         if done.returncode:
-            if limits is not None and done.returncode == -getattr(signal, "SIGXCPU", 0):
-                raise Failed(f"it was not finished after {limits.time_s:.3g} s of processor time")
+            if limits is not None and done.returncode == -getattr(
+                signal, "SIGXCPU", 0
+            ):
+                raise Failed(
+                    f"it was not finished after {limits.time_s:.3g} s of processor time"
+                )
             last_line = (done.stderr.strip().splitlines() or ["no message"])[-1]
             raise Failed(killed_by(done.returncode) or last_line)
         with np.load(folder / "found.npz") as stored:

@@ -14,7 +14,9 @@ _IN_CHECKOUT = Path(__file__).parents[1] / "docs"
 # Pages that Sphinx alone can show: lists of links and of names.
 _FOR_SPHINX = ("index", "api")
 # Label and topic of a link; the topic is empty where the link is to a section of the same page.
-_LINK_TO_PAGE = re.compile(r"\[([^\]]*)\]\((?:(?:[\w.-]+/)*(\w+)\.md(?:#[\w-]*)?|#[\w-]+)\)")
+_LINK_TO_PAGE = re.compile(
+    r"\[([^\]]*)\]\((?:(?:[\w.-]+/)*(\w+)\.md(?:#[\w-]*)?|#[\w-]+)\)"
+)
 
 
 def _folder() -> Path:
@@ -29,7 +31,9 @@ def page_files() -> dict[str, Path]:
     """
     files = (*_folder().glob("howto/*.md"), *_folder().glob("*.md"))
     return {
-        file.stem: file for file in sorted(files, key=_topic) if _topic(file) not in _FOR_SPHINX
+        file.stem: file
+        for file in sorted(files, key=_topic)
+        if _topic(file) not in _FOR_SPHINX
     }
 
 
@@ -58,7 +62,9 @@ def page_text(topic: str) -> str:
             return f"{label or page_title(other)} (`explain {other}`)"
         return label if other in (None, topic) else link[0]
 
-    return _LINK_TO_PAGE.sub(named, page_files()[topic].read_text(encoding="utf-8"))
+    return _LINK_TO_PAGE.sub(
+        named, page_files()[topic].read_text(encoding="utf-8")
+    )
 
 
 def explain_command(*topics: str) -> str:
@@ -87,8 +93,12 @@ def documentation_url() -> str | None:
     from importlib.metadata import PackageNotFoundError, metadata  # slow
 
     try:
-        project_urls = metadata("collocation-sysid").get_all("Project-URL") or []
+        project_urls = (
+            metadata("collocation-sysid").get_all("Project-URL") or []
+        )
     except PackageNotFoundError:
         return None
     urls = dict(each.split(", ", 1) for each in project_urls)
-    return urls["Documentation"].rstrip("/") if "Documentation" in urls else None
+    return (
+        urls["Documentation"].rstrip("/") if "Documentation" in urls else None
+    )

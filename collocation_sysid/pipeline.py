@@ -27,10 +27,17 @@ from .runs.numerical_error import refine
 from .runs.result_builder import build_result
 from .runs.result_content import Elapsed, Result
 from .runs.solved_problem import SolvedProblem
-from .runs.solving import solve, solve_with_renewed_correspondences, with_workers
+from .runs.solving import (
+    solve,
+    solve_with_renewed_correspondences,
+    with_workers,
+)
 from .runs.warm_start import WarmStart
 from .statistics.assessment import rotation_step_concerns
-from .statistics.consider_analysis import ResidualChanges, changes_of_assumptions
+from .statistics.consider_analysis import (
+    ResidualChanges,
+    changes_of_assumptions,
+)
 from .statistics.deep_probes import deep_probes, routine_probes_with_steps
 from .statistics.discretisation_error import MOST_SUBSTEPS
 from .statistics.fit_misspecifications import find_misspecifications
@@ -58,7 +65,9 @@ class Run(SolvedProblem):
     """
 
     def __str__(self) -> str:
-        from .result.run_sections import run_summary  # how it looks is no part of a run
+        from .result.run_sections import (
+            run_summary,
+        )  # how it looks is no part of a run
 
         return plain_text(run_summary(self.result))
 
@@ -71,12 +80,17 @@ class Run(SolvedProblem):
         """Return parameters, combined intervals, their sources and the verdict, as printed in the
         terminal.
         """
-        from .result.run_sections import estimate_sections  # how it looks is no part of a run
+        from .result.run_sections import (
+            estimate_sections,
+        )  # how it looks is no part of a run
 
         return plain_text(estimate_sections(self.result))
 
     def plot(
-        self, experiment: str | None = None, field: str | None = "von_mises_pa", count: int = 6
+        self,
+        experiment: str | None = None,
+        field: str | None = "von_mises_pa",
+        count: int = 6,
     ) -> Figure:
         """Draw a sequence of deformed shapes with the markers.
 
@@ -102,13 +116,17 @@ class Run(SolvedProblem):
         InputError
             For an unknown experiment or field, an invalid count, or a run without motion.
         """
-        from .result.animation import experiment_named  # how it looks is no part of a run
+        from .result.animation import (
+            experiment_named,
+        )  # how it looks is no part of a run
         from .result.pictures.shapes import field_shapes
         from .result.run_record import replays
 
         replay = experiment_named(replays(self), experiment)
         bodies = {each.name: each.body for each in self.problem.experiments}
-        return field_shapes(replay, bodies[replay.name], self.parameters, field, count)
+        return field_shapes(
+            replay, bodies[replay.name], self.parameters, field, count
+        )
 
     def interactive(self, experiment: str | None = None) -> Widget:
         """Return sliders over the estimated parameters beside the recording, for a notebook.
@@ -132,11 +150,15 @@ class Run(SolvedProblem):
             Without ipywidgets (``pip install 'collocation-sysid[interactive]'``), for an unknown
             experiment, or if no parameter was estimated.
         """
-        from .result.parameter_sliders import ParameterSliders  # how it looks is no part of a run
+        from .result.parameter_sliders import (
+            ParameterSliders,
+        )  # how it looks is no part of a run
 
         return ParameterSliders.from_run(self, experiment).widget
 
-    def save(self, folder: str | Path, frames: bool = True, pictures: bool = True) -> Path:
+    def save(
+        self, folder: str | Path, frames: bool = True, pictures: bool = True
+    ) -> Path:
         """Write the run folder, completely or not at all, and return it.
 
         The pictures are drawn after the folder is in its place.
@@ -154,7 +176,9 @@ class Run(SolvedProblem):
         InputError
             If the folder contains anything other than an earlier run.
         """
-        from .result.run_record import write_run  # what files hold is no part of a run
+        from .result.run_record import (
+            write_run,
+        )  # what files hold is no part of a run
 
         return write_run(self, folder, frames=frames, pictures=pictures)
 
@@ -205,11 +229,20 @@ def run(
         """Return the answer with the time until now; a search with finer steps is no check."""
         finer_s = answer.solution.timing.total - solution.timing.total
         checks_s = time.perf_counter() - searched_s - finer_s
-        return replace(answer, elapsed_s=Elapsed(searched_s - began_s + finer_s, checks_s))
+        return replace(
+            answer, elapsed_s=Elapsed(searched_s - began_s + finer_s, checks_s)
+        )
 
     bodies = (segment.body for segment in solution.collocation.transcriptions)
-    fields = {part.field_name: part.field for b in bodies for part in b.parts if part.field}
-    problem = problem.with_lengths({name: field.length_m for name, field in fields.items()})
+    fields = {
+        part.field_name: part.field
+        for b in bodies
+        for part in b.parts
+        if part.field
+    }
+    problem = problem.with_lengths(
+        {name: field.length_m for name, field in fields.items()}
+    )
     phases = {n: f for n, f in fields.items() if isinstance(f, TwoPhaseModes)}
     problem = problem.with_fields(phases) if phases else problem
     answer = Run(problem, solution, {}, None)
@@ -221,10 +254,14 @@ def run(
             "of the misfit"
         )
         if problem.substeps == "auto":
-            answer, fit = _fine_enough(answer, fit, problem.solver(method), watch, say, scheduler)
+            answer, fit = _fine_enough(
+                answer, fit, problem.solver(method), watch, say, scheduler
+            )
         substeps = answer.solution.collocation.substeps
         refits = (
-            c.message for e in problem.experiments for c in rotation_step_concerns(e, substeps)
+            c.message
+            for e in problem.experiments
+            for c in rotation_step_concerns(e, substeps)
         )
         of_tests = one_kind_notes(problem.experiments, problem.parameters)
         answer = replace(answer, notes=(*refits, *of_tests, *answer.notes))
@@ -232,8 +269,12 @@ def run(
             profiles = _profiles(answer, fit, say)
             changes = _changes(answer, say)
             sources = _sources(answer, fit, answer.uncertainty, changes)
-            answer = replace(answer, profiles=profiles, systematic_effects=sources)
-            answer = replace(answer, probes=_probes(answer, fit, changes, say, deep=probe))
+            answer = replace(
+                answer, profiles=profiles, systematic_effects=sources
+            )
+            answer = replace(
+                answer, probes=_probes(answer, fit, changes, say, deep=probe)
+            )
         if not seek_causes or answer.solution.status is Status.INTERRUPTED:
             return timed(answer)
         say("testing possible causes of the misfit")
@@ -242,12 +283,16 @@ def run(
             answer = refine(answer, report_progress=say)
         return timed(answer)
     except KeyboardInterrupt:
-        unsimulated = dict.fromkeys((e.name for e in problem.experiments), "interrupted")
+        unsimulated = dict.fromkeys(
+            (e.name for e in problem.experiments), "interrupted"
+        )
         rollouts = unsimulated | dict(answer.rollouts)
         return timed(replace(answer, rollouts=rollouts, omitted_checks=missing))
 
 
-def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, LinearisedFit | None]:
+def _checked(
+    problem: Problem, solution: Solution, say: Log
+) -> tuple[Run, LinearisedFit | None]:
     """Return a solution with forward simulations, uncertainties and step error, and the linearised
     fit.
 
@@ -266,16 +311,26 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
         with counted_phase(StepUnit.TIME_STEP, rows):
             fit, noises = with_pose_noise(fit, solution.collocation, solution.z)
     except SimulationError as error:
-        return Run(problem, solution, rollouts, None, notes=(f"no error bars: {error}",)), None
+        return Run(
+            problem,
+            solution,
+            rollouts,
+            None,
+            notes=(f"no error bars: {error}",),
+        ), None
     answer = Run(problem, solution, rollouts, None, diagnose_markers(fit))
     if not solution.collocation.nq:
         return answer, fit
     parameters = solution.collocation.parameters
     try:
-        uncertainty = uncertainty_from_fit(fit, parameters, solution.q, problem.uncertainty)
+        uncertainty = uncertainty_from_fit(
+            fit, parameters, solution.q, problem.uncertainty
+        )
     except InputError as error:
         raise error.located(problem.path) from error
-    answer = replace(answer, uncertainty=uncertainty, notes=tuple(n.message for n in noises))
+    answer = replace(
+        answer, uncertainty=uncertainty, notes=tuple(n.message for n in noises)
+    )
     error = step_error(problem, solution, fit, rollouts, answer.optimum)
     return replace(answer, refinement=error), fit
 
@@ -287,28 +342,44 @@ def _changes(answer: Run, say: Log) -> ResidualChanges:
     deviations = probed_deviations(answer.problem.uncertainty.considered)
     # One sweep for the assumptions, and one for the nuisance parameters that are not estimated.
     with counted_phase(StepUnit.TIME_STEP, 2 * _row_count(solution)):
-        return changes_of_assumptions(solution.collocation, solution.z, deviations)
+        return changes_of_assumptions(
+            solution.collocation, solution.z, deviations
+        )
 
 
 def _row_count(solution: Solution) -> int:
     """Return the number of time steps in one sweep over all experiments."""
-    return sum(s.grid_times - s.dynamics.first_row for s in solution.collocation.transcriptions)
+    return sum(
+        s.grid_times - s.dynamics.first_row
+        for s in solution.collocation.transcriptions
+    )
 
 
 def _sources(
-    answer: Run, fit: LinearisedFit, known: Uncertainty, changes: ResidualChanges
+    answer: Run,
+    fit: LinearisedFit,
+    known: Uncertainty,
+    changes: ResidualChanges,
 ) -> VarianceSources:
     """Return the systematic contributions to the uncertainty, without effects stated as exact."""
     solution = answer.solution
     deviations = answer.problem.uncertainty.assumptions.deviations
     parameters = solution.collocation.parameters
-    budgeted = changes.without(name for name, deviation in deviations.items() if deviation is None)
+    budgeted = changes.without(
+        name for name, deviation in deviations.items() if deviation is None
+    )
     means = answer.problem.uncertainty.assumptions.means
-    return VarianceSources.from_fit(fit, budgeted, parameters, solution.q, known, means)
+    return VarianceSources.from_fit(
+        fit, budgeted, parameters, solution.q, known, means
+    )
 
 
 def _probes(
-    answer: Run, fit: LinearisedFit, changes: ResidualChanges, say: Log, deep: bool
+    answer: Run,
+    fit: LinearisedFit,
+    changes: ResidualChanges,
+    say: Log,
+    deep: bool,
 ) -> tuple[Probe, ...]:
     """Return the routine probes, or for a `deep` check those of subsets and of every assumption."""
     solution = answer.solution
@@ -339,7 +410,11 @@ def _profiles(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
     for name in answer.problem.uncertainty.profile:
         say(f"profile likelihood of {name}")
         try:
-            profiles.append(profile_of_solution(answer.solution, fit, answer.uncertainty, name))
+            profiles.append(
+                profile_of_solution(
+                    answer.solution, fit, answer.uncertainty, name
+                )
+            )
         except InputError as error:
             raise error.located(answer.problem.path) from error
     return tuple(profiles)
@@ -373,7 +448,9 @@ def _fine_enough(
     first = coarse.solution
     problem = coarse.problem
     before = first.collocation.substeps
-    factor = coarse.refinement.suggested_substeps(coarse.optimum, as_scheme(problem.scheme).order)
+    factor = coarse.refinement.suggested_substeps(
+        coarse.optimum, as_scheme(problem.scheme).order
+    )
     substeps = min(before * factor, MOST_SUBSTEPS)
     steps = "one time step" if before == 1 else f"{before} time steps"
     worst, many = coarse.refinement.largest_correction(coarse.optimum)
@@ -397,7 +474,10 @@ def _fine_enough(
             raise failure
         with connect_executor(scheduler) as workers:
             finer = solve_with_renewed_correspondences(
-                with_workers(solver, workers), again, watch, again.pack(p, positions)
+                with_workers(solver, workers),
+                again,
+                watch,
+                again.pack(p, positions),
             )
         message = finer.message
     except (InputError, SimulationError) as error:
@@ -408,6 +488,10 @@ def _fine_enough(
     if finer is None or not finer.status.converged:
         note = f"{why}; the solve with {substeps} failed: {message}"
         return replace(coarse, notes=(note, *coarse.notes)), fit
-    most = ", the largest number that is chosen automatically" if substeps == MOST_SUBSTEPS else ""
+    most = (
+        ", the largest number that is chosen automatically"
+        if substeps == MOST_SUBSTEPS
+        else ""
+    )
     reason = f"{why}; therefore it was solved again with {substeps}{most}"
     return _checked(problem, finer.after(first, reason), say)

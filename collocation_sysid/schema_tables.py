@@ -33,10 +33,16 @@ class ByForm:
 
     first: type | tuple[type, ...]
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> Any:
         first, second = get_args(source)
-        forms = Union[Annotated[first, Tag("<first>")], Annotated[second, Tag("<second>")]]  # noqa: UP007
-        return handler.generate_schema(Annotated[forms, Discriminator(self._tag)])
+        forms = Union[  # noqa: UP007
+            Annotated[first, Tag("<first>")], Annotated[second, Tag("<second>")]
+        ]
+        return handler.generate_schema(
+            Annotated[forms, Discriminator(self._tag)]
+        )
 
     def _tag(self, value: Any) -> str:
         return "<first>" if isinstance(value, self.first) else "<second>"
@@ -48,7 +54,9 @@ class Among:
 
     words: tuple[str, ...]
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> Any:
         return handler.generate_schema(Literal[self.words])
 
 
@@ -65,7 +73,9 @@ class Section(BaseModel):
         for name, (_, description) in attributes(cls).items():
             if name in cls.model_fields:
                 cls.model_fields[name].description = description
-        text = inspect.cleandoc(cls.__doc__ or "").partition("\n\nAttributes\n")[0]
+        text = inspect.cleandoc(cls.__doc__ or "").partition(
+            "\n\nAttributes\n"
+        )[0]
         summary, gap, details = text.partition("\n\n")
         cls.__doc__ = " ".join(summary.split("\n")) + gap + details
 
@@ -105,4 +115,6 @@ def require_one(section: Section, *names: str) -> None:
     there = used_keys(section, *names)
     if len(there) != 1:
         which = " and ".join(there) or f"no {' or '.join(names)}"
-        raise ValueError(f"found {which}; expected exactly one of {', '.join(names)}")
+        raise ValueError(
+            f"found {which}; expected exactly one of {', '.join(names)}"
+        )

@@ -93,9 +93,15 @@ def heed_interrupts() -> Callable[[], None]:
     callable
         Function that restores the previous signal handlers.
     """
-    signal_numbers = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
+    signal_numbers = (
+        (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
+    )
     usual = (signal.SIG_DFL, signal.default_int_handler)
-    before = {n: handler for n in signal_numbers if (handler := signal.getsignal(n)) in usual}
+    before = {
+        n: handler
+        for n in signal_numbers
+        if (handler := signal.getsignal(n)) in usual
+    }
     for number in before:
         signal.signal(number, INTERRUPTS)
 
@@ -118,7 +124,9 @@ def leave(code: object) -> NoReturn:
     If a thread is still inside library code that would crash at exit, streams are flushed and the
     process ends without cleaning up.
     """
-    if not any(thread.name == ABANDONED_THREAD for thread in threading.enumerate()):
+    if not any(
+        thread.name == ABANDONED_THREAD for thread in threading.enumerate()
+    ):
         sys.exit(code if isinstance(code, int) else 1)
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError):

@@ -45,7 +45,9 @@ class _Phase:
     completed: float = 0.0
 
 
-_listener: ContextVar[ShareListener | None] = ContextVar("share_listener", default=None)
+_listener: ContextVar[ShareListener | None] = ContextVar(
+    "share_listener", default=None
+)
 _phase: ContextVar[_Phase | None] = ContextVar("phase", default=None)
 
 

@@ -31,10 +31,18 @@ def _of_usual_size(value: float) -> float:
 
 _Usual = AfterValidator(_of_usual_size)
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False), _Usual]
-Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0), _Usual]
-NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0), _Usual]
-AboveOne = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=1), _Usual]
-OneOrMore = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1), _Usual]
+Positive = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, gt=0), _Usual
+]
+NotNegative = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, ge=0), _Usual
+]
+AboveOne = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, gt=1), _Usual
+]
+OneOrMore = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, ge=1), _Usual
+]
 Boundless = Annotated[float, Field(strict=True)]
 StrictInteger = Annotated[int, Field(strict=True)]
 Count = Annotated[int, Field(strict=True, ge=0)]
@@ -94,13 +102,17 @@ class Options:
             try:
                 object.__setattr__(self, name, adapter.validate_python(value))
             except ValidationError as error:
-                raise _refusal(name, value, error.errors(include_url=False)[0]) from error
+                raise _refusal(
+                    name, value, error.errors(include_url=False)[0]
+                ) from error
 
 
 @cache
 def _adapters(kind: type[Options]) -> dict[str, TypeAdapter[Any]]:
     types = get_type_hints(kind, include_extras=True)
-    return {field.name: TypeAdapter(types[field.name]) for field in fields(kind)}
+    return {
+        field.name: TypeAdapter(types[field.name]) for field in fields(kind)
+    }
 
 
 def _refusal(name: str, value: Any, fault: Mapping[str, Any]) -> InputError:
@@ -111,6 +123,11 @@ def _refusal(name: str, value: Any, fault: Mapping[str, Any]) -> InputError:
             value = value[part]
     if fault["type"] == "value_error":
         return InputError(str(fault["ctx"]["error"]), None, name)
-    choices = re.findall("'(.*?)'", fault["ctx"]["expected"] if "literal" in fault["type"] else "")
+    choices = re.findall(
+        "'(.*?)'",
+        fault["ctx"]["expected"] if "literal" in fault["type"] else "",
+    )
     hint = hint_at(str(value), choices)
-    return InputError(f"found {value!r}; expected {expected(fault)}{hint}", None, name)
+    return InputError(
+        f"found {value!r}; expected {expected(fault)}{hint}", None, name
+    )

@@ -38,7 +38,9 @@ PIECE = 2
 
 
 def wrong(
-    experiment: Experiment, values: Mapping[str, float], off: Mapping[str, float]
+    experiment: Experiment,
+    values: Mapping[str, float],
+    off: Mapping[str, float],
 ) -> Experiment:
     """The recording of a body held by one grasp, with its markers as they would be seen.
 
@@ -54,7 +56,9 @@ def wrong(
     (grasp,) = experiment.grasps
     slower = 1 - off.get("time_scale", 0.0)
     poses = grasp.poses
-    slowed = PoseSequence(slower * poses.t_s, poses.positions_m, poses.quaternions_xyzw)
+    slowed = PoseSequence(
+        slower * poses.t_s, poses.positions_m, poses.quaternions_xyzw
+    )
     # Added mass is that of denser air, and what else this air does is taken back.
     denser = 1 + off.get("added_mass", 0.0)
     truth = replace(
@@ -62,15 +66,21 @@ def wrong(
         body=body,
         t_s=slower * experiment.t_s,
         grasps=(Grasp(grasp.nodes, slowed),),
-        markers=replace(experiment.markers, t_s=slower * experiment.t_s, located=None),
+        markers=replace(
+            experiment.markers, t_s=slower * experiment.t_s, located=None
+        ),
         forces=_lift(experiment, body, off),
         air_density_kg_m3=denser * experiment.air_density_kg_m3,
     )
     values = dict(values, poisson=values["poisson"] + off.get("poisson", 0.0))
-    return with_markers(experiment, _tracks(truth, values, off.get("stiffness_drift", 0.0)))
+    return with_markers(
+        experiment, _tracks(truth, values, off.get("stiffness_drift", 0.0))
+    )
 
 
-def _tracks(truth: Experiment, values: Mapping[str, float], drift: float) -> Array:
+def _tracks(
+    truth: Experiment, values: Mapping[str, float], drift: float
+) -> Array:
     """(T, M, 3) of a body whose stiffness drifts, one piece of the recording after another."""
     values = _lame(truth, values)
     if not drift:
@@ -80,13 +90,25 @@ def _tracks(truth: Experiment, values: Mapping[str, float], drift: float) -> Arr
     tracks, start, velocity = [markers.positions_m[:0]], {}, 0.0
     steps = len(t_s) - 1
     for first in range(0, steps - 1, PIECE):  # the last piece has what is left
-        here = slice(first, (first + PIECE if first + 2 * PIECE <= steps else steps) + 1)
+        here = slice(
+            first, (first + PIECE if first + 2 * PIECE <= steps else steps) + 1
+        )
         since = (t_s[here].mean() - t_s.mean()) / np.ptp(t_s)
-        now = {n: v * (1 + drift * since) if n in moduli else v for n, v in values.items()}
-        seen = replace(markers, t_s=t_s[here], positions_m=markers.positions_m[here], located=None)
+        now = {
+            n: v * (1 + drift * since) if n in moduli else v
+            for n, v in values.items()
+        }
+        seen = replace(
+            markers,
+            t_s=t_s[here],
+            positions_m=markers.positions_m[here],
+            located=None,
+        )
         piece = replace(truth, t_s=t_s[here], markers=seen, **start)
         moved = simulate(piece, now, SCHEME, substeps=1)
-        for way in np.diff(moved.positions_m, axis=0):  # as the midpoint rule has it
+        for way in np.diff(
+            moved.positions_m, axis=0
+        ):  # as the midpoint rule has it
             velocity = 2 * way / truth.timestep_s - velocity
         start = {
             "start": "given",
@@ -104,14 +126,23 @@ def _lame(truth: Experiment, values: Mapping[str, float]) -> dict[str, float]:
     young, poisson = values["young_pa"], values["poisson"]
     kept = {n: v for n, v in values.items() if n not in ("young_pa", "poisson")}
     mu = young / 2 / (1 + poisson)
-    return kept | {"mu_pa": mu, "lambda_pa": 2 * mu * poisson / (1 - 2 * poisson)}
+    return kept | {
+        "mu_pa": mu,
+        "lambda_pa": 2 * mu * poisson / (1 - 2 * poisson),
+    }
 
 
-def _body(experiment: Experiment, values: Mapping[str, float], off: Mapping[str, float]) -> Body:
+def _body(
+    experiment: Experiment,
+    values: Mapping[str, float],
+    off: Mapping[str, float],
+) -> Body:
     old, (grasp,) = experiment.body, experiment.grasps
     pivot_m = old.nodes_m[grasp.nodes].mean(axis=0)
     larger = 1 + off.get("body_scale", 0.0)
-    mesh = TetMesh(pivot_m + larger * (old.mesh.points_m - pivot_m), old.mesh.tetrahedra)
+    mesh = TetMesh(
+        pivot_m + larger * (old.mesh.points_m - pivot_m), old.mesh.tetrahedra
+    )
     stiffer = [off.get(f"anisotropy {axis}", 0.0) for axis in AXES]
     own: dict[str, Any] = {"damping": _damping(old.parts[0].damping, off)}
     if any(stiffer):
@@ -123,20 +154,33 @@ def _body(experiment: Experiment, values: Mapping[str, float], off: Mapping[str,
     body = Body(mesh, density_kg_m3=density, **own)
     factor = np.ones(len(body.nodes_m))
     for axis, name in enumerate(AXES):
-        place = body.nodes_m[:, axis] - np.average(body.nodes_m[:, axis], weights=body.node_mass)
-        factor += off.get(f"density_gradient {name}", 0.0) * place / np.abs(place).max()
-    body._lumped_m3 = [lumped * np.repeat(factor, 3) for lumped in body._lumped_m3]
+        place = body.nodes_m[:, axis] - np.average(
+            body.nodes_m[:, axis], weights=body.node_mass
+        )
+        factor += (
+            off.get(f"density_gradient {name}", 0.0)
+            * place
+            / np.abs(place).max()
+        )
+    body._lumped_m3 = [
+        lumped * np.repeat(factor, 3) for lumped in body._lumped_m3
+    ]
     body.node_mass = body.node_mass * factor
     return body
 
 
 def _stiffer_along(shares: Sequence[float]) -> Material:
     def energy(f, lambda_pa, mu_pa):
-        j, young_pa = ca.det(f), mu_pa * (3 * lambda_pa + 2 * mu_pa) / (lambda_pa + mu_pa)
+        j, young_pa = (
+            ca.det(f),
+            mu_pa * (3 * lambda_pa + 2 * mu_pa) / (lambda_pa + mu_pa),
+        )
         green = 0.5 * (f.T @ f - ca.SX.eye(3))
         isotropic = 0.5 * mu_pa * (2 * ca.trace(green) - 2 * ca.log(j))
         isotropic += 0.5 * lambda_pa * ca.log(j) ** 2
-        return isotropic + 0.5 * young_pa * sum(s * green[k, k] ** 2 for k, s in enumerate(shares))
+        return isotropic + 0.5 * young_pa * sum(
+            s * green[k, k] ** 2 for k, s in enumerate(shares)
+        )
 
     return Material.from_energy(energy)
 
@@ -155,7 +199,10 @@ def _damping(stated: DampingLaw, off: Mapping[str, float]) -> DampingLaw:
     own = 1 - sum(shares.values())
 
     def stress(psi, f, rate, gamma_r_s):
-        terms = [(own, stated), *((shares[law], DAMPINGS[law]) for law in OBJECTIVE_DAMPINGS)]
+        terms = [
+            (own, stated),
+            *((shares[law], DAMPINGS[law]) for law in OBJECTIVE_DAMPINGS),
+        ]
         stresses = ca.SX(9, 1)
         slopes = ca.SX(9, 9)
         for share, law in terms:
@@ -180,8 +227,19 @@ def _drag(density_kg_m3: float) -> NodeForce:
     return NodeForce.from_law(drag)
 
 
-def _lift(experiment: Experiment, body: Body, off: Mapping[str, float]) -> tuple[Force, ...]:
+def _lift(
+    experiment: Experiment, body: Body, off: Mapping[str, float]
+) -> tuple[Force, ...]:
     """Return the forces by which buoyancy differs from that of air with the true added mass."""
     more = off.get("buoyancy", 0.0) - off.get("added_mass", 0.0)
-    air_kg = experiment.air_density_kg_m3 * body.node_mass * body.mesh.volume_m3 / body.mass_kg
-    return tuple(Force([k], [0, 0, 9.81 * more * m]) for k, m in enumerate(air_kg) if more * m)
+    air_kg = (
+        experiment.air_density_kg_m3
+        * body.node_mass
+        * body.mesh.volume_m3
+        / body.mass_kg
+    )
+    return tuple(
+        Force([k], [0, 0, 9.81 * more * m])
+        for k, m in enumerate(air_kg)
+        if more * m
+    )

@@ -30,23 +30,34 @@ LAWS = ("rayleigh", "kelvin-voigt")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--mesh", default=PAPER_SIZE[0], help="rings x layers of the cylinder")
+    parser.add_argument(
+        "--mesh", default=PAPER_SIZE[0], help="rings x layers of the cylinder"
+    )
     parser.add_argument("--steps", type=int, default=PAPER_SIZE[1])
     parser.add_argument("--element", default="tet4")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
-    found = measure(given.mesh, given.steps, given.element, given.threads, given.rounds)
+    found = measure(
+        given.mesh, given.steps, given.element, given.threads, given.rounds
+    )
     if given.json:
         print(json.dumps(found, indent=1))
         return
     for law in LAWS:
-        print(f"{law:>13}: " + ", ".join(f"{k} {v:.1f} ms" for k, v in found[law].items()))
-    print(f"a sweep of kelvin-voigt takes {found['ratio']:.2f} of one of rayleigh")
+        print(
+            f"{law:>13}: "
+            + ", ".join(f"{k} {v:.1f} ms" for k, v in found[law].items())
+        )
+    print(
+        f"a sweep of kelvin-voigt takes {found['ratio']:.2f} of one of rayleigh"
+    )
 
 
-def measure(mesh: str, steps: int, element: str, threads: int, rounds: int) -> dict:
+def measure(
+    mesh: str, steps: int, element: str, threads: int, rounds: int
+) -> dict:
     """Best times in milliseconds, which a busy machine disturbs least, and the sweeps' ratio."""
     sweeps = {law: sweep_of(mesh, steps, element, threads, law) for law in LAWS}
     taken: dict[str, list[tuple[float, ...]]] = {law: [] for law in LAWS}
@@ -57,7 +68,9 @@ def measure(mesh: str, steps: int, element: str, threads: int, rounds: int) -> d
     found: dict = {
         law: {
             name: 1e3 * min(times)
-            for name, times in zip(names, zip(*taken[law], strict=True), strict=True)
+            for name, times in zip(
+                names, zip(*taken[law], strict=True), strict=True
+            )
         }
         for law in LAWS
     }
@@ -71,22 +84,32 @@ def sweep_of(
     rings, layers = map(int, mesh.split("x"))
     made = experiment_of(mesh, steps)
     shape = cylinder_mesh(0.04, 0.16, rings, layers)
-    body = Body(shape, density_kg_m3=20.0, element=element, damping=law, threads=threads)
+    body = Body(
+        shape, density_kg_m3=20.0, element=element, damping=law, threads=threads
+    )
     held = body.nodes_m[:, 2] < 1e-9
     grasp = replace(made.grasps[0], nodes=np.flatnonzero(held))
-    experiment = replace(made, body=body, grasps=(grasp,), markers=made.markers.on_body(body))
+    experiment = replace(
+        made, body=body, grasps=(grasp,), markers=made.markers.on_body(body)
+    )
     collocation = Collocation([experiment], PARAMETERS)
     (segment,) = collocation.transcriptions
     x = simulate_scheme(
         experiment,
-        Dynamics.from_experiment(experiment, "midpoint").with_theta(body.theta_from_values(TRUTH)),
+        Dynamics.from_experiment(experiment, "midpoint").with_theta(
+            body.theta_from_values(TRUTH)
+        ),
     )
     (part,) = collocation.iterates_at(collocation.guess_p, [x])
 
     def sweep() -> tuple[float, ...]:
         watch, began = Stopwatch(), time.perf_counter()
         Sweep(segment, stopwatch=watch).forward(part.x, part.equations)
-        return time.perf_counter() - began, watch.evaluations, watch.linear_algebra
+        return (
+            time.perf_counter() - began,
+            watch.evaluations,
+            watch.linear_algebra,
+        )
 
     sweep()
     return sweep

@@ -33,9 +33,19 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance
 
-TRUTH = {"lambda_pa": 1300.0, "mu_pa": 870.0, "gamma_r_s": 0.01, "gamma_m_1_s": 0.5}
+TRUTH = {
+    "lambda_pa": 1300.0,
+    "mu_pa": 870.0,
+    "gamma_r_s": 0.01,
+    "gamma_m_1_s": 0.5,
+}
 # By how much the initial guesses are wrong.
-FACTORS = {"lambda_pa": 1 / 3, "mu_pa": 1 / 3, "gamma_r_s": 3.6, "gamma_m_1_s": 3.0}
+FACTORS = {
+    "lambda_pa": 1 / 3,
+    "mu_pa": 1 / 3,
+    "gamma_r_s": 3.6,
+    "gamma_m_1_s": 3.0,
+}
 BOUNDS = {
     "lambda_pa": (1.0, 1e6),
     "mu_pa": (1.0, 1e6),
@@ -78,17 +88,28 @@ def bar(divisions: Sequence[int], samples: int, *, ideal: bool) -> Problem:
     held = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
     free = np.flatnonzero(body.nodes_m[:, 0] >= 1e-9)
     random = np.random.default_rng(SEED)
-    places_m = body.nodes_m[np.sort(random.choice(free, MARKERS, replace=False))]
-    markers = Markers(poses.t_s, np.zeros((samples, MARKERS, 3)), NOISE_M, places_m=places_m)
-    experiment = Experiment(body, poses.t_s, [Grasp(held, poses)], markers, name="soft bar")
+    places_m = body.nodes_m[
+        np.sort(random.choice(free, MARKERS, replace=False))
+    ]
+    markers = Markers(
+        poses.t_s, np.zeros((samples, MARKERS, 3)), NOISE_M, places_m=places_m
+    )
+    experiment = Experiment(
+        body, poses.t_s, [Grasp(held, poses)], markers, name="soft bar"
+    )
     tracks = simulate(experiment, TRUTH, timestep_s=STEP_S / 8).markers_m
     tracks = tracks + NOISE_M * random.normal(size=tracks.shape)
     if ideal:
-        described = replace(with_markers(experiment, tracks), nuisance=Nuisance.none())
+        described = replace(
+            with_markers(experiment, tracks), nuisance=Nuisance.none()
+        )
     else:
         unplaced = Markers(poses.t_s, tracks, NOISE_M, markers.names)
         described = replace(experiment, markers=unplaced, nuisance=Nuisance())
-    guesses = {name: Unknown(value * FACTORS[name], *BOUNDS[name]) for name, value in TRUTH.items()}
+    guesses = {
+        name: Unknown(value * FACTORS[name], *BOUNDS[name])
+        for name, value in TRUTH.items()
+    }
     return Problem([described], guesses, scheme="midpoint")
 
 
@@ -99,12 +120,23 @@ def measured(case: str, divisions: Sequence[int], samples: int) -> None:
     reference = pipeline.run(problem, ReducedSpace(), seek_causes=False)
     reference_s = time.process_time() - began_s
     with tempfile.TemporaryDirectory() as folder:
-        start = reference.save(Path(folder) / "reduced-space") if case == "warm" else None
+        start = (
+            reference.save(Path(folder) / "reduced-space")
+            if case == "warm"
+            else None
+        )
         began_s = time.process_time()
-        found = pipeline.run(problem, InteriorPoint(), start=start, seek_causes=False)
+        found = pipeline.run(
+            problem, InteriorPoint(), start=start, seek_causes=False
+        )
         found_s = time.process_time() - began_s
     solution = found.solution
-    off = np.log([solution.parameters[n] / reference.solution.parameters[n] for n in TRUTH])
+    off = np.log(
+        [
+            solution.parameters[n] / reference.solution.parameters[n]
+            for n in TRUTH
+        ]
+    )
     print(
         f"{case}: {solution.status.value}, {solution.iterations} iterations of IPOPT, "
         f"{solution.collocation.substeps} steps a sample, {found_s:.1f} s of processor time; "
@@ -119,11 +151,16 @@ def measured(case: str, divisions: Sequence[int], samples: int) -> None:
 def main() -> None:
     """Print what the cases take that the command line asks for."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--cells", nargs=3, type=int, default=[9, 2, 2], help="of the mesh")
+    parser.add_argument(
+        "--cells", nargs=3, type=int, default=[9, 2, 2], help="of the mesh"
+    )
     parser.add_argument("--samples", type=int, default=91)
-    parser.add_argument("--cases", nargs="*", default=list(CASES), choices=CASES)
+    parser.add_argument(
+        "--cases", nargs="*", default=list(CASES), choices=CASES
+    )
     arguments = parser.parse_args()
     for case in arguments.cases:
         measured(case, arguments.cells, arguments.samples)

@@ -30,7 +30,9 @@ PAPER_MS = 57.0
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--problem", type=Path, default=PROBLEM)
-    parser.add_argument("--scheme", default="backward-euler", help="the paper's by default")
+    parser.add_argument(
+        "--scheme", default="backward-euler", help="the paper's by default"
+    )
     parser.add_argument("--repeats", type=int, default=21)
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
@@ -51,16 +53,21 @@ def measure(path: Path, scheme: str, repeats: int) -> dict:
     for side, (evaluator, count) in sides.items():
         body = Body(
             problem.bodies[0].mesh,
-            density_kg_m3=problem.bodies[0].mass_kg / problem.bodies[0].mesh.volume_m3,
+            density_kg_m3=problem.bodies[0].mass_kg
+            / problem.bodies[0].mesh.volume_m3,
             damping="rayleigh",
             evaluator=evaluator,
             threads=count,
         )
         experiments = [replace(e, body=body) for e in problem.experiments]
-        collocations[side] = Collocation(experiments, problem.parameters, scheme)
+        collocations[side] = Collocation(
+            experiments, problem.parameters, scheme
+        )
     first = collocations["simd_1_ms"]
     rng = np.random.default_rng(0)
-    shape = [s.experiment.rigid_positions(s.dynamics.t_s) for s in first.segments]
+    shape = [
+        s.experiment.rigid_positions(s.dynamics.t_s) for s in first.segments
+    ]
     z = first.pack(first.parameters.guess_q, shape)
     z[first.nq :] += 1e-3 * rng.normal(size=len(z) - first.nq)
     multipliers = rng.normal(size=first.constraints)
@@ -81,14 +88,20 @@ def measure(path: Path, scheme: str, repeats: int) -> dict:
             "scheme": scheme,
         },
         "jacobian": _times(collocations, residual_and_jacobian, repeats)
-        | {"nonzeros": len(jacobian), "extra_memory_ratio": _extra(first, z, jacobian)},
-        "hessian": _times(collocations, lagrangian, repeats) | {"nonzeros": len(hessian)},
+        | {
+            "nonzeros": len(jacobian),
+            "extra_memory_ratio": _extra(first, z, jacobian),
+        },
+        "hessian": _times(collocations, lagrangian, repeats)
+        | {"nonzeros": len(hessian)},
         "paper_jacobian_ms": PAPER_MS,
     }
 
 
 def _times(
-    collocations: dict[str, Collocation], call: Callable[[Collocation], None], repeats: int
+    collocations: dict[str, Collocation],
+    call: Callable[[Collocation], None],
+    repeats: int,
 ) -> dict[str, float]:
     for collocation in collocations.values():
         call(collocation)
@@ -100,15 +113,23 @@ def _times(
             began = time.perf_counter()
             call(collocation)
             seconds[side].append(time.perf_counter() - began)
-    return {side: 1e3 * statistics.median(values) for side, values in seconds.items()}
+    return {
+        side: 1e3 * statistics.median(values)
+        for side, values in seconds.items()
+    }
 
 
-def _extra(collocation: Collocation, z: np.ndarray, values: np.ndarray) -> float:
+def _extra(
+    collocation: Collocation, z: np.ndarray, values: np.ndarray
+) -> float:
     """Peak memory of residual and Jacobian beside the values, over the size of the values.
 
     Counts the arrays kept between calls as well.
     """
-    kept = sum(segment.linearisation_buffer.nbytes for segment in collocation.transcriptions)
+    kept = sum(
+        segment.linearisation_buffer.nbytes
+        for segment in collocation.transcriptions
+    )
     tracemalloc.start()
     collocation.constraints_and_jacobian(z, values)
     _, peak = tracemalloc.get_traced_memory()
@@ -125,13 +146,21 @@ def report(measured: dict) -> None:
     for name in ("jacobian", "hessian"):
         row = measured[name]
         baseline = row["casadi_map_ms"]
-        print(f"\n{name}, {row['nonzeros']:,} nonzeros in the final sparse matrix")
+        print(
+            f"\n{name}, {row['nonzeros']:,} nonzeros in the final sparse matrix"
+        )
         for side, value in row.items():
             if side.endswith("_ms"):
-                print(f"  {side[:-3]:12s} {value:8.1f} ms   {baseline / value:6.1f} × Function.map")
+                print(
+                    f"  {side[:-3]:12s} {value:8.1f} ms   {baseline / value:6.1f} × Function.map"
+                )
         if name == "jacobian":
-            print(f"  {'paper':12s} {measured['paper_jacobian_ms']:8.1f} ms   (its own machine)")
-            print(f"  peak extra memory {row['extra_memory_ratio']:.2f} × the sparse values")
+            print(
+                f"  {'paper':12s} {measured['paper_jacobian_ms']:8.1f} ms   (its own machine)"
+            )
+            print(
+                f"  peak extra memory {row['extra_memory_ratio']:.2f} × the sparse values"
+            )
 
 
 if __name__ == "__main__":

@@ -22,7 +22,10 @@ import numpy as np
 from twins import SOFT, twin
 
 from collocation_sysid.live import Frame, LiveEstimator, LiveOptions
-from collocation_sysid.live.sources import frames_of_recording, without_garbage_of_startup
+from collocation_sysid.live.sources import (
+    frames_of_recording,
+    without_garbage_of_startup,
+)
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
@@ -33,8 +36,18 @@ PROBLEMS = Path(__file__).parent.parent / "problems"
 # Standard deviation of the noise that is added, and of the truth.
 NOISE_M = {"table1": 1e-3, "foam_cylinder": 0.0}
 TRUTH = {
-    "table1": {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0},
-    "foam_cylinder": {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5},
+    "table1": {
+        "lambda_pa": 200.0,
+        "mu_pa": 300.0,
+        "gamma_r_s": 0.009,
+        "gamma_m_1_s": 1.0,
+    },
+    "foam_cylinder": {
+        "lambda_pa": 800.0,
+        "mu_pa": 600.0,
+        "gamma_r_s": 0.006,
+        "gamma_m_1_s": 1.5,
+    },
     "block": SOFT,
 }
 EARLY_S = 0.3
@@ -45,11 +58,17 @@ def main() -> None:
     """Stream the problems and print what was found."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--problem", choices=[*TRUTH], action="append")
-    parser.add_argument("--rows", type=int, help="passed again a frame, in place of a budget")
+    parser.add_argument(
+        "--rows", type=int, help="passed again a frame, in place of a budget"
+    )
     parser.add_argument("--budget-ms", type=float)
-    parser.add_argument("--frames", type=int, help="stream to and fro for so many")
+    parser.add_argument(
+        "--frames", type=int, help="stream to and fro for so many"
+    )
     arguments = parser.parse_args()
-    budget_s = None if arguments.budget_ms is None else 1e-3 * arguments.budget_ms
+    budget_s = (
+        None if arguments.budget_ms is None else 1e-3 * arguments.budget_ms
+    )
     options = LiveOptions(budget_s=budget_s, rows=arguments.rows)
     for name in arguments.problem or NOISE_M:
         problem = _noisy(name)
@@ -67,13 +86,24 @@ def _noisy(name: str) -> Problem:
     problem = Problem.read(PROBLEMS / name / "problem.toml")
     (experiment,) = problem.experiments
     tracks = experiment.markers.positions_m
-    noise = np.random.default_rng(0).normal(scale=NOISE_M[name] or 1.0, size=tracks.shape)
+    noise = np.random.default_rng(0).normal(
+        scale=NOISE_M[name] or 1.0, size=tracks.shape
+    )
     tracks = tracks + noise * bool(NOISE_M[name])
-    seen = replace(experiment, markers=replace(experiment.markers, positions_m=tracks))
-    return Problem([seen], problem.parameters, scheme=problem.scheme, substeps=problem.substeps)
+    seen = replace(
+        experiment, markers=replace(experiment.markers, positions_m=tracks)
+    )
+    return Problem(
+        [seen],
+        problem.parameters,
+        scheme=problem.scheme,
+        substeps=problem.substeps,
+    )
 
 
-def _compared(name: str, problem: Problem, live: LiveEstimator, frames: list[Frame]) -> None:
+def _compared(
+    name: str, problem: Problem, live: LiveEstimator, frames: list[Frame]
+) -> None:
     took, again = [], []
     with without_garbage_of_startup():
         for frame in frames:
@@ -84,8 +114,12 @@ def _compared(name: str, problem: Problem, live: LiveEstimator, frames: list[Fra
                 early = update
     settled, row_s = live.finish() or update, _row_s(problem)
     median, late = 1e3 * np.percentile(took, [50, 99])
-    print(f"{name}: {len(frames)} frames of {live.model.substeps} rows, {np.mean(again):.1f} again")
-    print(f"    median {median:.2f} ms, 99 % below {late:.2f} ms, first {1e3 * took[0]:.2f} ms")
+    print(
+        f"{name}: {len(frames)} frames of {live.model.substeps} rows, {np.mean(again):.1f} again"
+    )
+    print(
+        f"    median {median:.2f} ms, 99 % below {late:.2f} ms, first {1e3 * took[0]:.2f} ms"
+    )
     print(
         f"    a row of the batch's sweep {1e3 * row_s:.2f} ms: {1e-3 * median / row_s:.1f} of these"
     )
@@ -94,7 +128,8 @@ def _compared(name: str, problem: Problem, live: LiveEstimator, frames: list[Fra
     for key, true in TRUTH[name].items():
         found, known = update.estimates[key], batch[key]
         apart, at_last = (
-            abs(each.value - known.value) / (known.statistical_std_error or np.nan)
+            abs(each.value - known.value)
+            / (known.statistical_std_error or np.nan)
             for each in (found, settled.estimates[key])
         )
         off = 100 * (early.estimates[key].value / true - 1)
@@ -105,7 +140,9 @@ def _compared(name: str, problem: Problem, live: LiveEstimator, frames: list[Fra
             f"{off:+.1f} % from the truth at {EARLY_S:g} s"
         )
     print(f"    verdict: {update.trust.verdict} {update.trust.reasons}")
-    print(f"    settled in {1e3 * settled.latency_s:.0f} ms: {settled.trust.verdict}")
+    print(
+        f"    settled in {1e3 * settled.latency_s:.0f} ms: {settled.trust.verdict}"
+    )
 
 
 def _row_s(problem: Problem) -> float:
@@ -125,16 +162,22 @@ def _to_and_fro(frames: list[Frame]) -> Iterator[Frame]:
     there_and_back = [*frames, *frames[-2:0:-1]]
     interval_s = frames[1].t_s - frames[0].t_s
     for k in count():
-        yield replace(there_and_back[k % len(there_and_back)], t_s=k * interval_s)
+        yield replace(
+            there_and_back[k % len(there_and_back)], t_s=k * interval_s
+        )
 
 
-def _endless(name: str, live: LiveEstimator, frames: list[Frame], wanted: int) -> None:
+def _endless(
+    name: str, live: LiveEstimator, frames: list[Frame], wanted: int
+) -> None:
     """The poses there and back again, with markers that stay behind: memory is what counts."""
     for k, frame in zip(range(wanted), _to_and_fro(frames), strict=False):
         live.process_frame(frame)
         if k in (999, wanted - 1) or (k + 1) % max(1, wanted // 10) == 0:
             used_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-            print(f"{name}: {k + 1} frames, {len(live.log)} rows kept, {used_mb:.0f} MB at most")
+            print(
+                f"{name}: {k + 1} frames, {len(live.log)} rows kept, {used_mb:.0f} MB at most"
+            )
 
 
 if __name__ == "__main__":

@@ -17,12 +17,24 @@ from pathlib import Path
 
 import numpy as np
 
-from collocation_sysid import Body, Collocation, Experiment, Parameters, Problem, Unknown
+from collocation_sysid import (
+    Body,
+    Collocation,
+    Experiment,
+    Parameters,
+    Problem,
+    Unknown,
+)
 from collocation_sysid.program.scheme_simulation import simulate_scheme
 from collocation_sysid.program.sweep import Sweep
 
 FILE = Path(__file__).parents[1] / "problems/table1/problem.toml"
-TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
+TRUTH = {
+    "lambda_pa": 200.0,
+    "mu_pa": 300.0,
+    "gamma_r_s": 0.009,
+    "gamma_m_1_s": 1.0,
+}
 MEMORY = {
     "prony_1.share": 0.3,
     "prony_1.tau_s": 0.1,
@@ -32,15 +44,24 @@ MEMORY = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="What branches of memory cost a sweep.")
+    parser = argparse.ArgumentParser(
+        description="What branches of memory cost a sweep."
+    )
     parser.add_argument("--repeats", type=int, default=15)
     repeats = parser.parse_args().repeats
     (experiment,) = Problem.read(FILE).experiments
     for estimated in (True, False):
         print(f"memory's parameters {'estimated' if estimated else 'fixed'}")
-        sweeps = [sweep(experiment, branches, estimated) for branches in range(3)]
-        seconds = np.array([[timed(run) for run, _ in sweeps] for _ in range(repeats)])
-        best, relative = seconds.min(axis=0), np.median(seconds / seconds[:, :1], axis=0)
+        sweeps = [
+            sweep(experiment, branches, estimated) for branches in range(3)
+        ]
+        seconds = np.array(
+            [[timed(run) for run, _ in sweeps] for _ in range(repeats)]
+        )
+        best, relative = (
+            seconds.min(axis=0),
+            np.median(seconds / seconds[:, :1], axis=0),
+        )
         for branches, (_, columns) in enumerate(sweeps):
             print(
                 f"  {branches} branches, {columns} columns: {1e3 * best[branches]:6.1f} ms at best,"
@@ -54,17 +75,34 @@ def sweep(
 ) -> tuple[Callable[[], object], int]:
     """A sweep of the experiment with so many branches, and how many columns it has."""
     plain, names = experiment.body, [f"prony_{k + 1}" for k in range(branches)]
-    body = Body(plain.mesh, density_kg_m3=plain.parts[0].density_kg_m3, prony=names, threads=1)
+    body = Body(
+        plain.mesh,
+        density_kg_m3=plain.parts[0].density_kg_m3,
+        prony=names,
+        threads=1,
+    )
     memory = {n: v for n, v in MEMORY.items() if n.partition(".")[0] in names}
-    given: dict[str, Unknown | float] = {name: Unknown(guess=v) for name, v in TRUTH.items()}
-    given |= {name: Unknown(guess=v) if estimated else v for name, v in memory.items()}
-    collocation = Collocation([replace(experiment, body=body)], Parameters.from_mapping(given))
+    given: dict[str, Unknown | float] = {
+        name: Unknown(guess=v) for name, v in TRUTH.items()
+    }
+    given |= {
+        name: Unknown(guess=v) if estimated else v for name, v in memory.items()
+    }
+    collocation = Collocation(
+        [replace(experiment, body=body)], Parameters.from_mapping(given)
+    )
     (segment,) = collocation.transcriptions
-    setting = segment.equations_at(collocation.guess_p, np.zeros(segment.nuisance.size))
-    x = simulate_scheme(experiment=segment.experiment, dynamics=setting.dynamics)
+    setting = segment.equations_at(
+        collocation.guess_p, np.zeros(segment.nuisance.size)
+    )
+    x = simulate_scheme(
+        experiment=segment.experiment, dynamics=setting.dynamics
+    )
     solver = Sweep(segment)
     solver.forward(x, setting)
-    return lambda: solver.forward(x, setting), 1 + len(segment.dynamic_parameters)
+    return lambda: solver.forward(x, setting), 1 + len(
+        segment.dynamic_parameters
+    )
 
 
 def timed(run: Callable[[], object]) -> float:

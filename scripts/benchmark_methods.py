@@ -51,7 +51,12 @@ from collocation_sysid.program.simulation import with_markers, with_wrenches
 from collocation_sysid.recording import Nuisance, Wrench, place_markers
 
 BOTH = ["interior-point", "reduced-space"]
-TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
+TRUTH = {
+    "lambda_pa": 200.0,
+    "mu_pa": 300.0,
+    "gamma_r_s": 0.009,
+    "gamma_m_1_s": 1.0,
+}
 PARAMETERS = Parameters(
     (
         Parameter("lambda_pa", 400.0, 10.0, 1e5),
@@ -92,12 +97,16 @@ class Row:
         return 1e6 * self.total_s / self.nodes / self.steps
 
 
-def experiment_of(mesh: str, steps: int, seed: int = 0, noise_m: float = 0.0) -> Experiment:
+def experiment_of(
+    mesh: str, steps: int, seed: int = 0, noise_m: float = 0.0
+) -> Experiment:
     """A hung and swung cylinder with tracks from the midpoint scheme."""
     body = Body(cylinder(mesh), density_kg_m3=20.0, damping="rayleigh")
     experiment = swung(body, steps)
     tracks = simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m
-    tracks = tracks + noise_m * np.random.default_rng(seed).normal(size=tracks.shape)
+    tracks = tracks + noise_m * np.random.default_rng(seed).normal(
+        size=tracks.shape
+    )
     return with_markers(experiment, tracks)
 
 
@@ -120,7 +129,9 @@ def swung(body: Body, steps: int) -> Experiment:
     )
     angle = np.arange(8) * 2.4
     height = np.linspace(0.04, 0.16, 8)
-    places = np.column_stack([0.035 * np.cos(angle), 0.035 * np.sin(angle), height])
+    places = np.column_stack(
+        [0.035 * np.cos(angle), 0.035 * np.sin(angle), height]
+    )
     placement = place_markers(places, body.nodes_m, body, "vertex")
     markers = Markers(t_s, np.zeros((steps, 8, 3)), 0.001, placement=placement)
     held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
@@ -170,7 +181,12 @@ def in_own_process(mesh: str, steps: int, method: str) -> Row:
 
 
 # What may not be known, each beside the same with nothing unknown but the parameters.
-UNKNOWN = ("clock, gravity, grasp", "places as well", "with a wrench", "with memory")
+UNKNOWN = (
+    "clock, gravity, grasp",
+    "places as well",
+    "with a wrench",
+    "with memory",
+)
 MEMORY = {"prony_1.share": 0.3, "prony_1.tau_s": 0.05}
 WRENCH_SIGMAS = 0.01, 0.001
 
@@ -179,25 +195,41 @@ def problem_of(mesh: str, steps: int, case: str, ideal: bool) -> Problem:
     """A recording with noise and what is unknown by default, or nothing."""
     noise = np.random.default_rng(0).normal
     memory = MEMORY if case == "with memory" else {}
-    body = Body(cylinder(mesh), density_kg_m3=20.0, prony=["prony_1"] if memory else [])
+    body = Body(
+        cylinder(mesh), density_kg_m3=20.0, prony=["prony_1"] if memory else []
+    )
     experiment = swung(body, steps)
     if case == "with a wrench":
         sensor = Wrench(experiment.t_s, np.zeros((steps, 6)), *WRENCH_SIGMAS)
         grasps = [replace(grasp, wrench=sensor) for grasp in experiment.grasps]
         experiment = replace(experiment, grasps=grasps)
-    made, markers = simulate(experiment, TRUTH | memory, "midpoint", substeps=1), experiment.markers
+    made, markers = (
+        simulate(experiment, TRUTH | memory, "midpoint", substeps=1),
+        experiment.markers,
+    )
     sigmas = np.repeat(WRENCH_SIGMAS, 3)
-    felt = [wrench + sigmas * noise(size=wrench.shape) for wrench in made.wrenches]
-    placement = None if case == "places as well" and not ideal else markers.placement
+    felt = [
+        wrench + sigmas * noise(size=wrench.shape) for wrench in made.wrenches
+    ]
+    placement = (
+        None if case == "places as well" and not ideal else markers.placement
+    )
     tracks = made.markers_m + 1e-3 * noise(size=made.markers_m.shape)
     seen = Markers(markers.t_s, tracks, markers.sigma_m, placement=placement)
     nuisance = Nuisance.none() if ideal else Nuisance()
-    experiment = replace(with_wrenches(experiment, felt), markers=seen, nuisance=nuisance)
-    guesses = {item.name: Unknown(item.guess, item.lower, item.upper) for item in PARAMETERS.items}
+    experiment = replace(
+        with_wrenches(experiment, felt), markers=seen, nuisance=nuisance
+    )
+    guesses = {
+        item.name: Unknown(item.guess, item.lower, item.upper)
+        for item in PARAMETERS.items
+    }
     return Problem([experiment], guesses | memory, scheme="midpoint")
 
 
-def identified(mesh: str, steps: int, case: str, ideal: bool) -> tuple[float, int, float]:
+def identified(
+    mesh: str, steps: int, case: str, ideal: bool
+) -> tuple[float, int, float]:
     """Processor time and iterations of interior point, and how far reduced space ends from it."""
     expected = solve(problem_of(mesh, steps, case, ideal), ReducedSpace())
     began = time.process_time()
@@ -212,7 +244,10 @@ def show_unknown(mesh: str, steps: int) -> None:
     """What interior point takes for what is not known, over what it takes without."""
     for case in UNKNOWN:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
-            ideal, whole = (pool.apply(identified, (mesh, steps, case, e)) for e in (True, False))
+            ideal, whole = (
+                pool.apply(identified, (mesh, steps, case, e))
+                for e in (True, False)
+            )
         print(
             f"{case:22} {mesh}, {steps} steps: {ideal[0]:7.2f} s, {ideal[1]} iterations without; "
             f"{whole[0]:7.2f} s, {whole[1]} with: {whole[0] / ideal[0]:.2f} times; "
@@ -221,7 +256,9 @@ def show_unknown(mesh: str, steps: int) -> None:
         )
 
 
-def shared_out(mesh: str, steps: int, experiments: int = 4, repeats: int = 3) -> None:
+def shared_out(
+    mesh: str, steps: int, experiments: int = 4, repeats: int = 3
+) -> None:
     """Print how much faster two workers, and two threads, are than one, in turns.
 
     Beside the wall's time stands processor time, of the busiest worker and of this process, which
@@ -233,29 +270,43 @@ def shared_out(mesh: str, steps: int, experiments: int = 4, repeats: int = 3) ->
     first = experiment_of(mesh, steps)
     recordings = []
     for k in range(experiments):
-        noise_m = 1e-3 * np.random.default_rng(k).normal(size=first.markers.positions_m.shape)
+        noise_m = 1e-3 * np.random.default_rng(k).normal(
+            size=first.markers.positions_m.shape
+        )
         made = with_markers(first, first.markers.positions_m + noise_m)
         recordings.append(replace(made, name=f"swing {k}"))
 
     collocation = Collocation(recordings, PARAMETERS)
 
-    def solve(workers: DaskExecutor | None, threads: int) -> tuple[float, float, float]:
+    def solve(
+        workers: DaskExecutor | None, threads: int
+    ) -> tuple[float, float, float]:
         first.body.threads = threads
         busy_s = workers.client.run(time.process_time) if workers else {}
         here_s, began = time.process_time(), time.perf_counter()
         solution = ReducedSpace()(collocation, workers=workers)
-        wall_s, here_s = time.perf_counter() - began, time.process_time() - here_s
+        wall_s, here_s = (
+            time.perf_counter() - began,
+            time.process_time() - here_s,
+        )
         busiest_s = 0.0
         if workers:
             after_s = workers.client.run(time.process_time)
-            busiest_s = max(after_s[address] - spent_s for address, spent_s in busy_s.items())
-        print(f"  {solution.status.value} after {solution.iterations} sweeps: {wall_s:.2f} s")
+            busiest_s = max(
+                after_s[address] - spent_s
+                for address, spent_s in busy_s.items()
+            )
+        print(
+            f"  {solution.status.value} after {solution.iterations} sweeps: {wall_s:.2f} s"
+        )
         return wall_s, busiest_s, here_s
 
     with ExitStack() as stack:
         clusters: list[DaskExecutor] = []
         for count in (1, 2):
-            cluster = LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=":0")
+            cluster = LocalCluster(
+                n_workers=count, threads_per_worker=1, dashboard_address=":0"
+            )
             client = stack.enter_context(Client(stack.enter_context(cluster)))
             clusters.append(DaskExecutor(client))
         cases = {
@@ -270,7 +321,9 @@ def shared_out(mesh: str, steps: int, experiments: int = 4, repeats: int = 3) ->
         for _ in range(repeats):
             for name, case in cases.items():
                 times[name].append(solve(*case))
-    print(f"{experiments} experiments, {mesh}, {steps} samples, {os.getloadavg()[0]:.1f} at work")
+    print(
+        f"{experiments} experiments, {mesh}, {steps} samples, {os.getloadavg()[0]:.1f} at work"
+    )
     for name, found in times.items():
         wall_s, busiest_s, here_s = np.median(found, axis=0)
         print(
@@ -292,7 +345,9 @@ def show(row: Row) -> None:
 
 def plot(rows: list[Row], folder: Path) -> None:
     figure = Figure(figsize=(8, 3.2), layout="constrained")
-    for place, (key, fixed) in enumerate((("steps", "nodes"), ("nodes", "steps"))):
+    for place, (key, fixed) in enumerate(
+        (("steps", "nodes"), ("nodes", "steps"))
+    ):
         axes = figure.add_subplot(1, 2, place + 1)
         for method in sorted({row.method for row in rows}):
             common = [row for row in rows if row.method == method]
@@ -303,8 +358,15 @@ def plot(rows: list[Row], folder: Path) -> None:
                 key=lambda row: getattr(row, key),
             )
             x = [getattr(row, key) for row in chosen]
-            axes.loglog(x, [row.total_s for row in chosen], "o-", label=f"{method}, {most} {fixed}")
-            axes.loglog(x, [row.simulation_s for row in chosen], ":", color="0.5")
+            axes.loglog(
+                x,
+                [row.total_s for row in chosen],
+                "o-",
+                label=f"{method}, {most} {fixed}",
+            )
+            axes.loglog(
+                x, [row.simulation_s for row in chosen], ":", color="0.5"
+            )
         axes.set(xlabel=key, ylabel="s (dotted: one simulation)")
         axes.legend(frameon=False, fontsize=8)
     figure.savefig(folder / "benchmark_methods.png", dpi=150)
@@ -312,16 +374,31 @@ def plot(rows: list[Row], folder: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--mesh", nargs="*", default=[PAPER_SIZE[0]], help="rings x layers")
+    parser.add_argument(
+        "--mesh", nargs="*", default=[PAPER_SIZE[0]], help="rings x layers"
+    )
     parser.add_argument("--steps", nargs="*", type=int, default=[PAPER_SIZE[1]])
-    parser.add_argument("--methods", nargs="*", default=BOTH, choices=list(METHODS))
-    parser.add_argument("--scaling", action="store_true", help="reduced space over T and meshes")
+    parser.add_argument(
+        "--methods", nargs="*", default=BOTH, choices=list(METHODS)
+    )
+    parser.add_argument(
+        "--scaling", action="store_true", help="reduced space over T and meshes"
+    )
     parser.add_argument("--out", type=Path, default=Path("results"))
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("--cluster", action="store_true", help="four experiments on 1, 2 workers")
-    parser.add_argument("--unknown", action="store_true", help="nuisances, places, wrench, memory")
+    parser.add_argument(
+        "--cluster",
+        action="store_true",
+        help="four experiments on 1, 2 workers",
+    )
+    parser.add_argument(
+        "--unknown",
+        action="store_true",
+        help="nuisances, places, wrench, memory",
+    )
     arguments = parser.parse_args()
     if arguments.unknown:
         show_unknown(arguments.mesh[0], arguments.steps[0])
@@ -329,10 +406,19 @@ def main() -> None:
     if arguments.cluster:
         shared_out(arguments.mesh[0], arguments.steps[0])
         return
-    cases = [(m, t, k) for m in arguments.mesh for t in arguments.steps for k in arguments.methods]
+    cases = [
+        (m, t, k)
+        for m in arguments.mesh
+        for t in arguments.steps
+        for k in arguments.methods
+    ]
     if arguments.scaling:
         cases = [(PAPER_SIZE[0], steps, "reduced-space") for steps in STEPS]
-        cases += [(mesh, PAPER_SIZE[1], "reduced-space") for mesh in MESHES if mesh != "2x8"]
+        cases += [
+            (mesh, PAPER_SIZE[1], "reduced-space")
+            for mesh in MESHES
+            if mesh != "2x8"
+        ]
     rows = []
     for case in cases:
         rows.append(in_own_process(*case))

@@ -48,7 +48,10 @@ class Cost:
 
     def told(self, steps: int) -> str:
         spent = self.stopwatch
-        shares = spent.evaluations / self.total_s, spent.linear_algebra / self.total_s
+        shares = (
+            spent.evaluations / self.total_s,
+            spent.linear_algebra / self.total_s,
+        )
         return (
             f"{1e3 * self.total_s / steps:8.1f} ms a step (elements {shares[0]:4.0%}, "
             f"linear algebra {shares[1]:4.0%})"
@@ -60,7 +63,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", nargs="+", choices=[*SIZES], default=[*SIZES])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--factorisation", nargs="+", choices=get_args(Choice), default=["auto"])
+    parser.add_argument(
+        "--factorisation", nargs="+", choices=get_args(Choice), default=["auto"]
+    )
     parser.add_argument("--damping", default="kelvin-voigt")
     parser.add_argument("--steps", type=int)
     given = parser.parse_args()
@@ -72,16 +77,24 @@ def main() -> None:
                     print(pool.apply(measured, arguments), flush=True)
 
 
-def measured(size: str, steps: int | None, threads: int, choice: Choice, damping: str) -> str:
+def measured(
+    size: str, steps: int | None, threads: int, choice: Choice, damping: str
+) -> str:
     """A line on one body."""
     mesh, element, few = SIZES[size]
     steps = steps or few
     body = Body(
-        cylinder(mesh), density_kg_m3=20.0, damping=damping, element=element, threads=threads
+        cylinder(mesh),
+        density_kg_m3=20.0,
+        damping=damping,
+        element=element,
+        threads=threads,
     )
     collocation = Collocation([swung(body, steps + 1)], PARAMETERS)
     (segment,) = collocation.transcriptions
-    setting = segment.equations_at(np.log([TRUTH[name] for name in PARAMETERS.names]), np.zeros(0))
+    setting = segment.equations_at(
+        np.log([TRUTH[name] for name in PARAMETERS.names]), np.zeros(0)
+    )
     before_mb = peak_mb()
     clock = time.perf_counter if threads > 1 else time.process_time
     began, spent = clock(), Stopwatch(clock)
@@ -114,7 +127,13 @@ def kind(solver: Sweep) -> str:
     chosen = solver.factoriser
     if chosen.skyline:
         return "skyline"
-    return "band" if chosen.is_banded else "supernodal" if chosen.is_supernodal else "sparse"
+    return (
+        "band"
+        if chosen.is_banded
+        else "supernodal"
+        if chosen.is_supernodal
+        else "sparse"
+    )
 
 
 def peak_mb() -> float:

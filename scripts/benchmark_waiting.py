@@ -22,7 +22,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-PROBLEM = Path(__file__).parents[1] / "problems" / "foam_cylinder" / "recording.toml"
+PROBLEM = (
+    Path(__file__).parents[1] / "problems" / "foam_cylinder" / "recording.toml"
+)
 MAIN = "from collocation_sysid.cli import main; main()"
 
 
@@ -43,7 +45,9 @@ def main() -> None:
     arguments = parser.parse_args()
     problem = str(arguments.problem)
     with tempfile.TemporaryDirectory() as place:
-        run, warm, cold = (str(Path(place) / name) for name in ("run", "warm", "cold"))
+        run, warm, cold = (
+            str(Path(place) / name) for name in ("run", "warm", "cold")
+        )
         solve = ["solve", problem, "--out", run]
         commands = {
             "--help": (["--help"], warm),
@@ -60,8 +64,14 @@ def main() -> None:
                 shutil.rmtree(cold, ignore_errors=True)
                 times.append(waited(words, cache))
             columns = ("first_s", "wall_s", "processor_s")
-            medians = [statistics.median(getattr(t, c) for t in times) for c in columns]
-            print(f"| {name} | " + " | ".join(f"{value:.2f}" for value in medians) + " |")
+            medians = [
+                statistics.median(getattr(t, c) for t in times) for c in columns
+            ]
+            print(
+                f"| {name} | "
+                + " | ".join(f"{value:.2f}" for value in medians)
+                + " |"
+            )
 
 
 def waited(words: list[str], cache: str) -> Waited:
@@ -70,7 +80,10 @@ def waited(words: list[str], cache: str) -> Waited:
     environment = {**os.environ, "XDG_CACHE_HOME": cache, "TERM": "xterm"}
     before, began = os.times(), time.perf_counter()
     with subprocess.Popen(
-        [sys.executable, "-c", MAIN, *words], stdout=theirs, stderr=theirs, env=environment
+        [sys.executable, "-c", MAIN, *words],
+        stdout=theirs,
+        stderr=theirs,
+        env=environment,
     ) as process:
         os.close(theirs)
         first_s = _drained(ours, began)

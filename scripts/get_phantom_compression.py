@@ -25,13 +25,17 @@ RUNS = tuple(f"A{k}" for k in range(1, 6))
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--from", dest="source", type=Path, help="a folder that has the files")
+    parser.add_argument(
+        "--from", dest="source", type=Path, help="a folder that has the files"
+    )
     source = parser.parse_args().source
     for material in MATERIALS:
         for run in RUNS:
             file = f"{material}_{run}.csv"
             if source is None:
-                content = urllib.request.urlopen(f"{SOURCE}/{material}/{file}").read()
+                content = urllib.request.urlopen(
+                    f"{SOURCE}/{material}/{file}"
+                ).read()
             elif (source / file).is_file():
                 content = (source / file).read_bytes()
             else:

@@ -43,7 +43,9 @@ BASE_M = np.array(
     ]
 )
 # Positions of the tip markers in the frame of the mesh [m], as the authors state them.
-TIP_M = np.array([[-0.009645, -0.0265, 0.0], [-0.009645, 0.0265, 0.0], [-0.0282, 0.0, 0.0]])
+TIP_M = np.array(
+    [[-0.009645, -0.0265, 0.0], [-0.009645, 0.0265, 0.0], [-0.0282, 0.0, 0.0]]
+)
 # The model is the half y > 0 of the arm: the marker at y < 0 is written as its mirror image.
 MIRRORED = "Tip - 1"
 # Written samples before the tip begins to move, and from there on; the sampling rate is 100 Hz.
@@ -86,9 +88,12 @@ class ArmShape:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--from", dest="source", type=Path, help="a folder that has the files")
+    parser.add_argument(
+        "--from", dest="source", type=Path, help="a folder that has the files"
+    )
     source = parser.parse_args().source
     arm_mesh(ArmShape()).write(FOLDER / "arm.vtu")
     with tempfile.TemporaryDirectory() as folder:
@@ -119,19 +124,33 @@ def table_of_tip(file: Path) -> str:
     rows = slice(start, start + SAMPLES_BEFORE + SAMPLES_AFTER + 1)
     names = [label.lower().replace(" - ", "_") for label in labels]
     columns = ["t_s", *(f"{name}_{axis}" for name in names for axis in "xyz")]
-    values = np.column_stack([t_s[rows] - t_s[start], tip_m[rows].reshape(-1, 3 * len(labels))])
-    lines = [",".join([f"{row[0]:.2f}", *(f"{v:.5f}" for v in row[1:])]) for row in values]
+    values = np.column_stack(
+        [t_s[rows] - t_s[start], tip_m[rows].reshape(-1, 3 * len(labels))]
+    )
+    lines = [
+        ",".join([f"{row[0]:.2f}", *(f"{v:.5f}" for v in row[1:])])
+        for row in values
+    ]
     return "\n".join([",".join(columns), *lines]) + "\n"
 
 
 def table_of_step(pressure_pa: float) -> str:
     """Return a table of a pressure that rises from zero at STEP_S."""
     end_s = (SAMPLES_BEFORE + SAMPLES_AFTER) / 100 + 1.0
-    rows = [(0.0, 0.0), (STEP_S, 0.0), (STEP_S + RAMP_S, pressure_pa), (end_s, pressure_pa)]
-    return "t_s,pressure_pa\n" + "".join(f"{t_s:g},{value:g}\n" for t_s, value in rows)
+    rows = [
+        (0.0, 0.0),
+        (STEP_S, 0.0),
+        (STEP_S + RAMP_S, pressure_pa),
+        (end_s, pressure_pa),
+    ]
+    return "t_s,pressure_pa\n" + "".join(
+        f"{t_s:g},{value:g}\n" for t_s, value in rows
+    )
 
 
-def tip_in_mesh_frame(file: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], list[str]]:
+def tip_in_mesh_frame(
+    file: Path,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], list[str]]:
     """Return the times (T,) [s], the tip markers (T, 3, 3) [m] in the frame of the mesh, and their
     labels.
 
@@ -143,7 +162,9 @@ def tip_in_mesh_frame(file: Path) -> tuple[NDArray[np.float64], NDArray[np.float
     base = [k for k, label in enumerate(labels) if label.startswith("Base")]
     tip = [k for k, label in enumerate(labels) if label.startswith("Tip")]
     positions_m = tracks.positions_m
-    rotation, shift_m = rigid_transform(positions_m[:, base].mean(axis=0), BASE_M)
+    rotation, shift_m = rigid_transform(
+        positions_m[:, base].mean(axis=0), BASE_M
+    )
     tip_m = positions_m[:, tip] @ rotation.T + shift_m
     tip_m += TIP_M - tip_m[REST].mean(axis=0)
     tip_labels = [labels[k] for k in tip]
@@ -157,7 +178,9 @@ def rigid_transform(
     """Return rotation (3, 3) and shift (3,) that map points (n, 3) to others with least squares."""
     from_middle_m = from_m.mean(axis=0)
     to_middle_m = to_m.mean(axis=0)
-    left, _, right = np.linalg.svd((to_m - to_middle_m).T @ (from_m - from_middle_m))
+    left, _, right = np.linalg.svd(
+        (to_m - to_middle_m).T @ (from_m - from_middle_m)
+    )
     handedness = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
     rotation = left @ handedness @ right
     return rotation, to_middle_m - rotation @ from_middle_m
@@ -180,27 +203,43 @@ def arm_mesh(shape: ArmShape) -> TetMesh:
     The cell arrays `ring_1` to `ring_7` are 1 in sectors of the outer wall between `ring_angles`,
     without the end. The chambers are open at the base, where the nodes are held.
     """
-    section_m, wall_triangles, chamber_triangles, chamber_corners = cross_section(shape)
-    heights_m = np.append(0.0, np.linspace(shape.cap_m, shape.length_m, shape.layers + 1))
+    section_m, wall_triangles, chamber_triangles, chamber_corners = (
+        cross_section(shape)
+    )
+    heights_m = np.append(
+        0.0, np.linspace(shape.cap_m, shape.length_m, shape.layers + 1)
+    )
     points_m = np.vstack(
-        [np.column_stack([section_m, np.full(len(section_m), z)]) for z in heights_m]
+        [
+            np.column_stack([section_m, np.full(len(section_m), z)])
+            for z in heights_m
+        ]
     )
     tetrahedra = []
     for layer in range(len(heights_m) - 1):
         triangles = wall_triangles + chamber_triangles * (layer == 0)
         offset = layer * len(section_m)
         for triangle in triangles:
-            tetrahedra += prism_tetrahedra([offset + k for k in triangle], len(section_m))
+            tetrahedra += prism_tetrahedra(
+                [offset + k for k in triangle], len(section_m)
+            )
     on_wall = np.zeros((len(heights_m), len(section_m)), dtype=bool)
     on_wall[1:, chamber_corners] = True
     mesh = TetMesh(points_m, tetrahedra)
     x, y, z = mesh.centres_m.T
     # Chords of the arcs are closer to the axis than their ends; the arms of the cross end before.
-    in_ring = (np.hypot(x, y) > 0.9 * (shape.radius_m - shape.wall_m)) & (z > shape.cap_m)
+    in_ring = (np.hypot(x, y) > 0.9 * (shape.radius_m - shape.wall_m)) & (
+        z > shape.cap_m
+    )
     sectors = np.searchsorted(ring_angles(shape), np.arctan2(y, x))
-    rings = {f"ring_{k}": (in_ring & (sectors == k)).astype(float) for k in range(1, 8)}
+    rings = {
+        f"ring_{k}": (in_ring & (sectors == k)).astype(float)
+        for k in range(1, 8)
+    }
     chamber = {"chamber": on_wall.ravel().astype(float)}
-    return TetMesh(points_m, mesh.tetrahedra, point_arrays=chamber, cell_arrays=rings)
+    return TetMesh(
+        points_m, mesh.tetrahedra, point_arrays=chamber, cell_arrays=rings
+    )
 
 
 def prism_tetrahedra(corners: list[int], count: int) -> list[list[int]]:
@@ -225,12 +264,18 @@ def cross_section(
     Points are the core of the cross (0 to 2), the inside of the outer wall (3 to 10) and its
     outside (11 to 18).
     """
-    core_m = shape.cross_m / np.sqrt(2) * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+    core_m = (
+        shape.cross_m
+        / np.sqrt(2)
+        * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+    )
     angles = ring_angles(shape)
     directions = np.column_stack([np.cos(angles), np.sin(angles)])
     directions[-1] = (-1.0, 0.0)
     inner_m = shape.radius_m - shape.wall_m
-    points_m = np.vstack([core_m, inner_m * directions, shape.radius_m * directions])
+    points_m = np.vstack(
+        [core_m, inner_m * directions, shape.radius_m * directions]
+    )
     wall = list(range(3, 11))
     outer = list(range(11, 19))
     quads = [(0, wall[2], wall[3], 1), (1, wall[5], wall[6], 2)]
@@ -239,7 +284,11 @@ def cross_section(
     for a, b, c, d in quads:
         walls += [[a, b, c], [a, c, d]]
     chambers = [[wall[0], wall[1], 0], [wall[1], wall[2], 0]]
-    chambers += [[wall[3], wall[4], 1], [wall[4], wall[5], 1], [wall[6], wall[7], 2]]
+    chambers += [
+        [wall[3], wall[4], 1],
+        [wall[4], wall[5], 1],
+        [wall[6], wall[7], 2],
+    ]
     return points_m, walls, chambers, [0, *wall[:3]]
 
 
@@ -251,7 +300,9 @@ def ring_angles(shape: ArmShape) -> NDArray[np.float64]:
     half = np.arcsin(shape.cross_m / 2 / (shape.radius_m - shape.wall_m))
     quarter = np.pi / 4
     side = np.array([quarter - half, quarter + half])
-    return np.array([0.0, side[0] / 2, *side, np.pi / 2, *(np.pi - side[::-1]), np.pi])
+    return np.array(
+        [0.0, side[0] / 2, *side, np.pi / 2, *(np.pi - side[::-1]), np.pi]
+    )
 
 
 def fibre_angles(shape: ArmShape) -> NDArray[np.float64]:

@@ -36,17 +36,32 @@ WITHIN = (15, 12, 10, 8, 6, 5, 4, 3, 3, 3, 3, 3)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--from", dest="source", type=Path, required=True, help="the folder")
+    parser.add_argument(
+        "--from", dest="source", type=Path, required=True, help="the folder"
+    )
     source = parser.parse_args().source
-    missing = [name for name in IMAGES if not (source / f"{name}.json").is_file()]
+    missing = [
+        name for name in IMAGES if not (source / f"{name}.json").is_file()
+    ]
     if missing:
         sys.exit(f"{source} has no {missing[0]}.json")
-    told = {name: json.loads((source / f"{name}.json").read_text()) for name in IMAGES}
+    told = {
+        name: json.loads((source / f"{name}.json").read_text())
+        for name in IMAGES
+    }
     to_world = np.array(told[IMAGES[0]]["mesh_to_object"])
     for name, said in told.items():
-        stated = np.array(said["object_to_camera"]) @ np.array(said["mesh_to_object"])
-        seen, matrix = np.load(source / f"{name}.npz"), np.array(said["camera_matrix"])
-        to_camera, depth_m = np.eye(4), seen["depth_counts"] * float(seen["count_m"])
+        stated = np.array(said["object_to_camera"]) @ np.array(
+            said["mesh_to_object"]
+        )
+        seen, matrix = (
+            np.load(source / f"{name}.npz"),
+            np.array(said["camera_matrix"]),
+        )
+        to_camera, depth_m = (
+            np.eye(4),
+            seen["depth_counts"] * float(seen["count_m"]),
+        )
         turned = upright(face_normals(depth_m, matrix), stated[:3, :3])
         to_camera[:3, :3] = turned
         to_camera[:3, 3] = (stated[:3, :3] - turned) @ CLAMP_M + stated[:3, 3]
@@ -65,17 +80,22 @@ def main() -> None:
 def face_normals(depth_m: Array, matrix: Array) -> Array:
     """Normals (P, 3) of the flat faces in an image, in the camera's frame, of either sign."""
     v, u = np.indices(depth_m.shape)
-    rays = np.linalg.solve(matrix, np.stack([u, v, np.ones_like(u)]).reshape(3, -1)).T
+    rays = np.linalg.solve(
+        matrix, np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
+    ).T
     points = rays.reshape(*depth_m.shape, 3) * depth_m[..., None]
     size = 2 * HALF + 1
-    near, far = (each(depth_m, size) for each in (minimum_filter, maximum_filter))
+    near, far = (
+        each(depth_m, size) for each in (minimum_filter, maximum_filter)
+    )
     inside = np.zeros(depth_m.shape, dtype=bool)
     inside[HALF:-HALF:EVERY, HALF:-HALF:EVERY] = True
     here = np.nonzero(inside & (near > 0) & (far - near < DEEP_M))
     mean = [uniform_filter(points[..., i], size)[here] for i in range(3)]
     spread = [
         [
-            uniform_filter(points[..., i] * points[..., j], size)[here] - mean[i] * mean[j]
+            uniform_filter(points[..., i] * points[..., j], size)[here]
+            - mean[i] * mean[j]
             for j in range(3)
         ]
         for i in range(3)
@@ -114,7 +134,9 @@ def bar(motion: np.ndarray, fine: int = 2) -> TetMesh:
         ]
     )
     middles = own[grid.tetrahedra].mean(axis=1)
-    cells = grid.tetrahedra[(middles[:, 0] < -0.07) | (np.abs(middles[:, 1]) < 0.015)]
+    cells = grid.tetrahedra[
+        (middles[:, 0] < -0.07) | (np.abs(middles[:, 1]) < 0.015)
+    ]
     masks = {
         "clamped": own[:, 0] >= 0.07 - 1e-9,
         "turned": own[:, 0] <= -0.07 + 1e-9,

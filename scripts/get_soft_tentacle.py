@@ -39,23 +39,41 @@ HEXAGON = (np.pi / 4 / (5 * np.sqrt(3) / 16)) ** 0.25
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--from", dest="source", type=Path, required=True, help="a folder of CSVs")
+    parser.add_argument(
+        "--from",
+        dest="source",
+        type=Path,
+        required=True,
+        help="a folder of CSVs",
+    )
     source = parser.parse_args().source
     tentacle().write(FOLDER / "tentacle.vtu")
     for name, groups in GROUPS.items():
         file = source / f"{name}.csv"
         if not file.is_file():
             sys.exit(f"{source} has no {file.name}")
-        columns = ["t_s", *(f"M{k}_{axis}" for k in range(1, 5) for axis in "xyz")]
+        columns = [
+            "t_s",
+            *(f"M{k}_{axis}" for k in range(1, 5) for axis in "xyz"),
+        ]
         row = [0.0, *markers_m(file, groups).ravel()]
-        text = ",".join(columns) + "\n" + ",".join(f"{value:.6f}" for value in row) + "\n"
+        text = (
+            ",".join(columns)
+            + "\n"
+            + ",".join(f"{value:.6f}" for value in row)
+            + "\n"
+        )
         (FOLDER / f"{name}_markers.csv").write_text(text)
         print(FOLDER / f"{name}_markers.csv")
 
 
 def markers_m(file: Path, groups: tuple[int, ...]) -> np.ndarray:
     """(4, 3) mean places of M1 to M4 from the centre of the clamped section."""
-    mean = np.loadtxt(file, delimiter=",")[:, 2:].mean(axis=0).reshape(5, 3)[list(groups)]
+    mean = (
+        np.loadtxt(file, delimiter=",")[:, 2:]
+        .mean(axis=0)
+        .reshape(5, 3)[list(groups)]
+    )
     x, y, z = (mean[1:] - mean[0] - BASE_TO_CENTRE_M).T
     return np.column_stack([x, z, -y])
 
@@ -65,7 +83,9 @@ def tentacle() -> TetMesh:
     mesh = cylinder_mesh(1.0, float(LAYERS), 1, LAYERS)
     s = np.linspace(0, LENGTH_M, 2001)
     thickness = np.interp(s, PLACES_M, RADII_M)
-    layer = np.concatenate([[0], np.cumsum(np.diff(s) / (thickness[1:] + thickness[:-1]))])
+    layer = np.concatenate(
+        [[0], np.cumsum(np.diff(s) / (thickness[1:] + thickness[:-1]))]
+    )
     along = np.interp(mesh.points_m[:, 2] / LAYERS, layer / layer[-1], s)
     radius = HEXAGON * np.interp(along, PLACES_M, RADII_M)
     points = np.column_stack([mesh.points_m[:, :2] * radius[:, None], -along])

@@ -23,14 +23,18 @@ SOURCE = (
     f"https://raw.githubusercontent.com/srl-ethz/diffPD_sim2real/{COMMIT}"
     "/python/realbeam_experiments/Measurement_data"
 )
-RECORDINGS = tuple(f"beam_{trial}_V2_a.c3d" for trial in ("gravity", "load52", "load101"))
+RECORDINGS = tuple(
+    f"beam_{trial}_V2_a.c3d" for trial in ("gravity", "load52", "load101")
+)
 SIZE_M, ORIGIN_M = (0.10, 0.03, 0.03), (-0.10, 0.0, 0.0)
 MESHES = {"beam.vtu": (5, 2, 2), "beam_coarse.vtu": (3, 1, 1)}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--from", dest="source", type=Path, help="a folder that has the files")
+    parser.add_argument(
+        "--from", dest="source", type=Path, help="a folder that has the files"
+    )
     source = parser.parse_args().source
     for name, divisions in MESHES.items():
         box_mesh(SIZE_M, divisions, ORIGIN_M).write(FOLDER / name)

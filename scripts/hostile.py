@@ -53,7 +53,6 @@ import problem_files
 from studies import markdown
 
 from collocation_sysid import cli
-from collocation_sysid.cli import problem_commands, run_commands, stream_commands  # noqa: F401
 from collocation_sysid.fem.kernels import jit
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.recording import read_markers, read_poses
@@ -94,10 +93,19 @@ class Ended:
         if "Traceback (most recent call last)" in self.err:
             return "traceback"
         said = self.err.strip().splitlines()
-        if self.code == 2 and len(said) == 1 and is_clean and _is_printable(self.err):
+        if (
+            self.code == 2
+            and len(said) == 1
+            and is_clean
+            and _is_printable(self.err)
+        ):
             return "refused"
         both = self.err + self.out
-        return "accepted" if self.code in (0, 1) and _is_printable(both) else "unclear"
+        return (
+            "accepted"
+            if self.code in (0, 1) and _is_printable(both)
+            else "unclear"
+        )
 
 
 def _is_printable(text: str) -> bool:
@@ -153,7 +161,9 @@ def start(
     seconds = int(np.ceil(limit_s))
     resource_limits = {resource.RLIMIT_AS: MOST_MEMORY, resource.RLIMIT_CORE: 0}
     resource_limits[resource.RLIMIT_CPU] = seconds
-    _be_the_command([str(word) for word in words], folder, files, resource_limits, before)
+    _be_the_command(
+        [str(word) for word in words], folder, files, resource_limits, before
+    )
     raise AssertionError("the fork has ended")
 
 
@@ -181,9 +191,14 @@ def _be_the_command(
         os.chdir(folder)
         for number, stream in enumerate(files, 1):
             os.dup2(stream, number)
-        sys.stdout = io.TextIOWrapper(io.FileIO(1, "w", closefd=False), "utf-8", "surrogateescape")
+        sys.stdout = io.TextIOWrapper(
+            io.FileIO(1, "w", closefd=False), "utf-8", "surrogateescape"
+        )
         sys.stderr = io.TextIOWrapper(
-            io.FileIO(2, "w", closefd=False), "utf-8", "backslashreplace", line_buffering=True
+            io.FileIO(2, "w", closefd=False),
+            "utf-8",
+            "backslashreplace",
+            line_buffering=True,
         )
         for kind, most in limits.items():
             resource.setrlimit(kind, (most, most + 1))
@@ -193,7 +208,11 @@ def _be_the_command(
         cli.main()
         code = 0
     except SystemExit as ended:
-        code = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
+        code = (
+            ended.code
+            if isinstance(ended.code, int)
+            else int(ended.code is not None)
+        )
     except BaseException:
         traceback.print_exc()
     finally:
@@ -272,7 +291,11 @@ def _left_out(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
 
 def _repeated(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
     at = _place(rng, content)
-    return content[:at] + content[at : at + int(rng.integers(1, 200))] * 3 + content[at:]
+    return (
+        content[:at]
+        + content[at : at + int(rng.integers(1, 200))] * 3
+        + content[at:]
+    )
 
 
 def _zeros(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
@@ -282,7 +305,9 @@ def _zeros(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
 
 def _largest(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
     at, length = _place(rng, content), int(rng.choice([2, 4, 8]))
-    return content[:at] + b"\xff" * (length - 1) + b"\x7f" + content[at + length :]
+    return (
+        content[:at] + b"\xff" * (length - 1) + b"\x7f" + content[at + length :]
+    )
 
 
 def _put_in(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
@@ -293,14 +318,25 @@ def _put_in(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
     at = _place(rng, content)
     if rng.random() < 0.5:
         return content[:at] + word + content[at:]
-    parts = [k for k in range(len(content)) if content[k : k + 1] in b' ,"<>=\n[]']
+    parts = [
+        k for k in range(len(content)) if content[k : k + 1] in b' ,"<>=\n[]'
+    ]
     if len(parts) < 2:
         return content[:at] + word + content[at:]
     number = int(rng.integers(len(parts) - 1))
     return content[: parts[number] + 1] + word + content[parts[number + 1] :]
 
 
-DAMAGES = (_cut, _replaced, _left_out, _repeated, _zeros, _largest, _put_in, _put_in)
+DAMAGES = (
+    _cut,
+    _replaced,
+    _left_out,
+    _repeated,
+    _zeros,
+    _largest,
+    _put_in,
+    _put_in,
+)
 
 
 # Damaged files ------------------------------------------------------------------------------------
@@ -334,14 +370,22 @@ class FileKind:
 
     def run(self, cases: Cases) -> Counter[str]:
         """Count the outcomes; none where the package that reads the format is missing."""
-        base, counts = cases.folder / f"base_{self.name.replace(' ', '_')}", Counter[str]()
+        base, counts = (
+            cases.folder / f"base_{self.name.replace(' ', '_')}",
+            Counter[str](),
+        )
         shutil.copytree(cases.problem, base)
         in_fork(lambda: self.make(base))
         for words in self.commands:
             if (ended := run(words, base, cases.limit_s)).code not in (0, 1):
-                if "No module named" in ended.err or "not installed" in ended.err:
+                if (
+                    "No module named" in ended.err
+                    or "not installed" in ended.err
+                ):
                     return counts
-                raise RuntimeError(f"{self.name} is refused before it is damaged: {ended.err}")
+                raise RuntimeError(
+                    f"{self.name} is refused before it is damaged: {ended.err}"
+                )
         (file,) = base.glob(self.file)
         whole = file.read_bytes()
         for number in range(cases.count):
@@ -349,7 +393,11 @@ class FileKind:
             folder = cases.folder / "case"
             shutil.copytree(base, folder)
             as_a_whole = self.whole and rng.random() < 0.2
-            content = self.whole[rng.integers(len(self.whole))] if as_a_whole else None
+            content = (
+                self.whole[rng.integers(len(self.whole))]
+                if as_a_whole
+                else None
+            )
             target = folder / file.relative_to(base)
             target.write_bytes(content or damaged(rng, whole, self.words))
             before = problem_files.contents(folder)
@@ -388,8 +436,13 @@ def _with_bag(kind: str) -> Callable[[Path], object]:
     """State poses and tracks by topics of a log, called trial with the ending of its kind."""
 
     def make(folder: Path) -> None:
-        poses, table = read_poses(folder / POSES), read_markers(folder / MARKERS)
-        log = logs_small.bag(folder / "log", logs_small.recorded(poses, table, kind), kind)
+        poses, table = (
+            read_poses(folder / POSES),
+            read_markers(folder / MARKERS),
+        )
+        log = logs_small.bag(
+            folder / "log", logs_small.recorded(poses, table, kind), kind
+        )
         if log.is_dir():
             log = next(log.glob("*.db3"))
         place = folder / f"trial{log.suffix}"
@@ -405,13 +458,17 @@ def _with_dataset(folder: Path) -> None:
     """State the poses by joints of a dataset in Parquet and by a robot's description."""
     joints = {"turn": 20 * [0.0], "slide": 20 * [0.0]}
     logs_small.dataset(folder / "robot", joints, episodes=1)
-    at_rest = logs_small.URDF.replace("0 0 0.5", "0 0 0").replace("0.2 0 0", "0 0 0")
+    at_rest = logs_small.URDF.replace("0 0 0.5", "0 0 0").replace(
+        "0.2 0 0", "0 0 0"
+    )
     (folder / "arm.urdf").write_text(at_rest)
     address = "robot#observation.state#arm.urdf#rad#base>tool"
     _state(folder, POSES, address)
 
 
-def _with_depth(file: str, write: Callable[[Path], object]) -> Callable[[Path], object]:
+def _with_depth(
+    file: str, write: Callable[[Path], object]
+) -> Callable[[Path], object]:
     """Add a camera that sees a plane: three images or clouds in a folder, or an .npz."""
 
     def make(folder: Path) -> None:
@@ -426,7 +483,9 @@ def _with_depth(file: str, write: Callable[[Path], object]) -> Callable[[Path], 
                 shutil.copy(place, place.with_stem(str(number)))
         camera = "camera = { matrix = [[100, 0, 16], [0, 100, 12], [0, 0, 1]] }"
         with (folder / "problem.toml").open("a") as problem:
-            problem.write(f"\n[[experiment.depth]]\nsigma_m = 0.001\n{stated}{camera}\n")
+            problem.write(
+                f"\n[[experiment.depth]]\nsigma_m = 0.001\n{stated}{camera}\n"
+            )
 
     return make
 
@@ -438,7 +497,10 @@ CLOUD_M = np.random.default_rng(0).normal(0.0, 0.05, (50, 3))
 def _exr(file: Path) -> None:
     import OpenEXR  # pyright: ignore[reportMissingImports]
 
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+    }
     with OpenEXR.File(header, {"Z": DEPTH_M}) as image:
         image.write(str(file))
 
@@ -450,18 +512,24 @@ def _png(file: Path) -> None:
 
 
 def _npz(file: Path) -> None:
-    np.savez(file, depth_m=np.stack(3 * [DEPTH_M]), t_s=np.array([0.0, 0.04, 0.08]))
+    np.savez(
+        file, depth_m=np.stack(3 * [DEPTH_M]), t_s=np.array([0.0, 0.04, 0.08])
+    )
 
 
 def _pcd(file: Path) -> None:
     head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 50\nHEIGHT 1\nPOINTS 50\n"
-    file.write_bytes(f"{head}DATA binary\n".encode() + CLOUD_M.astype("<f4").tobytes())
+    file.write_bytes(
+        f"{head}DATA binary\n".encode() + CLOUD_M.astype("<f4").tobytes()
+    )
 
 
 def _laughs(root: str, inner: str) -> bytes:
     """An XML file of 3 kB that expands to 10⁹ words."""
     levels = "".join(
-        f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">\n' if k else '<!ENTITY a0 "word">\n'
+        f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">\n'
+        if k
+        else '<!ENTITY a0 "word">\n'
         for k in range(10)
     )
     head = f'<?xml version="1.0"?>\n<!DOCTYPE x [\n{levels}]>\n'
@@ -508,8 +576,25 @@ DEFINITIONS = (
     b"unknown_msgs/Thing[] things\n",
 )
 BOTH: tuple[tuple[str, ...], ...] = (("check", "problem.toml"),)
-TOML = (b"[[[[", b"]", b'"', b"'''", b"{", b"= nan", b"= -inf", b"[a.b]", b"[[experiment]]")
-TOML += (b'"\\u001b[2J"', b"\xff", b"_", b"1e400", b"true", b'"../../etc/passwd"')
+TOML = (
+    b"[[[[",
+    b"]",
+    b'"',
+    b"'''",
+    b"{",
+    b"= nan",
+    b"= -inf",
+    b"[a.b]",
+    b"[[experiment]]",
+)
+TOML += (
+    b'"\\u001b[2J"',
+    b"\xff",
+    b"_",
+    b"1e400",
+    b"true",
+    b'"../../etc/passwd"',
+)
 CSV = (
     b"\x00",
     b"1e308",
@@ -523,7 +608,17 @@ CSV = (
     b"=1+1",
     b"\xef\xbb\xbf",
 )
-XML = (b"&a9;", b"<!--", b"-->", b"]]>", b"<![CDATA[", b"<a>", b"</a>", b'"', *COUNTS)
+XML = (
+    b"&a9;",
+    b"<!--",
+    b"-->",
+    b"]]>",
+    b"<![CDATA[",
+    b"<a>",
+    b"</a>",
+    b'"',
+    *COUNTS,
+)
 
 
 def _log_commands(name: str) -> tuple[tuple[str, ...], ...]:
@@ -531,7 +626,9 @@ def _log_commands(name: str) -> tuple[tuple[str, ...], ...]:
 
 
 FILES = (
-    FileKind("problem file", lambda _: None, "problem.toml", words=(*TOML, *COUNTS)),
+    FileKind(
+        "problem file", lambda _: None, "problem.toml", words=(*TOML, *COUNTS)
+    ),
     FileKind("tracks, CSV", lambda _: None, MARKERS, words=(*CSV, *COUNTS)),
     FileKind("poses, CSV", lambda _: None, POSES, words=(*CSV, *COUNTS)),
     FileKind("mesh, VTU", lambda _: None, "body.vtu", words=XML),
@@ -541,9 +638,21 @@ FILES = (
         _with_bag("ros1"),
         "trial.bag",
         _log_commands("trial.bag"),
-        (*DEFINITIONS, *COUNTS, b"message_definition=", b"md5sum=*", b"op=\x07"),
+        (
+            *DEFINITIONS,
+            *COUNTS,
+            b"message_definition=",
+            b"md5sum=*",
+            b"op=\x07",
+        ),
     ),
-    FileKind("bag, SQLite", _with_bag("sqlite3"), "trial.db3", _log_commands("trial.db3"), COUNTS),
+    FileKind(
+        "bag, SQLite",
+        _with_bag("sqlite3"),
+        "trial.db3",
+        _log_commands("trial.db3"),
+        COUNTS,
+    ),
     FileKind(
         "log, MCAP",
         _with_bag("mcap file"),
@@ -566,9 +675,17 @@ FILES = (
         (b"{", b"[", b"null", b'"', b"NaN", b"1e999", b"[" * 5000, *COUNTS),
     ),
     FileKind("robot, URDF", _with_dataset, "arm.urdf", words=XML, whole=URDFS),
-    FileKind("depth, EXR", _with_depth("frames/0.exr", _exr), "frames/0.exr", words=COUNTS),
     FileKind(
-        "depth, PNG", _with_depth("frames/0.png", _png), "frames/0.png", words=(b"IHDR", b"IDAT")
+        "depth, EXR",
+        _with_depth("frames/0.exr", _exr),
+        "frames/0.exr",
+        words=COUNTS,
+    ),
+    FileKind(
+        "depth, PNG",
+        _with_depth("frames/0.png", _png),
+        "frames/0.png",
+        words=(b"IHDR", b"IDAT"),
     ),
     FileKind(
         "depth, NPZ",
@@ -617,16 +734,23 @@ class Cases:
         """Of a case; the same whichever others are run."""
         return np.random.default_rng([self.seed, number, *kind.encode()])
 
-    def keep(self, kind: str, number: int, folder: Path, outcome: str, ended: Ended) -> None:
+    def keep(
+        self, kind: str, number: int, folder: Path, outcome: str, ended: Ended
+    ) -> None:
         """Report a case that failed, and store what it read."""
         if outcome in ("refused", "accepted"):
             return
         said = (ended.err.strip().splitlines() or ["nothing said"])[-1]
-        print(f"{kind} {number}: {outcome}, code {ended.code}: {said[:300]}", file=sys.stderr)
+        print(
+            f"{kind} {number}: {outcome}, code {ended.code}: {said[:300]}",
+            file=sys.stderr,
+        )
         if self.kept is not None:
             place = self.kept / f"{kind.replace(' ', '_')}_{number}"
             shutil.copytree(folder, place, symlinks=True, dirs_exist_ok=True)
-            (place / "said.txt").write_text(ended.out + ended.err, encoding="utf-8")
+            (place / "said.txt").write_text(
+                ended.out + ended.err, encoding="utf-8"
+            )
 
 
 @dataclass(frozen=True)
@@ -658,8 +782,12 @@ class OtherKind:
             return counts
         for number in range(max(1, round(self.share * cases.count))):
             folder = cases.folder / "case"
-            shutil.copytree(cases.solved if self.solved else cases.problem, folder)
-            outcome, ended = self.case(cases.rng(self.name, number), folder, cases.limit_s)
+            shutil.copytree(
+                cases.solved if self.solved else cases.problem, folder
+            )
+            outcome, ended = self.case(
+                cases.rng(self.name, number), folder, cases.limit_s
+            )
             counts[outcome] += 1
             cases.keep(self.name, number, folder, outcome, ended)
             shutil.rmtree(folder)
@@ -681,7 +809,17 @@ NAMES = (
     "|",
     "[a](b:c)",
 )
-NAMES += ("\n", "\n\n## Verdict\n", "\x1b[2J", "\x00", "\x07", "\ufffe", "\u202e", "\\", "@DATA@")
+NAMES += (
+    "\n",
+    "\n\n## Verdict\n",
+    "\x1b[2J",
+    "\x00",
+    "\x07",
+    "\ufffe",
+    "\u202e",
+    "\\",
+    "@DATA@",
+)
 NAMES += (
     "{0}",
     "%s",
@@ -704,12 +842,22 @@ NAMES += (
 def _named(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
     """Write reports and exports of a run whose names could be taken for other things."""
     name = "".join(rng.choice(NAMES, rng.integers(1, 8)))
-    problem, result = folder / "run" / "problem.toml", folder / "run" / "result.json"
-    problem.write_text(problem.read_text().replace('"A tiny foam bar"', _quoted(name)))
+    problem, result = (
+        folder / "run" / "problem.toml",
+        folder / "run" / "result.json",
+    )
+    problem.write_text(
+        problem.read_text().replace('"A tiny foam bar"', _quoted(name))
+    )
     told = json.loads(result.read_text())
     result.write_text(json.dumps({**told, "title": name}))
-    commands = [("report", "run", "--to", f"out/report{end}") for end in (".md", ".html")]
-    commands += [("export", "run", "--to", to, "--out", f"out/{to}") for to in TARGETS]
+    commands = [
+        ("report", "run", "--to", f"out/report{end}")
+        for end in (".md", ".html")
+    ]
+    commands += [
+        ("export", "run", "--to", to, "--out", f"out/{to}") for to in TARGETS
+    ]
     commands.append(("view", "run", "--html", "out/view.html"))
     ended = run(commands[rng.integers(len(commands))], folder, limit_s)
     outcome = ended.outcome()
@@ -723,7 +871,9 @@ def _named(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
 def _quoted(text: str) -> str:
     """Text as a string of TOML."""
     return (
-        json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f").replace("\x85", "\\u0085")
+        json.dumps(text, ensure_ascii=False)
+        .replace("\x7f", "\\u007f")
+        .replace("\x85", "\\u0085")
     )
 
 
@@ -794,17 +944,21 @@ def _full(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
     words = list(WRITING[rng.integers(len(WRITING))])
     (folder / "out").mkdir()
     if "run" in words:  # on a disk without more room
-        size = sum(f.stat().st_size + 4096 for f in (folder / "run").rglob("*") if f.is_file())
-        size += int(rng.integers(4, 60)) * 1024
-        prepared = (
-            'cp -r run out && cd out && cp ../*.csv ../*.toml ../*.vtu . 2>/dev/null; exec "$@"'
+        size = sum(
+            f.stat().st_size + 4096
+            for f in (folder / "run").rglob("*")
+            if f.is_file()
         )
+        size += int(rng.integers(4, 60)) * 1024
+        prepared = 'cp -r run out && cd out && cp ../*.csv ../*.toml ../*.vtu . 2>/dev/null; exec "$@"'
         size += sum(f.stat().st_size + 4096 for f in folder.glob("*.*"))
     else:
         size, prepared = int(rng.integers(4, 400)) * 1024, 'exec "$@"'
     mounted = f"mount -t tmpfs -o size={size} tmpfs out && {prepared}"
     program = [sys.executable, "-c", PROGRAM, *words]
-    ended = _ended(["unshare", "-m", "sh", "-c", mounted, "sh", *program], folder, limit_s)
+    ended = _ended(
+        ["unshare", "-m", "sh", "-c", mounted, "sh", *program], folder, limit_s
+    )
     return ended.outcome(), ended
 
 
@@ -823,13 +977,22 @@ def _ended(words: Sequence[str], folder: Path, limit_s: float) -> Ended:
     except subprocess.TimeoutExpired:
         os.killpg(done.pid, signal.SIGKILL)
         out, err = done.communicate()
-        return Ended(None, out.decode("utf-8", "replace"), err.decode("utf-8", "replace"))
-    return Ended(done.returncode, out.decode("utf-8", "replace"), err.decode("utf-8", "replace"))
+        return Ended(
+            None, out.decode("utf-8", "replace"), err.decode("utf-8", "replace")
+        )
+    return Ended(
+        done.returncode,
+        out.decode("utf-8", "replace"),
+        err.decode("utf-8", "replace"),
+    )
 
 
 def _kernels(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
     """Solve with compiled kernels that were damaged, exchanged, linked or made by another user."""
-    cache, words = folder / "cache", ("solve", "problem.toml", *REDUCED, "-q", "--out", "out")
+    cache, words = (
+        folder / "cache",
+        ("solve", "problem.toml", *REDUCED, "-q", "--out", "out"),
+    )
 
     def with_cache() -> None:
         os.environ["COLLOCATION_SYSID_CACHE"] = str(cache)
@@ -860,14 +1023,18 @@ def _two_solves(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
     words = ("solve", "problem.toml", *REDUCED, "-q", "--out", "out")
     first = start(words, folder, limit_s)
     time.sleep(float(rng.exponential(0.3)))
-    both = [start(words, folder, limit_s).finish(limit_s), first.finish(limit_s)]
+    both = [
+        start(words, folder, limit_s).finish(limit_s),
+        first.finish(limit_s),
+    ]
     outcomes = [each.outcome() for each in both]
     worst = max(range(2), key=lambda k: OUTCOMES.index(outcomes[k]))
     shown = run(("report", "out"), folder, limit_s)
     whole = shown.code == 0 and not list(folder.glob(".*.partial*"))
     if outcomes[worst] in ("refused", "accepted") and not whole:
         return "unclear", replace(
-            both[worst], err=f"{[p.name for p in folder.glob('.*.partial*')]} {shown.err}"
+            both[worst],
+            err=f"{[p.name for p in folder.glob('.*.partial*')]} {shown.err}",
         )
     return outcomes[worst], both[worst]
 
@@ -887,7 +1054,16 @@ JSON = (
     b"[" * 2000,
     b'"\\u001b[2J"',
 )
-JSON += (b'"\\ud800"', b"\xff", b"\x00", b'"t_s"', b'"markers"', b"true", b"9" * 5000, b"\x1b[2J")
+JSON += (
+    b'"\\ud800"',
+    b"\xff",
+    b"\x00",
+    b'"t_s"',
+    b'"markers"',
+    b"true",
+    b"9" * 5000,
+    b"\x1b[2J",
+)
 
 
 def _datagrams(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
@@ -895,7 +1071,9 @@ def _datagrams(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
     running = start(("live", "problem.toml", "--udp", "0"), folder, limit_s)
     until = time.monotonic() + WAITING * limit_s
     while "port " not in running.said(running.err) and time.monotonic() < until:
-        if os.waitid(os.P_PID, running.process, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+        if os.waitid(
+            os.P_PID, running.process, os.WEXITED | os.WNOHANG | os.WNOWAIT
+        ):
             break
         time.sleep(0.02)
     _, found, rest = running.said(running.err).partition("port ")
@@ -910,7 +1088,9 @@ def _datagrams(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
         for _ in range(100):  # one may be lost
             sender.sendto(b"", address)
             time.sleep(0.05)
-            if os.waitid(os.P_PID, running.process, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+            if os.waitid(
+                os.P_PID, running.process, os.WEXITED | os.WNOHANG | os.WNOWAIT
+            ):
                 break
     ended = running.finish(limit_s)
     _, *errors = ended.err.splitlines() or [""]
@@ -920,7 +1100,9 @@ def _datagrams(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
     return ended.outcome(), ended
 
 
-SCRIPT = "import sys\nfrom collocation_sysid.cli import main\nsys.exit(main())\n"
+SCRIPT = (
+    "import sys\nfrom collocation_sysid.cli import main\nsys.exit(main())\n"
+)
 # From the start of Python to some time behind the end of the small problem's solve [s].
 INTERRUPTED_WITHIN_S = 8.0
 
@@ -929,9 +1111,20 @@ def _interrupted(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
     """Interrupt a solve, once or twice; it ends with 130, and nothing or a whole run is left."""
     script = folder / "collocation-sysid"
     script.write_text(SCRIPT)
-    words = [sys.executable, str(script), "solve", "problem.toml", *REDUCED, "--out", "out"]
+    words = [
+        sys.executable,
+        str(script),
+        "solve",
+        "problem.toml",
+        *REDUCED,
+        "--out",
+        "out",
+    ]
     signals = [
-        int(each) for each in rng.choice([signal.SIGINT, signal.SIGTERM], rng.integers(1, 3))
+        int(each)
+        for each in rng.choice(
+            [signal.SIGINT, signal.SIGTERM], rng.integers(1, 3)
+        )
     ]
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         running = Running(0, out, err)
@@ -949,41 +1142,74 @@ def _interrupted(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
             code = process.wait() and None
         ended = Ended(code, running.said(out), running.said(err))
     outcome = ended.outcome()
-    if outcome == "crash" and -(code or 0) in signals:  # before there was anything to keep
+    if (
+        outcome == "crash" and -(code or 0) in signals
+    ):  # before there was anything to keep
         outcome = "refused"
     if outcome == "unclear" and code == 130:
         outcome = "refused"
-    whole = not (folder / "out").exists() or (folder / "out" / "result.json").is_file()
-    if outcome in ("refused", "accepted") and not (whole and not list(folder.glob(".out.*"))):
+    whole = (
+        not (folder / "out").exists()
+        or (folder / "out" / "result.json").is_file()
+    )
+    if outcome in ("refused", "accepted") and not (
+        whole and not list(folder.glob(".out.*"))
+    ):
         outcome = "unclear"
     return outcome, ended
 
 
 OTHERS = (
     OtherKind("names in outputs", _named, solved=True),
-    OtherKind("read-only folder", _read_only, share=0.5, needs_root=True, solved=True),
+    OtherKind(
+        "read-only folder", _read_only, share=0.5, needs_root=True, solved=True
+    ),
     OtherKind("full disk", _full, share=0.2, needs_root=True, solved=True),
     OtherKind("compiled kernels", _kernels, share=0.2, needs_root=True),
     OtherKind("two solves, one output", _two_solves, share=0.2),
     OtherKind("UDP frames", _datagrams, share=0.5),
     OtherKind("interrupts", _interrupted, share=0.4),
 )
-KINDS: dict[str, FileKind | OtherKind] = {each.name: each for each in (*FILES, *OTHERS)}
+KINDS: dict[str, FileKind | OtherKind] = {
+    each.name: each for each in (*FILES, *OTHERS)
+}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n\n")[0])
-    parser.add_argument("--count", type=int, default=100, help="cases of a kind")
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").partition("\n\n")[0]
+    )
+    parser.add_argument(
+        "--count", type=int, default=100, help="cases of a kind"
+    )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", nargs="*", choices=list(KINDS), default=list(KINDS))
-    parser.add_argument("--limit-s", type=float, default=30.0, help="longer is a hang")
-    parser.add_argument("--keep", type=Path, help="store the input of failures in this folder")
+    parser.add_argument(
+        "--only", nargs="*", choices=list(KINDS), default=list(KINDS)
+    )
+    parser.add_argument(
+        "--limit-s", type=float, default=30.0, help="longer is a hang"
+    )
+    parser.add_argument(
+        "--keep", type=Path, help="store the input of failures in this folder"
+    )
     arguments = parser.parse_args()
-    print(table(arguments.count, arguments.seed, arguments.only, arguments.limit_s, arguments.keep))
+    print(
+        table(
+            arguments.count,
+            arguments.seed,
+            arguments.only,
+            arguments.limit_s,
+            arguments.keep,
+        )
+    )
 
 
 def table(
-    count: int, seed: int, only: Sequence[str], limit_s: float, kept: Path | None = None
+    count: int,
+    seed: int,
+    only: Sequence[str],
+    limit_s: float,
+    kept: Path | None = None,
 ) -> str:
     """Run the cases; a row of counts for each kind."""
     rows = []
@@ -997,7 +1223,9 @@ def table(
         if any(KINDS[name] in OTHERS for name in only):
             words = ("solve", "problem.toml", *REDUCED, "-q", "--out", "run")
             if (ended := run(words, solved, 10 * limit_s)).code not in (0, 1):
-                raise RuntimeError(f"the small problem is not solved: {ended.err}")
+                raise RuntimeError(
+                    f"the small problem is not solved: {ended.err}"
+                )
         run_record._write_pictures = lambda *_: None
         cases = Cases(folder, problem, solved, count, seed, limit_s, kept)
         for name in only:

@@ -23,8 +23,14 @@ def lowest(requirements: list[str]) -> list[str]:
 def of_project() -> list[str]:
     """Of the package and its extras, but for what they ask of each other and on some machines."""
     project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
-    extras = [each for extra in project["optional-dependencies"].values() for each in extra]
-    stated = [e for e in extras if ";" not in e and not e.startswith(project["name"])]
+    extras = [
+        each
+        for extra in project["optional-dependencies"].values()
+        for each in extra
+    ]
+    stated = [
+        e for e in extras if ";" not in e and not e.startswith(project["name"])
+    ]
     return lowest([*project["dependencies"], *stated])
 
 

@@ -14,7 +14,12 @@ from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.recording import write_markers_csv
 
 FOLDER = Path(__file__).parents[1] / "problems" / "foam_cylinder"
-TRUTH = {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5}
+TRUTH = {
+    "lambda_pa": 800.0,
+    "mu_pa": 600.0,
+    "gamma_r_s": 0.006,
+    "gamma_m_1_s": 1.5,
+}
 NOISE_M = 0.0005
 SWING = Swing(
     duration_s=0.4,
@@ -31,7 +36,9 @@ def main() -> None:
     cylinder_mesh(radius_m=0.03, height_m=0.16, rings=1, layers=11).write(
         FOLDER / "foam_cylinder.vtu"
     )
-    experiment = unmeasured(FOLDER / "problem.toml", "swing_poses.csv", SWING.poses(POSE_STEP_S))
+    experiment = unmeasured(
+        FOLDER / "problem.toml", "swing_poses.csv", SWING.poses(POSE_STEP_S)
+    )
     tracks = measure(experiment, SWING.poses(FINE_S), TRUTH, NOISE_M, seed=1)
     frames = slice(None, None, round(STEP_S / POSE_STEP_S))
     write_markers_csv(

@@ -54,7 +54,9 @@ def main() -> None:
     for old in FOLDER.glob("setting_*.csv"):
         old.unlink()
     write_poses_csv(FOLDER / "setting_poses.csv", lowered(grid(STEP_S)))
-    (experiment,) = Problem.read(FOLDER / "problem.toml", simulation=True).experiments
+    (experiment,) = Problem.read(
+        FOLDER / "problem.toml", simulation=True
+    ).experiments
     gripper, plate = experiment.grasps
     assert plate.wrench is not None
     times = grid(PLATE_S)
@@ -65,8 +67,12 @@ def main() -> None:
     rng = np.random.default_rng(1)
     tracks = found.markers_m + NOISE_M * rng.normal(size=found.markers_m.shape)
     names = experiment.markers.names
-    write_markers_csv(FOLDER / "setting_markers.csv", experiment.t_s, names, tracks)
-    forces = found.wrenches[0][:, :3] + NOISE_N * rng.normal(size=(len(times), 3))
+    write_markers_csv(
+        FOLDER / "setting_markers.csv", experiment.t_s, names, tracks
+    )
+    forces = found.wrenches[0][:, :3] + NOISE_N * rng.normal(
+        size=(len(times), 3)
+    )
     known = np.isfinite(forces).all(axis=1)
     write_wrench_csv(FOLDER / "setting_plate.csv", times[known], forces[known])
 

@@ -15,10 +15,19 @@ from scipy.spatial.transform import Rotation
 from synthetic import Swing, exchanged, measure, occluded, unmeasured
 
 from collocation_sysid.fem.structured import cylinder_mesh
-from collocation_sysid.recording import Experiment, place_markers, write_markers_csv
+from collocation_sysid.recording import (
+    Experiment,
+    place_markers,
+    write_markers_csv,
+)
 
 FOLDER = Path(__file__).parents[1] / "problems" / "noisy_cylinder"
-TRUTH = {"lambda_pa": 2500.0, "mu_pa": 1500.0, "gamma_r_s": 0.005, "gamma_m_1_s": 1.5}
+TRUTH = {
+    "lambda_pa": 2500.0,
+    "mu_pa": 1500.0,
+    "gamma_r_s": 0.005,
+    "gamma_m_1_s": 1.5,
+}
 NOISE_M = 0.001
 SWING = Swing(
     duration_s=0.8,
@@ -26,13 +35,19 @@ SWING = Swing(
     amplitude_rad=(0.25, 0.05, 0.05),
     frequency_hz=(5.0, 1.6, 2.0),
     rise_s=0.1,
-    start=Rotation.from_rotvec([0, np.pi / 2, 0]),  # held level, the mesh's x pointing down
+    start=Rotation.from_rotvec(
+        [0, np.pi / 2, 0]
+    ),  # held level, the mesh's x pointing down
 )
 # Cameras at 100 Hz; the robot logs its poses at 200 Hz.
 STEP_S, POSE_STEP_S, FINE_S = 0.01, 0.005, 0.001
 MISPLACED, GLUED_M = "tip_2", (0.006, 0.02598, 0.155)
 SWAPS = (("low_1", "mid_1", slice(25, 33)), ("tip_1", "tip_3", slice(48, 60)))
-OCCLUSIONS = (("mid_2", slice(10, 24)), ("low_3", slice(40, 50)), ("tip_1", slice(64, 81)))
+OCCLUSIONS = (
+    ("mid_2", slice(10, 24)),
+    ("low_3", slice(40, 50)),
+    ("tip_1", slice(64, 81)),
+)
 LOST_SHARE = 0.03
 
 
@@ -40,16 +55,24 @@ def main() -> None:
     cylinder_mesh(radius_m=0.03, height_m=0.16, rings=1, layers=3).write(
         FOLDER / "noisy_cylinder.vtu"
     )
-    experiment = unmeasured(FOLDER / "problem.toml", "swing_poses.csv", SWING.poses(POSE_STEP_S))
+    experiment = unmeasured(
+        FOLDER / "problem.toml", "swing_poses.csv", SWING.poses(POSE_STEP_S)
+    )
     names = experiment.markers.names
-    simulated = measure(as_glued(experiment), SWING.poses(FINE_S), TRUTH, NOISE_M, seed=1)
+    simulated = measure(
+        as_glued(experiment), SWING.poses(FINE_S), TRUTH, NOISE_M, seed=1
+    )
     frames = slice(None, None, round(STEP_S / POSE_STEP_S))
     tracks = simulated[frames]
     for first, second, when in SWAPS:
-        tracks = exchanged(tracks, (names.index(first), names.index(second)), when)
+        tracks = exchanged(
+            tracks, (names.index(first), names.index(second)), when
+        )
     blocks = [(names.index(name), when) for name, when in OCCLUSIONS]
     tracks = occluded(tracks, blocks, LOST_SHARE, seed=2)
-    write_markers_csv(FOLDER / "swing_markers.csv", experiment.t_s[frames], names, tracks)
+    write_markers_csv(
+        FOLDER / "swing_markers.csv", experiment.t_s[frames], names, tracks
+    )
 
 
 def as_glued(experiment: Experiment) -> Experiment:

@@ -48,11 +48,16 @@ def forces_n(experiment: Experiment, depths_m: np.ndarray) -> np.ndarray:
     """What the whole ball is pushed back with, exactly, at depths that follow one another."""
     t_s = np.arange(len(depths_m), dtype=float)
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
-    down = PoseSequence(t_s, np.outer(depths_m, [0.0, 0.0, -1.0]), upright, "linear")
+    down = PoseSequence(
+        t_s, np.outer(depths_m, [0.0, 0.0, -1.0]), upright, "linear"
+    )
     *held, tip = experiment.grasps
     read = Wrench(t_s, np.zeros((len(t_s), 3)), NOISE_N)
     poked = replace(
-        experiment, t_s=t_s, grasps=[*held, replace(tip, poses=down, wrench=read)], markers=None
+        experiment,
+        t_s=t_s,
+        grasps=[*held, replace(tip, poses=down, wrench=read)],
+        markers=None,
     )
     return -QUARTERS * simulate(poked, TRUTH).wrenches[0][:, 2]
 
@@ -61,13 +66,16 @@ def measured_n(experiment: Experiment, seed: int) -> Iterator[np.ndarray]:
     """Forces at each place, whose surface is by chance a bit higher or lower."""
     rng = np.random.default_rng(seed)
     for onset_m in ONSET_M * rng.normal(size=PLACES):
-        yield forces_n(experiment, DEPTHS_M - onset_m) + NOISE_N * rng.normal(size=len(DEPTHS_M))
+        yield forces_n(experiment, DEPTHS_M - onset_m) + NOISE_N * rng.normal(
+            size=len(DEPTHS_M)
+        )
 
 
 def write(place: int, force_n: np.ndarray) -> None:
     """The table of a test bench."""
     rows = [
-        f"{t},{1e3 * d:.3f},{f:.5f}" for t, (d, f) in enumerate(zip(DEPTHS_M, force_n, strict=True))
+        f"{t},{1e3 * d:.3f},{f:.5f}"
+        for t, (d, f) in enumerate(zip(DEPTHS_M, force_n, strict=True))
     ]
     table = "\n".join(["Time (s),Displacement (mm),Force (N)", *rows, ""])
     write_text_file(FOLDER / f"place_{place:02d}.csv", table)
@@ -77,7 +85,9 @@ def main() -> None:
     quarter().write(FOLDER / "quarter.vtu")
     for place in range(1, PLACES + 1):
         write(place, np.zeros(len(DEPTHS_M)))
-    experiment = Problem.read(FOLDER / "problem.toml", simulation=True).experiments[0]
+    experiment = Problem.read(
+        FOLDER / "problem.toml", simulation=True
+    ).experiments[0]
     for place, force_n in enumerate(measured_n(experiment, seed=1), 1):
         write(place, force_n)
 

@@ -28,7 +28,12 @@ from collocation_sysid.recording import (
 )
 
 YOUNG_PA = 8e4
-SWUNG = {"young_pa": 8000.0, "poisson": 0.3, "gamma_r_s": 0.005, "gamma_m_1_s": 1.0}
+SWUNG = {
+    "young_pa": 8000.0,
+    "poisson": 0.3,
+    "gamma_r_s": 0.005,
+    "gamma_m_1_s": 1.0,
+}
 # Seeds of the noise. With 1, the swing has a rare draw, 2.6 standard deviations off: of ten others
 # the standardised errors have a root mean square of 0.85 to 1.1, and the headline intervals contain
 # the truth. The example for new users is one of the ten, with the verdict "good".
@@ -46,15 +51,25 @@ def swing(folder: Path) -> None:
         np.sin(11 * t_s) ** 2, [0, 1, 0]
     )
     poses = PoseSequence(t_s, shift_m, np.tile(hanging, (len(t_s), 1)))
-    places_m = np.array([[25, 0, 60], [0, 25, 105], [25, 0, 150], [-25, 0, 150]]) / 1000
+    places_m = (
+        np.array([[25, 0, 60], [0, 25, 105], [25, 0, 150], [-25, 0, 150]])
+        / 1000
+    )
     markers = Markers(t_s, np.zeros((len(t_s), 4, 3)), 1e-3, places_m=places_m)
     grasp = Grasp(Box((-1, -1, -1e-3), (1, 1, 1e-3)), poses)
     swung = Experiment(body, t_s, [grasp], markers, air_density_kg_m3="none")
     tracks_m = simulate(swung, SWUNG).markers_m
-    tracks_m = tracks_m + np.random.default_rng(SWING_SEED).normal(scale=1e-3, size=tracks_m.shape)
+    tracks_m = tracks_m + np.random.default_rng(SWING_SEED).normal(
+        scale=1e-3, size=tracks_m.shape
+    )
     mesh.write(folder / "body.vtu")
     write_poses_csv(folder / "poses.csv", poses)
-    write_markers_csv(folder / "markers.csv", t_s, ["low", "middle", "end_1", "end_2"], tracks_m)
+    write_markers_csv(
+        folder / "markers.csv",
+        t_s,
+        ["low", "middle", "end_1", "end_2"],
+        tracks_m,
+    )
 
 
 def compression(folder: Path) -> None:
@@ -69,10 +84,24 @@ def tension(folder: Path) -> None:
     t_s = np.arange(0.0, 60.5, 0.5)
     names = "Time (s),Strain (%),Stress (kPa)"
     area_m2 = 2.56e-4
-    benched(folder, names, t_s, 0.5 * t_s, noise=0.02e-3 / area_m2, scale=4e-3 / area_m2)
+    benched(
+        folder,
+        names,
+        t_s,
+        0.5 * t_s,
+        noise=0.02e-3 / area_m2,
+        scale=4e-3 / area_m2,
+    )
 
 
-def benched(folder: Path, names: str, t_s: Array, moved: Array, noise: float, scale: float) -> None:
+def benched(
+    folder: Path,
+    names: str,
+    t_s: Array,
+    moved: Array,
+    noise: float,
+    scale: float,
+) -> None:
     """The table of a test bench: what the crosshead does, and what the model answers to it.
 
     The reaction of the part that is modelled is multiplied by `scale`.
@@ -80,7 +109,10 @@ def benched(folder: Path, names: str, t_s: Array, moved: Array, noise: float, sc
     file = folder / "run_1.csv"
 
     def write(measured: Array) -> None:
-        rows = [f"{t:.1f},{m:.4f},{f:.4f}" for t, m, f in zip(t_s, moved, measured, strict=True)]
+        rows = [
+            f"{t:.1f},{m:.4f},{f:.4f}"
+            for t, m, f in zip(t_s, moved, measured, strict=True)
+        ]
         write_text_file(file, "\n".join([names, *rows, ""]))
 
     write(np.zeros(len(t_s)))

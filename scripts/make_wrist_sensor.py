@@ -16,7 +16,12 @@ from synthetic import Swing
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.recording import Grasp, write_markers_csv, write_poses_csv, write_wrench_csv
+from collocation_sysid.recording import (
+    Grasp,
+    write_markers_csv,
+    write_poses_csv,
+    write_wrench_csv,
+)
 
 FOLDER = Path(__file__).parents[1] / "problems" / "wrist_sensor"
 TRUTH = {
@@ -44,14 +49,21 @@ def main() -> None:
     for old in FOLDER.glob("swing_*.csv"):
         old.unlink()
     write_poses_csv(FOLDER / "swing_poses.csv", SWING.poses(POSE_STEP_S))
-    (experiment,) = Problem.read(FOLDER / "problem.toml", simulation=True).experiments
+    (experiment,) = Problem.read(
+        FOLDER / "problem.toml", simulation=True
+    ).experiments
     (grasp,) = experiment.grasps
     times = SENSOR_S * np.arange(round(SWING.duration_s / SENSOR_S) + 1)
     assert grasp.wrench is not None
     sensor = replace(grasp.wrench, t_s=times, values=np.zeros((len(times), 6)))
     moved = Grasp(grasp.nodes, SWING.poses(FINE_S), wrench=sensor)
-    found = simulate(replace(experiment, grasps=[moved]), TRUTH, timestep_s=FINE_S)
-    rng, frames = np.random.default_rng(1), slice(None, None, round(STEP_S / POSE_STEP_S))
+    found = simulate(
+        replace(experiment, grasps=[moved]), TRUTH, timestep_s=FINE_S
+    )
+    rng, frames = (
+        np.random.default_rng(1),
+        slice(None, None, round(STEP_S / POSE_STEP_S)),
+    )
     tracks = found.markers_m[frames]
     tracks = tracks + NOISE_M * rng.normal(size=tracks.shape)
     names, t_s = experiment.markers.names, experiment.t_s[frames]

@@ -52,7 +52,12 @@ COMPARED = {
     ast.In: ast.NotIn,
     ast.NotIn: ast.In,
 }
-OPERATED = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult}
+OPERATED = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+}
 JOINED = {ast.And: ast.Or, ast.Or: ast.And}
 
 
@@ -75,8 +80,15 @@ class Mutant:
     def applied(self, source: str) -> str:
         """The file with the change in it."""
         lines = source.encode().splitlines(keepends=True)
-        head = b"".join([*lines[: self.line - 1], lines[self.line - 1][: self.column]])
-        tail = b"".join([lines[self.end_line - 1][self.end_column :], *lines[self.end_line :]])
+        head = b"".join(
+            [*lines[: self.line - 1], lines[self.line - 1][: self.column]]
+        )
+        tail = b"".join(
+            [
+                lines[self.end_line - 1][self.end_column :],
+                *lines[self.end_line :],
+            ]
+        )
         return (head + self.after.encode() + tail).decode()
 
     def __str__(self) -> str:
@@ -86,7 +98,9 @@ class Mutant:
 def changed(node: ast.expr) -> ast.expr | None:
     """What stands in an expression's place, or None where nothing is changed."""
     match node:
-        case ast.Compare(left, [operator, *more], right) if type(operator) in COMPARED:
+        case ast.Compare(left, [operator, *more], right) if (
+            type(operator) in COMPARED
+        ):
             return ast.Compare(left, [COMPARED[type(operator)](), *more], right)
         case ast.BinOp(left, operator, right) if type(operator) in OPERATED:
             return ast.BinOp(left, OPERATED[type(operator)](), right)
@@ -101,17 +115,27 @@ def changed(node: ast.expr) -> ast.expr | None:
     return None
 
 
-def evaluated(node: ast.AST, function: int = 0) -> Iterator[tuple[ast.expr, int]]:
+def evaluated(
+    node: ast.AST, function: int = 0
+) -> Iterator[tuple[ast.expr, int]]:
     """Expressions that are run, with their function: no annotations, no texts of errors."""
     skipped: tuple[ast.AST, ...] = ()
     match node:
         case ast.FunctionDef():
             # Where its code begins, as the interpreter sees it.
-            function = min([node.lineno, *(each.lineno for each in node.decorator_list)])
+            function = min(
+                [node.lineno, *(each.lineno for each in node.decorator_list)]
+            )
             arguments = node.args
-            every = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
+            every = [
+                *arguments.posonlyargs,
+                *arguments.args,
+                *arguments.kwonlyargs,
+            ]
             skipped = (*node.decorator_list, *filter(None, [node.returns]))
-            skipped += tuple(each.annotation for each in every if each.annotation)
+            skipped += tuple(
+                each.annotation for each in every if each.annotation
+            )
         case ast.AnnAssign():
             skipped = (node.annotation,)
         case ast.JoinedStr() | ast.Raise() | ast.Import() | ast.ImportFrom():
@@ -130,13 +154,30 @@ def mutants_of(path: Path, root: Path) -> list[Mutant]:
     made = []
     for node, function in evaluated(tree):
         other = changed(node)
-        if other is None or node.end_lineno is None or node.end_col_offset is None:
+        if (
+            other is None
+            or node.end_lineno is None
+            or node.end_col_offset is None
+        ):
             continue
         after = ast.unparse(other)
         if isinstance(node, ast.UnaryOp):
             after = f"({after})"
-        ends = node.lineno, node.col_offset, node.end_lineno, node.end_col_offset
-        made.append(Mutant(str(path.relative_to(root)), *ends, ast.unparse(node), after, function))
+        ends = (
+            node.lineno,
+            node.col_offset,
+            node.end_lineno,
+            node.end_col_offset,
+        )
+        made.append(
+            Mutant(
+                str(path.relative_to(root)),
+                *ends,
+                ast.unparse(node),
+                after,
+                function,
+            )
+        )
     return made
 
 
@@ -165,8 +206,14 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     for file, line in seen:
         inside = Path(file).resolve()
         if inside.is_relative_to(Path.cwd()):
-            functions.setdefault(str(inside.relative_to(Path.cwd())), []).append(line)
-    row = {"test": item.nodeid, "s": time.perf_counter() - start, "ran": functions}
+            functions.setdefault(
+                str(inside.relative_to(Path.cwd())), []
+            ).append(line)
+    row = {
+        "test": item.nodeid,
+        "s": time.perf_counter() - start,
+        "ran": functions,
+    }
     with Path(os.environ["MUTANTS_RAN"]).open("a", encoding="utf-8") as file:
         file.write(json.dumps(row) + "\n")
 
@@ -182,19 +229,28 @@ class Ran:
     def reaches(self, mutant: Mutant) -> bool:
         """Whether it ran the mutant's function, or anything in its file if that has none."""
         functions = self.ran.get(mutant.path, ())
-        return mutant.function in functions if mutant.function else bool(functions)
+        return (
+            mutant.function in functions if mutant.function else bool(functions)
+        )
 
 
 def importers(path: str, tree: Path) -> set[str]:
     """Files of the package that import a file by its name."""
     wanted = re.compile(
-        rf"^\s*from .*\b{Path(path).stem} import |import .*\b{Path(path).stem}\b", re.M
+        rf"^\s*from .*\b{Path(path).stem} import |import .*\b{Path(path).stem}\b",
+        re.M,
     )
     files = (tree / PACKAGE).rglob("*.py")
-    return {str(each.relative_to(tree)) for each in files if wanted.search(each.read_text("utf-8"))}
+    return {
+        str(each.relative_to(tree))
+        for each in files
+        if wanted.search(each.read_text("utf-8"))
+    }
 
 
-def tests_against(mutant: Mutant, table: list[Ran], tree: Path, budget_s: float) -> list[Ran]:
+def tests_against(
+    mutant: Mutant, table: list[Ran], tree: Path, budget_s: float
+) -> list[Ran]:
     """The quickest tests that reach it, as many as the budget holds and at least one.
 
     Of what runs on import only, or once for all tests, they are those of the files that import it.
@@ -208,7 +264,9 @@ def tests_against(mutant: Mutant, table: list[Ran], tree: Path, budget_s: float)
         if chosen and sum(one.s for one in chosen) + each.s > budget_s:
             break
         chosen.append(each)
-    return sorted(chosen, key=lambda each: each.test)  # a module's fixtures are made once
+    return sorted(
+        chosen, key=lambda each: each.test
+    )  # a module's fixtures are made once
 
 
 # In a copy of the tree ----------------------------------------------------------------------------
@@ -241,11 +299,24 @@ def run_pytest(
         "OMP_NUM_THREADS": "1",
         "MUTANTS_RAN": str(OUT / "ran.jsonl"),
     }
-    quiet = ["-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--no-header", "--tb=no"]
+    quiet = [
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:xdist",
+        "--no-header",
+        "--tb=no",
+    ]
     command = [sys.executable, "-m", "pytest", *quiet, *arguments]
     with (OUT / "pytest.log").open("w") as log:
         process = subprocess.Popen(
-            command, cwd=tree, env=environment, stdout=log, stderr=log, start_new_session=True
+            command,
+            cwd=tree,
+            env=environment,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
         )
         try:
             return process.wait(timeout_s)
@@ -255,7 +326,9 @@ def run_pytest(
             return None
 
 
-def try_mutant(mutant: Mutant, tree: Path, table: list[Ran], budget_s: float) -> str:
+def try_mutant(
+    mutant: Mutant, tree: Path, table: list[Ran], budget_s: float
+) -> str:
     """Return "killed", "timeout", "survived", or "no test" if none runs it."""
     against = tests_against(mutant, table, tree, budget_s)
     if not against:
@@ -267,7 +340,9 @@ def try_mutant(mutant: Mutant, tree: Path, table: list[Ran], budget_s: float) ->
     cache = OUT / "spoiled" if kernels else OUT / "kernels"
     shutil.rmtree(OUT / "spoiled", ignore_errors=True)
     chosen = OUT / "chosen.txt"
-    chosen.write_text("\n".join(each.test for each in against), encoding="utf-8")
+    chosen.write_text(
+        "\n".join(each.test for each in against), encoding="utf-8"
+    )
     limit_s = 60 + (20 if kernels else 5) * sum(each.s for each in against)
     try:
         _put(file, mutant.applied(source))
@@ -299,17 +374,37 @@ def record_what_tests_run(tree: Path, ran: Path, tests: list[str]) -> None:
 
 
 def read_rows(path: Path) -> list[dict]:
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return [
+        json.loads(line)
+        for line in path.read_text(encoding="utf-8").splitlines()
+    ]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--count", type=int, default=100, help="how many mutants (default: 100)")
-    parser.add_argument("--seed", type=int, default=1, help="which of them (default: 1)")
-    parser.add_argument("--under", nargs="*", default=[""], help="folders or files of the package")
-    parser.add_argument("--tests", nargs="*", default=[], help="test files, of all")
-    parser.add_argument("--budget", type=float, default=20.0, help="seconds of tests a mutant")
-    parser.add_argument("--ran", type=Path, default=OUT / "tests.jsonl", help="what tests run")
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument(
+        "--count", type=int, default=100, help="how many mutants (default: 100)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=1, help="which of them (default: 1)"
+    )
+    parser.add_argument(
+        "--under",
+        nargs="*",
+        default=[""],
+        help="folders or files of the package",
+    )
+    parser.add_argument(
+        "--tests", nargs="*", default=[], help="test files, of all"
+    )
+    parser.add_argument(
+        "--budget", type=float, default=20.0, help="seconds of tests a mutant"
+    )
+    parser.add_argument(
+        "--ran", type=Path, default=OUT / "tests.jsonl", help="what tests run"
+    )
     asked = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     tree = OUT / "tree"
@@ -320,10 +415,15 @@ def main() -> None:
     every = [
         mutant
         for path in sorted((tree / PACKAGE).rglob("*.py"))
-        if any(str(path.relative_to(tree / PACKAGE)).startswith(under) for under in asked.under)
+        if any(
+            str(path.relative_to(tree / PACKAGE)).startswith(under)
+            for under in asked.under
+        )
         for mutant in mutants_of(path, tree)
     ]
-    chosen = random.Random(asked.seed).sample(every, min(asked.count, len(every)))
+    chosen = random.Random(asked.seed).sample(
+        every, min(asked.count, len(every))
+    )
     results = OUT / f"seed_{asked.seed}.jsonl"
     results.touch()
     done = {
@@ -333,19 +433,33 @@ def main() -> None:
     }
     for number, mutant in enumerate(chosen, 1):
         if str(mutant) not in done:
-            done[str(mutant)] = end = try_mutant(mutant, tree, table, asked.budget)
+            done[str(mutant)] = end = try_mutant(
+                mutant, tree, table, asked.budget
+            )
             with results.open("a", encoding="utf-8") as file:
                 file.write(
-                    json.dumps({"mutant": asdict(mutant), "end": end, "budget": asked.budget})
+                    json.dumps(
+                        {
+                            "mutant": asdict(mutant),
+                            "end": end,
+                            "budget": asked.budget,
+                        }
+                    )
                     + "\n"
                 )
-        print(f"{number}/{len(chosen)} {done[str(mutant)]:9} {mutant}", flush=True)
+        print(
+            f"{number}/{len(chosen)} {done[str(mutant)]:9} {mutant}", flush=True
+        )
     ends = [done[str(mutant)] for mutant in chosen]
     print(", ".join(f"{ends.count(end)} {end}" for end in sorted(set(ends))))
     for mutant in chosen:
         if done[str(mutant)] in ("survived", "no test"):
-            lines = (tree / mutant.path).read_text(encoding="utf-8").splitlines()
-            print(f"{done[str(mutant)]:9} {mutant}\n{'':10}{lines[mutant.line - 1].strip()}")
+            lines = (
+                (tree / mutant.path).read_text(encoding="utf-8").splitlines()
+            )
+            print(
+                f"{done[str(mutant)]:9} {mutant}\n{'':10}{lines[mutant.line - 1].strip()}"
+            )
 
 
 if __name__ == "__main__":

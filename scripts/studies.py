@@ -19,7 +19,12 @@ from collocation_sysid.plan import (
 from collocation_sysid.plan.study_rows import Row, SuccessCriterion, run_row
 from collocation_sysid.problem import Problem
 
-TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
+TRUTH = {
+    "lambda_pa": 200.0,
+    "mu_pa": 300.0,
+    "gamma_r_s": 0.009,
+    "gamma_m_1_s": 1.0,
+}
 HEADS = ("λ", "μ", "γ_r", "γ_m")
 
 # A run that does not end by its own time limit is killed this much later [s].
@@ -47,7 +52,10 @@ class Variant:
     @property
     def overrides(self) -> list[str]:
         """The options for the command line's --set."""
-        return [f"solver.{self.method}.{key}={value}" for key, value in self.options.items()]
+        return [
+            f"solver.{self.method}.{key}={value}"
+            for key, value in self.options.items()
+        ]
 
     def limited(self, time_s: float) -> Variant:
         """With a time limit, unless it has one of its own; reduced-space knows none."""
@@ -92,7 +100,9 @@ def run_variants(
         problem = Problem.read(path, overrides)
         count = max(1, round(starts * variant.share)) + 1 if starts else 1
         drawn = Starts(count, spread, seed)
-        runs = plan_comparison(problem, [variant.method], overrides, drawn, TRUTH)
+        runs = plan_comparison(
+            problem, [variant.method], overrides, drawn, TRUTH
+        )
         planned[variant.name] = runs[1:] if starts else runs
     remaining = [
         run
@@ -101,7 +111,12 @@ def run_variants(
         if store.load_finished(run.key, limits.time_limit_s) is None
     ]
     names = {run.key: name for name, runs in planned.items() for run in runs}
-    run_all(remaining, store, limits, lambda record, _: _tell(names[record["key"]], record))
+    run_all(
+        remaining,
+        store,
+        limits,
+        lambda record, _: _tell(names[record["key"]], record),
+    )
     yardstick = SuccessCriterion(TRUTH)
     return {
         name: [run_row(run, store.load(run.key), yardstick) for run in runs]
@@ -124,7 +139,9 @@ def worst_error(row: Row) -> float:
 def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table, names to the left and numbers to the right."""
     rule = ("---", *("---:" for _ in heads[1:]))
-    return "\n".join("| " + " | ".join(line) + " |" for line in (heads, rule, *rows))
+    return "\n".join(
+        "| " + " | ".join(line) + " |" for line in (heads, rule, *rows)
+    )
 
 
 def number(value: float | None, scale: float = 1.0, digits: int = 3) -> str:

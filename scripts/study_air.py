@@ -37,29 +37,41 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--twins", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--all", action="store_true", help="draw every assumption")
+    parser.add_argument(
+        "--all", action="store_true", help="draw every assumption"
+    )
     parser.add_argument("--vacuum", action="store_true", help="fit without air")
     parser.add_argument("--list", action="store_true", help="print every twin")
     arguments = parser.parse_args()
     began = time.perf_counter()
     twins = [
-        one_twin((arguments.seed, number), everything=arguments.all, in_vacuum=arguments.vacuum)
+        one_twin(
+            (arguments.seed, number),
+            everything=arguments.all,
+            in_vacuum=arguments.vacuum,
+        )
         for number in range(arguments.twins)
     ]
     if arguments.list:
         for twin in twins:
             print(twin)
-    print(summary([twin for twin in twins if twin is not None], arguments.twins))
+    print(
+        summary([twin for twin in twins if twin is not None], arguments.twins)
+    )
     print(f"{time.perf_counter() - began:.0f} s")
 
 
-def one_twin(seed: tuple[int, int], everything: bool, in_vacuum: bool) -> Twin | None:
+def one_twin(
+    seed: tuple[int, int], everything: bool, in_vacuum: bool
+) -> Twin | None:
     """Draw a twin and fit it; None if the fit does not converge."""
     rng = np.random.default_rng(seed)
     fault = "assumed: all of these" if everything else "assumed: air"
     actual, stated = drawn(ASSUMED[fault])(measured(), rng)
     tracks = actual.markers.positions_m
-    tracks = tracks + actual.markers.sigma_m[:, None] * rng.standard_normal(tracks.shape)
+    tracks = tracks + actual.markers.sigma_m[:, None] * rng.standard_normal(
+        tracks.shape
+    )
     if in_vacuum:
         stated = replace(stated, air_density_kg_m3="none")
     fit = fitted(with_markers(stated, tracks), ROWS[fault])
@@ -67,7 +79,9 @@ def one_twin(seed: tuple[int, int], everything: bool, in_vacuum: bool) -> Twin |
     interval = fit.uncertainty.estimates[GAMMA_M].statistical95
     if not fit.converged or line is None or interval is None:
         return None
-    return Twin(fit.uncertainty.estimates[GAMMA_M].value, interval, line.combined95)
+    return Twin(
+        fit.uncertainty.estimates[GAMMA_M].value, interval, line.combined95
+    )
 
 
 def summary(twins: list[Twin], count: int) -> str:

@@ -40,7 +40,9 @@ RADIUS_M, FINE_M = 50.0, 1.4
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def ticks(cells: int, fine_m: float, size_m: float, growth: float) -> np.ndarray:
+def ticks(
+    cells: int, fine_m: float, size_m: float, growth: float
+) -> np.ndarray:
     """So many equal cells to `fine_m`, then ever larger ones to `size_m`."""
     found, step = list(np.linspace(0, fine_m, cells + 1)), fine_m / cells
     while found[-1] < size_m:
@@ -57,11 +59,19 @@ def block(*edges: np.ndarray) -> cs.Body:
 
 
 def pressed(
-    body: cs.Body, shape: Solid, depth_m: float, edge_m: float, kappa: float, delta: float
+    body: cs.Body,
+    shape: Solid,
+    depth_m: float,
+    edge_m: float,
+    kappa: float,
+    delta: float,
 ) -> tuple[float, float]:
     """The force [N], and the mean square of the distances from the middle of the contact [m²]."""
     low = body.nodes_m.min(axis=0)
-    where = [np.flatnonzero(np.abs(body.nodes_m[:, k] - low[k]) < 1e-9) for k in range(3)]
+    where = [
+        np.flatnonzero(np.abs(body.nodes_m[:, k] - low[k]) < 1e-9)
+        for k in range(3)
+    ]
     fixed = cs.PoseSequence.fixed()
     sliding = [
         cs.Grasp(where[0], fixed, axes="x"),
@@ -73,7 +83,9 @@ def pressed(
         far = np.abs(body.nodes_m[:, 1] - body.nodes_m[:, 1].max()) < 1e-9
         sliding.append(cs.Grasp(np.flatnonzero(far), fixed, axes="y"))
     down = cs.PoseSequence(
-        np.arange(2.0), np.tile(-depth_m * UP, (2, 1)), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))
+        np.arange(2.0),
+        np.tile(-depth_m * UP, (2, 1)),
+        np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)),
     )
     top = cs.Box((-1.0, -1.0, -1e-9), (3.0, 3.0, 1e-9))
     touched = cs.Obstacle(
@@ -101,13 +113,19 @@ def pressed(
     )[0, 0]
     law = term.law_of_contact
     near, within = np.maximum(law.widths_m - gap_m, 0), np.maximum(-gap_m, 0)
-    push = law.surface.area_m2 * law.data[3] * (near**2 - within**2) / law.widths_m
+    push = (
+        law.surface.area_m2 * law.data[3] * (near**2 - within**2) / law.widths_m
+    )
     x_m, y_m, _ = place[:3] + term.law_of_contact.body.frame_nodes_m[0][:, None]
     r2_m2 = x_m**2 + (y_m**2 if isinstance(shape, cs.Sphere) else 0.0)
-    return -float(seen.wrenches[0][0, 2]), float((push * r2_m2).sum() / push.sum())
+    return -float(seen.wrenches[0][0, 2]), float(
+        (push * r2_m2).sum() / push.sum()
+    )
 
 
-def sphere(cells: float, kappa: float = 100.0, delta: float = 0.002) -> tuple[float, int]:
+def sphere(
+    cells: float, kappa: float = 100.0, delta: float = 0.002
+) -> tuple[float, int]:
     """Force over Hertz' for its radius, and nodes, at so many elements to the radius."""
     edge_m = 1 / cells
     wide = ticks(round(FINE_M * cells), FINE_M, 30.0, 3.0)
@@ -117,10 +135,14 @@ def sphere(cells: float, kappa: float = 100.0, delta: float = 0.002) -> tuple[fl
     force_n, r2_m2 = pressed(body, shape, 1 / RADIUS_M, edge_m, kappa, delta)
     # The mean of r² under √(1 − r²/a²) is 2a²/5; a quarter of the sphere is there.
     radius_m = np.sqrt(2.5 * r2_m2)
-    return 4 * force_n / (4 / 3 * CONTACT_PA * radius_m**3 / RADIUS_M), len(body.nodes_m)
+    return 4 * force_n / (4 / 3 * CONTACT_PA * radius_m**3 / RADIUS_M), len(
+        body.nodes_m
+    )
 
 
-def cylinder(cells: float, kappa: float = 100.0, delta: float = 0.002) -> tuple[float, int]:
+def cylinder(
+    cells: float, kappa: float = 100.0, delta: float = 0.002
+) -> tuple[float, int]:
     """The same of a long cylinder, of which half is there."""
     edge_m = 1 / cells
     wide = ticks(round(FINE_M * cells), FINE_M, 30.0, 2.0)
@@ -169,7 +191,9 @@ def twins(count: int) -> Iterator[Twin]:
     guess = f"parameters.young_pa.guess={gel.TRUTH['young_pa']}"
     problem = cs.Problem.read(gel.FOLDER / "problem.toml", [guess])
     reach_m = np.arange(-5e-4, 2.5e-3, 2e-5)
-    exact_n = CubicSpline(reach_m, gel.forces_n(problem.experiments[0], reach_m))
+    exact_n = CubicSpline(
+        reach_m, gel.forces_n(problem.experiments[0], reach_m)
+    )
     spread, z = student.ppf(0.975, gel.PLACES - 1), None
     for seed in range(count):
         rng = np.random.default_rng(seed)
@@ -187,8 +211,12 @@ def twins(count: int) -> Iterator[Twin]:
         twin = replace(problem, experiments=measured).collocation()
         solution = ReducedSpace()(twin, start=z)
         z, told = solution.z, uncertainty_at(solution.collocation, solution.z)
-        places = [part.phi[0] for part in solution.collocation.iterates(solution.z)]
-        off = np.abs(np.array(places) - onset_m / gel.ONSET_M) / list(told.nuisance.values())
+        places = [
+            part.phi[0] for part in solution.collocation.iterates(solution.z)
+        ]
+        off = np.abs(np.array(places) - onset_m / gel.ONSET_M) / list(
+            told.nuisance.values()
+        )
         simple = np.array([hertz_pa(gel.DEPTHS_M, own_n) for own_n in force_n])
         half = spread * sem(simple) * np.array([0, -1, 1])
         found = told.estimates["young_pa"]
@@ -205,12 +233,18 @@ def poked(count: int = 100) -> None:
     found = list(twins(count))
     for name in ("model_pa", "hertz_pa"):
         value, low, high = (
-            np.array([getattr(each, name) for each in found]).T / gel.TRUTH["young_pa"]
+            np.array([getattr(each, name) for each in found]).T
+            / gel.TRUTH["young_pa"]
         )
         inside = int(((low < 1) & (high > 1)).sum())
-        print(name, f"held by {inside} of {count}: {value.mean():.4f} ± {value.std(ddof=1):.4f}")
+        print(
+            name,
+            f"held by {inside} of {count}: {value.mean():.4f} ± {value.std(ddof=1):.4f}",
+        )
         print(f"  half width of an interval {np.mean(high - low) / 2:.4f}")
-    print(f"beginnings held: {sum(each.places_held for each in found)} of {count * gel.PLACES}")
+    print(
+        f"beginnings held: {sum(each.places_held for each in found)} of {count * gel.PLACES}"
+    )
 
 
 if __name__ == "__main__":
@@ -222,5 +256,13 @@ if __name__ == "__main__":
         for cells in (1.5, 3.0, 4.2) if name == "sphere" else (2.0, 4.0, 8.0):
             print(name, cells, law(cells), flush=True)
         if name == "cylinder":
-            for kappa, delta in ((10, 0.02), (30, 0.002), (100, 0.02), (300, 0.002), (1000, 2e-4)):
-                print(name, 8.0, kappa, delta, law(8.0, kappa, delta), flush=True)
+            for kappa, delta in (
+                (10, 0.02),
+                (30, 0.002),
+                (100, 0.02),
+                (300, 0.002),
+                (1000, 2e-4),
+            ):
+                print(
+                    name, 8.0, kappa, delta, law(8.0, kappa, delta), flush=True
+                )

@@ -99,12 +99,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--twins", type=int, default=200, help="of each case")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
-    parser.add_argument("--sigma-m", type=float, default=1e-3, help="deviation of the noise")
+    parser.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, help="processes"
+    )
+    parser.add_argument(
+        "--sigma-m", type=float, default=1e-3, help="deviation of the noise"
+    )
     arguments = parser.parse_args()
     began = time.perf_counter()
     # Workers start afresh and find one thread each.
-    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "COLLOCATION_SYSID_THREADS": "1"}
+    os.environ |= {
+        "OPENBLAS_NUM_THREADS": "1",
+        "COLLOCATION_SYSID_THREADS": "1",
+    }
     jobs = [
         (case, arguments.sigma_m, (arguments.seed, number, twin))
         for number, case in enumerate(CASES)
@@ -113,8 +120,15 @@ def main() -> None:
     start = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(arguments.workers, mp_context=start) as pool:
         outcomes = list(pool.map(run, *zip(*jobs, strict=True), chunksize=10))
-    by_case = [outcomes[k * arguments.twins : (k + 1) * arguments.twins] for k in range(len(CASES))]
-    print(header(arguments.sigma_m, arguments.twins), coverage_table(by_case), sep="\n\n")
+    by_case = [
+        outcomes[k * arguments.twins : (k + 1) * arguments.twins]
+        for k in range(len(CASES))
+    ]
+    print(
+        header(arguments.sigma_m, arguments.twins),
+        coverage_table(by_case),
+        sep="\n\n",
+    )
     print(f"\n{score_table(by_case)}\n\n{time.perf_counter() - began:.0f} s")
 
 
@@ -130,7 +144,10 @@ def run(case: Case, sigma_m: float, seed: Sequence[int]) -> Outcome:
     collocation = solution.collocation
     q = solution.z[: collocation.nq]
     fit = linearise_fit(collocation, solution.z)
-    found = [uncertainty_from_fit(fit, collocation.parameters, q, kind) for kind in KINDS]
+    found = [
+        uncertainty_from_fit(fit, collocation.parameters, q, kind)
+        for kind in KINDS
+    ]
     wrong = collocation.parameters_from(solution.z)[collocation.nq :] - phi
     return Outcome(
         solution.status.converged,
@@ -166,13 +183,19 @@ def reference(sigma_m: float) -> tuple[Experiment, Array]:
 
 
 def twin(
-    experiment: Experiment, x: Array, case: Case, sigma_m: float, rng: np.random.Generator
+    experiment: Experiment,
+    x: Array,
+    case: Case,
+    sigma_m: float,
+    rng: np.random.Generator,
 ) -> tuple[Collocation, Array]:
     """The identification of one twin, from the truth, and its nuisance parameters φ."""
     experiment = replace(experiment, nuisance=case.nuisance)
     collocation = collocation_of(experiment)
     drawn = rng.standard_normal(collocation.nphi)
-    followed, p = collocation.follow_estimates(np.append(collocation.parameters.guess_q, drawn))
+    followed, p = collocation.follow_estimates(
+        np.append(collocation.parameters.guess_q, drawn)
+    )
     (segment,), phi = followed.transcriptions, p[collocation.nq :]
     tracks = segment.markers.predict_positions(x, phi)
     noise = sigma_m * noise_of(rng, tracks.shape, case.phi)
@@ -180,10 +203,14 @@ def twin(
 
 
 def collocation_of(experiment: Experiment) -> Collocation:
-    return Collocation([experiment], parameters(np.array(list(TRUTH.values()))), SCHEME)
+    return Collocation(
+        [experiment], parameters(np.array(list(TRUTH.values()))), SCHEME
+    )
 
 
-def noise_of(rng: np.random.Generator, shape: tuple[int, ...], phi: float) -> Array:
+def noise_of(
+    rng: np.random.Generator, shape: tuple[int, ...], phi: float
+) -> Array:
     """Noise of unit variance, stationary and autoregressive along the first axis."""
     white = rng.standard_normal(shape)
     white[1:] *= np.sqrt(1 - phi**2)
@@ -191,7 +218,9 @@ def noise_of(rng: np.random.Generator, shape: tuple[int, ...], phi: float) -> Ar
 
 
 def truth() -> dict[str, float]:
-    young_pa, poisson = engineering_constants(TRUTH["lambda_pa"], TRUTH["mu_pa"])
+    young_pa, poisson = engineering_constants(
+        TRUTH["lambda_pa"], TRUTH["mu_pa"]
+    )
     return {**TRUTH, "young_pa": young_pa, "poisson": poisson}
 
 
@@ -200,7 +229,11 @@ def held(uncertainty: Uncertainty) -> list[float]:
     estimates, found = {**uncertainty.estimates, **uncertainty.derived}, []
     for name, value in truth().items():
         interval = estimates[name].statistical95
-        found.append(np.nan if interval is None else float(interval[0] <= value <= interval[1]))
+        found.append(
+            np.nan
+            if interval is None
+            else float(interval[0] <= value <= interval[1])
+        )
     return found
 
 
@@ -213,12 +246,16 @@ def held_own(uncertainty: Uncertainty, wrong: Array) -> float:
 
 
 def scores(uncertainty: Uncertainty, q: Array) -> Array:
-    return (q - np.log(list(TRUTH.values()))) / np.sqrt(np.diag(uncertainty.covariance))
+    return (q - np.log(list(TRUTH.values()))) / np.sqrt(
+        np.diag(uncertainty.covariance)
+    )
 
 
 def identified(uncertainty: Uncertainty) -> list[bool]:
     estimates = {**uncertainty.estimates, **uncertainty.derived}
-    return [estimates[name].statistical_std_error is not None for name in QUANTITIES]
+    return [
+        estimates[name].statistical_std_error is not None for name in QUANTITIES
+    ]
 
 
 # Tables ---------------------------------------------------------------------------------------
@@ -243,16 +280,26 @@ def coverage_table(by_case: list[list[Outcome]]) -> str:
             share = shares(outcomes, k)
             chosen = np.mean([outcome.correlated[k] for outcome in outcomes])
             name = f"{case.name}: {kind.noise}, {kind.errors}"
-            lines.append(_line(name, [_marked(s) for s in share]) + f"{100 * chosen:10.0f} %")
+            lines.append(
+                _line(name, [_marked(s) for s in share])
+                + f"{100 * chosen:10.0f} %"
+            )
     lines.append("")
     for case, outcomes in zip(CASES, by_case, strict=True):
         lost = sum(not outcome.converged for outcome in outcomes)
-        without = int(np.isnan([outcome.held[0, :-1] for outcome in outcomes]).sum())
-        vague = 1 - np.mean([outcome.identified[0] for outcome in outcomes], axis=0)
+        without = int(
+            np.isnan([outcome.held[0, :-1] for outcome in outcomes]).sum()
+        )
+        vague = 1 - np.mean(
+            [outcome.identified[0] for outcome in outcomes], axis=0
+        )
         lines.append(
             f"{case.name}: {lost} did not converge, {without} quantities without interval; "
             "called not identified: "
-            + ", ".join(f"{c} {100 * v:.0f} %" for c, v in zip(COLUMNS, vague, strict=False))
+            + ", ".join(
+                f"{c} {100 * v:.0f} %"
+                for c, v in zip(COLUMNS, vague, strict=False)
+            )
         )
     return "\n".join(lines)
 
@@ -263,7 +310,9 @@ def shares(outcomes: list[Outcome], kind: int) -> Array:
     there = np.isfinite(rows)
     counts = there.sum(axis=0)
     return np.where(
-        counts > 0, np.where(there, rows, 0).sum(axis=0) / np.maximum(counts, 1), np.nan
+        counts > 0,
+        np.where(there, rows, 0).sum(axis=0) / np.maximum(counts, 1),
+        np.nan,
     )
 
 
@@ -274,8 +323,13 @@ def score_table(by_case: list[list[Outcome]]) -> str:
         for case, outcomes in zip(CASES, by_case, strict=True):
             rows = np.array([outcome.scores[k] for outcome in outcomes])
             mean, deviation = np.nanmean(rows, axis=0), np.nanstd(rows, axis=0)
-            cells = [f"{m:+.2f} ± {d:.2f}" for m, d in zip(mean, deviation, strict=True)]
-            lines.append(_line(f"{case.name}: {kind.noise}, {kind.errors}", cells, 14))
+            cells = [
+                f"{m:+.2f} ± {d:.2f}"
+                for m, d in zip(mean, deviation, strict=True)
+            ]
+            lines.append(
+                _line(f"{case.name}: {kind.noise}, {kind.errors}", cells, 14)
+            )
     return "\n".join(lines)
 
 

@@ -21,10 +21,21 @@ from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
-from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
+from collocation_sysid.recording import (
+    Experiment,
+    Grasp,
+    Markers,
+    Nuisance,
+    PoseSequence,
+)
 
 SIZE_M, DIVISIONS, DENSITY_KG_M3 = (0.03, 0.03, 0.15), (1, 1, 5), 100.0
-TRUTH = {"lambda_pa": 16e3, "mu_pa": 12e3, "gamma_r_s": 0.006, "gamma_m_1_s": 0.5}
+TRUTH = {
+    "lambda_pa": 16e3,
+    "mu_pa": 12e3,
+    "gamma_r_s": 0.006,
+    "gamma_m_1_s": 0.5,
+}
 GUESS = {name: Unknown(guess=1.5 * value) for name, value in TRUTH.items()}
 STEP_S, TIME_S, NOISE_M, TURN_HZ = 0.005, 1.5, 3e-4, 1.5
 LAWS = ("kelvin-voigt", "rayleigh")
@@ -32,28 +43,50 @@ LAWS = ("kelvin-voigt", "rayleigh")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--speeds", type=float, nargs="*", default=[2.0, 5.0, 14.0], help="rad/s")
+    parser.add_argument(
+        "--speeds",
+        type=float,
+        nargs="*",
+        default=[2.0, 5.0, 14.0],
+        help="rad/s",
+    )
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     for speed in arguments.speeds:
         measured = swung(speed, arguments.seed)
         for law in LAWS:
-            print(f"{speed:4.1f} rad/s, fitted with {law}: {fitted(measured, law)}", flush=True)
+            print(
+                f"{speed:4.1f} rad/s, fitted with {law}: {fitted(measured, law)}",
+                flush=True,
+            )
 
 
 def swung(speed_rad_s: float, seed: int) -> Experiment:
     """The bar, held at one end, turned to and fro about two axes at this speed at most."""
     t_s = STEP_S * np.arange(round(TIME_S / STEP_S) + 1, dtype=np.float64)
-    angle = speed_rad_s / (2 * np.pi * TURN_HZ) * (1 - np.cos(2 * np.pi * TURN_HZ * t_s))
+    angle = (
+        speed_rad_s
+        / (2 * np.pi * TURN_HZ)
+        * (1 - np.cos(2 * np.pi * TURN_HZ * t_s))
+    )
     tilt = 0.5 * np.sin(2 * np.pi * 1.1 * t_s) ** 2
-    turns = Rotation.from_rotvec(np.outer(angle, [1, 0, 0]) + np.outer(tilt, [0, 1, 0]))
+    turns = Rotation.from_rotvec(
+        np.outer(angle, [1, 0, 0]) + np.outer(tilt, [0, 1, 0])
+    )
     body = bar("kelvin-voigt")
     held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
     places = body.nodes_m[body.nodes_m[:, 2] > 0.05][::3]
-    markers = Markers(t_s, np.zeros((len(t_s), len(places), 3)), NOISE_M, places_m=places)
+    markers = Markers(
+        t_s, np.zeros((len(t_s), len(places), 3)), NOISE_M, places_m=places
+    )
     poses = PoseSequence(t_s, np.zeros((len(t_s), 3)), turns.as_quat())
     experiment = Experiment(
-        body, t_s, [Grasp(held, poses)], markers, name="swing", nuisance=Nuisance.none()
+        body,
+        t_s,
+        [Grasp(held, poses)],
+        markers,
+        name="swing",
+        nuisance=Nuisance.none(),
     )
     tracks = simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m
     noise = np.random.default_rng(seed).normal(scale=NOISE_M, size=tracks.shape)
@@ -62,21 +95,33 @@ def swung(speed_rad_s: float, seed: int) -> Experiment:
 
 def bar(law: str) -> Body:
     """A foam bar under a damping law."""
-    return Body(box_mesh(SIZE_M, DIVISIONS), density_kg_m3=DENSITY_KG_M3, damping=law)
+    return Body(
+        box_mesh(SIZE_M, DIVISIONS), density_kg_m3=DENSITY_KG_M3, damping=law
+    )
 
 
 def fitted(measured: Experiment, law: str) -> str:
     """What comes out, in a line and the verdict's."""
     body = bar(law)
     markers = replace(measured.markers, placement=None)
-    found = run(Problem([replace(measured, body=body, markers=markers)], GUESS, substeps=1))
+    found = run(
+        Problem(
+            [replace(measured, body=body, markers=markers)], GUESS, substeps=1
+        )
+    )
     said = []
     for name, truth in TRUTH.items():
         estimate = found.estimates[name]
         said.append(f"{name} {100 * (estimate.value / truth - 1):+.1f} %")
         if estimate.statistical_std_error:
-            said[-1] += f" ({(estimate.value - truth) / estimate.statistical_std_error:+.1f} σ)"
-    lines = [", ".join(said), f"verdict {found.trust.verdict}", *found.trust.reasons]
+            said[-1] += (
+                f" ({(estimate.value - truth) / estimate.statistical_std_error:+.1f} σ)"
+            )
+    lines = [
+        ", ".join(said),
+        f"verdict {found.trust.verdict}",
+        *found.trust.reasons,
+    ]
     return "\n    ".join([*lines, *found.all_notes])
 
 

@@ -29,14 +29,26 @@ from collocation_sysid.program.visible_surface import VisibleSurface
 from collocation_sysid.runs.several_starts import SAME_LOSS, robust_loss
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
-TRUTH = {"young_pa": 1.5e5, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
+TRUTH = {
+    "young_pa": 1.5e5,
+    "poisson": 0.45,
+    "gamma_r_s": 1e-3,
+    "gamma_m_1_s": 0.1,
+}
 MATRIX, SHAPE = [[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]], (120, 160)
-MIDDLE_M, WAY, NOISE_M = np.array([0.06, 0.015, -0.01]), np.array([0, -0.9, 0.44]), 1.5e-4
+MIDDLE_M, WAY, NOISE_M = (
+    np.array([0.06, 0.015, -0.01]),
+    np.array([0, -0.9, 0.44]),
+    1.5e-4,
+)
 # Noise is along the rays; along the normals of what is seen it is so much of that.
 ALONG_NORMALS = 0.65
 TURN_RAD, SHIFT_M, BIAS_M, SCALE = 0.09, 0.02, 0.005, 0.005
 UNKNOWN = cs.Nuisance.none(
-    depth_turn_rad=TURN_RAD, depth_shift_m=SHIFT_M, depth_bias_m=BIAS_M, depth_scale=SCALE
+    depth_turn_rad=TURN_RAD,
+    depth_shift_m=SHIFT_M,
+    depth_bias_m=BIAS_M,
+    depth_scale=SCALE,
 )
 
 
@@ -44,7 +56,9 @@ def camera(distance_m: float) -> cs.DepthCamera:
     """One that looks at the middle of the bar from so far."""
     pose = np.eye(4)
     ahead = -WAY / np.linalg.norm(WAY)
-    right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(np.cross(ahead, [0, 0, 1]))
+    right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(
+        np.cross(ahead, [0, 0, 1])
+    )
     eye_m = MIDDLE_M - distance_m * ahead
     pose[:3] = np.column_stack([right, np.cross(ahead, right), ahead, eye_m])
     return cs.DepthCamera(MATRIX, pose=pose)
@@ -53,8 +67,12 @@ def camera(distance_m: float) -> cs.DepthCamera:
 def bar(depth: cs.Depth) -> cs.Experiment:
     """The bar at rest, with what a camera sees of it."""
     body = cs.Body(BODY, density_kg_m3=1070.0, element="tet10")
-    held = cs.Grasp(np.flatnonzero(body.nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed())
-    return cs.Experiment(body, [0.0], [held], kind="static", depths=[depth], nuisance=UNKNOWN)
+    held = cs.Grasp(
+        np.flatnonzero(body.nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed()
+    )
+    return cs.Experiment(
+        body, [0.0], [held], kind="static", depths=[depth], nuisance=UNKNOWN
+    )
 
 
 BODY = cs.box_mesh((0.12, 0.03, 0.02), (4, 1, 1))
@@ -69,11 +87,15 @@ def image_m(seen_by: cs.DepthCamera) -> np.ndarray:
         VisibleSurface.from_body(experiment.body, depth),
     )
     rotations, translations = seen_by.pose_at([0.0])
-    triangles = (skin.subdivided_triangles(x[skin.nodes]) - translations[0]) @ rotations[0]
+    triangles = (
+        skin.subdivided_triangles(x[skin.nodes]) - translations[0]
+    ) @ rotations[0]
     return cs.depth_image(seen_by, SHAPE, triangles)
 
 
-def off(camera: cs.DepthCamera, turn_rad: np.ndarray, shift_m: np.ndarray) -> cs.DepthCamera:
+def off(
+    camera: cs.DepthCamera, turn_rad: np.ndarray, shift_m: np.ndarray
+) -> cs.DepthCamera:
     """It, said to be turned about the middle of the bar and shifted."""
     pose, turn = camera.pose.copy(), Rotation.from_rotvec(turn_rad).as_matrix()
     pose[:3, :3] = turn @ pose[:3, :3]
@@ -93,22 +115,35 @@ def fitted(
     """
     seen_by = camera(distance_m)
     noise = gaussian_filter(rng.normal(size=SHAPE), 1.2)
-    image = image_m(seen_by) * (1 + SCALE * rng.normal()) + BIAS_M * rng.normal()
+    image = (
+        image_m(seen_by) * (1 + SCALE * rng.normal()) + BIAS_M * rng.normal()
+    )
     image += noise_m * noise / noise.std()
-    turn_rad, shift_m = pose or (TURN_RAD * rng.normal(size=3), SHIFT_M * rng.normal(size=3))
+    turn_rad, shift_m = pose or (
+        TURN_RAD * rng.normal(size=3),
+        SHIFT_M * rng.normal(size=3),
+    )
     said = off(seen_by, turn_rad, shift_m)
     sigma_m = ALONG_NORMALS * noise_m
     depth = cs.Depth.of_images("front", image, said, sigma_m, spacing_m=0.004)
     unknown = {**TRUTH, "young_pa": cs.Unknown()}
-    solution = cs.solve(cs.Problem([bar(depth)], cs.Parameters.from_mapping(unknown)))
-    bars = uncertainty_at(solution.collocation, solution.z).estimates["young_pa"]
+    solution = cs.solve(
+        cs.Problem([bar(depth)], cs.Parameters.from_mapping(unknown))
+    )
+    bars = uncertainty_at(solution.collocation, solution.z).estimates[
+        "young_pa"
+    ]
     low, high = bars.statistical95 or (0.0, np.inf)
     (part,) = solution.collocation.iterates(solution.z)
     (reading,) = part.segment.depths
     rms_mm = 1e3 * np.sqrt(
-        np.nanmean(reading.signed_distances_m(part.observables[-1], part.phi) ** 2)
+        np.nanmean(
+            reading.signed_distances_m(part.observables[-1], part.phi) ** 2
+        )
     )
-    return np.append(np.array([bars.value, low, high]) / TRUTH["young_pa"], rms_mm)
+    return np.append(
+        np.array([bars.value, low, high]) / TRUTH["young_pa"], rms_mm
+    )
 
 
 @dataclass(frozen=True)
@@ -150,8 +185,14 @@ class SoftTwin:
 
 
 SOFT_TRUTH = {**TRUTH, "young_pa": 2.5e4}
-SOFT_MATRIX, SOFT_SHAPE = [[420.0, 0, 160], [0, 420.0, 120], [0, 0, 1]], (240, 320)
-SOFT_MIDDLE_M, SOFT_WAY = np.array([0.045, 0.015, -0.04]), np.array([0, -0.9, 0.35])
+SOFT_MATRIX, SOFT_SHAPE = (
+    [[420.0, 0, 160], [0, 420.0, 120], [0, 0, 1]],
+    (240, 320),
+)
+SOFT_MIDDLE_M, SOFT_WAY = (
+    np.array([0.045, 0.015, -0.04]),
+    np.array([0, -0.9, 0.35]),
+)
 SOFT_DISTANCE_M, SOFT_NOISE_M = 0.4, 4e-4
 SOFT_TURN_RAD, SOFT_SHIFT_M = np.radians(2.7), 0.008
 
@@ -166,7 +207,9 @@ def soft_body() -> cs.Body:
 def soft_experiment(depth: cs.Depth) -> cs.Experiment:
     """The bar clamped at one end, with the default nuisance parameters."""
     body = soft_body()
-    held = cs.Grasp(np.flatnonzero(body.nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed())
+    held = cs.Grasp(
+        np.flatnonzero(body.nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed()
+    )
     return cs.Experiment(body, [0.0], [held], kind="static", depths=[depth])
 
 
@@ -174,7 +217,9 @@ def soft_camera(turn_rad: np.ndarray, shift_m: np.ndarray) -> cs.DepthCamera:
     """Return the camera of the soft bar, stated wrong by a turn about the bar and a shift."""
     pose = np.eye(4)
     ahead = -SOFT_WAY / np.linalg.norm(SOFT_WAY)
-    right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(np.cross(ahead, [0, 0, 1]))
+    right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(
+        np.cross(ahead, [0, 0, 1])
+    )
     eye_m = SOFT_MIDDLE_M - SOFT_DISTANCE_M * ahead
     pose[:3] = np.column_stack([right, np.cross(ahead, right), ahead, eye_m])
     turn = Rotation.from_rotvec(turn_rad).as_matrix()
@@ -194,7 +239,9 @@ def soft_image_m() -> np.ndarray:
         soft_camera(np.zeros(3), np.zeros(3)),
     )
     rotations, translations = camera.pose_at([0.0])
-    triangles = (skin.subdivided_triangles(x[skin.nodes]) - translations[0]) @ rotations[0]
+    triangles = (
+        skin.subdivided_triangles(x[skin.nodes]) - translations[0]
+    ) @ rotations[0]
     return cs.depth_image(camera, SOFT_SHAPE, triangles)
 
 
@@ -204,9 +251,12 @@ def soft_problem(seed: int, guess_pa: float | None = None) -> cs.Problem:
     image_m = soft_image_m() + SOFT_NOISE_M * rng.normal(size=SOFT_SHAPE)
     axis, way = rng.normal(size=(2, 3))
     camera = soft_camera(
-        SOFT_TURN_RAD * axis / np.linalg.norm(axis), SOFT_SHIFT_M * way / np.linalg.norm(way)
+        SOFT_TURN_RAD * axis / np.linalg.norm(axis),
+        SOFT_SHIFT_M * way / np.linalg.norm(way),
     )
-    depth = cs.Depth.of_images("front", image_m, camera, SOFT_NOISE_M, spacing_m=0.004)
+    depth = cs.Depth.of_images(
+        "front", image_m, camera, SOFT_NOISE_M, spacing_m=0.004
+    )
     unknown = cs.Unknown() if guess_pa is None else cs.Unknown(guess_pa)
     parameters = cs.Parameters.from_mapping({**SOFT_TRUTH, "young_pa": unknown})
     return cs.Problem([soft_experiment(depth)], parameters)
@@ -246,7 +296,9 @@ def study_soft_bar(seeds: range) -> None:
             f"{twin.verdict}",
             flush=True,
         )
-    values = np.array([twin.young_pa for twin in twins]) / SOFT_TRUTH["young_pa"]
+    values = (
+        np.array([twin.young_pa for twin in twins]) / SOFT_TRUTH["young_pa"]
+    )
     print(
         f"{sum(twin.contains_truth for twin in twins)} of {len(twins)} combined intervals contain "
         f"the truth; {sum(twin.is_better_optimum for twin in twins)} ended in the better optimum; "
@@ -280,10 +332,20 @@ def main() -> None:
         return
     for k in range(options.starts):
         value, low, high, rms_mm = started(k)
-        print(f"start {k}: E {value:.3f}, {low:.3f} to {high:.3f}, RMS {rms_mm:.3f} mm", flush=True)
-    for distance_m, noise_m in ((0.25, NOISE_M), (0.33, NOISE_M), (0.6, NOISE_M), (0.33, 1e-3)):
+        print(
+            f"start {k}: E {value:.3f}, {low:.3f} to {high:.3f}, RMS {rms_mm:.3f} mm",
+            flush=True,
+        )
+    for distance_m, noise_m in (
+        (0.25, NOISE_M),
+        (0.33, NOISE_M),
+        (0.6, NOISE_M),
+        (0.33, 1e-3),
+    ):
         nothing = np.zeros(3), np.zeros(3)
-        value, low, high, _ = fitted(np.random.default_rng(0), distance_m, noise_m, nothing)
+        value, low, high, _ = fitted(
+            np.random.default_rng(0), distance_m, noise_m, nothing
+        )
         print(
             f"{distance_m} m, {1e3 * noise_m:.2g} mm: E {value:.3f}, {low:.3f} to {high:.3f}",
             flush=True,

@@ -39,20 +39,33 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--twins", type=int, default=100)
     parser.add_argument("--duration", type=float, default=SWING.duration_s)
-    parser.add_argument("--limits", type=Path, help="the shipped swing's own by default")
+    parser.add_argument(
+        "--limits", type=Path, help="the shipped swing's own by default"
+    )
     parser.add_argument("--evaluations", type=int, default=300)
     parser.add_argument("--substeps", type=int, default=2)
     parser.add_argument("--waves", type=int, default=1)
-    parser.add_argument("--for", dest="names", default="", help="parameters that count")
-    parser.add_argument("--nuisance", choices=("none", "default"), default="none")
+    parser.add_argument(
+        "--for", dest="names", default="", help="parameters that count"
+    )
+    parser.add_argument(
+        "--nuisance", choices=("none", "default"), default="none"
+    )
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     problem = cylinder(given.duration, given.nuisance, given.substeps)
     limits = Limits.read(given.limits) if given.limits else own_limits()
     names = tuple(given.names.split(",")) if given.names else ()
-    options = DesignOptions(given.evaluations, pairs=0, waves=given.waves, seed=given.seed)
+    options = DesignOptions(
+        given.evaluations, pairs=0, waves=given.waves, seed=given.seed
+    )
     found = design_motion(
-        problem, limits, given.duration, DesignCriterion("worst", names), options, say=print
+        problem,
+        limits,
+        given.duration,
+        DesignCriterion("worst", names),
+        options,
+        say=print,
     )
     print(table(found), features(found), sep="\n\n", flush=True)
     if given.twins:
@@ -61,7 +74,9 @@ def main() -> None:
 
 def cylinder(duration_s: float, nuisance: str, substeps: int) -> Problem:
     """The shipped problem at the truth, moved by its swing for so long."""
-    guesses = [f"parameters.{name}.guess={value}" for name, value in TRUTH.items()]
+    guesses = [
+        f"parameters.{name}.guess={value}" for name, value in TRUTH.items()
+    ]
     overrides = [*guesses, f"transcription.substeps={substeps}"]
     shipped = Problem.read(FOLDER / "problem.toml", overrides)
     (experiment,) = shipped.experiments
@@ -76,7 +91,9 @@ def cylinder(duration_s: float, nuisance: str, substeps: int) -> Problem:
         markers=replace(experiment.markers, t_s=t_s, positions_m=unseen),
         nuisance=Nuisance() if nuisance == "default" else Nuisance.none(),
     )
-    return Problem([longer], shipped.parameters, scheme=shipped.scheme, substeps=substeps)
+    return Problem(
+        [longer], shipped.parameters, scheme=shipped.scheme, substeps=substeps
+    )
 
 
 def own_limits() -> Limits:
@@ -92,7 +109,9 @@ def own_limits() -> Limits:
     def in_degrees(vectors: np.ndarray) -> float:
         return float(np.degrees(largest(vectors)))
 
-    low, high = (tuple(side.tolist()) for side in (place.min(axis=0), place.max(axis=0)))
+    low, high = (
+        tuple(side.tolist()) for side in (place.min(axis=0), place.max(axis=0))
+    )
     return Limits.model_validate(
         {
             "workspace_m": (low, high),
@@ -100,7 +119,9 @@ def own_limits() -> Limits:
             "acceleration_m_s2": largest(np.gradient(speed, FINE_S, axis=0)),
             "rotation_deg": in_degrees((turns * turns[0].inv()).as_rotvec()),
             "angular_speed_deg_s": in_degrees(angular),
-            "angular_acceleration_deg_s2": in_degrees(np.gradient(angular, FINE_S, axis=0)),
+            "angular_acceleration_deg_s2": in_degrees(
+                np.gradient(angular, FINE_S, axis=0)
+            ),
         }
     )
 
@@ -112,10 +133,16 @@ def table(found: Design) -> str:
     lines.append("|  | swing % | designed % | ratio |\n|---|---|---|---|")
     for name, after in found.after.relative.items():
         before = found.before.relative[name]
-        lines.append(f"| {name} | {100 * before:.3g} | {100 * after:.3g} | {before / after:.2f} |")
+        lines.append(
+            f"| {name} | {100 * before:.3g} | {100 * after:.3g} | {before / after:.2f} |"
+        )
     free = [item.name for item in found.recording.problem.parameters.free]
-    before, after = (max(b.relative[n] for n in free) for b in (found.before, found.after))
-    lines.append(f"| worst | {100 * before:.3g} | {100 * after:.3g} | {before / after:.2f} |")
+    before, after = (
+        max(b.relative[n] for n in free) for b in (found.before, found.after)
+    )
+    lines.append(
+        f"| worst | {100 * before:.3g} | {100 * after:.3g} | {before / after:.2f} |"
+    )
     return "\n".join(lines)
 
 
@@ -126,18 +153,27 @@ def features(found: Design) -> str:
     """
     motion, (rotation, _) = found.motion, found.recording.start_pose
     place, rate, growth = motion.derivatives(motion.grid_s)
-    lines = ["|  | RMS | RMS acceleration | frequency Hz |", "|---|---|---|---|"]
-    for kind, columns, unit in (("shift", slice(3), "m"), ("turn", slice(3, 6), "rad")):
+    lines = [
+        "|  | RMS | RMS acceleration | frequency Hz |",
+        "|---|---|---|---|",
+    ]
+    for kind, columns, unit in (
+        ("shift", slice(3), "m"),
+        ("turn", slice(3, 6), "rad"),
+    ):
         own = [each[:, columns] @ rotation for each in (place, rate, growth)]
         for name, axes in (("along", [2]), ("across", [0, 1])):
             size, speed, most = (
-                float(np.sqrt(np.mean(np.sum(e[:, axes] ** 2, axis=1)))) for e in own
+                float(np.sqrt(np.mean(np.sum(e[:, axes] ** 2, axis=1))))
+                for e in own
             )
             lines.append(
                 f"| {kind} {name} | {size:.4f} {unit} | {most:.3g} {unit}/s² | "
                 f"{most / max(speed, 1e-300) / (2 * np.pi):.2f} |"
             )
-    return "\n".join([*lines, f"window {motion.active_s:.3g} of {motion.duration_s:.3g} s"])
+    return "\n".join(
+        [*lines, f"window {motion.active_s:.3g} of {motion.duration_s:.3g} s"]
+    )
 
 
 # Twins --------------------------------------------------------------------------------------------
@@ -149,7 +185,9 @@ def spread(found: Design, twins: int, seed: int) -> str:
     answers = [twin(found, rng) for _ in range(twins)]
     good = [each for each in answers if each is not None]
     lines = [f"{twins - len(good)} of {twins} twins did not converge"]
-    lines.append("|  | predicted % | spread % | ratio | bias % |\n|---|---|---|---|---|")
+    lines.append(
+        "|  | predicted % | spread % | ratio | bias % |\n|---|---|---|---|---|"
+    )
     for name, predicted in found.after.relative.items():
         logarithms = np.log([each[name] for each in good])
         deviation = logarithms.std(ddof=1)
@@ -169,11 +207,15 @@ def twin(found: Design, rng: np.random.Generator) -> dict[str, float] | None:
     phi = segment.guess_phi + rng.normal(size=segment.nuisance.size)
     values = problem.parameters.guesses
     _, scheme, substeps = options
-    actual = simulate(segment.corrected_experiment(phi), values, scheme, substeps=substeps)
+    actual = simulate(
+        segment.corrected_experiment(phi), values, scheme, substeps=substeps
+    )
     tracks = segment.markers.predict_samples(actual.positions_m, phi)
     noise = experiment.markers.sigma_m[:, None] * rng.normal(size=tracks.shape)
     seen = with_markers(experiment, tracks + noise)
-    solution = ReducedSpace(tolerance=1e-6, ladder=(1.0,))(Collocation([seen], *options))
+    solution = ReducedSpace(tolerance=1e-6, ladder=(1.0,))(
+        Collocation([seen], *options)
+    )
     if not solution.status.converged:
         return None
     derived = DerivedModuli.from_bodies(

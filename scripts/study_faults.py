@@ -33,12 +33,24 @@ from collocation_sysid import Problem
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
 from collocation_sysid.program.simulation import simulate, with_markers
-from collocation_sysid.recording import Experiment, Grasp, Nuisance, PoseSequence
+from collocation_sysid.recording import (
+    Experiment,
+    Grasp,
+    Nuisance,
+    PoseSequence,
+)
 from collocation_sysid.statistics.consider_analysis import changed_residuals
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.systematic_effects import ASSUMPTIONS, Assumption
+from collocation_sysid.statistics.systematic_effects import (
+    ASSUMPTIONS,
+    Assumption,
+)
 from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_at
-from collocation_sysid.statistics.uncertainty_budget import BudgetLine, VarianceSources, budget
+from collocation_sysid.statistics.uncertainty_budget import (
+    BudgetLine,
+    VarianceSources,
+    budget,
+)
 
 Array = NDArray[np.float64]
 Generator = np.random.Generator
@@ -83,19 +95,29 @@ class Fit:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--twins", type=int, default=200, help="of each fault")
-    parser.add_argument("--only", nargs="*", choices=list(FAULTS), default=list(FAULTS))
+    parser.add_argument(
+        "--only", nargs="*", choices=list(FAULTS), default=list(FAULTS)
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1, help="processes")
     arguments = parser.parse_args()
     # Workers start afresh and find one thread each.
-    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "COLLOCATION_SYSID_THREADS": "1"}
+    os.environ |= {
+        "OPENBLAS_NUM_THREADS": "1",
+        "COLLOCATION_SYSID_THREADS": "1",
+    }
     start, notes = multiprocessing.get_context("spawn"), []
     began = time.perf_counter()
     print(header(arguments.twins), table_head(), sep="\n\n", flush=True)
     with ProcessPoolExecutor(arguments.workers, mp_context=start) as pool:
         for fault in arguments.only:
-            seeds = [(arguments.seed, *fault.encode(), twin) for twin in range(arguments.twins)]
-            outcomes = list(pool.map(run, [fault] * len(seeds), seeds, chunksize=5))
+            seeds = [
+                (arguments.seed, *fault.encode(), twin)
+                for twin in range(arguments.twins)
+            ]
+            outcomes = list(
+                pool.map(run, [fault] * len(seeds), seeds, chunksize=5)
+            )
             print(table_row(fault, outcomes), flush=True)
             if fault == "none":
                 notes.append(loss_of_precision(outcomes))
@@ -110,8 +132,12 @@ def run(fault: str, seed: Sequence[int]) -> Outcome:
     rng = np.random.default_rng(seed)
     actual, stated = FAULTS[fault](measured(), rng)
     tracks = actual.markers.positions_m
-    tracks = tracks + actual.markers.sigma_m[:, None] * rng.standard_normal(tracks.shape)
-    found, whole, converged = identified(with_markers(stated, tracks), ROWS.get(fault, ()))
+    tracks = tracks + actual.markers.sigma_m[:, None] * rng.standard_normal(
+        tracks.shape
+    )
+    found, whole, converged = identified(
+        with_markers(stated, tracks), ROWS.get(fault, ())
+    )
     without = np.full(len(QUANTITIES), np.nan)
     if actual is stated:
         ideal = replace(with_markers(stated, tracks), nuisance=Nuisance.none())
@@ -130,7 +156,9 @@ def run(fault: str, seed: Sequence[int]) -> Outcome:
 def measured() -> Experiment:
     """The experiment with its tracks, without noise, and with the default nuisance parameters."""
     experiment = replace(reference(SIGMA_M)[0], nuisance=Nuisance())
-    return with_markers(experiment, experiment.markers.predict_positions(positions_m()))
+    return with_markers(
+        experiment, experiment.markers.predict_positions(positions_m())
+    )
 
 
 def positions_m() -> Array:
@@ -146,7 +174,9 @@ def identified(
     fit, true = fitted(experiment, assumed), truth()
     lines = fit.lines
     whole = [
-        float(lines[n].combined95[0] <= true[n] <= lines[n].combined95[1]) if n in lines else np.nan
+        float(lines[n].combined95[0] <= true[n] <= lines[n].combined95[1])
+        if n in lines
+        else np.nan
         for n in QUANTITIES
     ]
     return fit.uncertainty, np.array(whole), fit.converged
@@ -161,7 +191,9 @@ def fitted(experiment: Experiment, assumed: Sequence[Assumption]) -> Fit:
     deviations = [(row, row.sigma) for row in assumed if row.sigma is not None]
     changes = changed_residuals(collocation, z, deviations)
     fit = linearise_fit(collocation, z)
-    sources = VarianceSources.from_fit(fit, changes, collocation.parameters, solution.q, found)
+    sources = VarianceSources.from_fit(
+        fit, changes, collocation.parameters, solution.q, found
+    )
     lines = budget(sources, found, {}, problem.parameters)
     return Fit(found, lines, solution.status.converged)
 
@@ -169,7 +201,9 @@ def fitted(experiment: Experiment, assumed: Sequence[Assumption]) -> Fit:
 def relative_errors(found: Uncertainty) -> Array:
     estimates, true = {**found.estimates, **found.derived}, truth()
     errors = [estimates[name].statistical_std_error for name in QUANTITIES]
-    return np.array([np.nan if e is None else e for e in errors]) / [true[n] for n in QUANTITIES]
+    return np.array([np.nan if e is None else e for e in errors]) / [
+        true[n] for n in QUANTITIES
+    ]
 
 
 # Faults -------------------------------------------------------------------------------------------
@@ -190,21 +224,28 @@ def late(late_s: float) -> Callable[..., Pair]:
     return fault
 
 
-def noisy_poses(size_m: float, degrees: float, stated: bool) -> Callable[..., Pair]:
+def noisy_poses(
+    size_m: float, degrees: float, stated: bool
+) -> Callable[..., Pair]:
     """Every pose has noise of its own."""
     size_rad = np.radians(degrees)
 
     def fault(experiment: Experiment, rng: Generator) -> Pair:
         (grasp,) = experiment.grasps
         poses = grasp.poses
-        turns = Rotation.from_rotvec(size_rad * rng.standard_normal((len(poses.t_s), 3)))
+        turns = Rotation.from_rotvec(
+            size_rad * rng.standard_normal((len(poses.t_s), 3))
+        )
         noisy = PoseSequence(
             poses.t_s,
-            poses.positions_m + size_m * rng.standard_normal(poses.positions_m.shape),
+            poses.positions_m
+            + size_m * rng.standard_normal(poses.positions_m.shape),
             (turns * Rotation.from_quat(poses.quaternions_xyzw)).as_quat(),
         )
         sigmas = {"sigma_m": size_m, "sigma_rad": size_rad} if stated else {}
-        return experiment, replace(experiment, grasps=(Grasp(grasp.nodes, noisy, **sigmas),))
+        return experiment, replace(
+            experiment, grasps=(Grasp(grasp.nodes, noisy, **sigmas),)
+        )
 
     return fault
 
@@ -221,7 +262,9 @@ def tilted(experiment: Experiment, rng: Generator) -> Pair:
 def off_in_gripper(experiment: Experiment, rng: Generator) -> Pair:
     """The body is off in the gripper by 1 mm and 0.5° an axis."""
     matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(np.radians(0.5) * rng.standard_normal(3)).as_matrix()
+    matrix[:3, :3] = Rotation.from_rotvec(
+        np.radians(0.5) * rng.standard_normal(3)
+    ).as_matrix()
     matrix[:3, 3] = 1e-3 * rng.standard_normal(3)
     (grasp,) = experiment.grasps
     moved = Grasp(grasp.nodes, grasp.poses.after(matrix))
@@ -229,7 +272,9 @@ def off_in_gripper(experiment: Experiment, rng: Generator) -> Pair:
 
 
 def simulated(experiment: Experiment) -> Experiment:
-    return with_markers(experiment, simulate(experiment, TRUTH, SCHEME, substeps=1).markers_m)
+    return with_markers(
+        experiment, simulate(experiment, TRUTH, SCHEME, substeps=1).markers_m
+    )
 
 
 def claiming(factor: float) -> Callable[..., Pair]:
@@ -247,14 +292,20 @@ def loose(experiment: Experiment, rng: Generator) -> Pair:
     """The first marker is three times as noisy."""
     sigma_m = experiment.markers.sigma_m.copy()
     sigma_m[0] *= 3
-    return replace(experiment, markers=replace(experiment.markers, sigma_m=sigma_m)), experiment
+    return replace(
+        experiment, markers=replace(experiment.markers, sigma_m=sigma_m)
+    ), experiment
 
 
 def misplaced(experiment: Experiment, rng: Generator) -> Pair:
     """Every marker sits 1 mm an axis off its place."""
     places_m = experiment.markers.predict_positions(experiment.body.nodes_m)
-    moved = at_places(experiment, places_m + 1e-3 * rng.standard_normal(places_m.shape))
-    return with_markers(experiment, moved.markers.predict_positions(positions_m())), experiment
+    moved = at_places(
+        experiment, places_m + 1e-3 * rng.standard_normal(places_m.shape)
+    )
+    return with_markers(
+        experiment, moved.markers.predict_positions(positions_m())
+    ), experiment
 
 
 def unplaced(experiment: Experiment, rng: Generator) -> Pair:
@@ -265,7 +316,11 @@ def unplaced(experiment: Experiment, rng: Generator) -> Pair:
 
 def at_places(experiment: Experiment, places_m: Array) -> Experiment:
     markers = replace(
-        experiment.markers, placement=None, located=None, places_m=places_m, attach="embedded"
+        experiment.markers,
+        placement=None,
+        located=None,
+        places_m=places_m,
+        attach="embedded",
     )
     return replace(experiment, markers=markers)
 
@@ -280,7 +335,10 @@ def drawn(names: Sequence[str]) -> Callable[..., Pair]:
                 size = (row.sigma or 0.0) * rng.standard_normal()
                 # No coefficient of the air is below zero.
                 off[name] = max(size, -0.99) if row.name in AIR else size
-        values = {name: truth()[name] for name in ("young_pa", "poisson", *list(TRUTH)[2:])}
+        values = {
+            name: truth()[name]
+            for name in ("young_pa", "poisson", *list(TRUTH)[2:])
+        }
         return wrong(experiment, values, off), experiment
 
     return fault
@@ -288,13 +346,23 @@ def drawn(names: Sequence[str]) -> Callable[..., Pair]:
 
 AIR = ("air_drag", "added_mass", "buoyancy")
 SINGLE = (
-    *("body_scale", "mass", "density_gradient", "anisotropy", "stiffness_drift", "time_scale"),
+    *(
+        "body_scale",
+        "mass",
+        "density_gradient",
+        "anisotropy",
+        "stiffness_drift",
+        "time_scale",
+    ),
     *AIR,
 )
 # What a budget has of each fault.
 ASSUMED = {f"assumed: {name}": (name,) for name in SINGLE}
 ASSUMED |= {"assumed: air": AIR, "assumed: all of these": SINGLE}
-ROWS = {f: tuple(r for r in ASSUMPTIONS if r.name in names) for f, names in ASSUMED.items()}
+ROWS = {
+    f: tuple(r for r in ASSUMPTIONS if r.name in names)
+    for f, names in ASSUMED.items()
+}
 
 FAULTS: dict[str, Callable[[Experiment, Generator], Pair]] = {
     "none": faultless,
@@ -327,7 +395,9 @@ def header(twins: int) -> str:
 
 
 def table_head() -> str:
-    columns = [f"{c} {what} %" for what in ("held", "whole", "error") for c in COLUMNS]
+    columns = [
+        f"{c} {what} %" for what in ("held", "whole", "error") for c in COLUMNS
+    ]
     cells = ["fault", *columns, "correlated %", "lost"]
     return _line(cells) + "\n" + _line(["---"] * len(cells))
 
@@ -361,8 +431,12 @@ def _share(held: Array) -> str:
 
 def loss_of_precision(outcomes: Sequence[Outcome]) -> str:
     """What the default nuisance parameters cost where nothing is wrong."""
-    ratios = np.nanmedian([outcome.relative / outcome.without for outcome in outcomes], axis=0)
-    listed = ", ".join(f"{c} {ratio:.2f}" for c, ratio in zip(COLUMNS, ratios, strict=True))
+    ratios = np.nanmedian(
+        [outcome.relative / outcome.without for outcome in outcomes], axis=0
+    )
+    listed = ", ".join(
+        f"{c} {ratio:.2f}" for c, ratio in zip(COLUMNS, ratios, strict=True)
+    )
     return f"Faultless, standard errors over those without nuisance parameters: {listed}"
 
 

@@ -26,7 +26,10 @@ import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.spatial_field import Prior
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.statistics.field_estimates import FieldEstimate, field_estimates
+from collocation_sysid.statistics.field_estimates import (
+    FieldEstimate,
+    field_estimates,
+)
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 Array = NDArray[np.float64]
@@ -64,17 +67,22 @@ def stiff_cells(kind: str, mesh: cs.TetMesh) -> NDArray[np.bool_]:
 def hung(body: Body, count: int, steps: int) -> cs.Experiment:
     """The block in the hand, with markers on its surface that nobody has seen yet."""
     t_s, upright = STEP_S * np.arange(steps), Rotation.identity()
-    poses = swing(t_s, (0.02, 0.02, 0.01), (0.3, 0.3, 0.5), (1.7, 2.3, 1.3), 0.2, upright)
+    poses = swing(
+        t_s, (0.02, 0.02, 0.01), (0.3, 0.3, 0.5), (1.7, 2.3, 1.3), 0.2, upright
+    )
     x, high = body.nodes_m, np.array(SIZE_M)
     surface = np.flatnonzero(
-        ((x < 1e-9) | (x > high - 1e-9)).any(axis=1) & (x[:, 2] < high[2] - 0.01)
+        ((x < 1e-9) | (x > high - 1e-9)).any(axis=1)
+        & (x[:, 2] < high[2] - 0.01)
     )
     chosen = np.random.default_rng(0).permutation(surface)[:count]
     names = [f"m{k}" for k in range(len(chosen))]
     nowhere = np.zeros((steps, len(chosen), 3))
     markers = cs.Markers(t_s, nowhere, SIGMA_M, names, x[chosen]).on_body(body)
     grasp = cs.Grasp(np.flatnonzero(x[:, 2] > high[2] - 1e-9), poses)
-    return cs.Experiment(body, t_s, [grasp], markers, nuisance=cs.Nuisance.none())
+    return cs.Experiment(
+        body, t_s, [grasp], markers, nuisance=cs.Nuisance.none()
+    )
 
 
 def problem_of(twin: Twin, seed: int) -> tuple[cs.Problem, Array]:
@@ -83,15 +91,29 @@ def problem_of(twin: Twin, seed: int) -> tuple[cs.Problem, Array]:
     stiff = stiff_cells(twin.kind, mesh)
     regions = [cs.Region("stiff", stiff)] if stiff.any() else []
     true = Body(mesh, density_kg_m3=1000.0, regions=regions)
-    values = {"young_pa": YOUNG_PA, "stiff.young_pa": twin.ratio * YOUNG_PA, **BESIDE}
-    known = {n: v for n, v in values.items() if regions or not n.startswith("stiff")}
-    made = cs.simulate(hung(true, twin.markers, twin.steps), known, "midpoint", substeps=1)
+    values = {
+        "young_pa": YOUNG_PA,
+        "stiff.young_pa": twin.ratio * YOUNG_PA,
+        **BESIDE,
+    }
+    known = {
+        n: v for n, v in values.items() if regions or not n.startswith("stiff")
+    }
+    made = cs.simulate(
+        hung(true, twin.markers, twin.steps), known, "midpoint", substeps=1
+    )
     amplitude = twin.amplitude if twin.prior == "smooth" else None
-    field = cs.Field(twin.length_m, modes=twin.modes, amplitude=amplitude, prior=twin.prior)
-    sought = hung(Body(mesh, density_kg_m3=1000.0, field=field), twin.markers, twin.steps)
+    field = cs.Field(
+        twin.length_m, modes=twin.modes, amplitude=amplitude, prior=twin.prior
+    )
+    sought = hung(
+        Body(mesh, density_kg_m3=1000.0, field=field), twin.markers, twin.steps
+    )
     noise = np.random.default_rng(seed).normal(size=made.markers_m.shape)
     experiment = cs.with_markers(sought, made.markers_m + SIGMA_M * noise)
-    guesses = {n: cs.Unknown(0.7 * values[n]) for n in ("young_pa", "gamma_r_s")}
+    guesses = {
+        n: cs.Unknown(0.7 * values[n]) for n in ("young_pa", "gamma_r_s")
+    }
     problem = cs.Problem([experiment], {**BESIDE, **guesses}, substeps=1)
     return problem, np.log(YOUNG_PA * np.where(stiff, twin.ratio, 1.0))
 
@@ -102,9 +124,15 @@ TWINS = (
     Twin("the same, 12 markers", "half", 2.0, 0.04, 60, markers=12),
     Twin("stiff ball, twice", "ball", 2.0, 0.03, 80),
     Twin("stiff ball, three times", "ball", 3.0, 0.03, 80),
-    Twin("half three times, two phases", "half", 3.0, 0.04, 60, prior="two-phase"),
-    Twin("ball three times, two phases", "ball", 3.0, 0.03, 80, prior="two-phase"),
-    Twin("ball five times, two phases", "ball", 5.0, 0.03, 80, prior="two-phase"),
+    Twin(
+        "half three times, two phases", "half", 3.0, 0.04, 60, prior="two-phase"
+    ),
+    Twin(
+        "ball three times, two phases", "ball", 3.0, 0.03, 80, prior="two-phase"
+    ),
+    Twin(
+        "ball five times, two phases", "ball", 5.0, 0.03, 80, prior="two-phase"
+    ),
     Twin("even, two phases", "none", 1.0, 0.04, 60, prior="two-phase"),
     Twin("even", "none", 1.0, 0.04, 60),
     Twin("half, amplitude 0.1", "half", 2.0, 0.04, 60, 0.1),
@@ -135,7 +163,9 @@ def found_of(twin: Twin, seed: int) -> Found:
     body = collocation.transcriptions[0].body
     (field,) = field_estimates(body, collocation.parameters, solution.q, known)
     estimate = known.estimates.get("contrast")
-    return Found(field, truth, body.mesh, took_s, estimate and estimate.statistical95)
+    return Found(
+        field, truth, body.mesh, took_s, estimate and estimate.statistical95
+    )
 
 
 def told(twin: Twin, seeds: range) -> str:
@@ -143,24 +173,43 @@ def told(twin: Twin, seeds: range) -> str:
     rows, said = [], set[str]()
     for seed in seeds:
         found = found_of(twin, seed)
-        field, truth, mesh, took_s = found.field, found.truth, found.mesh, found.took_s
+        field, truth, mesh, took_s = (
+            found.field,
+            found.truth,
+            found.mesh,
+            found.took_s,
+        )
         low, high = np.log(field.statistical95)
         held = (low < truth) & (truth < high)
         stiff, log = stiff_cells(twin.kind, mesh), np.log(field.value)
-        ratio = np.exp(log[stiff].mean() - log[~stiff].mean()) if stiff.any() else np.nan
+        ratio = (
+            np.exp(log[stiff].mean() - log[~stiff].mean())
+            if stiff.any()
+            else np.nan
+        )
         z_m = mesh.points_m[mesh.tetrahedra].mean(axis=1)[:, 2]
         step_mm = 1e3 * step_of(z_m, log) if twin.kind == "half" else np.nan
         share, width = field.is_informed.mean(), np.median(field.deviation)
         error = np.sqrt(np.mean((log - truth) ** 2))
-        inside = held[field.is_informed].mean() if field.is_informed.any() else np.nan
+        inside = (
+            held[field.is_informed].mean()
+            if field.is_informed.any()
+            else np.nan
+        )
         within = held[stiff].mean() if stiff.any() else np.nan
         counts = field.identified_modes, took_s, within
-        rows.append((share, inside, held.mean(), error, width, ratio, step_mm, *counts))
+        rows.append(
+            (share, inside, held.mean(), error, width, ratio, step_mm, *counts)
+        )
         if found.contrast95 is not None:
             lower, upper = found.contrast95
             said |= {f"contrast {lower:.3g} to {upper:.3g}"}
         said |= {concern.code for concern in field.concerns}
-        said |= {f"length {field.modes.length_m:g}"} if isinstance(twin.length_m, tuple) else set()
+        said |= (
+            {f"length {field.modes.length_m:g}"}
+            if isinstance(twin.length_m, tuple)
+            else set()
+        )
     mean = np.mean(rows, axis=0)
     cells = (
         f"{mean[0]:.0%}", f"{mean[1]:.1%}", f"{mean[2]:.1%}", f"{mean[3]:.3f}", f"{mean[4]:.3f}",
@@ -174,7 +223,10 @@ def step_of(z_m: Array, log: Array) -> float:
     """Height at which a step that fits best is, of the layers' means."""
     edges = np.linspace(0, SIZE_M[2], 61)[5:-5]
     misfits = [
-        sum(((part - part.mean()) ** 2).sum() for part in (log[z_m < at], log[z_m >= at]))
+        sum(
+            ((part - part.mean()) ** 2).sum()
+            for part in (log[z_m < at], log[z_m >= at])
+        )
         for at in edges
     ]
     return float(edges[np.array(misfits) < min(misfits) * (1 + 1e-9)].mean())
@@ -182,24 +234,35 @@ def step_of(z_m: Array, log: Array) -> float:
 
 def cost() -> None:
     """What a mode costs: processor time of a solve an iteration, over that without a field."""
-    print("| modes | nodes | s an iteration | over that without |\n|---|---|---|---|")
+    print(
+        "| modes | nodes | s an iteration | over that without |\n|---|---|---|---|"
+    )
     without = 0.0
     for modes in (0, 10, 20, 40, 80):
         twin = Twin("", "half", 2.0, 0.04, max(1, modes))
         problem, _ = problem_of(twin, 1)
         if not modes:
-            fixed = {name: 0.0 for name in problem.bodies[0].field_coefficient_names}
+            fixed = {
+                name: 0.0 for name in problem.bodies[0].field_coefficient_names
+            }
             problem = cs.Problem(
-                problem.experiments, problem.parameters.with_fixed(fixed), substeps=1
+                problem.experiments,
+                problem.parameters.with_fixed(fixed),
+                substeps=1,
             )
         best = np.inf
         for _ in range(2):
             began = time.process_time()
             solution = ReducedSpace()(problem.collocation())
-            best = min(best, (time.process_time() - began) / solution.iterations)
+            best = min(
+                best, (time.process_time() - began) / solution.iterations
+            )
         without = without or best
         nodes = len(problem.bodies[0].nodes_m)
-        print(f"| {modes} | {nodes} | {best:.2f} | {best / without:.2f} |", flush=True)
+        print(
+            f"| {modes} | {nodes} | {best:.2f} | {best / without:.2f} |",
+            flush=True,
+        )
 
 
 def main() -> None:

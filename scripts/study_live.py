@@ -54,7 +54,9 @@ class Tally:
                     self._count(at_s, update)
             if abs(frame.t_s - EARLY_S) < 1e-6:
                 found = update.estimates
-                self.errors.append([abs(found[n].value / SOFT[n] - 1) for n in SOFT])
+                self.errors.append(
+                    [abs(found[n].value / SOFT[n] - 1) for n in SOFT]
+                )
         if batch:
             solution = solve(problem, ReducedSpace())
             known = uncertainty_at(solution.collocation, solution.z).estimates
@@ -76,32 +78,59 @@ class Tally:
         """Print it."""
         print(f"{len(self.errors)} twins")
         for at_s in LOOKED_AT_S:
-            shares = (f"{n} {self.held[at_s, n] / max(1, self.told[at_s, n]):.3f}" for n in SOFT)
-            held, told = (sum(each[at_s, n] for n in SOFT) for each in (self.held, self.told))
-            print(f"t = {at_s:g} s: {', '.join(shares)}; all {held / max(1, told):.3f} of {told}")
-            said = (f"{v} {self.verdicts[at_s, v]}" for v in ("good", "check", "doubtful"))
+            shares = (
+                f"{n} {self.held[at_s, n] / max(1, self.told[at_s, n]):.3f}"
+                for n in SOFT
+            )
+            held, told = (
+                sum(each[at_s, n] for n in SOFT)
+                for each in (self.held, self.told)
+            )
+            print(
+                f"t = {at_s:g} s: {', '.join(shares)}; all {held / max(1, told):.3f} of {told}"
+            )
+            said = (
+                f"{v} {self.verdicts[at_s, v]}"
+                for v in ("good", "check", "doubtful")
+            )
             print(f"    verdicts: {', '.join(said)}")
         near = np.mean(np.array(self.errors) <= NEAR, axis=0)
-        shares = (f"{n} {share:.2f}" for n, share in zip(SOFT, near, strict=True))
-        print(f"within {NEAR:.0%} of the truth after {EARLY_S:g} s: {', '.join(shares)}")
+        shares = (
+            f"{n} {share:.2f}" for n, share in zip(SOFT, near, strict=True)
+        )
+        print(
+            f"within {NEAR:.0%} of the truth after {EARLY_S:g} s: {', '.join(shares)}"
+        )
         median, late = 1e3 * np.percentile(self.latency_s, [50, 99])
-        print(f"processor time of a frame: median {median:.2f} ms, 99 % below {late:.2f} ms")
+        print(
+            f"processor time of a frame: median {median:.2f} ms, 99 % below {late:.2f} ms"
+        )
         if self.apart:
-            print(f"from the batch's answer in its standard errors: largest {max(self.apart):.3f}")
+            print(
+                f"from the batch's answer in its standard errors: largest {max(self.apart):.3f}"
+            )
 
 
 def main() -> None:
     """Stream the twins and print a table now and then."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--twins", type=int, default=200)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first")
+    parser.add_argument(
+        "--first", type=int, default=0, help="seed of the first"
+    )
     parser.add_argument("--body", default="block")
-    parser.add_argument("--rows", type=int, default=6, help="passed again with each frame")
-    parser.add_argument("--batch", type=int, default=0, help="so many are solved as a whole too")
+    parser.add_argument(
+        "--rows", type=int, default=6, help="passed again with each frame"
+    )
+    parser.add_argument(
+        "--batch", type=int, default=0, help="so many are solved as a whole too"
+    )
     arguments = parser.parse_args()
     tally = Tally()
     for number in range(arguments.twins):
-        problem = twin(arguments.body, SOFT, arguments.first + number, SAMPLES, "midpoint")
+        problem = twin(
+            arguments.body, SOFT, arguments.first + number, SAMPLES, "midpoint"
+        )
         tally.stream(problem, arguments.rows, number < arguments.batch)
         if (number + 1) % SHOWN_EVERY == 0 or number + 1 == arguments.twins:
             tally.show()

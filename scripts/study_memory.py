@@ -37,7 +37,12 @@ from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 SIZE_M, DIVISIONS = (0.1, 0.03, 0.03), (4, 1, 1)
 NOISE_M, STEPS, STEP_S, MOVED_S = 2e-4, 120, 0.01, 0.4
-TRUTH = {"young_pa": 2e4, "poisson": 0.3, "gamma_r_s": 0.003, "gamma_m_1_s": 0.5}
+TRUTH = {
+    "young_pa": 2e4,
+    "poisson": 0.3,
+    "gamma_r_s": 0.003,
+    "gamma_m_1_s": 0.5,
+}
 BRANCHES = (
     {"prony_1.share": 0.4, "prony_1.tau_s": 0.3},
     {"prony_2.share": 0.3, "prony_2.tau_s": 0.03},
@@ -45,9 +50,13 @@ BRANCHES = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Coverage of intervals with memory.")
+    parser = argparse.ArgumentParser(
+        description="Coverage of intervals with memory."
+    )
     parser.add_argument("--twins", type=int, default=200)
-    parser.add_argument("--branches", type=int, nargs="+", choices=(1, 2), default=[1, 2])
+    parser.add_argument(
+        "--branches", type=int, nargs="+", choices=(1, 2), default=[1, 2]
+    )
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     for branches in arguments.branches:
@@ -59,39 +68,63 @@ def report(branches: int, twins: int, seed: int) -> None:
     exact, parameters = recording(branches), unknowns(branches)
     solution = ReducedSpace()(Collocation([exact], parameters))
     true = truth(branches)
-    worst = max(abs(solution.parameters[name] / value - 1) for name, value in true.items())
-    print(f"{branches} branches; without noise all parameters are right to {worst:.1e}")
+    worst = max(
+        abs(solution.parameters[name] / value - 1)
+        for name, value in true.items()
+    )
+    print(
+        f"{branches} branches; without noise all parameters are right to {worst:.1e}"
+    )
     rng = np.random.default_rng(seed)
-    at_once = true["young_pa"] * (1 + sum(v for n, v in true.items() if n.endswith("share")))
+    at_once = true["young_pa"] * (
+        1 + sum(v for n, v in true.items() if n.endswith("share"))
+    )
     true |= {"instantaneous_young_pa": at_once}
     held = {name: 0 for name in true}
     wide = dict.fromkeys(true, 0)
     for _ in range(twins):
         tracks = exact.markers.positions_m
-        noisy = with_markers(exact, tracks + rng.normal(scale=NOISE_M, size=tracks.shape))
+        noisy = with_markers(
+            exact, tracks + rng.normal(scale=NOISE_M, size=tracks.shape)
+        )
         collocation = Collocation([noisy], parameters)
         found = ReducedSpace()(collocation)
         fit = linearise_fit(collocation, found.z)
         uncertainty = uncertainty_from_fit(fit, parameters, found.q)
-        for name, estimate in {**uncertainty.estimates, **uncertainty.derived}.items():
+        for name, estimate in {
+            **uncertainty.estimates,
+            **uncertainty.derived,
+        }.items():
             if name in true and estimate.statistical95 is not None:
-                held[name] += estimate.statistical95[0] <= true[name] <= estimate.statistical95[1]
+                held[name] += (
+                    estimate.statistical95[0]
+                    <= true[name]
+                    <= estimate.statistical95[1]
+                )
                 wide[name] += 1
     low, high = binom.interval(0.95, twins, 0.95)
-    print(f"  {twins} twins; by chance {100 * low / twins:.1f} to {100 * high / twins:.1f} %")
+    print(
+        f"  {twins} twins; by chance {100 * low / twins:.1f} to {100 * high / twins:.1f} %"
+    )
     for name, count in held.items():
         share = 100 * count / max(1, wide[name])
-        print(f"  {name:24}{share:6.1f} % of {wide[name]} intervals", flush=True)
+        print(
+            f"  {name:24}{share:6.1f} % of {wide[name]} intervals", flush=True
+        )
 
 
 def truth(branches: int) -> dict[str, float]:
     """All parameters with so many branches."""
-    return TRUTH | {name: v for branch in BRANCHES[:branches] for name, v in branch.items()}
+    return TRUTH | {
+        name: v for branch in BRANCHES[:branches] for name, v in branch.items()
+    }
 
 
 def unknowns(branches: int) -> Parameters:
     """All to be estimated, from guesses near the truth."""
-    return Parameters.from_mapping({n: Unknown(guess=1.1 * v) for n, v in truth(branches).items()})
+    return Parameters.from_mapping(
+        {n: Unknown(guess=1.1 * v) for n, v in truth(branches).items()}
+    )
 
 
 @cache
@@ -111,9 +144,16 @@ def recording(branches: int) -> Experiment:
     nowhere = np.zeros((len(t_s), len(seen), 3))
     markers = Markers(t_s, nowhere, NOISE_M, places_m=body.nodes_m[seen])
     experiment = Experiment(
-        body, t_s, [Grasp(held, poses)], markers, name="block", nuisance=Nuisance.none()
+        body,
+        t_s,
+        [Grasp(held, poses)],
+        markers,
+        name="block",
+        nuisance=Nuisance.none(),
     )
-    tracks = simulate(experiment, truth(branches), "midpoint", substeps=1).markers_m
+    tracks = simulate(
+        experiment, truth(branches), "midpoint", substeps=1
+    ).markers_m
     return replace(experiment, markers=with_markers(experiment, tracks).markers)
 
 

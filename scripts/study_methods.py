@@ -17,7 +17,15 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from studies import TRUTH, Variant, markdown, number, run_variants, save, worst_error
+from studies import (
+    TRUTH,
+    Variant,
+    markdown,
+    number,
+    run_variants,
+    save,
+    worst_error,
+)
 from synthetic import swing
 
 from collocation_sysid.fem.structured import cylinder_mesh
@@ -39,9 +47,16 @@ VARIANTS = (
     Variant("shooting, growing horizon", "continuation", SHOOT),
     Variant("penalty, LM", "penalty", LM),
     Variant(
-        "augmented-lagrangian, LM, first ρ = 1e2", "augmented-lagrangian", {"rho": 1e2}, share=0.5
+        "augmented-lagrangian, LM, first ρ = 1e2",
+        "augmented-lagrangian",
+        {"rho": 1e2},
+        share=0.5,
     ),
-    Variant("augmented-lagrangian, LM, first ρ = 1e5", "augmented-lagrangian", share=0.5),
+    Variant(
+        "augmented-lagrangian, LM, first ρ = 1e5",
+        "augmented-lagrangian",
+        share=0.5,
+    ),
     Variant("interior-point", "interior-point", ALONE, share=0.25),
     Variant("penalty, CG", "penalty", {"max_time_s": 15}, share=0.25),
 )
@@ -108,23 +123,38 @@ class Score:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--starts", type=int, default=40)
     parser.add_argument("--spread", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--layers", type=int, default=7, help="7 (layers + 1) nodes")
+    parser.add_argument(
+        "--layers", type=int, default=7, help="7 (layers + 1) nodes"
+    )
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--step-s", type=float, default=0.02)
-    parser.add_argument("--time-s", type=float, default=40.0, help="limit of a run")
+    parser.add_argument(
+        "--time-s", type=float, default=40.0, help="limit of a run"
+    )
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--methods", nargs="*", choices=[v.name for v in VARIANTS])
-    parser.add_argument("--out", type=Path, default=Path("results/study_methods"))
+    parser.add_argument(
+        "--methods", nargs="*", choices=[v.name for v in VARIANTS]
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("results/study_methods")
+    )
     arguments = parser.parse_args()
-    path = write_problem(arguments.out, arguments.layers, arguments.steps, arguments.step_s)
+    path = write_problem(
+        arguments.out, arguments.layers, arguments.steps, arguments.step_s
+    )
     rows = run_variants(
         path,
-        [v for v in VARIANTS if not arguments.methods or v.name in arguments.methods],
+        [
+            v
+            for v in VARIANTS
+            if not arguments.methods or v.name in arguments.methods
+        ],
         arguments.out,
         starts=arguments.starts,
         spread=arguments.spread,
@@ -132,7 +162,11 @@ def main() -> None:
         time_s=arguments.time_s,
         workers=arguments.workers,
     )
-    save(arguments.out, "study_methods", table([score(name, each) for name, each in rows.items()]))
+    save(
+        arguments.out,
+        "study_methods",
+        table([score(name, each) for name, each in rows.items()]),
+    )
 
 
 def write_problem(folder: Path, layers: int, steps: int, step_s: float) -> Path:
@@ -150,13 +184,25 @@ def write_problem(folder: Path, layers: int, steps: int, step_s: float) -> Path:
     )
     write_poses_csv(folder / "motion.csv", poses)
     on_side = np.linalg.norm(mesh.points_m[:, :2], axis=1) > RADIUS_M / 2
-    marked = mesh.points_m[on_side & (mesh.points_m[:, 2] > 0.2 * HEIGHT_M)][::5]
-    places = ", ".join(f"m{k} = {point.tolist()}" for k, point in enumerate(marked))
+    marked = mesh.points_m[on_side & (mesh.points_m[:, 2] > 0.2 * HEIGHT_M)][
+        ::5
+    ]
+    places = ", ".join(
+        f"m{k} = {point.tolist()}" for k, point in enumerate(marked)
+    )
     path = folder / "problem.toml"
-    path.write_text(PROBLEM.replace("REFERENCES", f"{{ {places} }}"), encoding="utf-8")
-    at_truth = [f"parameters.{name}.guess={value}" for name, value in TRUTH.items()]
+    path.write_text(
+        PROBLEM.replace("REFERENCES", f"{{ {places} }}"), encoding="utf-8"
+    )
+    at_truth = [
+        f"parameters.{name}.guess={value}" for name, value in TRUTH.items()
+    ]
     (folder / "swing_markers.csv").unlink(missing_ok=True)
-    write_data(Problem.read(path, at_truth, simulation=True), folder, Recipe("midpoint"))
+    write_data(
+        Problem.read(path, at_truth, simulation=True),
+        folder,
+        Recipe("midpoint"),
+    )
     return path
 
 
@@ -164,14 +210,32 @@ def score(name: str, rows: Sequence[Row]) -> Score:
     """Count a variant's runs."""
     near = [worst_error(row) <= WITHIN for row in rows]
     converged = [bool(row["converged"]) for row in rows]
-    times = [row["total_s"] if row["total_s"] is not None else row["wall_s"] for row in rows]
+    times = [
+        row["total_s"] if row["total_s"] is not None else row["wall_s"]
+        for row in rows
+    ]
     misled = sum(c and not n for c, n in zip(converged, near, strict=True))
-    return Score(name, len(rows), sum(near), sum(converged), misled, float(np.median(times)))
+    return Score(
+        name,
+        len(rows),
+        sum(near),
+        sum(converged),
+        misled,
+        float(np.median(times)),
+    )
 
 
 def table(scores: Sequence[Score]) -> str:
     """Success rates as Markdown."""
-    heads = ("method", "found", "rate [%]", "95 % interval", "converged", "elsewhere", "median [s]")
+    heads = (
+        "method",
+        "found",
+        "rate [%]",
+        "95 % interval",
+        "converged",
+        "elsewhere",
+        "median [s]",
+    )
     lines = []
     for each in scores:
         low, high = each.interval

@@ -58,14 +58,25 @@ class Fit:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--schemes", nargs="*", choices=SCHEMES, default=list(SCHEMES))
-    parser.add_argument("--substeps", nargs="*", type=int, default=[1, 2, 4, 8, 16])
-    parser.add_argument("--layers", type=int, default=7, help="7 (layers + 1) nodes")
+    parser.add_argument(
+        "--schemes", nargs="*", choices=SCHEMES, default=list(SCHEMES)
+    )
+    parser.add_argument(
+        "--substeps", nargs="*", type=int, default=[1, 2, 4, 8, 16]
+    )
+    parser.add_argument(
+        "--layers", type=int, default=7, help="7 (layers + 1) nodes"
+    )
     parser.add_argument("--samples", type=int, default=50)
-    parser.add_argument("--fine-s", type=float, default=1.25e-4, help="Newmark's step")
-    parser.add_argument("--out", type=Path, default=Path("results/study_mismatch"))
+    parser.add_argument(
+        "--fine-s", type=float, default=1.25e-4, help="Newmark's step"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("results/study_mismatch")
+    )
     arguments = parser.parse_args()
     experiment = measured(arguments.layers, arguments.samples, arguments.fine_s)
     fits = [
@@ -73,7 +84,9 @@ def main() -> None:
         for scheme in arguments.schemes
         for substeps in arguments.substeps
     ]
-    save(arguments.out, "study_mismatch", f"{table(fits)}\n\n{order_table(fits)}")
+    save(
+        arguments.out, "study_mismatch", f"{table(fits)}\n\n{order_table(fits)}"
+    )
 
 
 def measured(layers: int, samples: int, fine_s: float) -> Experiment:
@@ -90,18 +103,23 @@ def measured(layers: int, samples: int, fine_s: float) -> Experiment:
     grasp = Grasp(experiment.grasps[0].nodes, motion.poses(fine_s))
     markers = replace(experiment.markers, t_s=t_s)
     experiment = replace(experiment, t_s=t_s, grasps=(grasp,), markers=markers)
-    return with_markers(experiment, simulate(experiment, TRUTH, timestep_s=fine_s).markers_m)
+    return with_markers(
+        experiment, simulate(experiment, TRUTH, timestep_s=fine_s).markers_m
+    )
 
 
 def identify(experiment: Experiment, scheme: str, substeps: int) -> Fit:
     """The parameters that a scheme takes for the truth."""
     parameters = Parameters(
         tuple(
-            Parameter(name, guess, *BOUNDS[name]) for name, guess in zip(TRUTH, GUESS, strict=True)
+            Parameter(name, guess, *BOUNDS[name])
+            for name, guess in zip(TRUTH, GUESS, strict=True)
         )
     )
     began = time.perf_counter()
-    solution = ReducedSpace()(Collocation([experiment], parameters, scheme, substeps))
+    solution = ReducedSpace()(
+        Collocation([experiment], parameters, scheme, substeps)
+    )
     found = solution.theta
     walls = np.array([BOUNDS[name] for name in TRUTH])
     return Fit(
@@ -121,12 +139,20 @@ def orders(fits: Sequence[Fit]) -> Array:
     if len(telling) < 2:
         return np.full(len(TRUTH), np.nan)
     steps = np.log([fit.step_s for fit in telling])
-    return np.polyfit(steps, np.log(np.abs([fit.errors for fit in telling])), 1)[0]
+    return np.polyfit(
+        steps, np.log(np.abs([fit.errors for fit in telling])), 1
+    )[0]
 
 
 def table(fits: Sequence[Fit]) -> str:
     """Relative errors as Markdown."""
-    heads = ("scheme", "Δt [ms]", *(f"{name} [%]" for name in HEADS), "rms [mm]", "time [s]")
+    heads = (
+        "scheme",
+        "Δt [ms]",
+        *(f"{name} [%]" for name in HEADS),
+        "rms [mm]",
+        "time [s]",
+    )
     lines = []
     for fit in fits:
         cells = [
@@ -143,7 +169,9 @@ def order_table(fits: Sequence[Fit]) -> str:
     """Orders over all steps, and over the two finest, as Markdown."""
     lines = []
     for scheme in dict.fromkeys(fit.scheme for fit in fits):
-        common = sorted((f for f in fits if f.scheme == scheme), key=lambda fit: fit.step_s)
+        common = sorted(
+            (f for f in fits if f.scheme == scheme), key=lambda fit: fit.step_s
+        )
         for name, chosen in (("all steps", common), ("two finest", common[:2])):
             cells = ["–" if np.isnan(o) else f"{o:.2f}" for o in orders(chosen)]
             lines.append((f"{scheme}, {name}", *cells))

@@ -16,7 +16,13 @@ from pathlib import Path
 
 import numpy as np
 from twins import BODIES, SOFT, sensing_twin, twin
-from wrong_twins import FAULTS, OBSTACLE_FAULTS, TRACK_FAULTS, WRENCH_FAULTS, Fault
+from wrong_twins import (
+    FAULTS,
+    OBSTACLE_FAULTS,
+    TRACK_FAULTS,
+    WRENCH_FAULTS,
+    Fault,
+)
 
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.pipeline import run
@@ -36,12 +42,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--body", choices=list(BODIES), default="bar")
     parser.add_argument("--samples", type=int, default=40)
-    parser.add_argument("--seeds", type=int, default=5, help="of right problems")
-    parser.add_argument("--only", default="", help="mistakes whose name contains this")
-    parser.add_argument("--check-only", action="store_true", help="leave out what solve reports")
+    parser.add_argument(
+        "--seeds", type=int, default=5, help="of right problems"
+    )
+    parser.add_argument(
+        "--only", default="", help="mistakes whose name contains this"
+    )
+    parser.add_argument(
+        "--check-only", action="store_true", help="leave out what solve reports"
+    )
     given = parser.parse_args()
     began, counts = time.perf_counter(), [0, 0, 0]
-    print(_line(["mistake", "`check`", "`solve`"]), _line(["---"] * 3), sep="\n", flush=True)
+    print(
+        _line(["mistake", "`check`", "`solve`"]),
+        _line(["---"] * 3),
+        sep="\n",
+        flush=True,
+    )
     for name, fault, problem in cases(given.body, given.samples, given.seeds):
         if given.only not in name:
             continue
@@ -53,7 +70,9 @@ def main() -> None:
             found, checked = (), f"refused: {error}"
         right = name.startswith(RIGHT)
         counts[0] += not right
-        counts[1] += not right and (bool(found) or checked.startswith("refused"))
+        counts[1] += not right and (
+            bool(found) or checked.startswith("refused")
+        )
         counts[2] += right and bool(found)
         solved = "" if given.check_only else solved_report(wrong)
         print(_line([name, checked, solved]), flush=True)
@@ -61,7 +80,9 @@ def main() -> None:
     print(f"\n{of}; {time.perf_counter() - began:.0f} s")
 
 
-def cases(body: str, samples: int, seeds: int) -> Iterator[tuple[str, Fault, Problem]]:
+def cases(
+    body: str, samples: int, seeds: int
+) -> Iterator[tuple[str, Fault, Problem]]:
     """Yield every mistake with a right problem to make it in."""
     for seed in range(1, seeds + 1):
         yield f"{RIGHT}, seed {seed}", NOTHING, twin(body, SOFT, seed, samples)
@@ -70,16 +91,30 @@ def cases(body: str, samples: int, seeds: int) -> Iterator[tuple[str, Fault, Pro
             NOTHING,
             sensing_twin(body, SOFT, seed, samples),
         )
-    seen, felt = twin(body, SOFT, 1, samples), sensing_twin(body, SOFT, 1, samples)
-    yield from ((name, fault, seen) for name, fault in {**FAULTS, **TRACK_FAULTS}.items())
+    seen, felt = (
+        twin(body, SOFT, 1, samples),
+        sensing_twin(body, SOFT, 1, samples),
+    )
+    yield from (
+        (name, fault, seen)
+        for name, fault in {**FAULTS, **TRACK_FAULTS}.items()
+    )
     yield from ((name, fault, felt) for name, fault in WRENCH_FAULTS.items())
     laid = Problem.read(PROBLEMS / "laid_block" / "problem.toml")
     poked = Problem.read(PROBLEMS / "poked_block" / "problem.toml")
     poked = replace(poked, experiments=poked.experiments[:PLACES])
     for problem in (laid, poked):
         yield f"{RIGHT}, {problem.title}", NOTHING, problem
-    yield "obstacle: normal reversed", OBSTACLE_FAULTS["obstacle: normal reversed"], laid
-    yield "obstacle: load reversed", OBSTACLE_FAULTS["obstacle: load reversed"], poked
+    yield (
+        "obstacle: normal reversed",
+        OBSTACLE_FAULTS["obstacle: normal reversed"],
+        laid,
+    )
+    yield (
+        "obstacle: load reversed",
+        OBSTACLE_FAULTS["obstacle: load reversed"],
+        poked,
+    )
 
 
 def checked_causes(problem: Problem) -> tuple:
@@ -94,7 +129,9 @@ def solved_report(problem: Problem) -> str:
         answer = run(problem)
     except (InputError, SimulationError) as error:
         return f"refused: {error}"
-    causes = named(answer.causes) if answer.causes else answer.solution.status.value
+    causes = (
+        named(answer.causes) if answer.causes else answer.solution.status.value
+    )
     return f"{answer.trust.verdict}: {causes}"
 
 
@@ -105,7 +142,11 @@ def named(causes: Sequence) -> str:
 
 
 def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(" ".join(cell.split()).replace("|", "/") for cell in cells) + " |"
+    return (
+        "| "
+        + " | ".join(" ".join(cell.split()).replace("|", "/") for cell in cells)
+        + " |"
+    )
 
 
 if __name__ == "__main__":

@@ -73,15 +73,21 @@ class Outcome:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--sigma-m", type=float, default=1e-3)
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, help="processes"
+    )
     parser.add_argument("--out", type=Path, default=Path("results/study_noise"))
     arguments = parser.parse_args()
     # Workers start afresh and find one thread each.
-    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "COLLOCATION_SYSID_THREADS": "1"}
+    os.environ |= {
+        "OPENBLAS_NUM_THREADS": "1",
+        "COLLOCATION_SYSID_THREADS": "1",
+    }
     start = multiprocessing.get_context("spawn")
     outcomes = {}
     with ProcessPoolExecutor(arguments.workers, mp_context=start) as pool:
@@ -106,14 +112,21 @@ def run(case: Case, sigma_m: float, seed: int) -> Outcome:
     )
 
 
-def noisy(sigma_m: float, seed: int | None, guess: Sequence[float]) -> Collocation:
+def noisy(
+    sigma_m: float, seed: int | None, guess: Sequence[float]
+) -> Collocation:
     """The twin with noise of its seed; without noise where there is none."""
     experiment, x = reference(sigma_m)
     tracks = experiment.markers.predict_positions(x.reshape(len(x), -1, 3))
     if seed is not None:
-        tracks = tracks + sigma_m * np.random.default_rng(seed).standard_normal(tracks.shape)
+        tracks = tracks + sigma_m * np.random.default_rng(seed).standard_normal(
+            tracks.shape
+        )
     parameters = Parameters(
-        tuple(Parameter(n, g, *BOUNDS[n]) for n, g in zip(TRUTH, guess, strict=True))
+        tuple(
+            Parameter(n, g, *BOUNDS[n])
+            for n, g in zip(TRUTH, guess, strict=True)
+        )
     )
     return Collocation([with_markers(experiment, tracks)], parameters, SCHEME)
 
@@ -131,23 +144,35 @@ def predicted(sigma_m: float) -> tuple[float, ...]:
     return tuple(np.sqrt(variances).tolist())
 
 
-def table(outcomes: Mapping[str, Sequence[Outcome]], expected: Sequence[float]) -> str:
+def table(
+    outcomes: Mapping[str, Sequence[Outcome]], expected: Sequence[float]
+) -> str:
     """Bias and spread of every method as Markdown."""
     heads = (
         *("method", "seeds", "converged"),
-        *(f"{name} {what} [%]" for name in HEADS for what in ("bias", "spread")),
+        *(
+            f"{name} {what} [%]"
+            for name in HEADS
+            for what in ("bias", "spread")
+        ),
         "median [s]",
     )
     spreads = [cell for each in expected for cell in ("0", f"{100 * each:.3g}")]
     lines = [("predicted", "–", "–", *spreads, "–")]
     for name, each in outcomes.items():
-        errors = 100 * np.array([outcome.errors for outcome in each if outcome.converged])
+        errors = 100 * np.array(
+            [outcome.errors for outcome in each if outcome.converged]
+        )
         cells = []
-        for bias, spread in zip(errors.mean(axis=0), errors.std(axis=0, ddof=1), strict=True):
+        for bias, spread in zip(
+            errors.mean(axis=0), errors.std(axis=0, ddof=1), strict=True
+        ):
             doubt = spread / np.sqrt(len(errors))
             cells += [f"{bias:+.2g} ± {doubt:.1g}", f"{spread:.3g}"]
         time_s = float(np.median([outcome.time_s for outcome in each]))
-        lines.append((name, str(len(each)), str(len(errors)), *cells, f"{time_s:.2g}"))
+        lines.append(
+            (name, str(len(each)), str(len(errors)), *cells, f"{time_s:.2g}")
+        )
     return markdown(heads, lines)
 
 

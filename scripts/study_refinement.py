@@ -29,7 +29,10 @@ from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
 
 NOISE_M = 5e-5
 SAMPLES, STEP_S = 20, 0.01
-BODIES = {"block": ((0.06, 0.06, 0.09), (2, 2, 2)), "bar": ((0.04, 0.04, 0.06), (1, 1, 1))}
+BODIES = {
+    "block": ((0.06, 0.06, 0.09), (2, 2, 2)),
+    "bar": ((0.04, 0.04, 0.06), (1, 1, 1)),
+}
 ELEMENTS = {"block": "tet4", "bar": "tet10"}
 YOUNG_PA = {"block": 1e3, "bar": 500.0}
 NAMES = ("young_pa", "poisson", "gamma_r_s", "gamma_m_1_s")
@@ -38,21 +41,34 @@ NAMES = ("young_pa", "poisson", "gamma_r_s", "gamma_m_1_s")
 def drawn(name: str, rng: np.random.Generator) -> dict[str, float]:
     """True parameters."""
     young_pa = YOUNG_PA[name] * float(np.exp(rng.uniform(-0.5, 0.5)))
-    damping = {"gamma_r_s": 0.004 * np.exp(rng.uniform(-0.5, 0.5)), "gamma_m_1_s": 1.0}
-    return {"young_pa": young_pa, "poisson": float(rng.uniform(0.15, 0.4)), **damping}
+    damping = {
+        "gamma_r_s": 0.004 * np.exp(rng.uniform(-0.5, 0.5)),
+        "gamma_m_1_s": 1.0,
+    }
+    return {
+        "young_pa": young_pa,
+        "poisson": float(rng.uniform(0.15, 0.4)),
+        **damping,
+    }
 
 
-def still(name: str, rng: np.random.Generator) -> tuple[Problem, dict[str, float]]:
+def still(
+    name: str, rng: np.random.Generator
+) -> tuple[Problem, dict[str, float]]:
     """A problem without data, and what is true."""
     size_m, divisions = BODIES[name]
-    body = Body(box_mesh(size_m, divisions), density_kg_m3=30.0, element=ELEMENTS[name])
+    body = Body(
+        box_mesh(size_m, divisions), density_kg_m3=30.0, element=ELEMENTS[name]
+    )
     t_s = STEP_S * np.arange(SAMPLES)
     held = np.flatnonzero(body.nodes_m[:, 2] > size_m[2] - 1e-6)
     free = np.setdiff1d(np.arange(len(body.nodes_m)), held)
     places = body.nodes_m[rng.choice(free, 6, replace=False)]
     markers = Markers(t_s, np.zeros((SAMPLES, 6, 3)), NOISE_M, places_m=places)
     grasp = Grasp(held, random_poses(t_s, rng))
-    moved = Experiment(body, t_s, [grasp], markers, name=name, nuisance=Nuisance.none())
+    moved = Experiment(
+        body, t_s, [grasp], markers, name=name, nuisance=Nuisance.none()
+    )
     truth = drawn(name, rng)
     guess = {
         "young_pa": Unknown(truth["young_pa"], 10.0, 1e6),
@@ -70,7 +86,10 @@ def twin(name: str, seed: int) -> tuple[Problem, dict[str, float]]:
     (fine,) = finer_mesh(finer_mesh(coarse)).experiments
     tracks = simulate(fine, truth, "midpoint", substeps=4).markers_m
     noise = rng.normal(scale=NOISE_M, size=tracks.shape)
-    return replace(coarse, experiments=[with_markers(coarse.experiments[0], tracks + noise)]), truth
+    return replace(
+        coarse,
+        experiments=[with_markers(coarse.experiments[0], tracks + noise)],
+    ), truth
 
 
 def main(twins: int = 20, first: int = 0) -> None:
@@ -81,12 +100,20 @@ def main(twins: int = 20, first: int = 0) -> None:
             problem, truth = twin(name, seed)
             solution = solve(problem)
             found = uncertainty_at(
-                solution.collocation, solution.z, ErrorModel(errors="independent")
+                solution.collocation,
+                solution.z,
+                ErrorModel(errors="independent"),
             )
-            refined = solve_refined(problem, WarmStart.of(solution), found.estimates)
+            refined = solve_refined(
+                problem, WarmStart.of(solution), found.estimates
+            )
             for key in held:
                 estimate, error = found.estimates[key], refined.errors.get(key)
-                if estimate.statistical95 is None or error is None or error.interval95 is None:
+                if (
+                    estimate.statistical95 is None
+                    or error is None
+                    or error.interval95 is None
+                ):
                     print(name, seed, key, estimate.reason, flush=True)
                     continue
                 both = tuple(
@@ -98,13 +125,25 @@ def main(twins: int = 20, first: int = 0) -> None:
                     [f"{v:.5g}" for v in pair]
                     for pair in (estimate.statistical95, error.interval95)
                 ]
-                changes = [f"{way:+.3g}" for way in (error.step or 0.0, error.mesh or 0.0)]
-                told = f"{truth[key]:.5g}", f"{estimate.value:.5g}", *changes, *intervals
+                changes = [
+                    f"{way:+.3g}"
+                    for way in (error.step or 0.0, error.mesh or 0.0)
+                ]
+                told = (
+                    f"{truth[key]:.5g}",
+                    f"{estimate.value:.5g}",
+                    *changes,
+                    *intervals,
+                )
                 print(name, seed, key, *told, *map(bool, both), flush=True)
     for key, found in held.items():
         shares = np.mean(found, axis=0)
-        print(f"{key}: noise {shares[0]:.0%}, with numerical error {shares[1]:.0%} of {len(found)}")
-    shares = np.mean([each for found in held.values() for each in found], axis=0)
+        print(
+            f"{key}: noise {shares[0]:.0%}, with numerical error {shares[1]:.0%} of {len(found)}"
+        )
+    shares = np.mean(
+        [each for found in held.values() for each in found], axis=0
+    )
     print(f"all: noise {shares[0]:.0%}, with numerical error {shares[1]:.0%}")
 
 

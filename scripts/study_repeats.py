@@ -41,9 +41,13 @@ class Repeats:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="*", choices=("beam", "cylinders", "tentacle"))
+    parser.add_argument(
+        "--only", nargs="*", choices=("beam", "cylinders", "tentacle")
+    )
     only = parser.parse_args().only or ("beam", "cylinders", "tentacle")
-    print("| repeats | number | values | scatter % | 95 % ± % | whole ± % | held | held by whole |")
+    print(
+        "| repeats | number | values | scatter % | 95 % ± % | whole ± % | held | held by whole |"
+    )
     print("|---|---|---|---|---|---|---|---|")
     for repeats in _all(only):
         values: dict[str, list[ReportedEstimate]] = {}
@@ -57,16 +61,24 @@ def main() -> None:
 def _all(only: Sequence[str]) -> Iterator[Repeats]:
     if "beam" in only:
         beam = Problem.read(PROBLEMS / "srl_beam" / "problem.toml")
-        yield Repeats("beam, three loads", beam, {e.name: [e.name] for e in beam.experiments})
+        yield Repeats(
+            "beam, three loads",
+            beam,
+            {e.name: [e.name] for e in beam.experiments},
+        )
     if "cylinders" in only:
         for silicone in SILICONES:
             runs = _cylinders(silicone)
             yield Repeats(
-                f"cylinders {silicone}", runs, {e.name: [e.name] for e in runs.experiments}
+                f"cylinders {silicone}",
+                runs,
+                {e.name: [e.name] for e in runs.experiments},
             )
     if "tentacle" in only:
         bent = Problem.read(PROBLEMS / "soft_tentacle" / "problem.toml")
-        pairs = {tension: [f"m{k}_{tension}" for k in (1, 2)] for tension in TENSIONS}
+        pairs = {
+            tension: [f"m{k}_{tension}" for k in (1, 2)] for tension in TENSIONS
+        }
         yield Repeats("tentacle, by tension", bent, pairs)
 
 
@@ -76,36 +88,71 @@ def _cylinders(silicone: str) -> Problem:
     with tempfile.TemporaryDirectory() as folder:
         for file in source.glob(f"{silicone}_*.csv"):
             shutil.copyfile(file, Path(folder) / file.name)
-        text = (source / "problem.toml").read_text().replace("EF30_0T", f"{silicone}_0T")
+        text = (
+            (source / "problem.toml")
+            .read_text()
+            .replace("EF30_0T", f"{silicone}_0T")
+        )
         problem = Path(folder) / "problem.toml"
         problem.write_text(text)
         return Problem.read(problem)
 
 
-def _alone(problem: Problem, names: Sequence[str]) -> dict[str, ReportedEstimate]:
+def _alone(
+    problem: Problem, names: Sequence[str]
+) -> dict[str, ReportedEstimate]:
     """What some recordings tell by themselves."""
-    own = [replace(e, validation=False) for e in problem.experiments if e.name in names]
+    own = [
+        replace(e, validation=False)
+        for e in problem.experiments
+        if e.name in names
+    ]
     try:
         found = run(replace(problem, experiments=own), seek_causes=False)
     except InputError:
         return {}
     known = found.estimates
-    return {n: known[n] for n in NAMES if n in known and known[n].statistical_std_error}
+    return {
+        n: known[n]
+        for n in NAMES
+        if n in known and known[n].statistical_std_error
+    }
 
 
-def _line(repeats: str, name: str, estimates: Sequence[ReportedEstimate]) -> str:
+def _line(
+    repeats: str, name: str, estimates: Sequence[ReportedEstimate]
+) -> str:
     # Where intervals are, with what the step does to all repeats alike.
-    logs = np.array([np.log(e.statistical95 or (e.value, e.value)).mean() for e in estimates])
+    logs = np.array(
+        [
+            np.log(e.statistical95 or (e.value, e.value)).mean()
+            for e in estimates
+        ]
+    )
     mean, count = logs.mean(), len(logs)
     scatter = 100 * float(logs.std(ddof=1)) if count > 1 else np.nan
     told = [(e.statistical95, e.combined95) for e in estimates]
     halves, held = [], []
     for intervals in zip(*told, strict=True):
-        ends = [np.log(np.maximum(interval, 1e-12)) for interval in intervals if interval]
-        halves.append(100 * float(np.median([(high - low) / 2 for low, high in ends])))
-        held.append(f"{sum(low <= mean <= high for low, high in ends)} of {len(ends)}")
+        ends = [
+            np.log(np.maximum(interval, 1e-12))
+            for interval in intervals
+            if interval
+        ]
+        halves.append(
+            100 * float(np.median([(high - low) / 2 for low, high in ends]))
+        )
+        held.append(
+            f"{sum(low <= mean <= high for low, high in ends)} of {len(ends)}"
+        )
     values = ", ".join(f"{e.value:.4g}" for e in estimates)
-    cells = (repeats, symbol_of(name), values, f"{scatter:.2g}", *(f"{h:.2g}" for h in halves))
+    cells = (
+        repeats,
+        symbol_of(name),
+        values,
+        f"{scatter:.2g}",
+        *(f"{h:.2g}" for h in halves),
+    )
     return f"| {' | '.join((*cells, *held))} |"
 
 

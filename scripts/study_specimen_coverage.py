@@ -75,20 +75,29 @@ CASES = (
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--twins", type=int, default=200)
-    parser.add_argument("--case", type=int, choices=range(len(CASES)), help="one of the cases")
+    parser.add_argument(
+        "--case", type=int, choices=range(len(CASES)), help="one of the cases"
+    )
     options = parser.parse_args()
     rows = []
-    for case in CASES if options.case is None else CASES[options.case : options.case + 1]:
+    for case in (
+        CASES
+        if options.case is None
+        else CASES[options.case : options.case + 1]
+    ):
         start = time.perf_counter()
         outcomes = [covered(case, seed) for seed in range(options.twins)]
         elapsed = time.perf_counter() - start
         for name in case.free:
             inside = np.array([outcome[name] for outcome in outcomes])
             share = f"{inside.sum()} of {len(inside)}, {inside.mean():.1%}"
-            rows.append((case.name, name, share, f"{elapsed / len(inside):.2g}"))
+            rows.append(
+                (case.name, name, share, f"{elapsed / len(inside):.2g}")
+            )
     heads = ("twins", "constant", "intervals with the truth", "s a twin")
     print(markdown(heads, rows))
 
@@ -97,13 +106,17 @@ def covered(case: Case, seed: int) -> dict[str, bool]:
     """Whether the statistical 95 % interval of each estimated constant contains the truth."""
     rng = np.random.default_rng(seed)
     experiments = [twin(case, test, rng) for test in case.tests]
-    free = {name: cs.Unknown(guess=GUESS * case.truth[name]) for name in case.free}
+    free = {
+        name: cs.Unknown(guess=GUESS * case.truth[name]) for name in case.free
+    }
     problem = cs.Problem(experiments, {**case.truth, **UNDAMPED, **free})
     solution = cs.solve(problem)
     assert solution.status.converged, seed
     fit = linearise_fit(solution.collocation, solution.z)
     parameters = solution.collocation.parameters
-    known = uncertainty_from_fit(fit, parameters, solution.q, problem.uncertainty)
+    known = uncertainty_from_fit(
+        fit, parameters, solution.q, problem.uncertainty
+    )
     inside = {}
     for name in case.free:
         interval = known.estimates[name].statistical95
@@ -118,16 +131,26 @@ def twin(case: Case, test: str, rng: np.random.Generator) -> cs.Experiment:
     zeros = np.zeros(SAMPLES)
     lateral: Any = 1 + zeros if case.has_lateral else None
     stated = cs.Specimen(
-        test, strain, zeros, SIGMA_PA, lateral_stretch=lateral, lateral_sigma=LATERAL_SIGMA
+        test,
+        strain,
+        zeros,
+        SIGMA_PA,
+        lateral_stretch=lateral,
+        lateral_sigma=LATERAL_SIGMA,
     )
     shifted = strain + stated.strain_zero * rng.normal()
     true = cs.Specimen(test, shifted, zeros, SIGMA_PA, lateral_stretch=lateral)
-    trajectory = cs.simulate(true.experiment(case.material, test), {**case.truth, **UNDAMPED})
+    trajectory = cs.simulate(
+        true.experiment(case.material, test), {**case.truth, **UNDAMPED}
+    )
     area = 1 + stated.area_error * rng.normal()
     experiment = stated.experiment(case.material, test)
     values = [
-        (area if gauge.unit == "Pa" else 1.0) * read + gauge.sigma * rng.normal(size=read.shape)
-        for gauge, read in zip(experiment.readings, trajectory.custom_sensor_values, strict=True)
+        (area if gauge.unit == "Pa" else 1.0) * read
+        + gauge.sigma * rng.normal(size=read.shape)
+        for gauge, read in zip(
+            experiment.readings, trajectory.custom_sensor_values, strict=True
+        )
     ]
     return with_readings(experiment, values)
 

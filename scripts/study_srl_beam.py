@@ -25,10 +25,15 @@ from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import ExperimentIterate
 from collocation_sysid.statistics.estimates import Estimate
-from collocation_sysid.statistics.identifiability import identifiability_sentences
+from collocation_sysid.statistics.identifiability import (
+    identifiability_sentences,
+)
 from collocation_sysid.statistics.linearised import LinearisedFit, linearise_fit
 from collocation_sysid.statistics.residual_diagnostics import diagnose_markers
-from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_from_fit
+from collocation_sysid.statistics.uncertainty import (
+    Uncertainty,
+    uncertainty_from_fit,
+)
 
 TRIALS = ("gravity", "load52", "load101")
 # Element and bricks along x, y and z.
@@ -52,7 +57,9 @@ class Beam:
 
     def load(self, *overrides: str) -> Problem:
         """The problem with these recordings, and other values for some keys."""
-        markers = (self.recordings / f"beam_{trial}_V2_a.c3d" for trial in TRIALS)
+        markers = (
+            self.recordings / f"beam_{trial}_V2_a.c3d" for trial in TRIALS
+        )
         files = [
             f"experiment.{trial}.markers.file={file}"
             for trial, file in zip(TRIALS, markers, strict=True)
@@ -70,13 +77,29 @@ class Fit:
 
 
 def main() -> None:
-    parts = {"joint": joint, "refinement": refinement, "validation": validation, "poisson": poisson}
+    parts = {
+        "joint": joint,
+        "refinement": refinement,
+        "validation": validation,
+        "poisson": poisson,
+    }
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--from", dest="source", type=Path, default=FOLDER, help="the recordings")
-    parser.add_argument("--problem", default="problem.toml", help="a file of problems/srl_beam")
-    parser.add_argument("--parts", nargs="+", choices=parts, default=list(parts))
+    parser.add_argument(
+        "--from",
+        dest="source",
+        type=Path,
+        default=FOLDER,
+        help="the recordings",
+    )
+    parser.add_argument(
+        "--problem", default="problem.toml", help="a file of problems/srl_beam"
+    )
+    parser.add_argument(
+        "--parts", nargs="+", choices=parts, default=list(parts)
+    )
     arguments = parser.parse_args()
     for part in arguments.parts:
         print(f"\n== {part} ==\n", flush=True)
@@ -96,7 +119,9 @@ def fit(problem: Problem, solution: Solution | None = None) -> Fit:
         print(f"NOT CONVERGED: {solution.message}")
     linearised = linearise_fit(solution.collocation, solution.z)
     return Fit(
-        solution, linearised, uncertainty_from_fit(linearised, problem.parameters, solution.q)
+        solution,
+        linearised,
+        uncertainty_from_fit(linearised, problem.parameters, solution.q),
     )
 
 
@@ -107,41 +132,67 @@ def joint(beam: Beam) -> None:
     """One material for the three trials, and everything the report has to say of it."""
     found = fit(beam.load(), shipped(beam))
     solution, uncertainty = found.solution, found.uncertainty
-    print(f"{solution.message} {solution.iterations} sweeps, {solution.timing.total:.0f} s")
-    print(f"\n{'parameter':14}{'value':>12}   95 % interval ({uncertainty.errors} errors)")
+    print(
+        f"{solution.message} {solution.iterations} sweeps, {solution.timing.total:.0f} s"
+    )
+    print(
+        f"\n{'parameter':14}{'value':>12}   95 % interval ({uncertainty.errors} errors)"
+    )
     for name, estimate in uncertainty.estimates.items():
         print(f"{name:14}{estimate.value:12.5g}   {interval(estimate)}")
-    print("\ncorrelations\n" + matrix(uncertainty.names, uncertainty.correlation))
+    print(
+        "\ncorrelations\n" + matrix(uncertainty.names, uncertainty.correlation)
+    )
     print("\nnuisance parameters, and their standard deviations")
     for part in solution.collocation.iterates(solution.z):
         nuisance = part.segment.nuisance
-        for name, value, scale in zip(nuisance.names, part.phi, nuisance.scales, strict=True):
+        for name, value, scale in zip(
+            nuisance.names, part.phi, nuisance.scales, strict=True
+        ):
             deviation = uncertainty.nuisance[name] * scale
-            print(f"  {name:45}{1e3 * value * scale:8.2f} ±{1e3 * deviation:6.2f} 1e-3")
+            print(
+                f"  {name:45}{1e3 * value * scale:8.2f} ±{1e3 * deviation:6.2f} 1e-3"
+            )
     print(f"\nRMS distance [mm]: {rms_line(solution)}")
     said = dict.fromkeys(
-        (*solution.notes, *uncertainty.notes, *identifiability_sentences(uncertainty))
+        (
+            *solution.notes,
+            *uncertainty.notes,
+            *identifiability_sentences(uncertainty),
+        )
     )
-    sentences = [diagnosis.sentence for diagnosis in diagnose_markers(found.linearised)]
+    sentences = [
+        diagnosis.sentence for diagnosis in diagnose_markers(found.linearised)
+    ]
     print("\n" + "\n".join(f"- {sentence}" for sentence in (*said, *sentences)))
 
 
 def refinement(beam: Beam) -> None:
     """The same fit on other meshes, other steps, and with other schemes."""
-    print(f"{'':34}{'E [kPa]':>8}  95 % interval    γ_r [ms]  γ_m [1/s]  RMS [mm]")
+    print(
+        f"{'':34}{'E [kPa]':>8}  95 % interval    γ_r [ms]  γ_m [1/s]  RMS [mm]"
+    )
     near = shipped(beam)
     for substeps in SUBSTEPS:
         for scheme in SCHEMES:
             steps = f"transcription.substeps={substeps}"
-            here = started(beam.load(f"transcription.scheme={scheme}", steps), near)
+            here = started(
+                beam.load(f"transcription.scheme={scheme}", steps), near
+            )
             report(f"{scheme}, {10 / substeps:g} ms", fit(here))
     with tempfile.TemporaryDirectory() as folder:
         for element, divisions in MESHES:
             mesh = Path(folder) / "beam.vtu"
             box_mesh(SIZE_M, divisions, ORIGIN_M).write(mesh)
-            here = started(beam.load(f"object.mesh={mesh}", f"object.element={element}"), near)
+            here = started(
+                beam.load(f"object.mesh={mesh}", f"object.element={element}"),
+                near,
+            )
             bricks = " x ".join(map(str, divisions))
-            report(f"{element} {bricks}, {len(here.bodies[0].nodes_m)} nodes", fit(here))
+            report(
+                f"{element} {bricks}, {len(here.bodies[0].nodes_m)} nodes",
+                fit(here),
+            )
 
 
 def validation(beam: Beam) -> None:
@@ -152,12 +203,17 @@ def validation(beam: Beam) -> None:
     print(f"{'RMS [mm] with its nuisance':>30}{'without':>10}{'fitted':>9}")
     all_three = dict(zip(TRIALS, rms_mm(together), strict=True))
     for trial in TRIALS:
-        problem = started(beam.load(f"experiment.{trial}.validation=true"), together)
+        problem = started(
+            beam.load(f"experiment.{trial}.validation=true"), together
+        )
         solution = solve(problem)
         with_own, without = predicted_rms_mm(problem, trial, solution)
         values = "".join(f"{solution.parameters[name]:15.5g}" for name in free)
         print(f"{trial:12}{values}", end="")
-        print(f"{with_own:30.3f}{without:10.3f}{all_three[trial]:9.3f}", flush=True)
+        print(
+            f"{with_own:30.3f}{without:10.3f}{all_three[trial]:9.3f}",
+            flush=True,
+        )
 
 
 def poisson(beam: Beam) -> None:
@@ -168,14 +224,23 @@ def poisson(beam: Beam) -> None:
     report("estimated", found)
     ratio = found.uncertainty.estimates["poisson"]
     print(f"ν = {ratio.value:.3f}, {interval(ratio)}")
-    said = dict.fromkeys((*found.uncertainty.notes, *identifiability_sentences(found.uncertainty)))
+    said = dict.fromkeys(
+        (
+            *found.uncertainty.notes,
+            *identifiability_sentences(found.uncertainty),
+        )
+    )
     print("\n".join(f"- {sentence}" for sentence in said))
     for value in (0.3, 0.4, 0.45, 0.48, 0.49):
-        here = started(beam.load(f"parameters.poisson={{ fixed = {value} }}"), near)
+        here = started(
+            beam.load(f"parameters.poisson={{ fixed = {value} }}"), near
+        )
         report(f"fixed at {value}", fit(here))
 
 
-def predicted_rms_mm(problem: Problem, trial: str, solution: Solution) -> tuple[float, float]:
+def predicted_rms_mm(
+    problem: Problem, trial: str, solution: Solution
+) -> tuple[float, float]:
     """RMS distance of a trial at a solution's material: its nuisance fitted, and all zero."""
     experiment = next(e for e in problem.experiments if e.name == trial)
     fixed = tuple(
@@ -219,14 +284,18 @@ def matrix(names: Sequence[str], values: NDArray[np.float64]) -> str:
         f"{name:14}" + "".join(f"{value:13.3f}" for value in row)
         for name, row in zip(names, values, strict=True)
     )
-    return "\n".join([" " * 14 + "".join(f"{name:>13}" for name in names), *rows])
+    return "\n".join(
+        [" " * 14 + "".join(f"{name:>13}" for name in names), *rows]
+    )
 
 
 def started(problem: Problem, solution: Solution) -> Problem:
     """The problem with an answer's values as guesses of what both estimate."""
     found = solution.parameters
     items = tuple(
-        item if item.is_fixed or item.name not in found else replace(item, guess=found[item.name])
+        item
+        if item.is_fixed or item.name not in found
+        else replace(item, guess=found[item.name])
         for item in problem.parameters.items
     )
     return replace(problem, parameters=replace(problem.parameters, items=items))

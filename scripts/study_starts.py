@@ -37,9 +37,17 @@ from collocation_sysid.program.factorisation import Factor, Factoriser
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_from_fit
+from collocation_sysid.statistics.uncertainty import (
+    ErrorModel,
+    uncertainty_from_fit,
+)
 
-TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
+TRUTH = {
+    "lambda_pa": 200.0,
+    "mu_pa": 300.0,
+    "gamma_r_s": 0.009,
+    "gamma_m_1_s": 1.0,
+}
 BOUNDS = {
     "lambda_pa": (10.0, 1e5),
     "mu_pa": (10.0, 1e5),
@@ -90,35 +98,57 @@ class Outcome:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bodies", nargs="*", default=list(CASES), choices=list(CASES))
+    parser.add_argument(
+        "--bodies", nargs="*", default=list(CASES), choices=list(CASES)
+    )
     parser.add_argument("--starts", type=int, default=100)
     parser.add_argument("--factor", type=float, default=30.0)
     parser.add_argument(
-        "--unguessed", action="store_true", help="no guess at all, and other noise every time"
+        "--unguessed",
+        action="store_true",
+        help="no guess at all, and other noise every time",
     )
-    parser.add_argument("--unplaced", action="store_true", help="markers' places are unknown too")
-    parser.add_argument("--ideal", action="store_true", help="no nuisance parameters")
+    parser.add_argument(
+        "--unplaced",
+        action="store_true",
+        help="markers' places are unknown too",
+    )
+    parser.add_argument(
+        "--ideal", action="store_true", help="no nuisance parameters"
+    )
     parser.add_argument("--method", default="reduced-space")
     parser.add_argument("--noise-m", type=float, help="other than the case's")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", type=int, nargs="*", help="numbers of the starts to run")
+    parser.add_argument(
+        "--only", type=int, nargs="*", help="numbers of the starts to run"
+    )
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     found = {}
     for body in arguments.bodies:
         case = described(CASES[body](), arguments.unplaced, arguments.ideal)
-        noise_m = case.noise_m if arguments.noise_m is None else arguments.noise_m
-        starts = guesses(arguments.starts, arguments.factor, arguments.seed, case.truth)
+        noise_m = (
+            case.noise_m if arguments.noise_m is None else arguments.noise_m
+        )
+        starts = guesses(
+            arguments.starts, arguments.factor, arguments.seed, case.truth
+        )
         if arguments.unguessed:
             seeds = arguments.only or range(arguments.starts)
-            found[body] = [unguessed(case, noise_m, seed, arguments.method) for seed in seeds]
+            found[body] = [
+                unguessed(case, noise_m, seed, arguments.method)
+                for seed in seeds
+            ]
         else:
             noisy = with_noise(case, noise_m, arguments.seed)
             found[body] = study(noisy, starts, arguments.method, arguments.only)
         if not arguments.json:
             print(f"{body}: {summary(found[body])}", flush=True)
     if arguments.json:
-        listed = {body: [asdict(each) for each in outcomes] for body, outcomes in found.items()}
+        listed = {
+            body: [asdict(each) for each in outcomes]
+            for body, outcomes in found.items()
+        }
         print(json.dumps(listed, indent=1))
 
 
@@ -127,12 +157,18 @@ def main() -> None:
 
 def cylinder() -> Case:
     """The paper's: 171 nodes of foam, 100 steps of 10 ms."""
-    return Case(hanging_cylinder(layers=8, steps=100, scheme="midpoint", rings=2), TRUTH)
+    return Case(
+        hanging_cylinder(layers=8, steps=100, scheme="midpoint", rings=2), TRUTH
+    )
 
 
 def soft_bar() -> Case:
     """A bar of 220 × 35 × 50 mm of E = 2 kPa and 95 kg/m³, clamped: its tip hangs down."""
-    body = Body(box_mesh((0.22, 0.035, 0.05), (11, 2, 3)), density_kg_m3=95.0, damping="rayleigh")
+    body = Body(
+        box_mesh((0.22, 0.035, 0.05), (11, 2, 3)),
+        density_kg_m3=95.0,
+        damping="rayleigh",
+    )
     motion = Swing(
         duration_s=1.0,
         amplitude_m=(0.03, 0.04, 0.03),
@@ -142,7 +178,12 @@ def soft_bar() -> Case:
         start=Rotation.identity(),
     )
     held = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
-    return measured(body, held, motion, moduli(2e3, 0.3) | {"gamma_r_s": 0.01, "gamma_m_1_s": 0.5})
+    return measured(
+        body,
+        held,
+        motion,
+        moduli(2e3, 0.3) | {"gamma_r_s": 0.01, "gamma_m_1_s": 0.5},
+    )
 
 
 def silicone_block() -> Case:
@@ -151,7 +192,11 @@ def silicone_block() -> Case:
     It sways by some tenths of a millimetre, so its markers are seen as well as that: noise of 1 mm
     would tell nothing of its damping.
     """
-    body = Body(box_mesh((0.06, 0.06, 0.1), (3, 3, 5)), density_kg_m3=1100.0, damping="rayleigh")
+    body = Body(
+        box_mesh((0.06, 0.06, 0.1), (3, 3, 5)),
+        density_kg_m3=1100.0,
+        damping="rayleigh",
+    )
     motion = Swing(
         duration_s=1.0,
         amplitude_m=(0.05, 0.04, 0.03),
@@ -167,7 +212,10 @@ def silicone_block() -> Case:
 
 def moduli(young_pa: float, poisson: float) -> dict[str, float]:
     shear = young_pa / (2 * (1 + poisson))
-    return {"lambda_pa": 2 * shear * poisson / (1 - 2 * poisson), "mu_pa": shear}
+    return {
+        "lambda_pa": 2 * shear * poisson / (1 - 2 * poisson),
+        "mu_pa": shear,
+    }
 
 
 def measured(
@@ -183,9 +231,13 @@ def measured(
     at_side = (nodes == nodes.min(axis=0)) | (nodes == nodes.max(axis=0))
     marked = np.setdiff1d(np.flatnonzero(at_side.any(axis=1)), held)[::5]
     nowhere = np.zeros((len(poses.t_s), len(marked), 3))
-    markers = Markers(poses.t_s, nowhere, noise_m, places_m=body.nodes_m[marked])
+    markers = Markers(
+        poses.t_s, nowhere, noise_m, places_m=body.nodes_m[marked]
+    )
     grasp, ideal = Grasp(held, poses), Nuisance.none()
-    experiment = Experiment(body, poses.t_s, [grasp], markers, name="swing", nuisance=ideal)
+    experiment = Experiment(
+        body, poses.t_s, [grasp], markers, name="swing", nuisance=ideal
+    )
     tracks = simulate(experiment, truth, "midpoint", substeps=1).markers_m
     return Case(with_markers(experiment, tracks), truth, noise_m=noise_m)
 
@@ -195,7 +247,9 @@ def described(case: Case, unplaced: bool, ideal: bool) -> Case:
     experiment = case.experiment
     if unplaced:
         markers = experiment.markers
-        unknown = Markers(markers.t_s, markers.positions_m, markers.sigma_m, markers.names)
+        unknown = Markers(
+            markers.t_s, markers.positions_m, markers.sigma_m, markers.names
+        )
         experiment = replace(experiment, markers=unknown)
     nuisance = Nuisance.none() if ideal else Nuisance()
     return replace(case, experiment=replace(experiment, nuisance=nuisance))
@@ -204,7 +258,9 @@ def described(case: Case, unplaced: bool, ideal: bool) -> Case:
 def with_noise(case: Case, noise_m: float, seed: int) -> Case:
     tracks = case.experiment.markers.positions_m
     noise = np.random.default_rng(seed).normal(size=tracks.shape) * noise_m
-    return replace(case, experiment=with_markers(case.experiment, tracks + noise))
+    return replace(
+        case, experiment=with_markers(case.experiment, tracks + noise)
+    )
 
 
 CASES: dict[str, Callable[[], Case]] = {
@@ -214,7 +270,9 @@ CASES: dict[str, Callable[[], Case]] = {
 }
 
 
-def hanging_cylinder(layers: int, steps: int, scheme: str, rings: int = 1) -> Experiment:
+def hanging_cylinder(
+    layers: int, steps: int, scheme: str, rings: int = 1
+) -> Experiment:
     """A cylinder held at one end, hanging and swung, with tracks of its own scheme."""
     shape = cylinder_mesh(RADIUS_M, HEIGHT_M, rings, layers)
     body = Body(shape, density_kg_m3=20.0, damping="rayleigh")
@@ -234,8 +292,12 @@ def hanging_cylinder(layers: int, steps: int, scheme: str, rings: int = 1) -> Ex
     markers = Markers(t_s, nowhere, SIGMA_M, places_m=body.nodes_m[marked])
     grasp = Grasp(np.flatnonzero(heights < 1e-9), poses)
     ideal = Nuisance.none()
-    experiment = Experiment(body, t_s, [grasp], markers, name="swing", nuisance=ideal)
-    return with_markers(experiment, simulate(experiment, TRUTH, scheme, substeps=1).markers_m)
+    experiment = Experiment(
+        body, t_s, [grasp], markers, name="swing", nuisance=ideal
+    )
+    return with_markers(
+        experiment, simulate(experiment, TRUTH, scheme, substeps=1).markers_m
+    )
 
 
 # Starts -------------------------------------------------------------------------------------------
@@ -262,20 +324,32 @@ def study(
         raise SystemExit(f"from the truth: {best.message}")
     fit = linearise_fit(best.collocation, best.z)
     found = uncertainty_from_fit(
-        fit, best.collocation.parameters, best.q, ErrorModel("given", "independent")
+        fit,
+        best.collocation.parameters,
+        best.q,
+        ErrorModel("given", "independent"),
     )
-    std_errors = [found.estimates[name].statistical_std_error or np.nan for name in case.truth]
+    std_errors = [
+        found.estimates[name].statistical_std_error or np.nan
+        for name in case.truth
+    ]
     outcomes = []
     for number, guess in enumerate(starts):
         if not only or number in only:
             outcomes.append(attempt(case, number, guess, method))
             print(end=".", file=sys.stderr, flush=True)
     losses = [best.history[-1].loss, *(each.loss for each in outcomes)]
-    answers = [tuple(best.parameters[name] for name in case.truth), *(e.found for e in outcomes)]
+    answers = [
+        tuple(best.parameters[name] for name in case.truth),
+        *(e.found for e in outcomes),
+    ]
     ended = [True, *(each.status in ENDED for each in outcomes)]
     first = min(np.flatnonzero(ended), key=lambda k: losses[k])
     least, reference = losses[first], np.array(answers[first])
-    return [judged(each, reference, least, np.array(std_errors)) for each in outcomes]
+    return [
+        judged(each, reference, least, np.array(std_errors))
+        for each in outcomes
+    ]
 
 
 def unguessed(case: Case, noise_m: float, seed: int, method: str) -> Outcome:
@@ -297,10 +371,14 @@ def unguessed(case: Case, noise_m: float, seed: int, method: str) -> Outcome:
 def loss_of_truth(noisy: Case, clean: Case) -> float:
     """The noise's sum of squares, in its deviations."""
     seen, true = noisy.experiment.markers, clean.experiment.markers.positions_m
-    return float((((seen.positions_m - true) / seen.sigma_m[:, None]) ** 2).sum())
+    return float(
+        (((seen.positions_m - true) / seen.sigma_m[:, None]) ** 2).sum()
+    )
 
 
-def attempt(case: Case, number: int, guess: NDArray[np.float64], method: str) -> Outcome:
+def attempt(
+    case: Case, number: int, guess: NDArray[np.float64], method: str
+) -> Outcome:
     """Solve from one start."""
     given, nothing = tuple(guess.tolist()), (np.nan,) * len(guess)
     with counted_factorisations() as count:
@@ -309,7 +387,17 @@ def attempt(case: Case, number: int, guess: NDArray[np.float64], method: str) ->
         except InputError as error:
             worst = (np.inf, np.inf, np.nan, np.inf, np.inf)
             return Outcome(
-                number, "refused", False, False, 0.0, 0.0, *worst, given, nothing, (), str(error)
+                number,
+                "refused",
+                False,
+                False,
+                0.0,
+                0.0,
+                *worst,
+                given,
+                nothing,
+                (),
+                str(error),
             )
     return Outcome(
         number,
@@ -317,7 +405,8 @@ def attempt(case: Case, number: int, guess: NDArray[np.float64], method: str) ->
         False,
         False,
         count[0] / len(case.experiment.t_s),
-        solution.timing.total + (solution.scan.time_s if solution.scan else 0.0),
+        solution.timing.total
+        + (solution.scan.time_s if solution.scan else 0.0),
         solution.history[-1].loss if solution.history else np.inf,
         np.inf,
         solution.rms_m,
@@ -331,7 +420,10 @@ def attempt(case: Case, number: int, guess: NDArray[np.float64], method: str) ->
 
 
 def judged(
-    outcome: Outcome, best: NDArray[np.float64], least: float, std_errors: NDArray[np.float64]
+    outcome: Outcome,
+    best: NDArray[np.float64],
+    least: float,
+    std_errors: NDArray[np.float64],
 ) -> Outcome:
     """The outcome compared with the best answer."""
     found, excess = np.array(outcome.found), outcome.loss - least
@@ -390,7 +482,9 @@ def summary(outcomes: list[Outcome]) -> str:
     lines = [
         f"success: {len(sweeps)} of {len(outcomes)}, of which by an equal fit only: "
         f"{sum(outcome.success and outcome.same_fit for outcome in outcomes)}",
-        f"sweeps: median {np.median(sweeps):.1f}, max {np.max(sweeps):.1f}" if sweeps else "",
+        f"sweeps: median {np.median(sweeps):.1f}, max {np.max(sweeps):.1f}"
+        if sweeps
+        else "",
         f"time: {sum(outcome.time_s for outcome in outcomes):.1f} s",
         f"failures: {dict(Counter(outcome.status for outcome in failures)) or 'none'}",
     ]

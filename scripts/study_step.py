@@ -23,12 +23,16 @@ from collocation_sysid.runs.result_content import ReportedEstimate
 NOISES_M = (5e-5, 2e-4, 1e-3)
 
 
-def twin(name: str, noise_m: float, seed: int) -> tuple[Problem, dict[str, float]]:
+def twin(
+    name: str, noise_m: float, seed: int
+) -> tuple[Problem, dict[str, float]]:
     """A problem with data of a far finer step, and what is true."""
     rng = np.random.default_rng(seed)
     problem, truth = still(name, rng)
     (moved,) = problem.experiments
-    markers = replace(moved.markers, sigma_m=np.full(len(moved.markers.names), noise_m))
+    markers = replace(
+        moved.markers, sigma_m=np.full(len(moved.markers.names), noise_m)
+    )
     tracks = simulate(moved, truth, timestep_s=STEP_S / 16).markers_m
     noise = rng.normal(scale=noise_m, size=tracks.shape)
     seen = with_markers(replace(moved, markers=markers), tracks + noise)
@@ -54,9 +58,18 @@ def main(twins: int = 20, first: int = 0) -> None:
                     }
                     if all(ends.values()):
                         all_of_them += 1
-                        held.update(k for k, e in ends.items() if e and e[0] <= truth[key] <= e[1])
-        shares = ", ".join(f"{kind} {100 * n / all_of_them:.0f} %" for kind, n in held.items())
-        print(f"{1e3 * noise_m:g} mm, {all_of_them} intervals held: {shares}", flush=True)
+                        held.update(
+                            k
+                            for k, e in ends.items()
+                            if e and e[0] <= truth[key] <= e[1]
+                        )
+        shares = ", ".join(
+            f"{kind} {100 * n / all_of_them:.0f} %" for kind, n in held.items()
+        )
+        print(
+            f"{1e3 * noise_m:g} mm, {all_of_them} intervals held: {shares}",
+            flush=True,
+        )
         print(f"    steps a sample: {dict(sorted(steps.items()))}", flush=True)
 
 

@@ -17,16 +17,26 @@ from studies import HEADS, TRUTH, Variant, markdown, number, run_variants, save
 
 from collocation_sysid.plan.study_rows import Row
 
-PROBLEM = Path(__file__).parents[1] / "problems" / "table1" / "problem_scheme.toml"
+PROBLEM = (
+    Path(__file__).parents[1] / "problems" / "table1" / "problem_scheme.toml"
+)
 LM = {"inner": "levenberg-marquardt"}
 VARIANTS = (
     Variant("reduced-space", "reduced-space"),
     Variant("shooting", "shooting"),
     Variant("augmented-lagrangian, LM, first ρ = 1e5", "augmented-lagrangian"),
-    Variant("augmented-lagrangian, LM, first ρ = 1e2", "augmented-lagrangian", {"rho": 1e2}),
+    Variant(
+        "augmented-lagrangian, LM, first ρ = 1e2",
+        "augmented-lagrangian",
+        {"rho": 1e2},
+    ),
     Variant("penalty, CG", "penalty"),
     # Without the schedule, the weight that the first stage has, and a large one.
-    Variant("penalty, CG, ρ = 1e2", "penalty", {"schedule": "constant", "inner_iterations": 10000}),
+    Variant(
+        "penalty, CG, ρ = 1e2",
+        "penalty",
+        {"schedule": "constant", "inner_iterations": 10000},
+    ),
     Variant(
         "penalty, CG, ρ = 1e6",
         "penalty",
@@ -44,13 +54,20 @@ PAPER = (
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     names = [variant.name for variant in VARIANTS]
-    parser.add_argument("--methods", nargs="*", choices=names, default=names[:-1])
-    parser.add_argument("--time-s", type=float, default=180.0, help="limit of a run")
+    parser.add_argument(
+        "--methods", nargs="*", choices=names, default=names[:-1]
+    )
+    parser.add_argument(
+        "--time-s", type=float, default=180.0, help="limit of a run"
+    )
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=Path("results/study_table1"))
+    parser.add_argument(
+        "--out", type=Path, default=Path("results/study_table1")
+    )
     arguments = parser.parse_args()
     rows = run_variants(
         PROBLEM,
@@ -65,10 +82,22 @@ def main() -> None:
 def table(rows: Mapping[str, Sequence[Row]]) -> str:
     """Estimates and how far they are to be believed, as Markdown."""
     heads = (
-        *("method", *HEADS, "marker rms [mm]", "violation [N]", "relative", "tip error [mm]"),
+        *(
+            "method",
+            *HEADS,
+            "marker rms [mm]",
+            "violation [N]",
+            "relative",
+            "tip error [mm]",
+        ),
         *("iterations", "time [s]", "status"),
     )
-    truth = ("truth", *(f"{value:g}" for value in TRUTH.values()), *("0",) * 4, *"–––")
+    truth = (
+        "truth",
+        *(f"{value:g}" for value in TRUTH.values()),
+        *("0",) * 4,
+        *"–––",
+    )
     lines = [truth, PAPER]
     for name, (row, *_) in rows.items():
         lines.append(

@@ -34,8 +34,12 @@ from collocation_sysid.problem import Problem, UncertaintyOptions
 from collocation_sysid.problem.recording_reader import require_plausible_markers
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers
-from collocation_sysid.statistics.fit_misspecifications import find_misspecifications
-from collocation_sysid.statistics.plausibility import size_and_density_hypotheses
+from collocation_sysid.statistics.fit_misspecifications import (
+    find_misspecifications,
+)
+from collocation_sysid.statistics.plausibility import (
+    size_and_density_hypotheses,
+)
 from collocation_sysid.statistics.systematic_effects import Assumptions
 
 # With fewer steps the scheme, not a mistake, would be what is recognised.
@@ -66,9 +70,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--twins", type=int, default=200, help="faultless ones")
     parser.add_argument("--faulty", type=int, default=9, help="of each fault")
-    parser.add_argument("--only", nargs="*", choices=["none", *FAULTS], default=["none", *FAULTS])
+    parser.add_argument(
+        "--only",
+        nargs="*",
+        choices=["none", *FAULTS],
+        default=["none", *FAULTS],
+    )
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--json", type=Path, help="a file for every twin, a line each")
+    parser.add_argument(
+        "--json", type=Path, help="a file for every twin, a line each"
+    )
     arguments = parser.parse_args()
     rows, faulty, began = [], [], time.perf_counter()
     for name in arguments.only:
@@ -82,7 +93,15 @@ def main() -> None:
         faulty += outcomes if name != "none" else []
         rows.append(row(name, outcomes))
         print(" | ".join(rows[-1]), flush=True)
-    heads = ("twins", "refused", "doubtful", "check", "good", "of these right", "mostly said")
+    heads = (
+        "twins",
+        "refused",
+        "doubtful",
+        "check",
+        "good",
+        "of these right",
+        "mostly said",
+    )
     print(markdown(heads, [*rows, row("all with a fault", faulty)]))
     print(f"{time.perf_counter() - began:.0f} s")
 
@@ -90,9 +109,13 @@ def main() -> None:
 def row(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
     """Of the table: how many there are of each verdict."""
     verdicts = Counter(each.verdict for each in outcomes)
-    counts = [str(verdicts[word]) for word in ("refused", "doubtful", "check", "good")]
+    counts = [
+        str(verdicts[word]) for word in ("refused", "doubtful", "check", "good")
+    ]
     right = sum(each.verdict == "good" and each.is_right for each in outcomes)
-    said = Counter(subject(each.reasons[0]) for each in outcomes if each.reasons)
+    said = Counter(
+        subject(each.reasons[0]) for each in outcomes if each.reasons
+    )
     return (
         name,
         *counts,
@@ -103,26 +126,35 @@ def row(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
 
 def subject(reason: str) -> str:
     """What a reason is about, without its numbers."""
-    return re.split(r"[:;,(]| by | that | as if | is | are ", re.sub("likely: '.*?':", "", reason))[
-        0
-    ].strip()
+    return re.split(
+        r"[:;,(]| by | that | as if | is | are ",
+        re.sub("likely: '.*?':", "", reason),
+    )[0].strip()
 
 
 def judged(fault: str, seed: int) -> Outcome:
     """Verdict on one twin; "refused" where the problem is not even read or solved."""
     problem, truth = swung(seed)
     # Nothing but the stated fault is unlike the twin: its systematic effects are none.
-    problem = replace(problem, uncertainty=UncertaintyOptions(assumptions=Assumptions.exact()))
+    problem = replace(
+        problem, uncertainty=UncertaintyOptions(assumptions=Assumptions.exact())
+    )
     try:
         if fault != "none":
-            problem = FAULTS[fault](problem, np.random.default_rng((seed, *fault.encode())))
+            problem = FAULTS[fault](
+                problem, np.random.default_rng((seed, *fault.encode()))
+            )
         for body in problem.bodies:
             size_and_density_hypotheses(body)
         for experiment in problem.experiments:
-            require_plausible_markers(experiment, typical_constants(problem.parameters))
+            require_plausible_markers(
+                experiment, typical_constants(problem.parameters)
+            )
         found = run(problem, seek_causes=False)
         if found.trust.verdict == "good":
-            found = replace(found, causes=find_misspecifications(found.solution))
+            found = replace(
+                found, causes=find_misspecifications(found.solution)
+            )
     except (InputError, SimulationError) as error:
         return Outcome(fault, seed, "refused", (str(error),), None, None)
     errors = errors_of(found, truth)
@@ -150,7 +182,10 @@ def errors_of(found: Run, truth: Mapping[str, float]) -> dict[str, float]:
 @cache
 def bodies() -> tuple[tuple[Body, float], ...]:
     """Each with its Young's modulus [Pa] where it is soft."""
-    cylinder, box = cylinder_mesh(0.04, 0.16, 1, 5), box_mesh((0.04, 0.05, 0.15), (2, 2, 5))
+    cylinder, box = (
+        cylinder_mesh(0.04, 0.16, 1, 5),
+        box_mesh((0.04, 0.05, 0.15), (2, 2, 5)),
+    )
     return (
         (Body(cylinder, density_kg_m3=20.0, damping="rayleigh"), 700.0),
         (Body(box, density_kg_m3=100.0, damping="rayleigh"), 5e3),
@@ -162,20 +197,29 @@ def swung(seed: int) -> tuple[Problem, dict[str, float]]:
     """A body moved at random, described rightly and guessed wrongly, and its truth."""
     rng = np.random.default_rng(seed)
     body, young_pa = bodies()[seed % 2]
-    truth = {"young_pa": young_pa * (1, 1.5)[seed // 2 % 2], "poisson": 0.3} | DAMPING
+    truth = {
+        "young_pa": young_pa * (1, 1.5)[seed // 2 % 2],
+        "poisson": 0.3,
+    } | DAMPING
     t_s = STEP_S * np.arange(SAMPLES)
     nodes, length_m = body.nodes_m, np.ptp(body.nodes_m[:, 2])
     held = np.flatnonzero(nodes[:, 2] < 1e-9)
     outside = np.setdiff1d(
-        np.unique(body.mesh.surface), np.flatnonzero(nodes[:, 2] < 0.3 * length_m)
+        np.unique(body.mesh.surface),
+        np.flatnonzero(nodes[:, 2] < 0.3 * length_m),
     )
     places = nodes[rng.choice(outside, 8, replace=False)]
     markers = Markers(t_s, np.zeros((SAMPLES, 8, 3)), SIGMA_M, places_m=places)
     grasp = Grasp(held, random_poses(t_s, rng))
     experiment = Experiment(body, t_s, [grasp], markers, name="swing")
     tracks = simulate(experiment, truth).markers_m
-    seen = with_markers(experiment, tracks + rng.normal(scale=SIGMA_M, size=tracks.shape))
-    guesses = {name: Unknown(float(value * rng.uniform(0.3, 3))) for name, value in truth.items()}
+    seen = with_markers(
+        experiment, tracks + rng.normal(scale=SIGMA_M, size=tracks.shape)
+    )
+    guesses = {
+        name: Unknown(float(value * rng.uniform(0.3, 3)))
+        for name, value in truth.items()
+    }
     guesses["poisson"] = Unknown(float(rng.uniform(0.2, 0.45)))
     return Problem([seen], guesses, substeps=SUBSTEPS), truth
 

@@ -23,7 +23,12 @@ from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.methods.solution import pooled_wrench_rms
 from collocation_sysid.runs.result_content import ReportedEstimate
 
-FILE = Path(__file__).parents[1] / "problems" / "phantom_compression" / "whole_stroke.toml"
+FILE = (
+    Path(__file__).parents[1]
+    / "problems"
+    / "phantom_compression"
+    / "whole_stroke.toml"
+)
 PLATEN = "experiment.A1.obstacle.platen"
 ASSUMED = {
     "as shipped": (),
@@ -38,16 +43,22 @@ ASSUMED = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="*", choices=("specimens", "assumed", "meshes"))
+    parser.add_argument(
+        "--only", nargs="*", choices=("specimens", "assumed", "meshes")
+    )
     only = parser.parse_args().only or ("specimens", "assumed", "meshes")
-    print("| | E kPa | 95 % | whole | μ | 95 % | whole | misfit N | % of the largest load |")
+    print(
+        "| | E kPa | 95 % | whole | μ | 95 % | whole | misfit N | % of the largest load |"
+    )
     print("|---|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         for name, specimen, changes in _variants(only, Path(folder)):
             print(_line(name, specimen, changes), flush=True)
 
 
-def _variants(only: Sequence[str], folder: Path) -> Iterator[tuple[str, str, Sequence[str]]]:
+def _variants(
+    only: Sequence[str], folder: Path
+) -> Iterator[tuple[str, str, Sequence[str]]]:
     if "specimens" in only:
         for k in range(1, 6):
             yield f"A{k}", f"A{k}", ()
@@ -67,7 +78,9 @@ def _line(name: str, specimen: str, changes: Sequence[str]) -> str:
         found = run(replace(problem, experiments=[alone]), seek_causes=False)
     except (InputError, SimulationError) as error:
         return f"| {name} | {error} | | | | | | | |"
-    (wrench,) = (each.wrench for each in alone.obstacles if each.wrench is not None)
+    (wrench,) = (
+        each.wrench for each in alone.obstacles if each.wrench is not None
+    )
     largest_n = wrench.symmetry * np.nanmax(np.abs(wrench.values))
     missed_n = pooled_wrench_rms(found.solution)[0]
     assert missed_n is not None

@@ -49,7 +49,9 @@ COUNTED = ("young_pa", "poisson", DENSITY)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Coverage of intervals with a force sensor.")
+    parser = argparse.ArgumentParser(
+        description="Coverage of intervals with a force sensor."
+    )
     parser.add_argument("--twins", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
@@ -62,24 +64,37 @@ def main() -> None:
             estimate = uncertainty.estimates[name]
             assert estimate.statistical95 is not None
             assert estimate.statistical_std_error is not None
-            held[name] += estimate.statistical95[0] <= TRUTH[name] <= estimate.statistical95[1]
+            held[name] += (
+                estimate.statistical95[0]
+                <= TRUTH[name]
+                <= estimate.statistical95[1]
+            )
             errors[name].append(estimate.statistical_std_error / TRUTH[name])
         if twin % 20 == 0 or twin == arguments.twins:
             report(held, errors, twin)
 
 
-def report(held: dict[str, int], errors: dict[str, list[float]], twins: int) -> None:
+def report(
+    held: dict[str, int], errors: dict[str, list[float]], twins: int
+) -> None:
     """Say how often, and how wide."""
     low, high = binom.interval(0.95, twins, 0.95)
-    print(f"{twins} twins; by chance {100 * low / twins:.1f} to {100 * high / twins:.1f} %")
+    print(
+        f"{twins} twins; by chance {100 * low / twins:.1f} to {100 * high / twins:.1f} %"
+    )
     for name, count in held.items():
         error = 100 * np.median(errors[name])
-        print(f"  {name:16}{100 * count / twins:6.1f} % held, ± {error:.2g} %", flush=True)
+        print(
+            f"  {name:16}{100 * count / twins:6.1f} % held, ± {error:.2g} %",
+            flush=True,
+        )
 
 
 def fitted(experiment: Experiment):
     """The uncertainty of a fit of all parameters, from guesses near the truth."""
-    unknown = {name: Unknown(guess=1.1 * value) for name, value in TRUTH.items()}
+    unknown = {
+        name: Unknown(guess=1.1 * value) for name, value in TRUTH.items()
+    }
     problem = Problem([experiment], unknown)
     solution = ReducedSpace()(problem.collocation())
     fit = linearise_fit(solution.collocation, solution.z)
@@ -91,8 +106,12 @@ def noisy(exact: Experiment, rng: np.random.Generator) -> Experiment:
     tracks, (grasp,) = exact.markers.positions_m, exact.grasps
     assert grasp.wrench is not None
     sizes = np.repeat([NOISE_N, NOISE_NM], 3)
-    wrench = grasp.wrench.values + sizes * rng.normal(size=grasp.wrench.values.shape)
-    seen = with_markers(exact, tracks + rng.normal(scale=NOISE_M, size=tracks.shape))
+    wrench = grasp.wrench.values + sizes * rng.normal(
+        size=grasp.wrench.values.shape
+    )
+    seen = with_markers(
+        exact, tracks + rng.normal(scale=NOISE_M, size=tracks.shape)
+    )
     return with_wrenches(seen, [wrench])
 
 
@@ -107,16 +126,27 @@ def recording() -> Experiment:
     poses = PoseSequence(t_s, np.outer(share, [0.01, 0.02, 0.03]), quaternions)
     held = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
     seen = np.flatnonzero(body.nodes_m[:, 0] > 0.09)
-    markers = Markers(t_s, np.zeros((len(t_s), len(seen), 3)), NOISE_M, places_m=body.nodes_m[seen])
-    sensor = Wrench(t_s, np.zeros((len(t_s), 6)), NOISE_N, NOISE_NM, frame="grasp")
+    markers = Markers(
+        t_s,
+        np.zeros((len(t_s), len(seen), 3)),
+        NOISE_M,
+        places_m=body.nodes_m[seen],
+    )
+    sensor = Wrench(
+        t_s, np.zeros((len(t_s), 6)), NOISE_N, NOISE_NM, frame="grasp"
+    )
     grasp = Grasp(held, poses, sigma_m=0.0, sigma_rad=0.0, wrench=sensor)
     nuisance = Nuisance.none(tare=10.0)
-    experiment = Experiment(body, t_s, [grasp], markers, name="block", nuisance=nuisance)
-    values = {name: value for name, value in TRUTH.items() if name in body.constants} | {
-        name: TRUTH[name] for name in ("young_pa", "poisson")
-    }
+    experiment = Experiment(
+        body, t_s, [grasp], markers, name="block", nuisance=nuisance
+    )
+    values = {
+        name: value for name, value in TRUTH.items() if name in body.constants
+    } | {name: TRUTH[name] for name in ("young_pa", "poisson")}
     found = simulate(experiment, values, "midpoint", substeps=1)
-    return with_wrenches(with_markers(experiment, found.markers_m), found.wrenches)
+    return with_wrenches(
+        with_markers(experiment, found.markers_m), found.wrenches
+    )
 
 
 if __name__ == "__main__":

@@ -11,7 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.recording import Experiment, Grasp, PoseSequence, write_poses_csv
+from collocation_sysid.recording import (
+    Experiment,
+    Grasp,
+    PoseSequence,
+    write_poses_csv,
+)
 
 HANGING = Rotation.from_rotvec([np.pi, 0, 0])
 
@@ -54,8 +59,14 @@ def swing(
     rise = t**2 / (t**2 + rise_s**2)
     angular = 2 * np.pi * np.array(frequency_hz)
     phase = np.outer(t, angular)
-    positions = rise[:, None] * amplitude_m * np.sin(phase + np.array([0.0, 0.7, 1.4]))
-    turns = rise[:, None] * amplitude_rad * np.sin(1.2 * phase + np.array([0.3, 1.0, 1.7]))
+    positions = (
+        rise[:, None] * amplitude_m * np.sin(phase + np.array([0.0, 0.7, 1.4]))
+    )
+    turns = (
+        rise[:, None]
+        * amplitude_rad
+        * np.sin(1.2 * phase + np.array([0.3, 1.0, 1.7]))
+    )
     rotations = Rotation.from_rotvec(turns) * start
     return PoseSequence(np.asarray(t_s), positions, rotations.as_quat())
 
@@ -80,10 +91,14 @@ def measure(
     moved = replace(experiment, grasps=(Grasp(grasp.nodes, fine),))
     step_s = float(fine.t_s[1] - fine.t_s[0])
     tracks = simulate(moved, truth, timestep_s=step_s).markers_m
-    return tracks + np.random.default_rng(seed).normal(size=tracks.shape) * noise_m
+    return (
+        tracks + np.random.default_rng(seed).normal(size=tracks.shape) * noise_m
+    )
 
 
-def exchanged(tracks: np.ndarray, pair: Sequence[int], frames: slice) -> np.ndarray:
+def exchanged(
+    tracks: np.ndarray, pair: Sequence[int], frames: slice
+) -> np.ndarray:
     """Tracks in which two markers have each other's label for some frames."""
     swapped = tracks.copy()
     swapped[frames, list(pair)] = tracks[frames, list(pair)[::-1]]
@@ -91,7 +106,10 @@ def exchanged(tracks: np.ndarray, pair: Sequence[int], frames: slice) -> np.ndar
 
 
 def occluded(
-    tracks: np.ndarray, blocks: Sequence[tuple[int, slice]], share: float, seed: int
+    tracks: np.ndarray,
+    blocks: Sequence[tuple[int, slice]],
+    share: float,
+    seed: int,
 ) -> np.ndarray:
     """Tracks without some markers' blocks of frames, and without a share of all samples."""
     lost = np.random.default_rng(seed).random(tracks.shape[:2]) < share

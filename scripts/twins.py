@@ -13,13 +13,27 @@ from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
-from collocation_sysid.recording import Experiment, Grasp, Markers, PoseSequence, Wrench
+from collocation_sysid.recording import (
+    Experiment,
+    Grasp,
+    Markers,
+    PoseSequence,
+    Wrench,
+)
 
 NOISE_M = 5e-4
 SAMPLES, STEP_S = 60, 0.01
 # Body, and where its grasp begins along its longest axis; both hang or stick out of the hand.
-BODIES = {"block": ((0.06, 0.06, 0.09), (2, 2, 3)), "bar": ((0.03, 0.03, 0.12), (1, 1, 4))}
-SOFT = {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5}
+BODIES = {
+    "block": ((0.06, 0.06, 0.09), (2, 2, 3)),
+    "bar": ((0.03, 0.03, 0.12), (1, 1, 4)),
+}
+SOFT = {
+    "lambda_pa": 800.0,
+    "mu_pa": 600.0,
+    "gamma_r_s": 0.006,
+    "gamma_m_1_s": 1.5,
+}
 GUESS = {
     "lambda_pa": Unknown(400.0, 10.0, 1e5),
     "mu_pa": Unknown(150.0, 10.0, 1e5),
@@ -32,7 +46,9 @@ STIFF = SOFT | {"lambda_pa": 16e3, "mu_pa": 12e3, "gamma_r_s": 0.002}
 @cache
 def block(size_m: tuple[float, ...], divisions: tuple[int, ...]) -> Body:
     """Bodies are shared: their kernels compile once."""
-    return Body(box_mesh(size_m, divisions), density_kg_m3=30.0, damping="rayleigh")
+    return Body(
+        box_mesh(size_m, divisions), density_kg_m3=30.0, damping="rayleigh"
+    )
 
 
 def random_poses(t_s: np.ndarray, rng: np.random.Generator) -> PoseSequence:
@@ -42,7 +58,10 @@ def random_poses(t_s: np.ndarray, rng: np.random.Generator) -> PoseSequence:
     rise = (t_s - t_s[0]) ** 2 / ((t_s - t_s[0]) ** 2 + 0.1**2)
 
     def swing(size: float) -> np.ndarray:
-        frequency, phase = rng.uniform(1.0, 3.0, 3), rng.uniform(0, 2 * np.pi, 3)
+        frequency, phase = (
+            rng.uniform(1.0, 3.0, 3),
+            rng.uniform(0, 2 * np.pi, 3),
+        )
         wave = np.sin(2 * np.pi * np.outer(t_s, frequency) + phase)
         return size * rise[:, None] * rng.uniform(0.5, 1.0, 3) * wave
 
@@ -65,7 +84,9 @@ def twin(
     free = np.setdiff1d(np.arange(len(body.nodes_m)), held)
     places = body.nodes_m[rng.choice(free, 6, replace=False)]
     markers = Markers(t_s, np.zeros((samples, 6, 3)), NOISE_M, places_m=places)
-    experiment = Experiment(body, t_s, [Grasp(held, random_poses(t_s, rng))], markers, name="swing")
+    experiment = Experiment(
+        body, t_s, [Grasp(held, random_poses(t_s, rng))], markers, name="swing"
+    )
     tracks = simulate(experiment, truth, integrator).markers_m
     noise = rng.normal(scale=NOISE_M, size=tracks.shape)
     return Problem([with_markers(experiment, tracks + noise)], GUESS)
@@ -74,18 +95,30 @@ def twin(
 WRENCH_N, WRENCH_NM = 5e-4, 5e-5
 
 
-def sensing_twin(name: str, truth: dict[str, float], seed: int, samples: int = SAMPLES) -> Problem:
+def sensing_twin(
+    name: str, truth: dict[str, float], seed: int, samples: int = SAMPLES
+) -> Problem:
     """The same with a sensor at the grasp, in its frame and about a point above the body."""
     given = twin(name, truth, seed, samples)
     (experiment,) = given.experiments
     (grasp,) = experiment.grasps
     point_m = (0.01, 0.02, BODIES[name][0][2] + 0.03)
     zero = np.zeros((samples, 6))
-    sensor = Wrench(experiment.t_s, zero, WRENCH_N, WRENCH_NM, frame="grasp", point_m=point_m)
+    sensor = Wrench(
+        experiment.t_s,
+        zero,
+        WRENCH_N,
+        WRENCH_NM,
+        frame="grasp",
+        point_m=point_m,
+    )
     sensed = replace(experiment, grasps=[replace(grasp, wrench=sensor)])
     (values,) = simulate(sensed, truth, "newmark").wrenches
     noise = np.random.default_rng(seed).normal(
         scale=np.repeat([WRENCH_N, WRENCH_NM], 3), size=values.shape
     )
     felt = replace(sensor, values=values + noise)
-    return replace(given, experiments=[replace(experiment, grasps=[replace(grasp, wrench=felt)])])
+    return replace(
+        given,
+        experiments=[replace(experiment, grasps=[replace(grasp, wrench=felt)])],
+    )

@@ -39,17 +39,25 @@ class Fault:
 
     def __call__(self, problem: Problem, rng: Rng) -> Problem:
         """The problem with this mistake in every experiment."""
-        return replace(problem, experiments=[self.change(e, rng) for e in problem.experiments])
+        return replace(
+            problem,
+            experiments=[self.change(e, rng) for e in problem.experiments],
+        )
 
 
 def _with_poses(
     experiment: Experiment, change: Callable[[PoseSequence], PoseSequence]
 ) -> Experiment:
-    grasps = [Grasp(g.nodes, change(g.poses), g.from_s, g.until_s) for g in experiment.grasps]
+    grasps = [
+        Grasp(g.nodes, change(g.poses), g.from_s, g.until_s)
+        for g in experiment.grasps
+    ]
     return replace(experiment, grasps=grasps)
 
 
-def _with_body(experiment: Experiment, points_m: np.ndarray, density: float = 1.0) -> Experiment:
+def _with_body(
+    experiment: Experiment, points_m: np.ndarray, density: float = 1.0
+) -> Experiment:
     """With another mesh, on which grasps and markers keep their nodes."""
     old = experiment.body
     density_kg_m3 = density * old.mass_kg / old.mesh.volume_m3
@@ -108,7 +116,10 @@ def reordered(places: int) -> Callable[[PoseSequence], PoseSequence]:
     """Quaternions read in the other order: by 1, w first taken for x; by −1 the reverse."""
 
     def change(poses: PoseSequence) -> PoseSequence:
-        return replace(poses, quaternions_xyzw=np.roll(poses.quaternions_xyzw, places, axis=1))
+        return replace(
+            poses,
+            quaternions_xyzw=np.roll(poses.quaternions_xyzw, places, axis=1),
+        )
 
     return change
 
@@ -120,13 +131,22 @@ def late(lag_s: float) -> Change:
         end_s = experiment.t_s[-1] - max(lag_s, 0.0)
         begin_s = experiment.t_s[0] - min(lag_s, 0.0)
         slack = 1e-9
-        kept = (experiment.t_s >= begin_s - slack) & (experiment.t_s <= end_s + slack)
+        kept = (experiment.t_s >= begin_s - slack) & (
+            experiment.t_s <= end_s + slack
+        )
         markers = experiment.markers
-        tracks = replace(markers, t_s=markers.t_s[kept], positions_m=markers.positions_m[kept])
+        tracks = replace(
+            markers,
+            t_s=markers.t_s[kept],
+            positions_m=markers.positions_m[kept],
+        )
         shifted = [
-            replace(g, poses=replace(g.poses, t_s=g.poses.t_s - lag_s)) for g in experiment.grasps
+            replace(g, poses=replace(g.poses, t_s=g.poses.t_s - lag_s))
+            for g in experiment.grasps
         ]
-        return replace(experiment, t_s=experiment.t_s[kept], grasps=shifted, markers=tracks)
+        return replace(
+            experiment, t_s=experiment.t_s[kept], grasps=shifted, markers=tracks
+        )
 
     return change
 
@@ -134,7 +154,9 @@ def late(lag_s: float) -> Change:
 def jumping(experiment: Experiment, rng: Rng) -> Experiment:
     """Poses that are shifted from a sample on."""
     shift = _direction(rng) * rng.uniform(*JUMP_M)
-    from_s = rng.choice(experiment.t_s[len(experiment.t_s) // 4 : -len(experiment.t_s) // 4])
+    from_s = rng.choice(
+        experiment.t_s[len(experiment.t_s) // 4 : -len(experiment.t_s) // 4]
+    )
 
     def change(poses: PoseSequence) -> PoseSequence:
         after = (poses.t_s >= from_s - 1e-9)[:, None]
@@ -169,7 +191,10 @@ def in_grippers_frame(experiment: Experiment, rng: Rng) -> Experiment:
 def in_meshs_frame(experiment: Experiment, rng: Rng) -> Experiment:
     """A mesh that lies elsewhere than the poses take it to."""
     turn, shift_m = _frame(rng)
-    return _with_body(experiment, turn.apply(np.array(experiment.body.mesh.points_m)) + shift_m)
+    return _with_body(
+        experiment,
+        turn.apply(np.array(experiment.body.mesh.points_m)) + shift_m,
+    )
 
 
 def in_cameras_frame(experiment: Experiment, rng: Rng) -> Experiment:
@@ -216,7 +241,9 @@ def held_deeper(experiment: Experiment, rng: Rng) -> Experiment:
     grasps = []
     for grasp in experiment.grasps:
         touched = np.isin(experiment.body.cells, grasp.nodes).any(axis=1)
-        grasps.append(replace(grasp, nodes=np.unique(experiment.body.cells[touched])))
+        grasps.append(
+            replace(grasp, nodes=np.unique(experiment.body.cells[touched]))
+        )
     return replace(experiment, grasps=grasps)
 
 
@@ -233,9 +260,15 @@ FAULTS = {
     "markers in km": Fault(markers_times(1e-3), ("length-unit",)),
     "mesh in mm": Fault(mesh_times(1e3), ("length-unit",)),
     "mesh in km": Fault(mesh_times(1e-3), ("length-unit",)),
-    "poses inverted": Fault(lambda e, rng: _with_poses(e, inverted), ("poses-inverted",)),
-    "wxyz as xyzw": Fault(lambda e, rng: _with_poses(e, reordered(1)), ("quaternion-order",)),
-    "xyzw as wxyz": Fault(lambda e, rng: _with_poses(e, reordered(-1)), ("quaternion-order",)),
+    "poses inverted": Fault(
+        lambda e, rng: _with_poses(e, inverted), ("poses-inverted",)
+    ),
+    "wxyz as xyzw": Fault(
+        lambda e, rng: _with_poses(e, reordered(1)), ("quaternion-order",)
+    ),
+    "xyzw as wxyz": Fault(
+        lambda e, rng: _with_poses(e, reordered(-1)), ("quaternion-order",)
+    ),
     "clock 10 ms late": Fault(late(0.01), ("clock",)),
     "clock 30 ms late": Fault(late(0.03), ("clock",)),
     "clock 100 ms late": Fault(late(0.1), ("clock",)),
@@ -256,9 +289,13 @@ FAULTS = {
 # Tracks and bodies that no grasped body has ------------------------------------------------------
 
 
-def with_track_axes(order: tuple[int, ...], signs: tuple[int, ...] = (1, 1, 1)) -> Change:
+def with_track_axes(
+    order: tuple[int, ...], signs: tuple[int, ...] = (1, 1, 1)
+) -> Change:
     """Tracks with their axes exchanged or reversed."""
-    return lambda e, rng: with_markers(e, np.array(signs) * e.markers.positions_m[..., list(order)])
+    return lambda e, rng: with_markers(
+        e, np.array(signs) * e.markers.positions_m[..., list(order)]
+    )
 
 
 def constant(poses: PoseSequence) -> PoseSequence:
@@ -267,7 +304,9 @@ def constant(poses: PoseSequence) -> PoseSequence:
     return replace(
         poses,
         positions_m=np.repeat(poses.positions_m[first], len(poses.t_s), axis=0),
-        quaternions_xyzw=np.repeat(poses.quaternions_xyzw[first], len(poses.t_s), axis=0),
+        quaternions_xyzw=np.repeat(
+            poses.quaternions_xyzw[first], len(poses.t_s), axis=0
+        ),
     )
 
 
@@ -276,7 +315,9 @@ def restarting(experiment: Experiment, rng: Rng) -> Experiment:
     tracks = np.array(experiment.markers.positions_m)
     k = int(rng.integers(len(tracks) // 2, 3 * len(tracks) // 4))
     growth = 0.002 * 2.0 ** np.arange(6)
-    tracks[k : k + 6] += growth[:, None, None] * np.where(np.arange(6) % 2, 1, -1)[:, None, None]
+    tracks[k : k + 6] += (
+        growth[:, None, None] * np.where(np.arange(6) % 2, 1, -1)[:, None, None]
+    )
     tracks[k + 6 : k + 8] = np.nan
     tracks[k + 8 :] = tracks[: len(tracks) - k - 8]
     return with_markers(experiment, tracks)
@@ -302,18 +343,28 @@ def torn(experiment: Experiment, rng: Rng) -> Experiment:
     )
     places_m = experiment.markers.predict_positions(body.nodes_m)
     markers = replace(
-        experiment.markers, placement=None, located=None, places_m=places_m, attach="embedded"
+        experiment.markers,
+        placement=None,
+        located=None,
+        places_m=places_m,
+        attach="embedded",
     )
     return replace(experiment, body=other, markers=markers)
 
 
 TRACK_FAULTS = {
-    "markers: y and z exchanged": Fault(with_track_axes((0, 2, 1)), ("markers-axes",)),
-    "markers: mirrored in x": Fault(with_track_axes((0, 1, 2), (-1, 1, 1)), ("markers-axes",)),
+    "markers: y and z exchanged": Fault(
+        with_track_axes((0, 2, 1)), ("markers-axes",)
+    ),
+    "markers: mirrored in x": Fault(
+        with_track_axes((0, 1, 2), (-1, 1, 1)), ("markers-axes",)
+    ),
     "markers: turned by 90 deg": Fault(
         with_track_axes((1, 0, 2), (-1, 1, 1)), ("markers-axes", "camera-frame")
     ),
-    "poses constant": Fault(lambda e, rng: _with_poses(e, constant), ("poses-constant",)),
+    "poses constant": Fault(
+        lambda e, rng: _with_poses(e, constant), ("poses-constant",)
+    ),
     "simulation reset after NaN": Fault(restarting, ("markers-jump", "unlike")),
     "mesh in two parts": Fault(torn, ("mesh-parts",)),
 }
@@ -327,7 +378,9 @@ def wrenches(change: Callable[[Wrench], Wrench]) -> Change:
 
     def changed(experiment: Experiment, rng: Rng) -> Experiment:
         grasps = [
-            grasp if grasp.wrench is None else replace(grasp, wrench=change(grasp.wrench))
+            grasp
+            if grasp.wrench is None
+            else replace(grasp, wrench=change(grasp.wrench))
             for grasp in experiment.grasps
         ]
         return replace(experiment, grasps=grasps)
@@ -343,28 +396,43 @@ def wrench_times(force: float, torque: float) -> Change:
 
 def tared(wrench: Wrench) -> Wrench:
     """Zeroed with the body in hand."""
-    return replace(wrench, values=wrench.values - np.nanmean(wrench.values[:5], axis=0))
+    return replace(
+        wrench, values=wrench.values - np.nanmean(wrench.values[:5], axis=0)
+    )
 
 
 def in_other_frame(wrench: Wrench) -> Wrench:
     """Stated in the world's axes if in the grasp's, and the reverse."""
-    return replace(wrench, frame="world" if wrench.frame == "grasp" else "grasp")
+    return replace(
+        wrench, frame="world" if wrench.frame == "grasp" else "grasp"
+    )
 
 
 GRAM_FORCE_N = 9.80665e-3
 WRENCH_FAULTS = {
     "wrench: sign": Fault(wrench_times(-1, -1), ("wrench-sign",)),
-    "wrench: force alone reversed": Fault(wrench_times(-1, 1), ("wrench-sign",)),
+    "wrench: force alone reversed": Fault(
+        wrench_times(-1, 1), ("wrench-sign",)
+    ),
     "wrench: y and z exchanged": Fault(
-        wrenches(lambda w: replace(w, values=w.values[:, [0, 2, 1, 3, 5, 4]])), ("wrench-axes",)
+        wrenches(lambda w: replace(w, values=w.values[:, [0, 2, 1, 3, 5, 4]])),
+        ("wrench-axes",),
     ),
     "wrench: torques in N mm": Fault(wrench_times(1, 1e3), ("wrench-unit",)),
-    "wrench: forces in gram-force": Fault(wrench_times(1 / GRAM_FORCE_N, 1), ("wrench-unit",)),
-    "wrench: gain 20 % too large": Fault(wrench_times(1.2, 1.2), ("wrench-gain",)),
-    "wrench: 0.1 s late": Fault(wrenches(lambda w: replace(w, t_s=w.t_s + 0.1)), ("wrench-clock",)),
+    "wrench: forces in gram-force": Fault(
+        wrench_times(1 / GRAM_FORCE_N, 1), ("wrench-unit",)
+    ),
+    "wrench: gain 20 % too large": Fault(
+        wrench_times(1.2, 1.2), ("wrench-gain",)
+    ),
+    "wrench: 0.1 s late": Fault(
+        wrenches(lambda w: replace(w, t_s=w.t_s + 0.1)), ("wrench-clock",)
+    ),
     "wrench: other frame": Fault(wrenches(in_other_frame), ("wrench-frame",)),
     "wrench: point off by 50 mm": Fault(
-        wrenches(lambda w: replace(w, point_m=w.point_m + np.array([0.05, 0, 0]))),
+        wrenches(
+            lambda w: replace(w, point_m=w.point_m + np.array([0.05, 0, 0]))
+        ),
         ("wrench-point",),
     ),
     "wrench: tared with the body": Fault(wrenches(tared), ("wrench-tare",)),
@@ -376,16 +444,24 @@ WRENCH_FAULTS = {
 
 def obstacles(change: Callable[[Obstacle], Obstacle]) -> Change:
     """Every obstacle changed."""
-    return lambda e, rng: e.with_obstacles([change(each) for each in e.obstacles])
+    return lambda e, rng: e.with_obstacles(
+        [change(each) for each in e.obstacles]
+    )
 
 
 def reversed_normal(obstacle: Obstacle) -> Obstacle:
     """A plane on the other side of which the body is."""
     assert isinstance(obstacle.shape, Plane)
-    return replace(obstacle, shape=replace(obstacle.shape, normal=-obstacle.shape.normal))
+    return replace(
+        obstacle, shape=replace(obstacle.shape, normal=-obstacle.shape.normal)
+    )
 
 
 OBSTACLE_FAULTS = {
-    "obstacle: normal reversed": Fault(obstacles(reversed_normal), ("obstacle-normal",)),
-    "obstacle: load reversed": Fault(wrench_times(-1, -1), ("sign", "wrench-sign")),
+    "obstacle: normal reversed": Fault(
+        obstacles(reversed_normal), ("obstacle-normal",)
+    ),
+    "obstacle: load reversed": Fault(
+        wrench_times(-1, -1), ("sign", "wrench-sign")
+    ),
 }

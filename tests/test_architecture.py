@@ -18,8 +18,23 @@ import collocation_sysid
 PACKAGE = Path(collocation_sysid.__file__).parent
 # As in CONTRIBUTING.md.
 LAYERS = (
-    {"array_files", "array_types", "cluster", "console", "declarations", "display", "errors"}
-    | {"files", "isolated_process", "machine", "pages", "schema_tables", "serialisation"}
+    {
+        "array_files",
+        "array_types",
+        "cluster",
+        "console",
+        "declarations",
+        "display",
+        "errors",
+    }
+    | {
+        "files",
+        "isolated_process",
+        "machine",
+        "pages",
+        "schema_tables",
+        "serialisation",
+    }
     | {"signal_handling", "step_counting", "validated_types", "written_files"},
     {"fem"},
     {"recording"},
@@ -59,13 +74,17 @@ def tree_of(name: str) -> ast.Module:
 def imports(name: str) -> set[str]:
     """Modules of the package that one imports, also those inside functions and for types alone."""
     path = MODULES[name]
-    folder = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
+    folder = (
+        name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
+    )
     found = set()
     for statement in ast.walk(tree_of(name)):
         if not isinstance(statement, ast.ImportFrom) or statement.level == 0:
             continue
         base = folder[: len(folder) - statement.level + 1]
-        target = ".".join([*base, *(statement.module or "").split(".")]).strip(".")
+        target = ".".join([*base, *(statement.module or "").split(".")]).strip(
+            "."
+        )
         for alias in statement.names:
             inner = f"{target}.{alias.name}".strip(".")
             found.add(inner if inner in MODULES else target)
@@ -85,13 +104,24 @@ def test_a_module_imports_nothing_from_above(name):
 
 
 def test_no_imports_go_in_circles():
-    graph = {name: {other for other in imports(name) if other} for name in MODULES}
+    graph = {
+        name: {other for other in imports(name) if other} for name in MODULES
+    }
     assert len([*TopologicalSorter(graph).static_order()]) >= len(MODULES)
 
 
 # Packages with the mathematics of an identification, and those that use it; see docs/core.md.
 CORE = ("fem", "recording", "model", "program", "methods", "statistics")
-OUTER = ("runs", "result", "live", "plan", "cli", "testing", "pipeline", "installation_check")
+OUTER = (
+    "runs",
+    "result",
+    "live",
+    "plan",
+    "cli",
+    "testing",
+    "pipeline",
+    "installation_check",
+)
 # The module of `program` that live estimation imports, and the largest number of its names.
 STREAMING = "program.streaming"
 STREAMING_NAMES = 12
@@ -106,7 +136,9 @@ def test_the_core_is_loaded_without_the_packages_that_use_it():
         "ours = [name for name in sys.modules if name.startswith('collocation_sysid.')]\n"
         "print(*{name.split('.')[1] for name in ours})"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     loaded = set(done.stdout.split())
     assert set(CORE) <= loaded
     assert not loaded & {*OUTER, "problem"}
@@ -118,10 +150,13 @@ def test_no_module_imports_the_package_by_its_name():
         for statement in ast.walk(tree_of(name)):
             if isinstance(statement, ast.Import):
                 assert not any(
-                    each.name.startswith("collocation_sysid") for each in statement.names
+                    each.name.startswith("collocation_sysid")
+                    for each in statement.names
                 )
             if isinstance(statement, ast.ImportFrom) and not statement.level:
-                assert not (statement.module or "").startswith("collocation_sysid"), name
+                assert not (statement.module or "").startswith(
+                    "collocation_sysid"
+                ), name
 
 
 def test_live_estimation_uses_a_small_interface_of_the_program():
@@ -129,7 +164,9 @@ def test_live_estimation_uses_a_small_interface_of_the_program():
     for name in MODULES:
         if name.split(".")[0] != "live":
             continue
-        assert {each for each in imports(name) if each.startswith("program")} <= {STREAMING}, name
+        assert {
+            each for each in imports(name) if each.startswith("program")
+        } <= {STREAMING}, name
         for statement in ast.walk(tree_of(name)):
             if not isinstance(statement, ast.ImportFrom):
                 continue
@@ -144,19 +181,23 @@ def test_live_estimation_uses_a_small_interface_of_the_program():
 
 def test_the_contribution_guide_names_the_layers():
     guide = (PACKAGE.parent / "CONTRIBUTING.md").read_text()
-    drawn = next(line for line in guide.splitlines() if line.strip().startswith("fem →"))
-    order = [name.strip() for part in drawn.split("→") for name in part.split(",")]
+    drawn = next(
+        line for line in guide.splitlines() if line.strip().startswith("fem →")
+    )
+    order = [
+        name.strip() for part in drawn.split("→") for name in part.split(",")
+    ]
     assert all(layer(a) <= layer(b) for a, b in pairwise(order))
 
 
 # Names that two classes of different rooms still have.
-TWICE = (
-    "Branch Columns Design Grid Model Motion Picture Replay Scatter Section Slopes View _Emitter"
-)
+TWICE = "Branch Columns Design Grid Model Motion Picture Replay Scatter Section Slopes View _Emitter"
 
 
 def test_a_class_name_occurs_once():
     nodes = chain.from_iterable(ast.walk(tree_of(name)) for name in MODULES)
-    names = Counter(node.name for node in nodes if isinstance(node, ast.ClassDef))
+    names = Counter(
+        node.name for node in nodes if isinstance(node, ast.ClassDef)
+    )
     twice = {name for name, count in names.items() if count > 1}
     assert twice <= set(TWICE.split())

@@ -41,9 +41,15 @@ from collocation_sysid.statistics.discretisation_error import estimate_changes
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.remedies import REMEDIES, remedy_for
-from collocation_sysid.statistics.systematic_effects import ASSUMPTIONS, Assumptions
+from collocation_sysid.statistics.systematic_effects import (
+    ASSUMPTIONS,
+    Assumptions,
+)
 from collocation_sysid.statistics.uncertainty import uncertainty_at
-from collocation_sysid.statistics.uncertainty_budget import VarianceSources, source_label
+from collocation_sysid.statistics.uncertainty_budget import (
+    VarianceSources,
+    source_label,
+)
 
 NOTHING = {name: "none" for name in Assumptions().deviations}
 
@@ -75,10 +81,19 @@ def test_the_combined_interval_contains_the_statistical_one(finished):
 
 
 def test_without_systematic_effects_and_discretisation_error_both_intervals_agree():
-    exact = run(replace(problem(**NOTHING), rollout=RolloutOptions("scheme")), seek_causes=False)
+    exact = run(
+        replace(problem(**NOTHING), rollout=RolloutOptions("scheme")),
+        seek_causes=False,
+    )
     for name, line in exact.budget.items():
-        assert line.combined95 == pytest.approx(exact.estimates[name].statistical95)
-        assert set(line.shares) <= {"noise", "nuisance parameters", "step and mesh"}
+        assert line.combined95 == pytest.approx(
+            exact.estimates[name].statistical95
+        )
+        assert set(line.shares) <= {
+            "noise",
+            "nuisance parameters",
+            "step and mesh",
+        }
 
 
 def assumed_deviation(solved: Run, name: str) -> float:
@@ -90,7 +105,10 @@ def test_one_assumption_alone_has_its_own_variance(finished):
     heavy = run(problem(**NOTHING | {"mass": 0.05}), seek_causes=False)
     # Markers that swing tell moduli over density: E follows the mass.
     assert assumed_deviation(heavy, "mu_pa") == pytest.approx(0.05, rel=1e-3)
-    assert max(heavy.budget["mu_pa"].shares, key=heavy.budget["mu_pa"].shares.get) == "mass"
+    assert (
+        max(heavy.budget["mu_pa"].shares, key=heavy.budget["mu_pa"].shares.get)
+        == "mass"
+    )
 
 
 def test_a_large_systematic_effect_stays_on_the_logarithmic_scale_of_its_parameter():
@@ -115,10 +133,18 @@ def test_a_parameter_with_an_interval_wider_than_its_value_is_not_determined():
 
 def test_intervals_respect_the_bounds_of_their_parameter():
     estimate = Estimate(0.05, 0.1, (0.0, 0.25))
-    combined = combine("x_friction", estimate, None, 0.1, linear=True, bounds=(0.0, 0.2))
+    combined = combine(
+        "x_friction", estimate, None, 0.1, linear=True, bounds=(0.0, 0.2)
+    )
     assert combined.statistical95 == (0.0, 0.2)
     assert combined.combined95 == (0.0, 0.2)
-    ratio = combine("poisson", Estimate(0.4, 0.02, (0.36, 0.44)), None, 2.0, bounds=(0.001, 0.495))
+    ratio = combine(
+        "poisson",
+        Estimate(0.4, 0.02, (0.36, 0.44)),
+        None,
+        2.0,
+        bounds=(0.001, 0.495),
+    )
     assert 0.001 < ratio.combined95[0] < 0.4 < ratio.combined95[1] <= 0.495
 
 
@@ -128,30 +154,49 @@ def test_every_assumption_has_a_remedy():
 
 
 @pytest.mark.parametrize("huber", [None, 1.0])
-def test_a_considered_nuisance_moves_estimates_as_a_recording_that_is_off_by_it(huber):
+def test_a_considered_nuisance_moves_estimates_as_a_recording_that_is_off_by_it(
+    huber,
+):
     experiment = measured(hung_cube(20))
     if huber:  # under which most samples count less than they are
         noise_m = 5e-3 * np.random.default_rng(1).standard_normal((21, 9, 3))
-        experiment = with_markers(experiment, experiment.markers.positions_m + noise_m)
+        experiment = with_markers(
+            experiment, experiment.markers.positions_m + noise_m
+        )
     described = Problem([experiment], GUESS, substeps=1, huber=huber)
     first = solve(described, ReducedSpace(tolerance=1e-9))
     collocation, off = first.collocation, 2e-4
-    changes = changes_of_nuisances(collocation, first.z, {"calibration_scale": off})
-    assert changes.names == ("calibration_scale", "calibration_distortion_1_m2", "clock_rate")
-    told = -estimate_changes(linearise_fit(collocation, first.z), changes.blocks)[: len(first.q), 0]
+    changes = changes_of_nuisances(
+        collocation, first.z, {"calibration_scale": off}
+    )
+    assert changes.names == (
+        "calibration_scale",
+        "calibration_distortion_1_m2",
+        "clock_rate",
+    )
+    told = -estimate_changes(
+        linearise_fit(collocation, first.z), changes.blocks
+    )[: len(first.q), 0]
     pivot = experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0)
     tracks = pivot + (1 + off) * (experiment.markers.positions_m - pivot)
     moved = replace(described, experiments=[with_markers(experiment, tracks)])
     again = solve(moved, ReducedSpace(tolerance=1e-9))
-    atol = (0.3 if huber else 0.03) * np.abs(told).max()  # weights follow residuals
+    atol = (0.3 if huber else 0.03) * np.abs(
+        told
+    ).max()  # weights follow residuals
     np.testing.assert_allclose(again.q - first.q, told, atol=atol)
 
 
 def test_what_is_estimated_is_not_considered():
     experiment = measured(cube_with_nuisance(8))
-    wide = replace(experiment, nuisance=replace(experiment.nuisance, calibration_scale=0.01))
+    wide = replace(
+        experiment,
+        nuisance=replace(experiment.nuisance, calibration_scale=0.01),
+    )
     solution = solve(Problem([wide], GUESS))
-    names = changes_of_nuisances(solution.collocation, solution.z, Assumptions().deviations).names
+    names = changes_of_nuisances(
+        solution.collocation, solution.z, Assumptions().deviations
+    ).names
     assert "calibration_scale" not in names
     assert "clock_rate" in names
 
@@ -166,15 +211,21 @@ def test_a_nuisance_that_moves_the_body_may_be_considered():
 
 
 def test_every_assumption_has_a_key_a_default_and_words():
-    assert set(Assumptions().deviations) == {row.name for row in (*ASSUMPTIONS, *KINDS)}
-    assert all(row.description and source_label(row.name) for row in ASSUMPTIONS)
+    assert set(Assumptions().deviations) == {
+        row.name for row in (*ASSUMPTIONS, *KINDS)
+    }
+    assert all(
+        row.description and source_label(row.name) for row in ASSUMPTIONS
+    )
     assert source_label("grip_layer_m") == "grip layer"
 
 
 def test_sources_need_no_nuisance_parameters():
     solution = solve(Problem([measured(hung_cube(12))], GUESS))
     fit = linearise_fit(solution.collocation, solution.z)
-    changes = changes_of_assumptions(solution.collocation, solution.z, Assumptions().deviations)
+    changes = changes_of_assumptions(
+        solution.collocation, solution.z, Assumptions().deviations
+    )
     known = uncertainty_at(solution.collocation, solution.z)
     sources = VarianceSources.from_fit(fit, changes, GUESS, solution.q, known)
     assert sources.noise_shares(np.eye(len(solution.q))[0]) == (1.0, 1.0)
@@ -185,10 +236,16 @@ def swings(*gamma_r_s: float) -> Problem:
     rng, recordings = np.random.default_rng(5), []
     for k, damping in enumerate(gamma_r_s):
         swing = replace(hung_cube(25), name=f"swing {k}")
-        markers = simulate(swing, TRUTH | {"gamma_r_s": damping}, "midpoint", substeps=1).markers_m
-        noise_m = swing.markers.sigma_m[:, None] * rng.standard_normal(markers.shape)
+        markers = simulate(
+            swing, TRUTH | {"gamma_r_s": damping}, "midpoint", substeps=1
+        ).markers_m
+        noise_m = swing.markers.sigma_m[:, None] * rng.standard_normal(
+            markers.shape
+        )
         recordings.append(with_markers(swing, markers + noise_m))
-    options = UncertaintyOptions(assumptions=Assumptions(**NOTHING), numerical=False)
+    options = UncertaintyOptions(
+        assumptions=Assumptions(**NOTHING), numerical=False
+    )
     return Problem(recordings, GUESS, substeps=1, uncertainty=options)
 
 
@@ -213,7 +270,9 @@ def test_terminal_page_and_pictures_show_the_budget(finished, tmp_path):
     assert (folder / "budget.png").exists()
     told = Result.read(folder)
     assert set(told.budget["mu_pa"]) == set(finished.budget["mu_pa"].shares)
-    short, whole = (plain_text(run_summary(told, folder, budget=b)) for b in (False, True))
+    short, whole = (
+        plain_text(run_summary(told, folder, budget=b)) for b in (False, True)
+    )
     assert "± syst" in short
     assert "% of the variance" not in short
     assert "% of the variance" in whole
@@ -228,12 +287,18 @@ def test_terminal_page_and_pictures_show_the_budget(finished, tmp_path):
     [
         ("mass", "-0.1", "uncertainty.assumptions.mass: found -0.1; expected"),
         ("weight", "0.1", "uncertainty.assumptions.weight: unknown key"),
-        ("air_drag", '"off"', "uncertainty.assumptions.air_drag: found 'off'; expected"),
+        (
+            "air_drag",
+            '"off"',
+            "uncertainty.assumptions.air_drag: found 'off'; expected",
+        ),
     ],
 )
 def test_what_cannot_be_assumed_is_one_message(tmp_path, key, value, said):
     file = write_problem(tmp_path, {"swing": 8})
-    file.write_text(file.read_text() + f"\n[uncertainty.assumptions]\n{key} = {value}\n")
+    file.write_text(
+        file.read_text() + f"\n[uncertainty.assumptions]\n{key} = {value}\n"
+    )
     outcome = run_command("check", file)
     assert outcome.code == 2
     assert said in " ".join(outcome.err.split())
@@ -246,15 +311,28 @@ def fast_block(damping: str, sigma_m: float = 3e-4) -> Experiment:
     """A block of 400 kg/m³ that is swung 12 cm at 2 Hz, so that it is strained by some 10 %."""
     t_s = np.linspace(0.0, 0.5, 26)
     way_m = np.outer(0.06 * (1 - np.cos(4 * np.pi * t_s)), [1, 0, 0.5])
-    body = Body(box_mesh((0.05, 0.05, 0.15), (1, 1, 3)), density_kg_m3=400.0, damping=damping)
+    body = Body(
+        box_mesh((0.05, 0.05, 0.15), (1, 1, 3)),
+        density_kg_m3=400.0,
+        damping=damping,
+    )
     top = np.flatnonzero(body.nodes_m[:, 2] > 0.149)
     low = body.nodes_m[body.nodes_m[:, 2] < 0.06][::4]
     swing = PoseSequence(t_s, way_m, np.tile([0, 0, 0, 1.0], (len(t_s), 1)))
-    markers = Markers(t_s, np.zeros((len(t_s), len(low), 3)), sigma_m, places_m=low)
-    return Experiment(body, t_s, [Grasp(top, swing)], markers, nuisance=Nuisance.none())
+    markers = Markers(
+        t_s, np.zeros((len(t_s), len(low), 3)), sigma_m, places_m=low
+    )
+    return Experiment(
+        body, t_s, [Grasp(top, swing)], markers, nuisance=Nuisance.none()
+    )
 
 
-BLOCK = {"young_pa": 20e3, "poisson": 0.3, "gamma_r_s": 6e-3, "gamma_m_1_s": 0.2}
+BLOCK = {
+    "young_pa": 20e3,
+    "poisson": 0.3,
+    "gamma_r_s": 6e-3,
+    "gamma_m_1_s": 0.2,
+}
 
 
 def fitted_block(made_with: str, fitted_with: str, **stated):
@@ -265,7 +343,9 @@ def fitted_block(made_with: str, fitted_with: str, **stated):
     described = Problem(
         [with_markers(fast_block(fitted_with), twin)],
         BLOCK | unknown,
-        uncertainty=UncertaintyOptions(assumptions=Assumptions(**(NOTHING | stated))),
+        uncertainty=UncertaintyOptions(
+            assumptions=Assumptions(**(NOTHING | stated))
+        ),
     )
     return run(described, seek_causes=False)
 
@@ -278,7 +358,9 @@ def fitted_block(made_with: str, fitted_with: str, **stated):
         pytest.param("rayleigh", "kelvin-voigt", marks=pytest.mark.long),
     ],
 )
-def test_a_wrong_law_of_damping_is_covered_by_the_budget_not_by_the_noise(made_with, fitted_with):
+def test_a_wrong_law_of_damping_is_covered_by_the_budget_not_by_the_noise(
+    made_with, fitted_with
+):
     wrong = fitted_block(made_with, fitted_with, damping_law=1.0)
     truth = BLOCK["gamma_r_s"]
     low, high = wrong.estimates["gamma_r_s"].statistical95

@@ -14,8 +14,14 @@ from problems_small import GUESS, hung_cube
 from collocation_sysid.model.recursion import Recursion, RecursionTrajectory
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.experiment_iterate import ExperimentIterate
-from collocation_sysid.program.expression_patterns import ExpressionPattern, PatternIndices
-from collocation_sysid.program.lifted_variables import LiftedOffsets, LiftedVariables
+from collocation_sysid.program.expression_patterns import (
+    ExpressionPattern,
+    PatternIndices,
+)
+from collocation_sysid.program.lifted_variables import (
+    LiftedOffsets,
+    LiftedVariables,
+)
 
 CORNERS = np.array([[0, 3], [1, 5], [2, 4]])
 MODULUS_PA = 1e3
@@ -51,7 +57,9 @@ class Stretches(LiftedVariables):
 
     def evolution(self, part: ExperimentIterate) -> RecursionTrajectory:
         modulus_pa = np.exp(part.q[:1])
-        return RecursionTrajectory.from_signal(STRETCH, modulus_pa, self.began, self.looked(part.x))
+        return RecursionTrajectory.from_signal(
+            STRETCH, modulus_pa, self.began, self.looked(part.x)
+        )
 
     def looked(self, x: np.ndarray) -> np.ndarray:
         """(6, N, 3, …) positions of each pair."""
@@ -64,10 +72,14 @@ class Stretches(LiftedVariables):
     @cached_property
     def patterns(self) -> tuple[ExpressionPattern, ...]:
         rows = np.arange(self.count).reshape(self.shape)
-        columns = np.arange(self.segment.columns.start, self.segment.columns.stop)
+        columns = np.arange(
+            self.segment.columns.start, self.segment.columns.stop
+        )
         at = self.looked(columns.reshape(self.segment.grid_times, -1))
         recursion = Recursion(
-            lambda before, now, last, q, data: slow_stretch(before, now, last, ca.exp(q), data),
+            lambda before, now, last, q, data: slow_stretch(
+                before, now, last, ca.exp(q), data
+            ),
             *(1, 6, 1, 1),
         )
         looked = PatternIndices(at, np.full((1, 1, 1), self.segment.length_m))
@@ -83,13 +95,19 @@ class Stretches(LiftedVariables):
 def program() -> Collocation:
     made = Collocation([hung_cube(5)], GUESS)
     last = LiftedOffsets(made.variable_count, made.constraint_count)
-    vars(made)["lifted"] = (Stretches(made.transcriptions[0], 0, made.phi_columns.start, last),)
+    vars(made)["lifted"] = (
+        Stretches(made.transcriptions[0], 0, made.phi_columns.start, last),
+    )
     return made
 
 
-def some_positions(program: Collocation, rng: np.random.Generator) -> np.ndarray:
+def some_positions(
+    program: Collocation, rng: np.random.Generator
+) -> np.ndarray:
     (segment,) = program.transcriptions
-    rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dof_count)
+    rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(
+        -1, segment.dof_count
+    )
     return rigid + 1e-3 * rng.normal(size=rigid.shape)
 
 
@@ -97,7 +115,9 @@ def test_rows_vanish_where_it_follows_from_the_motion(program, rng):
     z = program.pack(program.guess_p, [some_positions(program, rng)])
     (carried,) = program.lifted
     assert (z[carried.columns] > 0.01).all()
-    np.testing.assert_allclose(program.constraint_values(z)[carried.rows], 0.0, atol=1e-14)
+    np.testing.assert_allclose(
+        program.constraint_values(z)[carried.rows], 0.0, atol=1e-14
+    )
 
 
 def test_a_programs_matrices_have_it(program, rng):
@@ -107,8 +127,20 @@ def test_a_programs_matrices_have_it(program, rng):
     jacobian, hessian = program.jacobian(z), program.hessian(z, 1.3, y)
     own = jacobian[carried.rows]
     values = program.constraint_values
-    assert_derivative(lambda at: values(at)[carried.rows], lambda d: own @ d, z, rng, 1e-7, 0.1, 1)
-    for here in (slice(program.nq), program.transcriptions[0].columns, carried.columns):
+    assert_derivative(
+        lambda at: values(at)[carried.rows],
+        lambda d: own @ d,
+        z,
+        rng,
+        1e-7,
+        0.1,
+        1,
+    )
+    for here in (
+        slice(program.nq),
+        program.transcriptions[0].columns,
+        carried.columns,
+    ):
         scale = np.zeros(len(z))
         scale[here] = 0.1
         assert_derivative(
@@ -155,6 +187,10 @@ def test_coefficients_of_a_linear_one_are_those_of_all_its_instances(rng):
 
     c, data = ca.SX.sym("c", 2), ca.SX.sym("data", 1)
     found = ca.Function(
-        "found", [c, data], [Recursion(blend, 1, 1, 2, 1).linear_coefficients(c, data)]
+        "found",
+        [c, data],
+        [Recursion(blend, 1, 1, 2, 1).linear_coefficients(c, data)],
     )
-    np.testing.assert_allclose(found([0.5, 3.0], 2.0).full().ravel(), [0.5, 2.0, -9.0])
+    np.testing.assert_allclose(
+        found([0.5, 3.0], 2.0).full().ravel(), [0.5, 2.0, -9.0]
+    )

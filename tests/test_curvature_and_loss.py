@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from checks import directional_derivative
 from memories_small import guesses, recorded, truth
-from problems_small import GUESS, TRUTH, bar_let_go, cube_with_nuisance, hung_cube, noisy
+from problems_small import (
+    GUESS,
+    TRUTH,
+    bar_let_go,
+    cube_with_nuisance,
+    hung_cube,
+    noisy,
+)
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.horizon import Horizon, Iterate
@@ -14,14 +21,20 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.loss_curvature import exact_curvature
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.measurement_residual import huber_as_least_squares
+from collocation_sysid.program.measurement_residual import (
+    huber_as_least_squares,
+)
 from collocation_sysid.program.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment
 
 
-def with_noise(noise_m: float, experiment: Experiment | None = None, **changes) -> Collocation:
-    return Collocation([noisy(experiment or hung_cube(), noise_m, seed=2)], GUESS, **changes)
+def with_noise(
+    noise_m: float, experiment: Experiment | None = None, **changes
+) -> Collocation:
+    return Collocation(
+        [noisy(experiment or hung_cube(), noise_m, seed=2)], GUESS, **changes
+    )
 
 
 def point_at(collocation: Collocation, p: np.ndarray) -> Iterate:
@@ -33,11 +46,17 @@ def point_at(collocation: Collocation, p: np.ndarray) -> Iterate:
 
 
 @pytest.mark.parametrize("huber", [None, 4.0])
-@pytest.mark.parametrize("experiment", [hung_cube(), bar_let_go(), cube_with_nuisance()])
-def test_exact_curvature_completes_the_hessian_of_the_loss(experiment, huber, rng):
+@pytest.mark.parametrize(
+    "experiment", [hung_cube(), bar_let_go(), cube_with_nuisance()]
+)
+def test_exact_curvature_completes_the_hessian_of_the_loss(
+    experiment, huber, rng
+):
     collocation = with_noise(5e-3, experiment, huber=huber)
     count = 4 + collocation.nphi
-    p = np.concatenate([np.log(list(TRUTH.values())), np.zeros(collocation.nphi)])
+    p = np.concatenate(
+        [np.log(list(TRUTH.values())), np.zeros(collocation.nphi)]
+    )
     p += 0.05 * rng.normal(size=count)
     direction = rng.normal(size=count)
     point = point_at(collocation, p)
@@ -52,14 +71,19 @@ def test_exact_curvature_completes_the_hessian_of_the_loss(experiment, huber, rn
         hessian @ direction, differences, atol=1e-6 * np.abs(differences).max()
     )
     gauss_newton = point.fit.information @ direction
-    assert np.abs(gauss_newton - differences).max() > 1e-3 * np.abs(differences).max()
+    assert (
+        np.abs(gauss_newton - differences).max()
+        > 1e-3 * np.abs(differences).max()
+    )
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("experiment", "huber"), [(bar_let_go(), 2.0), (cube_with_nuisance(), None)]
 )
-def test_both_methods_find_the_same_optimum_of_all_parameters(experiment, huber):
+def test_both_methods_find_the_same_optimum_of_all_parameters(
+    experiment, huber
+):
     collocation = with_noise(1e-3, experiment, huber=huber)
     reduced = ReducedSpace(tolerance=1e-9)(collocation)
     alone = InteriorPoint(initial="simulation", tolerance=1e-10)
@@ -67,7 +91,9 @@ def test_both_methods_find_the_same_optimum_of_all_parameters(experiment, huber)
     assert reduced.status.converged
     assert interior.status.converged
     assert reduced.kkt_residual < 1e-7
-    found, expected = (collocation.parameters_from(s.z) for s in (reduced, interior))
+    found, expected = (
+        collocation.parameters_from(s.z) for s in (reduced, interior)
+    )
     np.testing.assert_allclose(found, expected, atol=2e-5)
 
 
@@ -91,7 +117,9 @@ def test_huberised_residuals_square_to_hubers_loss_with_its_gradient(rng):
     shrunk, weighted = huber_as_least_squares(residual, slope, 2.0)
     assert np.sum(shrunk**2) == pytest.approx(loss(np.zeros(2))[0])
     expected = directional_derivative(loss, np.zeros(2), direction, 1e-4)[0]
-    assert 2 * np.sum(shrunk * (weighted @ direction)) == pytest.approx(expected, rel=1e-6)
+    assert 2 * np.sum(shrunk * (weighted @ direction)) == pytest.approx(
+        expected, rel=1e-6
+    )
 
 
 def test_hubers_loss_is_not_led_astray_by_swapped_markers():
@@ -102,7 +130,9 @@ def test_hubers_loss_is_not_led_astray_by_swapped_markers():
     mistaken = with_markers(experiment, tracks)
     truth = np.log(list(TRUTH.values()))
     best = np.abs(ReducedSpace()(collocation).q - truth).max()
-    squared = np.abs(ReducedSpace()(Collocation([mistaken], GUESS)).q - truth).max()
+    squared = np.abs(
+        ReducedSpace()(Collocation([mistaken], GUESS)).q - truth
+    ).max()
     huber = ReducedSpace()(Collocation([mistaken], GUESS, huber=2.0))
     assert huber.status.converged
     assert np.abs(huber.q - truth).max() < 0.5 * squared
@@ -121,5 +151,7 @@ def test_an_exact_hessian_is_refused_where_there_is_none_before_anything_is_solv
         raise AssertionError("a sweep was made")
 
     remembers = Collocation([recorded("hung-cube", 4)], guesses(truth(1)))
-    with pytest.raises(InputError, match=r"materials with memory .*expected 'gauss-newton'"):
+    with pytest.raises(
+        InputError, match=r"materials with memory .*expected 'gauss-newton'"
+    ):
         ReducedSpace(hessian="exact")(remembers, watch)

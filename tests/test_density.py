@@ -47,9 +47,15 @@ GUESS = {
 def with_core(experiment: Experiment, **changes) -> Experiment:
     """The experiment with a body of two parts, whose densities are free."""
     old = experiment.body
-    core = Region("core", old.mesh.volumes_m3.argsort()[::2][:6], density_kg_m3=50.0)
+    core = Region(
+        "core", old.mesh.volumes_m3.argsort()[::2][:6], density_kg_m3=50.0
+    )
     body = Body(
-        old.mesh, density_kg_m3=30.0, element=old.element.name, regions=[core], **changes
+        old.mesh,
+        density_kg_m3=30.0,
+        element=old.element.name,
+        regions=[core],
+        **changes,
     ).with_free_densities(["", "core"])
     return replace(experiment, body=body)
 
@@ -57,7 +63,9 @@ def with_core(experiment: Experiment, **changes) -> Experiment:
 def weighted(experiment: Experiment) -> Experiment:
     """The experiment with a known mass on two of its nodes."""
     here = experiment.free_dofs[[-4, -1]] // 3
-    return replace(experiment, masses=(*experiment.masses, PointMass(here, 0.01)))
+    return replace(
+        experiment, masses=(*experiment.masses, PointMass(here, 0.01))
+    )
 
 
 def parameters(truth=TRUTH, guess=GUESS) -> Parameters:
@@ -87,20 +95,26 @@ def test_derivatives_of_the_forces_of_a_body_by_its_densities(rng):
     def force(values):
         return body.force(x, v, values, tied)[0]
 
-    assert_derivative(force, lambda d: at.by_theta[0] @ d, theta, rng, scale=0.1 * theta)
+    assert_derivative(
+        force, lambda d: at.by_theta[0] @ d, theta, rng, scale=0.1 * theta
+    )
     found = body.second_derivatives(x, v, w, theta, tied_kg=tied)
 
     def slope(values):
         return body.linearise(x, v, values, tied_kg=tied).by_theta[0].T @ w
 
-    assert_derivative(slope, lambda d: found.theta_theta[0] @ d, theta, rng, scale=0.1 * theta)
+    assert_derivative(
+        slope, lambda d: found.theta_theta[0] @ d, theta, rng, scale=0.1 * theta
+    )
 
     def by_velocity(values):
         matrix = body.linearise(x, v, values, tied_kg=tied).by_velocity[0]
         return body.pattern.matrix(matrix) @ w
 
     along = found.velocity_theta[0]
-    assert_derivative(by_velocity, lambda d: along @ d, theta, rng, scale=0.1 * theta)
+    assert_derivative(
+        by_velocity, lambda d: along @ d, theta, rng, scale=0.1 * theta
+    )
 
 
 # The same optimum ---------------------------------------------------------------------------
@@ -111,13 +125,18 @@ def test_methods_find_densities_where_a_known_mass_sets_the_scale(name):
     experiment = measured_with(MADE[name](), TRUTH)
     collocation = Collocation([experiment], parameters())
     reduced, interior, shot = (
-        METHODS[m]()(collocation) for m in ("reduced-space", "interior-point", "shooting")
+        METHODS[m]()(collocation)
+        for m in ("reduced-space", "interior-point", "shooting")
     )
     for solution in (reduced, interior, shot):
         assert solution.status.converged, solution.message
         for each in GUESS:
-            assert solution.parameters[each] == pytest.approx(TRUTH[each], rel=1e-3)
-    values = [[*solution.parameters.values()] for solution in (reduced, interior)]
+            assert solution.parameters[each] == pytest.approx(
+                TRUTH[each], rel=1e-3
+            )
+    values = [
+        [*solution.parameters.values()] for solution in (reduced, interior)
+    ]
     np.testing.assert_allclose(*values, rtol=1e-5)
     assert reduced.kkt_residual < 1e-8
 
@@ -135,7 +154,9 @@ TOLD = {name: (make, TRUTH) for name, make in MADE.items()}
 TOLD["memory"] = remembering_core, REMEMBERED
 
 
-@pytest.mark.parametrize(("name", "integrator"), [*zip(TOLD, cycle(["newmark", "midpoint"]))])
+@pytest.mark.parametrize(
+    ("name", "integrator"), [*zip(TOLD, cycle(["newmark", "midpoint"]))]
+)
 def test_a_density_in_theta_is_one_that_is_stated(name, integrator):
     make, truth = TOLD[name]
     free = make()
@@ -147,7 +168,13 @@ def test_a_density_in_theta_is_one_that_is_stated(name, integrator):
         element=free.body.element.name,
         damping=rest.damping,
         prony=rest.prony,
-        regions=[Region("core", core.cells, density_kg_m3=DENSITY_KG_M3["core.density_kg_m3"])],
+        regions=[
+            Region(
+                "core",
+                core.cells,
+                density_kg_m3=DENSITY_KG_M3["core.density_kg_m3"],
+            )
+        ],
     )
     found = simulate(free, truth, integrator).markers_m
     expected = simulate(replace(free, body=body), stated, integrator).markers_m

@@ -18,13 +18,20 @@ import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.program.depth_camera_model import DepthCameraModel
-from collocation_sysid.program.surface_correspondences import SurfaceCorrespondences
+from collocation_sysid.program.surface_correspondences import (
+    SurfaceCorrespondences,
+)
 from collocation_sysid.program.visible_surface import VisibleSurface
 from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
-TRUTH = {"young_pa": 1.5e5, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
+TRUTH = {
+    "young_pa": 1.5e5,
+    "poisson": 0.45,
+    "gamma_r_s": 1e-3,
+    "gamma_m_1_s": 0.1,
+}
 MATRIX, SHAPE = [[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]], (120, 160)
 MIDDLE_M, BIAS_M, NOISE_M = np.array([0.06, 0.015, -0.01]), 0.002, 1.5e-4
 
@@ -45,18 +52,30 @@ POSE = looking(np.array([0.06, -0.3, 0.15]))
 @cache
 def bar() -> cs.Body:
     return cs.Body(
-        cs.box_mesh((0.12, 0.03, 0.02), (4, 1, 1)), density_kg_m3=1070.0, element="tet10"
+        cs.box_mesh((0.12, 0.03, 0.02), (4, 1, 1)),
+        density_kg_m3=1070.0,
+        element="tet10",
     )
 
 
 def hanging(depths: tuple[cs.Depth, ...], **changes) -> cs.Experiment:
     """The bar held at one end, sagging."""
-    held = cs.Grasp(np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed())
+    held = cs.Grasp(
+        np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed()
+    )
     kept = cs.Nuisance.none(
-        depth_turn_rad=0.09, depth_shift_m=0.02, depth_bias_m=0.005, depth_scale=0.005
+        depth_turn_rad=0.09,
+        depth_shift_m=0.02,
+        depth_bias_m=0.005,
+        depth_scale=0.005,
     )
     return cs.Experiment(
-        bar(), [0.0], [held], kind="static", depths=depths, **{"nuisance": kept} | changes
+        bar(),
+        [0.0],
+        [held],
+        kind="static",
+        depths=depths,
+        **{"nuisance": kept} | changes,
     )
 
 
@@ -73,7 +92,10 @@ def hanging_m() -> np.ndarray:
 @cache
 def image_m() -> np.ndarray:
     """What a camera at POSE sees of the bar, without noise."""
-    skin, camera = VisibleSurface.from_body(bar(), NOTHING), cs.DepthCamera(MATRIX, pose=POSE)
+    skin, camera = (
+        VisibleSurface.from_body(bar(), NOTHING),
+        cs.DepthCamera(MATRIX, pose=POSE),
+    )
     seen = (skin.subdivided_triangles(hanging_m()) - POSE[:3, 3]) @ POSE[:3, :3]
     return cs.depth_image(camera, SHAPE, seen)
 
@@ -92,44 +114,65 @@ def moved(turn_rad: np.ndarray, shift_m: np.ndarray) -> np.ndarray:
     return off @ POSE
 
 
-def fitted(image: np.ndarray, pose: np.ndarray, guess: float = 2e5, **options) -> cs.Solution:
+def fitted(
+    image: np.ndarray, pose: np.ndarray, guess: float = 2e5, **options
+) -> cs.Solution:
     camera = cs.DepthCamera(MATRIX, pose=pose)
-    depth = cs.Depth.of_images("front", image, camera, NOISE_M, spacing_m=0.004, **options)
+    depth = cs.Depth.of_images(
+        "front", image, camera, NOISE_M, spacing_m=0.004, **options
+    )
     unknown = {**TRUTH, "young_pa": cs.Unknown(guess)}
-    return cs.solve(cs.Problem([hanging((depth,))], cs.Parameters.from_mapping(unknown)))
+    return cs.solve(
+        cs.Problem([hanging((depth,))], cs.Parameters.from_mapping(unknown))
+    )
 
 
 def test_stiffness_is_found_with_the_camera_20_mm_and_10_degrees_off(rng):
     axis, way = np.array([0.1, 0.8, -0.6]), np.array([0.5, 0.6, 0.6])
-    pose = moved(np.radians(10) * axis / np.linalg.norm(axis), 0.02 * way / np.linalg.norm(way))
+    pose = moved(
+        np.radians(10) * axis / np.linalg.norm(axis),
+        0.02 * way / np.linalg.norm(way),
+    )
     solution = fitted(noisy(rng), pose)
     assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.05
     (part,) = solution.collocation.iterates(solution.z)
     (reading,) = part.segment.depths
     apart = reading.signed_distances_m(part.observables[-1], part.phi)
     assert np.sqrt(np.nanmean(apart**2)) < 2e-4
-    bars = uncertainty_at(solution.collocation, solution.z).estimates["young_pa"]
+    bars = uncertainty_at(solution.collocation, solution.z).estimates[
+        "young_pa"
+    ]
     low, high = bars.statistical95
     assert low < TRUTH["young_pa"] < high < 1.2 * low
 
 
 @pytest.mark.parametrize(
     ("axis", "way"),
-    [((0.61, -0.71, 0.36), (-0.54, 0.48, -0.7)), ((0.83, 0.31, 0.46), (-0.09, 0.53, -0.84))],
+    [
+        ((0.61, -0.71, 0.36), (-0.54, 0.48, -0.7)),
+        ((0.83, 0.31, 0.46), (-0.09, 0.53, -0.84)),
+    ],
 )
-def test_a_camera_sees_the_faces_that_are_turned_to_where_it_is_found_to_be(axis, way, rng):
+def test_a_camera_sees_the_faces_that_are_turned_to_where_it_is_found_to_be(
+    axis, way, rng
+):
     """Not to where it is said to be: 20 mm and 10 degrees off, it would not see the bar's top."""
     camera = cs.DepthCamera(
-        MATRIX, pose=moved(np.radians(10) * np.array(axis), 0.02 * np.array(way))
+        MATRIX,
+        pose=moved(np.radians(10) * np.array(axis), 0.02 * np.array(way)),
     )
-    depth = cs.Depth.of_images("front", noisy(rng), camera, NOISE_M, spacing_m=0.004)
+    depth = cs.Depth.of_images(
+        "front", noisy(rng), camera, NOISE_M, spacing_m=0.004
+    )
     experiment = hanging((depth,))
     nuisance = NuisanceMap.from_experiment(experiment)
     view, nothing = (
         DepthCameraModel.from_experiment(experiment, 0, nuisance),
         np.zeros(nuisance.size),
     )
-    sighting = SurfaceCorrespondences.from_alignment(view, bar(), hanging_m()[None], nothing)
+    sighting = SurfaceCorrespondences.from_alignment(
+        view, bar(), hanging_m()[None], nothing
+    )
     assert sighting.gate_m == depth.gate_m
     assert sighting.is_compared.sum() > 0.95 * len(depth.points_m[0])
 
@@ -138,21 +181,29 @@ def test_what_is_beside_the_body_is_left_out_and_counted(rng):
     image = noisy(rng)
     image[:20] = 0.34  # a wall above the bar, nearer than it
     solution = fitted(image, POSE)
-    (sighting,) = solution.collocation.transcriptions[0].association.correspondences
+    (sighting,) = solution.collocation.transcriptions[
+        0
+    ].association.correspondences
     assert sighting.excluded_counts["far"] > 20
     assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.05
 
 
 def test_a_point_whose_normal_is_turned_from_that_of_the_surface_is_left_out():
     camera = cs.DepthCamera(MATRIX, pose=POSE)
-    depth = cs.Depth.of_images("front", image_m(), camera, NOISE_M, spacing_m=0.004)
+    depth = cs.Depth.of_images(
+        "front", image_m(), camera, NOISE_M, spacing_m=0.004
+    )
 
     def sighting(depth: cs.Depth) -> SurfaceCorrespondences:
         experiment = hanging((depth,))
         nuisance = NuisanceMap.from_experiment(experiment)
         view = DepthCameraModel.from_experiment(experiment, 0, nuisance)
         return SurfaceCorrespondences.from_shapes(
-            view, bar(), hanging_m()[None], np.zeros(nuisance.size), depth.gate_m
+            view,
+            bar(),
+            hanging_m()[None],
+            np.zeros(nuisance.size),
+            depth.gate_m,
         )
 
     plain = sighting(depth)
@@ -168,18 +219,30 @@ def test_a_point_whose_normal_is_turned_from_that_of_the_surface_is_left_out():
 def test_an_interior_point_method_finds_the_same(rng):
     image = noisy(rng)
     reduced = fitted(image, POSE)
-    unknown = {**TRUTH, "young_pa": cs.Unknown(1.05 * reduced.parameters["young_pa"])}
+    unknown = {
+        **TRUTH,
+        "young_pa": cs.Unknown(1.05 * reduced.parameters["young_pa"]),
+    }
     seen = reduced.collocation.experiments
-    other = cs.solve(cs.Problem(seen, cs.Parameters.from_mapping(unknown), method="interior-point"))
+    other = cs.solve(
+        cs.Problem(
+            seen, cs.Parameters.from_mapping(unknown), method="interior-point"
+        )
+    )
     assert other.status.converged
-    assert abs(other.parameters["young_pa"] / reduced.parameters["young_pa"] - 1) < 5e-3
+    assert (
+        abs(other.parameters["young_pa"] / reduced.parameters["young_pa"] - 1)
+        < 5e-3
+    )
 
 
 def test_pixels_at_edges_and_without_depth_are_left_out():
     image = np.full((8, 10), 0.5)
     image[:, 5:] = 0.6
     image[3, 2] = 0.0
-    points = points_from_image(image, cs.DepthCamera([[100, 0, 5], [0, 100, 4], [0, 0, 1]]))
+    points = points_from_image(
+        image, cs.DepthCamera([[100, 0, 5], [0, 100, 4], [0, 0, 1]])
+    )
     # Rows 1 to 6, columns 1 to 8, without both beside the jump, nor the hole and its neighbours.
     assert len(points) == 6 * 6 - 5
     assert set(points[:, 2]) == {0.5, 0.6}
@@ -192,17 +255,24 @@ def test_a_lens_bends_the_rays_as_its_distortion_says():
     radial = 1 + 0.1 * r2 - 0.02 * r2 * r2
     u = x * radial + 2 * 1e-3 * x * y + 2e-3 * (r2 + 2 * x * x)
     v = y * radial + 1e-3 * (r2 + 2 * y * y) + 2 * 2e-3 * x * y
-    np.testing.assert_allclose([300 * u + 80, 300 * v + 60], [20, 100], atol=1e-6)
+    np.testing.assert_allclose(
+        [300 * u + 80, 300 * v + 60], [20, 100], atol=1e-6
+    )
 
 
 def written(folder: Path) -> dict[str, Path]:
     """One cloud of three points with normals, and an image, in all formats."""
     points, normals = np.arange(9.0).reshape(3, 3), np.tile([0.0, 0, 1], (3, 1))
-    files = {kind: folder / f"cloud.{kind}" for kind in ("npy", "xyz", "ply", "pcd", "npz", "png")}
+    files = {
+        kind: folder / f"cloud.{kind}"
+        for kind in ("npy", "xyz", "ply", "pcd", "npz", "png")
+    }
     np.save(files["npy"], np.hstack([points, normals]))
     np.savetxt(files["xyz"], points)
     columns = {f"n{axis}": normals[:, k] for k, axis in enumerate("xyz")}
-    meshio.write(files["ply"], meshio.Mesh(points, [("triangle", [[0, 1, 2]])], columns))
+    meshio.write(
+        files["ply"], meshio.Mesh(points, [("triangle", [[0, 1, 2]])], columns)
+    )
     head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nPOINTS 3\nDATA binary\n"
     files["pcd"].write_bytes(head.encode() + points.astype("<f4").tobytes())
     np.savez(files["npz"], depth_counts=np.full((4, 5), 500), count_m=1e-3)
@@ -232,7 +302,9 @@ def test_clouds_and_images_are_read_from_every_format(tmp_path):
         ("image.exr", "OpenEXR"),
     ],
 )
-def test_files_that_cannot_be_read_are_refused_with_a_remedy(tmp_path, monkeypatch, name, said):
+def test_files_that_cannot_be_read_are_refused_with_a_remedy(
+    tmp_path, monkeypatch, name, said
+):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)  # as where it is missing
     file = tmp_path / name
     if name == "flat.npy":
@@ -242,14 +314,19 @@ def test_files_that_cannot_be_read_are_refused_with_a_remedy(tmp_path, monkeypat
     elif name == "two.npz":
         np.savez(file, other=np.zeros(3))
     else:
-        file.write_text("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA binary_compressed\n")
+        file.write_text(
+            "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA binary_compressed\n"
+        )
     with pytest.raises(InputError, match=said):
         read_depth(file, None, 1.0)
 
 
 def test_an_exr_image_is_read(tmp_path):
     library = pytest.importorskip("OpenEXR")
-    header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
+    header = {
+        "compression": library.ZIP_COMPRESSION,
+        "type": library.scanlineimage,
+    }
     with library.File(header, {"Z": image_m().astype(np.float32)}) as image:
         image.write(str(tmp_path / "image.exr"))
     read = read_depth(tmp_path / "image.exr", None, 1.0)
@@ -258,7 +335,10 @@ def test_an_exr_image_is_read(tmp_path):
 
 def test_of_a_damaged_exr_image_only_the_refusal_is_said(tmp_path, capfd):
     library, file = pytest.importorskip("OpenEXR"), tmp_path / "image.exr"
-    header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
+    header = {
+        "compression": library.ZIP_COMPRESSION,
+        "type": library.scanlineimage,
+    }
     with library.File(header, {"Z": image_m().astype(np.float32)}) as image:
         image.write(str(file))
     file.write_bytes(file.read_bytes()[:308])
@@ -291,7 +371,12 @@ sigma_m = 0.0002
 
 def test_a_problem_file_states_depth(tmp_path):
     bar().mesh.write(tmp_path / "bar.vtu")
-    np.savez(tmp_path / "front.npz", depth_m=image_m(), camera_matrix=MATRIX, camera_pose=POSE)
+    np.savez(
+        tmp_path / "front.npz",
+        depth_m=image_m(),
+        camera_matrix=MATRIX,
+        camera_pose=POSE,
+    )
     more = "spacing_m = 0.005\n[experiment.nuisance]\ndepth_pose = { prior_m = 0.01 }\n"
     text = PROBLEM.replace('name = "front"\n', "") + more
     file = tmp_path / "problem.toml"
@@ -318,18 +403,32 @@ def test_noise_that_persists_from_image_to_image_widens_the_interval():
     for share in (0.0, 0.9):
         noise, images = noisy(rng) - image_m(), []
         for _ in range(20):
-            noise = share * noise + np.sqrt(1 - share**2) * (noisy(rng) - BIAS_M - image_m())
+            noise = share * noise + np.sqrt(1 - share**2) * (
+                noisy(rng) - BIAS_M - image_m()
+            )
             images.append(image_m() + noise)
         camera, t_s = cs.DepthCamera(MATRIX, pose=POSE), np.arange(20.0)
-        depth = cs.Depth.of_images("front", images, camera, NOISE_M, t_s=t_s, spacing_m=0.006)
-        depth = replace(depth, background="unknown")  # outlines have their own noise
-        held = cs.Grasp(np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed())
+        depth = cs.Depth.of_images(
+            "front", images, camera, NOISE_M, t_s=t_s, spacing_m=0.006
+        )
+        depth = replace(
+            depth, background="unknown"
+        )  # outlines have their own noise
+        held = cs.Grasp(
+            np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed()
+        )
         kept = hanging((NOTHING,)).nuisance
-        experiment = cs.Experiment(bar(), t_s, [held], kind="static", depths=[depth], nuisance=kept)
+        experiment = cs.Experiment(
+            bar(), t_s, [held], kind="static", depths=[depth], nuisance=kept
+        )
         unknown = {**TRUTH, "young_pa": cs.Unknown(1.6e5)}
-        solution = cs.solve(cs.Problem([experiment], cs.Parameters.from_mapping(unknown)))
+        solution = cs.solve(
+            cs.Problem([experiment], cs.Parameters.from_mapping(unknown))
+        )
         low, high = (
-            uncertainty_at(solution.collocation, solution.z).estimates["young_pa"].statistical95
+            uncertainty_at(solution.collocation, solution.z)
+            .estimates["young_pa"]
+            .statistical95
         )
         widths.append(np.log(high / low))
     assert 2 < widths[1] / widths[0] < 4.4

@@ -21,7 +21,13 @@ from collocation_sysid.model.parameters import Parameters, Unknown
 from collocation_sysid.program.block_band import full_matrix
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.transcription import Transcription
-from collocation_sysid.recording import Experiment, Force, Markers, Nuisance, PointMass
+from collocation_sysid.recording import (
+    Experiment,
+    Force,
+    Markers,
+    Nuisance,
+    PointMass,
+)
 
 # Of a tendon whose tension grows and a pressure that stays.
 BAR = driven_bar()
@@ -41,13 +47,17 @@ def joined_cube() -> Experiment:
         cube,
         masses=(PointMass(tip, 0.01, 0.02),),
         forces=(Force(tip, [0.01, 0.02, 0.03], from_s=0.03, until_s=0.06),),
-        nuisance=Nuisance.none(joining_s=0.01, gravity_rad=0.03, pose_turn_rad=0.02),
+        nuisance=Nuisance.none(
+            joining_s=0.01, gravity_rad=0.03, pose_turn_rad=0.02
+        ),
     )
 
 
 def drag(x, v, at, drag_coefficient):
     """Of air, by the share of the surface."""
-    return -0.6 * drag_coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-4) * v
+    return (
+        -0.6 * drag_coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-4) * v
+    )
 
 
 def foundation(x, v, at, bed_n_m3, whirl_n_m3):
@@ -55,7 +65,10 @@ def foundation(x, v, at, bed_n_m3, whirl_n_m3):
     moved = x - at.rest_m
     beside = ca.vertcat(-moved[1], moved[0], 0)
     spring = bed_n_m3 * at.area_m2 * (1 + ca.sumsqr(moved) / 1e-4)
-    return -spring * (moved + 0.1 * v) + whirl_n_m3 * at.t_s * at.volume_m3 * beside
+    return (
+        -spring * (moved + 0.1 * v)
+        + whirl_n_m3 * at.t_s * at.volume_m3 * beside
+    )
 
 
 def cube_in_air() -> Collocation:
@@ -67,13 +80,19 @@ def cube_in_air() -> Collocation:
     ]
     body = Body(old.body.mesh, density_kg_m3=30.0, forces=forces)
     given = {"drag_coefficient": 1.1, "bed_n_m3": 900.0, "whirl_n_m3": 4e4}
-    known = Parameters.from_mapping({name: Unknown(value) for name, value in given.items()})
-    return Collocation([replace(old, body=body)], Parameters((*GUESS.items, *known.items)))
+    known = Parameters.from_mapping(
+        {name: Unknown(value) for name, value in given.items()}
+    )
+    return Collocation(
+        [replace(old, body=body)], Parameters((*GUESS.items, *known.items))
+    )
 
 
 def breath(x, v, at, breath_pa, brake_pa_s_m):
     """A pressure that grows in time and with the place, and what brakes along the normal."""
-    pressure_pa = breath_pa * (1 + 10 * at.t_s) * (1 + ca.sumsqr(x - at.rest_m) / 1e-6)
+    pressure_pa = (
+        breath_pa * (1 + 10 * at.t_s) * (1 + ca.sumsqr(x - at.rest_m) / 1e-6)
+    )
     along = ca.dot(v, at.normal)
     return -at.area_m2 * (pressure_pa + brake_pa_s_m * along) * at.normal
 
@@ -81,11 +100,21 @@ def breath(x, v, at, breath_pa, brake_pa_s_m):
 def breathed(element: str) -> Collocation:
     """A hung cube with a force of a user on some of its faces."""
     old = hung_cube(8, (1, 1, 2))
-    force = NodeForce.from_law(breath, nodes=Box((-1, -1, -1), (1, 1, 0.051)), on="faces")
-    body = Body(old.body.mesh, density_kg_m3=30.0, element=element, forces=[force])
-    markers = Markers(old.t_s, np.zeros((9, 1, 3)), 1e-3, places_m=[[0.1, 0.1, 0.0]])
-    grasp = replace(old.grasps[0], nodes=nodes_where(body, 2, 0.1), selection=None)
-    known = Parameters.from_mapping({"breath_pa": Unknown(3.0), "brake_pa_s_m": Unknown(2.0)})
+    force = NodeForce.from_law(
+        breath, nodes=Box((-1, -1, -1), (1, 1, 0.051)), on="faces"
+    )
+    body = Body(
+        old.body.mesh, density_kg_m3=30.0, element=element, forces=[force]
+    )
+    markers = Markers(
+        old.t_s, np.zeros((9, 1, 3)), 1e-3, places_m=[[0.1, 0.1, 0.0]]
+    )
+    grasp = replace(
+        old.grasps[0], nodes=nodes_where(body, 2, 0.1), selection=None
+    )
+    known = Parameters.from_mapping(
+        {"breath_pa": Unknown(3.0), "brake_pa_s_m": Unknown(2.0)}
+    )
     experiment = replace(old, body=body, grasps=[grasp], markers=markers)
     return Collocation([experiment], Parameters((*GUESS.items, *known.items)))
 
@@ -111,7 +140,9 @@ def segment(request) -> Transcription:
     return CASES[request.param]().transcriptions[0]
 
 
-def states(segment: Transcription, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def states(
+    segment: Transcription, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Positions and velocities at the evaluations of `ROWS`."""
     nodes_m = segment.body.nodes_m.ravel()
     count = len(range(*ROWS.indices(segment.grid_times)))
@@ -121,7 +152,12 @@ def states(segment: Transcription, rng: np.random.Generator) -> tuple[np.ndarray
 
 def some_inputs(segment: Transcription, rng: np.random.Generator) -> np.ndarray:
     """U (T, U), shaken."""
-    p = np.concatenate([segment.parameters.guess_q, np.zeros(len(segment.nuisance.motion_indices))])
+    p = np.concatenate(
+        [
+            segment.parameters.guess_q,
+            np.zeros(len(segment.nuisance.motion_indices)),
+        ]
+    )
     u = segment.inputs.evaluate_at(p)[0][ROWS]
     return u * (1 + 0.1 * rng.normal(size=u.shape[1]))
 
@@ -133,13 +169,20 @@ def forces_at(segment: Transcription, u: np.ndarray) -> Forces:
     return segment.dynamics.with_inputs(whole).forces.at_times(ROWS)
 
 
-def test_tendons_and_pressures_are_lengths_and_volumes_times_what_drives_them(rng):
+def test_tendons_and_pressures_are_lengths_and_volumes_times_what_drives_them(
+    rng,
+):
     xi = states(Collocation([BAR], GUESS).transcriptions[0], rng)[0][:2]
     tendon, pressure = BAR.actuators
     expected = -tension_n(FROM_S)[:, None] * tendon.measure.gradient(xi)
-    expected -= pressure.energy_amplitude_at(FROM_S)[:, None] * pressure.measure.gradient(xi)
+    expected -= pressure.energy_amplitude_at(FROM_S)[
+        :, None
+    ] * pressure.measure.gradient(xi)
     given = States(xi, np.zeros_like(xi), np.zeros(0))
-    found = sum(term.force(given) for term in Forces.from_experiment(BAR, FROM_S).external_terms)
+    found = sum(
+        term.force(given)
+        for term in Forces.from_experiment(BAR, FROM_S).external_terms
+    )
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
@@ -147,7 +190,8 @@ def test_what_is_lost_and_a_factor_count_and_a_tendon_only_pulls():
     tendon, pressure = BAR.actuators
     stated = tension_n(FROM_S)
     np.testing.assert_allclose(
-        tendon.with_calibration(1.2, 0.003, 0.0).energy_amplitude_at(FROM_S), 1.2 * stated - 0.003
+        tendon.with_calibration(1.2, 0.003, 0.0).energy_amplitude_at(FROM_S),
+        1.2 * stated - 0.003,
     )
     np.testing.assert_array_equal(
         tendon.with_calibration(1.0, 1.0, 0.0).energy_amplitude_at(FROM_S), 0.0
@@ -157,22 +201,32 @@ def test_what_is_lost_and_a_factor_count_and_a_tendon_only_pulls():
         pressure.with_calibration(0.9, 2.0, 0.0).energy_amplitude_at(FROM_S),
         -(0.9 * in_chamber - 2.0),
     )
-    assert pressure.with_calibration(1.0, 0.0, np.log(2)).lag_s == pytest.approx(2 * pressure.lag_s)
+    assert pressure.with_calibration(
+        1.0, 0.0, np.log(2)
+    ).lag_s == pytest.approx(2 * pressure.lag_s)
 
 
 def test_forces_on_the_way_to_other_times_lie_between_them(segment, rng):
     x, v = states(segment, rng)
     theta = segment.constants.theta(segment.parameters.guess_q)
-    here, there = (Forces.from_experiment(segment.experiment, t_s, theta) for t_s in (FROM_S, TO_S))
+    here, there = (
+        Forces.from_experiment(segment.experiment, t_s, theta)
+        for t_s in (FROM_S, TO_S)
+    )
     ends = [each.total(x[:2], v[:2]) for each in (here, there)]
     for share in (0.0, SHARE, 1.0):
         found = here.interpolate(there, share).total(x[:2], v[:2])
-        np.testing.assert_allclose(found, (1 - share) * ends[0] + share * ends[1], atol=1e-12)
+        np.testing.assert_allclose(
+            found, (1 - share) * ends[0] + share * ends[1], atol=1e-12
+        )
 
 
 def test_a_share_is_one_of_all_that_acts(segment, rng):
     x, _ = states(segment, rng)
-    theta, still = segment.constants.theta(segment.parameters.guess_q), np.zeros_like(x[:2])
+    theta, still = (
+        segment.constants.theta(segment.parameters.guess_q),
+        np.zeros_like(x[:2]),
+    )
     whole = Forces.from_experiment(segment.experiment, FROM_S, theta)
     internal = segment.body.force(x[:2], still, theta)
     outer = whole.total(x[:2], still) - internal
@@ -181,10 +235,14 @@ def test_a_share_is_one_of_all_that_acts(segment, rng):
     assert np.abs(outer).max() > 1e-3
 
 
-def matrix_times(forces: Forces, lower: np.ndarray, skew: np.ndarray, ways: np.ndarray):
+def matrix_times(
+    forces: Forces, lower: np.ndarray, skew: np.ndarray, ways: np.ndarray
+):
     """(T, 3n) products with matrices given by symmetric and skew parts."""
     parts = zip(lower, skew, ways, strict=True)
-    return np.stack([full_matrix(forces.pattern, a, b) @ way for a, b, way in parts])
+    return np.stack(
+        [full_matrix(forces.pattern, a, b) @ way for a, b, way in parts]
+    )
 
 
 @pytest.mark.parametrize("segment", BUILT_IN, indirect=True)
@@ -205,11 +263,15 @@ def test_slopes_of_forces_are_those_of_what_they_are(segment, rng):
     def by_v(way: np.ndarray) -> np.ndarray:
         return matrix_times(forces, at.by_velocity, none, way)
 
-    assert_derivative(lambda x: forces.total(x, nu), by_x, xi, rng, 1e-6, scale=1e-3)
+    assert_derivative(
+        lambda x: forces.total(x, nu), by_x, xi, rng, 1e-6, scale=1e-3
+    )
     assert_derivative(lambda v: forces.total(xi, v), by_v, nu, rng, 1e-6)
     by_u = np.einsum("tiu,tu->tiu", at.by_theta, u)
     for one in np.eye(u.shape[1]):
-        assert_derivative(of_inputs, lambda d: by_u @ d, np.zeros(len(one)), rng, 1e-6, one)
+        assert_derivative(
+            of_inputs, lambda d: by_u @ d, np.zeros(len(one)), rng, 1e-6, one
+        )
 
 
 @pytest.mark.parametrize("segment", BUILT_IN, indirect=True)
@@ -220,7 +282,9 @@ def test_second_derivatives_of_forces_are_those_of_the_slopes(segment, rng):
     at = forces.weighted_hessian(xi, nu, w)
     none = np.zeros((len(xi), 0))
 
-    def slopes(x: np.ndarray, v: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, ...]:
+    def slopes(
+        x: np.ndarray, v: np.ndarray, change: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
         """Of wᵀ F by x, v and u."""
         other = forces_at(segment, u * (1 + change))
         here = other.linearise(x, v)
@@ -234,7 +298,9 @@ def test_second_derivatives_of_forces_are_those_of_the_slopes(segment, rng):
     def twice(way: np.ndarray) -> np.ndarray:
         return matrix_times(forces, at.position_position, none, way)
 
-    assert_derivative(lambda x: slopes(x, nu, steady)[0], twice, xi, rng, 1e-6, scale=1e-3)
+    assert_derivative(
+        lambda x: slopes(x, nu, steady)[0], twice, xi, rng, 1e-6, scale=1e-3
+    )
     if at.velocity_velocity.size:
         assert_derivative(
             lambda v: slopes(xi, v, steady)[1],
@@ -254,15 +320,24 @@ def test_second_derivatives_of_forces_are_those_of_the_slopes(segment, rng):
         for k, mixed in enumerate((found, rates, both)):
             if np.abs(mixed @ one).max() > 1e-12:
                 of_u = lambda d, k=k: slopes(xi, nu, d)[k]  # noqa: E731
-                assert_derivative(of_u, lambda d, m=mixed: m @ d, steady, rng, 1e-6, one)
+                assert_derivative(
+                    of_u, lambda d, m=mixed: m @ d, steady, rng, 1e-6, one
+                )
             else:
-                change = slopes(xi, nu, 1e-3 * one)[k] - slopes(xi, nu, steady)[k]
+                change = (
+                    slopes(xi, nu, 1e-3 * one)[k] - slopes(xi, nu, steady)[k]
+                )
                 np.testing.assert_allclose(change, 0.0, atol=1e-10)
 
 
 def test_inputs_follow_from_parameters_with_their_derivatives(segment, rng):
     inputs = segment.inputs
-    p = np.concatenate([segment.parameters.guess_q, np.zeros(len(segment.nuisance.motion_indices))])
+    p = np.concatenate(
+        [
+            segment.parameters.guess_q,
+            np.zeros(len(segment.nuisance.motion_indices)),
+        ]
+    )
     weights = rng.normal(size=inputs.evaluate_at(p)[0].shape)
 
     def slopes(p: np.ndarray) -> np.ndarray:
@@ -272,9 +347,22 @@ def test_inputs_follow_from_parameters_with_their_derivatives(segment, rng):
     for one in np.eye(len(p)):
         if by_p.any(axis=(0, 1)) @ one:
             found = lambda d: by_p @ d  # noqa: E731
-            assert_derivative(lambda p: inputs.evaluate_at(p)[0], found, p, rng, 1e-6, 0.1 * one)
-        weighed = np.einsum("tu,tum->m", weights, slopes(p + 1e-5 * one) - slopes(p - 1e-5 * one))
-        np.testing.assert_allclose(weighed / 2e-5, twice @ one, rtol=1e-5, atol=1e-4)
+            assert_derivative(
+                lambda p: inputs.evaluate_at(p)[0],
+                found,
+                p,
+                rng,
+                1e-6,
+                0.1 * one,
+            )
+        weighed = np.einsum(
+            "tu,tum->m",
+            weights,
+            slopes(p + 1e-5 * one) - slopes(p - 1e-5 * one),
+        )
+        np.testing.assert_allclose(
+            weighed / 2e-5, twice @ one, rtol=1e-5, atol=1e-4
+        )
 
 
 def test_without_any_nothing_is_added():
@@ -282,7 +370,9 @@ def test_without_any_nothing_is_added():
     x = body.nodes_m.ravel()[None]
     theta = np.array([1e3, 1e3, 0.0, 0.0])
     alone = Forces.of_body_alone(body, theta)
-    np.testing.assert_array_equal(alone.total(x, 0 * x), body.force(x, 0 * x, theta))
+    np.testing.assert_array_equal(
+        alone.total(x, 0 * x), body.force(x, 0 * x, theta)
+    )
     assert alone.linearise(x, 0 * x).by_theta.shape[2] == len(theta)
 
 
@@ -304,17 +394,24 @@ def test_a_pressure_on_all_faces_is_what_grows_the_volume_inside(element, rng):
     np.testing.assert_allclose(total.sum(axis=0), 0.0, atol=1e-12)
     if element == "tet4":
         grown = np.einsum("ij,ij->", total, x)  # 3 p V, V being of third degree
-        assert grown == pytest.approx(21.0 * volumes(x, mesh.tetrahedra).sum(), rel=1e-9)
+        assert grown == pytest.approx(
+            21.0 * volumes(x, mesh.tetrahedra).sum(), rel=1e-9
+        )
 
 
 def test_a_force_on_faces_that_are_not_there_is_refused():
     inside = Box((0.04, 0.04, 0.04), (0.06, 0.06, 0.06))
     force = NodeForce.from_law(breath, nodes=inside, on="faces")
-    with pytest.raises(InputError, match="'breath' is on faces, but none of the surface"):
+    with pytest.raises(
+        InputError, match="'breath' is on faces, but none of the surface"
+    ):
         Forces.of_body_alone(
-            Body(hung_cube(2).body.mesh, density_kg_m3=30.0, forces=[force]), np.zeros(1)
+            Body(hung_cube(2).body.mesh, density_kg_m3=30.0, forces=[force]),
+            np.zeros(1),
         )
-    with pytest.raises(InputError, match="on 'edges'; expected one of nodes, faces"):
+    with pytest.raises(
+        InputError, match="on 'edges'; expected one of nodes, faces"
+    ):
         NodeForce.from_law(breath, on="edges")  # pyright: ignore[reportArgumentType]
 
 

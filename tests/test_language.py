@@ -39,7 +39,9 @@ def summaries() -> Iterator[tuple[str, str]]:
     """Place and first docstring line of everything that the package documents."""
     for path, tree in trees():
         for node in ast.walk(tree):
-            if isinstance(node, Documented) and (docstring := ast.get_docstring(node)):
+            if isinstance(node, Documented) and (
+                docstring := ast.get_docstring(node)
+            ):
                 yield identifier(path, node), docstring.split("\n")[0]
 
 
@@ -63,12 +65,16 @@ def test_class_and_module_names_occur_once():
         for node in ast.walk(tree)
         if isinstance(node, ast.ClassDef)
     )
-    assert [name for name, count in (modules + classes).items() if count > 1] == []
+    assert [
+        name for name, count in (modules + classes).items() if count > 1
+    ] == []
 
 
 @pytest.mark.parametrize("pattern", [WITHOUT_SUBJECT, CAPITAL_SYMBOL])
 def test_every_docstring_begins_with_a_subject(pattern):
-    assert [f"{place} {text}" for place, text in summaries() if pattern.match(text)] == []
+    assert [
+        f"{place} {text}" for place, text in summaries() if pattern.match(text)
+    ] == []
 
 
 def test_a_module_assigns_each_of_its_names_once():
@@ -77,10 +83,22 @@ def test_a_module_assigns_each_of_its_names_once():
         names: Counter[str] = Counter()
         for node in tree.body:
             if isinstance(node, ast.Assign | ast.AnnAssign):
-                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-                stored = (each for target in targets for each in ast.walk(target))
-                names.update(each.id for each in stored if isinstance(each, ast.Name))
-        repeated += [f"{identifier(path, tree)} {name}" for name, n in names.items() if n > 1]
+                targets = (
+                    node.targets
+                    if isinstance(node, ast.Assign)
+                    else [node.target]
+                )
+                stored = (
+                    each for target in targets for each in ast.walk(target)
+                )
+                names.update(
+                    each.id for each in stored if isinstance(each, ast.Name)
+                )
+        repeated += [
+            f"{identifier(path, tree)} {name}"
+            for name, n in names.items()
+            if n > 1
+        ]
     assert repeated == []
 
 

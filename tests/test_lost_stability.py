@@ -10,7 +10,11 @@ import pytest
 
 import collocation_sysid as cs
 from collocation_sysid.errors import SimulationError
-from collocation_sysid.program.loss_of_stability import BIOT_RATIO, StabilityLoss, _on_surface
+from collocation_sysid.program.loss_of_stability import (
+    BIOT_RATIO,
+    StabilityLoss,
+    _on_surface,
+)
 
 LAW = {"young_pa": 2e4, "poisson": 0.45, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 SIZE_M = (0.08, 0.01, 0.06)
@@ -35,7 +39,10 @@ def compressed(
     grasps = [
         cs.Grasp(face(0, 0.0), fixed, axes=axes),
         cs.Grasp(
-            face(0, size_m[0]), ends, axes=axes, wrench=cs.Wrench(t_s, np.zeros((15, 3)), 1.0)
+            face(0, size_m[0]),
+            ends,
+            axes=axes,
+            wrench=cs.Wrench(t_s, np.zeros((15, 3)), 1.0),
         ),
         cs.Grasp(face(1, 0.0), fixed, axes="y"),
         cs.Grasp(face(1, size_m[1]), fixed, axes="y"),
@@ -53,7 +60,9 @@ def compressed(
 
 
 @cache
-def failure(divisions: tuple[int, int, int], size_m: tuple[float, float, float]) -> SimulationError:
+def failure(
+    divisions: tuple[int, int, int], size_m: tuple[float, float, float]
+) -> SimulationError:
     with pytest.raises(SimulationError) as failed:
         cs.simulate(compressed(divisions, size_m), LAW)
     return failed.value
@@ -100,7 +109,9 @@ def test_critical_stretches_are_biots(stretch, across, critical):
 
 @pytest.mark.long
 def test_a_picture_shows_the_mode():
-    from collocation_sysid.result.pictures.instability import instability_picture
+    from collocation_sysid.result.pictures.instability import (
+        instability_picture,
+    )
 
     figure = instability_picture(failure((8, 1, 6), SIZE_M).stability_loss)
     assert "wavelength" in figure.axes[0].texts[0].get_text()

@@ -34,7 +34,9 @@ KINDS = {
 def collocation(request: pytest.FixtureRequest) -> Collocation:
     kind, scheme = request.param
     name, changes = KINDS[kind]
-    return Collocation([remembering(name, 5, 2, **changes)], guesses(TWO, 1.1), scheme)
+    return Collocation(
+        [remembering(name, 5, 2, **changes)], guesses(TWO, 1.1), scheme
+    )
 
 
 def some_parameters(collocation: Collocation) -> np.ndarray:
@@ -55,10 +57,14 @@ def disturbed(part: ExperimentIterate, size_m: float = 1e-4) -> np.ndarray:
     segment = part.segment
     change = np.zeros_like(part.x)
     free = (len(part.x), len(segment.free_dofs))
-    change[:, segment.free_dofs] = np.random.default_rng(0).standard_normal(free)
+    change[:, segment.free_dofs] = np.random.default_rng(0).standard_normal(
+        free
+    )
     first = segment.dynamics.first_row
     x = part.x.copy()
-    x[first:] += size_m * segment.dynamics.zero_prescribed_forces(change)[first:]
+    x[first:] += (
+        size_m * segment.dynamics.zero_prescribed_forces(change)[first:]
+    )
     return x
 
 
@@ -86,15 +92,23 @@ def test_a_sweep_may_be_continued(collocation: Collocation):
     known = Sweep(part.segment, 3).forward(x[:3], setting)
     continued = Sweep(part.segment).forward(x, setting, known)
     whole = Sweep(part.segment).forward(x, setting)
-    np.testing.assert_allclose(continued.by_p, whole.by_p, rtol=1e-12, atol=1e-15)
-    np.testing.assert_allclose(continued.step, whole.step, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        continued.by_p, whole.by_p, rtol=1e-12, atol=1e-15
+    )
+    np.testing.assert_allclose(
+        continued.step, whole.step, rtol=1e-12, atol=1e-15
+    )
 
 
-def test_the_feasibility_step_solves_the_linearised_equations(collocation: Collocation):
+def test_the_feasibility_step_solves_the_linearised_equations(
+    collocation: Collocation,
+):
     part = marched(collocation, some_parameters(collocation))
     segment, setting, x = part.segment, part.equations, disturbed(part)
     step = Sweep(segment).forward(x, setting).step
-    change = directional_derivative(lambda at: segment.residual_n(at, setting), x, step)
+    change = directional_derivative(
+        lambda at: segment.residual_n(at, setting), x, step
+    )
     assert relative_error(change, -segment.residual_n(x, setting)) < 1e-9
 
 
@@ -107,11 +121,15 @@ def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
     residual = setting.dynamics.residual(x)
     residual[:, segment.prescribed_dofs] = 0
     residual = setting.dynamics.zero_prescribed_forces(residual)
-    expected = float(np.sum(gradient[:, segment.free_dofs] * step[:, segment.free_dofs]))
+    expected = float(
+        np.sum(gradient[:, segment.free_dofs] * step[:, segment.free_dofs])
+    )
     assert float(np.sum(y * residual)) == pytest.approx(expected, rel=1e-9)
 
 
-def test_derivatives_are_pulled_back_through_the_memory(collocation: Collocation, rng):
+def test_derivatives_are_pulled_back_through_the_memory(
+    collocation: Collocation, rng
+):
     part = marched(collocation, some_parameters(collocation))
     p = some_parameters(collocation)
     z = collocation.pack(p, [disturbed(part)])
@@ -119,7 +137,9 @@ def test_derivatives_are_pulled_back_through_the_memory(collocation: Collocation
         rng.standard_normal(n) for n in (collocation.constraint_count, len(z))
     )
     expected = directional_derivative(
-        lambda at: multipliers @ collocation.constraint_values(at), z, 0.1 * direction
+        lambda at: multipliers @ collocation.constraint_values(at),
+        z,
+        0.1 * direction,
     )
     found = collocation.jacobian_vjp(z, multipliers) @ (0.1 * direction)
     assert found == pytest.approx(float(expected), rel=1e-8)
@@ -135,7 +155,9 @@ def test_the_memory_that_made_a_recording_is_found():
 
 
 @pytest.mark.parametrize(
-    "method", [Shooting(), Continuation(stage={"method": "reduced-space"})], ids=lambda m: m.name
+    "method",
+    [Shooting(), Continuation(stage={"method": "reduced-space"})],
+    ids=lambda m: m.name,
 )
 def test_other_methods_find_the_same(method):
     collocation = Collocation([recorded("hung-cube", 20)], guesses(ONE, 1.2))
@@ -158,7 +180,9 @@ def test_newmark_and_the_schemes_meet_as_the_step_shrinks(kind: str):
     moved = np.abs(fine - fine[0]).max()
     for integrator, count in (("newmark", 8), ("bdf2", 16)):
         step_s = experiment.timestep_s / count
-        found = simulate(experiment, TWO, integrator, timestep_s=step_s, substeps=count)
+        found = simulate(
+            experiment, TWO, integrator, timestep_s=step_s, substeps=count
+        )
         assert np.abs(found.positions_m - fine).max() < 8e-3 * moved
 
 

@@ -18,21 +18,28 @@ from collocation_sysid.result.run_sections import _remedy_lines, remedy_command
 from collocation_sysid.statistics.concerns import TOPICS, Concern
 
 ROOT = Path(__file__).parents[1]
-CONCERNS = (Concern("residuals/persist"), Concern("scheme/step"), Concern("solve/no-start"))
+CONCERNS = (
+    Concern("residuals/persist"),
+    Concern("scheme/step"),
+    Concern("solve/no-start"),
+)
 
 
 def test_topics_are_listed_with_a_line_each():
     lines = run_command("explain").out.splitlines()
     assert len(lines) == 1 + len(page_files())
-    assert next(line for line in lines if line.startswith("verdict")).split(maxsplit=1)[
-        1
-    ].strip() == ("Reading the verdict")
+    assert next(line for line in lines if line.startswith("verdict")).split(
+        maxsplit=1
+    )[1].strip() == ("Reading the verdict")
 
 
 def test_a_page_is_shown_with_its_links_as_topics():
     shown = run_command("explain", "trust").out
     assert shown.startswith("# When the answer can't be trusted\n")
-    assert "The verdict (`explain verdict`) says which of these is the case." in shown
+    assert (
+        "The verdict (`explain verdict`) says which of these is the case."
+        in shown
+    )
     for topic in page_files():
         assert ".md)" not in page_text(topic), topic
 
@@ -46,12 +53,24 @@ def test_an_unknown_topic_is_refused_with_the_likely_one():
 
 def test_code_of_a_page_can_be_copied_from_a_narrow_terminal():
     file = io.StringIO()
-    console = PlainConsole(file=file, width=40, force_terminal=True, color_system=None)
-    console.print(TerminalPage(page_text("forces"), hyperlinks=False), crop=False)
-    (line,) = [each for each in page_text("forces").splitlines() if each.startswith("wrench = {")]
+    console = PlainConsole(
+        file=file, width=40, force_terminal=True, color_system=None
+    )
+    console.print(
+        TerminalPage(page_text("forces"), hyperlinks=False), crop=False
+    )
+    (line,) = [
+        each
+        for each in page_text("forces").splitlines()
+        if each.startswith("wrench = {")
+    ]
     assert len(line) > 40
     assert line in [each.strip() for each in file.getvalue().splitlines()]
-    prose = [each for each in file.getvalue().splitlines() if each.startswith("Markers alone")]
+    prose = [
+        each
+        for each in file.getvalue().splitlines()
+        if each.startswith("Markers alone")
+    ]
     assert all(len(each.rstrip()) <= 40 for each in prose)
 
 
@@ -78,7 +97,12 @@ def test_reports_link_to_the_documentation_that_the_project_states(
     if base is not None:
         stated["Project-URL"] = f"Documentation, {base}"
     monkeypatch.setattr(metadata, "metadata", lambda name: stated)
-    links = [span.to for cure in _remedy_lines(CONCERNS) for span in cure.spans if span.to]
+    links = [
+        span.to
+        for cure in _remedy_lines(CONCERNS)
+        for span in cure.spans
+        if span.to
+    ]
     if base is None:
         assert page_url("theory") is None
         assert links == []

@@ -25,7 +25,9 @@ def answer(*free: str) -> cs.Solution:
     swung = hung_cube()
     tracks_m = cs.simulate(swung, TRUTH, "midpoint", substeps=1).markers_m
     estimated = {name: cs.Unknown(TRUTH[name]) for name in free}
-    return cs.solve(cs.Problem([cs.with_markers(swung, tracks_m)], {**TRUTH, **estimated}))
+    return cs.solve(
+        cs.Problem([cs.with_markers(swung, tracks_m)], {**TRUTH, **estimated})
+    )
 
 
 def test_the_second_start_has_the_usual_ratio_and_the_same_stiffness():
@@ -47,7 +49,12 @@ def test_the_better_of_two_answers_counts():
     first = answer("young_pa", "poisson", "gamma_r_s")
     same = _best_of_second_start(cs.ReducedSpace(), first, None)
     assert same is first
-    worse = replace(first, history=(replace(first.history[-1], loss=first.history[-1].loss + 5),))
+    worse = replace(
+        first,
+        history=(replace(first.history[-1], loss=first.history[-1].loss + 5),),
+    )
     better = _best_of_second_start(cs.ReducedSpace(), worse, None)
     assert "χ² lower by 5" in better.notes[0]
-    assert better.parameters["poisson"] == pytest.approx(first.parameters["poisson"], rel=1e-3)
+    assert better.parameters["poisson"] == pytest.approx(
+        first.parameters["poisson"], rel=1e-3
+    )

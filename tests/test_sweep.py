@@ -19,7 +19,9 @@ from problems_small import (
 
 from collocation_sysid.errors import SimulationError
 from collocation_sysid.methods.solution import constraint_multipliers
-from collocation_sysid.model.equations_at_parameters import EquationsAtParameters
+from collocation_sysid.model.equations_at_parameters import (
+    EquationsAtParameters,
+)
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program import sweep
 from collocation_sysid.program.collocation import Collocation
@@ -42,11 +44,17 @@ def disturbed(
     rng = np.random.default_rng(seed)
     positions = []
     for segment in collocation.transcriptions:
-        x = simulate_scheme(segment.experiment, segment.dynamics.with_theta(as_theta(TRUTH)))
+        x = simulate_scheme(
+            segment.experiment, segment.dynamics.with_theta(as_theta(TRUTH))
+        )
         change = np.zeros_like(x)
-        change[:, segment.free_dofs] = rng.standard_normal((len(x), len(segment.free_dofs)))
+        change[:, segment.free_dofs] = rng.standard_normal(
+            (len(x), len(segment.free_dofs))
+        )
         change = segment.dynamics.zero_prescribed_forces(change)
-        x[segment.dynamics.first_row :] += size_m * change[segment.dynamics.first_row :]
+        x[segment.dynamics.first_row :] += (
+            size_m * change[segment.dynamics.first_row :]
+        )
         positions.append(x)
     return collocation.pack(some_parameters(collocation), positions), positions
 
@@ -59,18 +67,31 @@ def some_parameters(collocation: Collocation) -> np.ndarray:
 
 def only_setting(collocation: Collocation) -> EquationsAtParameters:
     (segment,) = collocation.transcriptions
-    return segment.equations_at(*np.split(some_parameters(collocation), [collocation.nq]))
+    return segment.equations_at(
+        *np.split(some_parameters(collocation), [collocation.nq])
+    )
 
 
-def forward(collocation: Collocation, positions: list[np.ndarray]) -> list[Tangent]:
+def forward(
+    collocation: Collocation, positions: list[np.ndarray]
+) -> list[Tangent]:
     parts = collocation.iterates_at(some_parameters(collocation), positions)
-    return [Sweep(part.segment).forward(part.x, part.equations) for part in parts]
+    return [
+        Sweep(part.segment).forward(part.x, part.equations) for part in parts
+    ]
 
 
 @pytest.fixture(
     scope="module",
-    params=[(*pair, "bounds") for pair in [*EXPERIMENTS_AND_SCHEMES, ("bar-loaded", "bdf2")]]
-    + [("hung-cube", scheme, layout) for scheme in SCHEMES for layout in list(LAYOUTS)[1:]],
+    params=[
+        (*pair, "bounds")
+        for pair in [*EXPERIMENTS_AND_SCHEMES, ("bar-loaded", "bdf2")]
+    ]
+    + [
+        ("hung-cube", scheme, layout)
+        for scheme in SCHEMES
+        for layout in list(LAYOUTS)[1:]
+    ],
     ids="-".join,
 )
 def collocation(request: pytest.FixtureRequest) -> Collocation:
@@ -78,25 +99,35 @@ def collocation(request: pytest.FixtureRequest) -> Collocation:
     return Collocation([EXPERIMENTS[name](5)], GUESS, scheme, **LAYOUTS[layout])
 
 
-def test_the_feasibility_step_solves_the_linearised_constraints(collocation: Collocation):
+def test_the_feasibility_step_solves_the_linearised_constraints(
+    collocation: Collocation,
+):
     z, positions = disturbed(collocation)
     step = [tangent.step for tangent in forward(collocation, positions)]
     values = collocation.constraint_values(z)
     still = np.zeros_like(collocation.guess_p)
     change = collocation.jacobian(z) @ collocation.pack(still, step)
     assert np.abs(values).max() > 1e-4
-    np.testing.assert_allclose(change, -values, atol=1e-9 * np.abs(values).max())
+    np.testing.assert_allclose(
+        change, -values, atol=1e-9 * np.abs(values).max()
+    )
 
 
-def test_multipliers_make_the_lagrangian_stationary_in_the_positions(collocation: Collocation):
-    collocation = replace(collocation, experiments=[*map(measured, collocation.experiments)])
+def test_multipliers_make_the_lagrangian_stationary_in_the_positions(
+    collocation: Collocation,
+):
+    collocation = replace(
+        collocation, experiments=[*map(measured, collocation.experiments)]
+    )
     z, _ = disturbed(collocation)
     multipliers = constraint_multipliers(collocation, z)
     gradient = collocation.gradient(z)
     slope = gradient + collocation.jacobian(z).T @ multipliers
     lower, upper = collocation.bounds()
     first = collocation.nq
-    free = first + np.flatnonzero((lower < upper)[first : len(z) - collocation.nphi])
+    free = first + np.flatnonzero(
+        (lower < upper)[first : len(z) - collocation.nphi]
+    )
     assert np.abs(gradient[free]).max() > 0
     assert np.abs(slope[free]).max() < 1e-9 * np.abs(gradient[free]).max()
 
@@ -109,7 +140,9 @@ def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
     goals = (
         setting.prescribed.positions_m
     )  # what is grasped is where it should be: no step of its own
-    x[:, setting.prescribed.dofs] = np.where(np.isnan(goals), x[:, setting.prescribed.dofs], goals)
+    x[:, setting.prescribed.dofs] = np.where(
+        np.isnan(goals), x[:, setting.prescribed.dofs], goals
+    )
     gradient = rng.standard_normal(x.shape)
     y = Sweep(segment).backward(x, setting, gradient)
     (found,) = forward(collocation, [x])
@@ -123,7 +156,12 @@ def test_what_is_given_does_not_move():
     _, positions = disturbed(collocation)
     (found,) = forward(collocation, positions)
     held = collocation.transcriptions[0].prescribed_dofs
-    for part in (found.step[0], found.by_p[0], found.step[:, held], found.by_p[:, held]):
+    for part in (
+        found.step[0],
+        found.by_p[0],
+        found.step[:, held],
+        found.by_p[:, held],
+    ):
         assert not part.any()
 
 
@@ -136,7 +174,9 @@ def test_chunks_do_not_show(monkeypatch: pytest.MonkeyPatch):
     (parts,) = forward(collocation, positions)
     np.testing.assert_allclose(parts.step, whole.step, rtol=1e-10, atol=1e-15)
     np.testing.assert_allclose(parts.by_p, whole.by_p, rtol=1e-10, atol=1e-15)
-    np.testing.assert_allclose(constraint_multipliers(collocation, z), multipliers, rtol=1e-9)
+    np.testing.assert_allclose(
+        constraint_multipliers(collocation, z), multipliers, rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -160,8 +200,12 @@ def test_the_first_rows_can_be_continued(scheme: str, done: int):
     setting = only_setting(collocation)
     first = Sweep(segment, done).forward(x[:done], setting)
     continued = Sweep(segment).forward(x, setting, first)
-    np.testing.assert_allclose(continued.step, whole.step, rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(continued.by_p, whole.by_p, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(
+        continued.step, whole.step, rtol=1e-9, atol=1e-15
+    )
+    np.testing.assert_allclose(
+        continued.by_p, whole.by_p, rtol=1e-9, atol=1e-15
+    )
     assert continued.violation_n == pytest.approx(whole.violation_n)
 
 
@@ -169,8 +213,12 @@ def test_rows_one_by_one_are_the_same_sensitivities():
     collocation = Collocation([hung_cube(5)], GUESS)
     _, (x,) = disturbed(collocation)
     (whole,) = forward(collocation, [x])
-    rows = Sweep(collocation.transcriptions[0]).sensitivities(x, only_setting(collocation))
-    np.testing.assert_allclose(np.stack(list(rows)), whole.by_p, rtol=1e-9, atol=1e-15)
+    rows = Sweep(collocation.transcriptions[0]).sensitivities(
+        x, only_setting(collocation)
+    )
+    np.testing.assert_allclose(
+        np.stack(list(rows)), whole.by_p, rtol=1e-9, atol=1e-15
+    )
 
 
 def test_indefinite_blocks_are_counted():
@@ -179,7 +227,9 @@ def test_indefinite_blocks_are_counted():
     (segment,) = collocation.transcriptions
     x = np.tile(segment.body.nodes_m.ravel(), (segment.grid_times, 1))
     x.reshape(len(x), -1, 3)[3:, :, 2] *= 0.05
-    jacobian = collocation.jacobian(collocation.pack(GUESS.guess_q, [x])).toarray()
+    jacobian = collocation.jacobian(
+        collocation.pack(GUESS.guess_q, [x])
+    ).toarray()
     count, expected = len(segment.free_dofs), 0
     for t in range(segment.grid_times):
         columns = collocation.nq + t * segment.dof_count + segment.free_dofs

@@ -32,7 +32,9 @@ def waved_bar(steps: int = 12, **body) -> Experiment:
     return replace(bar, name="waved bar", body=other, grasps=bar.grasps[1:])
 
 
-def stiffening(F: ca.SX, shear_pa: ca.SX, bulk_pa: ca.SX, stiffening: ca.SX) -> ca.SX:
+def stiffening(
+    F: ca.SX, shear_pa: ca.SX, bulk_pa: ca.SX, stiffening: ca.SX
+) -> ca.SX:
     """A user's own material of three constants, nearly linear at first."""
     log_j = ca.log(ca.det(F))
     strain = ca.sumsqr(F) * ca.exp(-2 / 3 * log_j) - 3
@@ -48,7 +50,11 @@ MODELS = {
         {"mu_pa": 450.0, "stiff.mu_pa": 600.0, "gamma_r_s": 0.006},
     ),
     "two materials": (
-        {"regions": [Region("stiff", LEFT_HALF, material="st-venant-kirchhoff")]},
+        {
+            "regions": [
+                Region("stiff", LEFT_HALF, material="st-venant-kirchhoff")
+            ]
+        },
         {
             "young_pa": 720.0,
             "poisson": 0.2,
@@ -60,8 +66,19 @@ MODELS = {
     ),
     "three constants": (
         {"material": "yeoh"},
-        {"c10_pa": 150.0, "c20_pa": 60.0, "c30_pa": 0.0, "kappa_pa": 400.0, **DAMPING},
-        {"c10_pa": 220.0, "c20_pa": 20.0, "kappa_pa": 600.0, "gamma_r_s": 0.006},
+        {
+            "c10_pa": 150.0,
+            "c20_pa": 60.0,
+            "c30_pa": 0.0,
+            "kappa_pa": 400.0,
+            **DAMPING,
+        },
+        {
+            "c10_pa": 220.0,
+            "c20_pa": 20.0,
+            "kappa_pa": 600.0,
+            "gamma_r_s": 0.006,
+        },
     ),
     "an exponent": (
         {"material": "ogden-1"},
@@ -81,10 +98,13 @@ MODELS = {
 }
 
 
-def parameters(truth: Mapping[str, float], guesses: Mapping[str, float]) -> Parameters:
+def parameters(
+    truth: Mapping[str, float], guesses: Mapping[str, float]
+) -> Parameters:
     """Estimated where there is a guess, fixed at the truth elsewhere."""
     stated = {
-        name: Unknown(guesses[name]) if name in guesses else value for name, value in truth.items()
+        name: Unknown(guesses[name]) if name in guesses else value
+        for name, value in truth.items()
     }
     return Parameters.from_mapping(stated)
 
@@ -100,12 +120,18 @@ def collocation_of(name: str) -> Collocation:
 def test_both_methods_recover_the_truth(name):
     truth, guesses = MODELS[name][1:]
     collocation = collocation_of(name)
-    reduced, interior = (METHODS[m]()(collocation) for m in ("reduced-space", "interior-point"))
+    reduced, interior = (
+        METHODS[m]()(collocation) for m in ("reduced-space", "interior-point")
+    )
     for solution in (reduced, interior):
         assert solution.status.converged, solution.message
         for parameter in guesses:
-            assert solution.parameters[parameter] == pytest.approx(truth[parameter], rel=1e-3)
-    values = [[*solution.parameters.values()] for solution in (reduced, interior)]
+            assert solution.parameters[parameter] == pytest.approx(
+                truth[parameter], rel=1e-3
+            )
+    values = [
+        [*solution.parameters.values()] for solution in (reduced, interior)
+    ]
     np.testing.assert_allclose(*values, rtol=1e-5)
     assert reduced.kkt_residual < 1e-8
 
@@ -113,9 +139,17 @@ def test_both_methods_recover_the_truth(name):
 def test_error_bars_of_regions_follow_the_noise(rng):
     body, truth, guesses = MODELS["two stiffnesses"]
     clean = measured_with(waved_bar(**body), truth)
-    tracks = clean.markers.positions_m + 1e-4 * rng.standard_normal(clean.markers.positions_m.shape)
-    markers = replace(clean.markers, positions_m=tracks, sigma_m=np.full(tracks.shape[1], 1e-4))
-    collocation = Collocation([replace(clean, markers=markers)], parameters(truth, guesses))
+    tracks = clean.markers.positions_m + 1e-4 * rng.standard_normal(
+        clean.markers.positions_m.shape
+    )
+    markers = replace(
+        clean.markers,
+        positions_m=tracks,
+        sigma_m=np.full(tracks.shape[1], 1e-4),
+    )
+    collocation = Collocation(
+        [replace(clean, markers=markers)], parameters(truth, guesses)
+    )
     solution = METHODS["reduced-space"]()(collocation)
     found = uncertainty_at(collocation, solution.z)
     assert set(found.derived) >= {"young_pa", "stiff.young_pa"}
@@ -129,7 +163,11 @@ def test_error_bars_of_regions_follow_the_noise(rng):
 def test_a_tied_parameter_is_no_unknown_of_its_own():
     body, truth, _ = MODELS["two stiffnesses"]
     experiment = measured_with(waved_bar(**body), truth)
-    stated = {**truth, "mu_pa": Unknown(450.0), "stiff.mu_pa": Tied("mu_pa", ratio=3.0)}
+    stated = {
+        **truth,
+        "mu_pa": Unknown(450.0),
+        "stiff.mu_pa": Tied("mu_pa", ratio=3.0),
+    }
     collocation = Collocation([experiment], Parameters.from_mapping(stated))
     assert collocation.nq == 1
     solution = METHODS["reduced-space"]()(collocation)
@@ -137,7 +175,9 @@ def test_a_tied_parameter_is_no_unknown_of_its_own():
     assert solution.parameters["stiff.mu_pa"] == pytest.approx(900.0, rel=1e-5)
 
 
-def test_another_parameter_costs_a_right_hand_side_and_no_factorisation(monkeypatch):
+def test_another_parameter_costs_a_right_hand_side_and_no_factorisation(
+    monkeypatch,
+):
     """A sweep factorises every timestep once, whatever the number of parameters."""
     body, truth, guesses = MODELS["two stiffnesses"]
     experiment = measured_with(waved_bar(**body), truth)
@@ -169,4 +209,7 @@ def test_regions_of_one_stiffness_are_the_body_without_regions():
         measured_with(waved_bar(**body), truth)
         for body in ({}, {"regions": [Region("half", LEFT_HALF)]})
     )
-    assert relative_error(divided.markers.positions_m, plain.markers.positions_m) < 1e-12
+    assert (
+        relative_error(divided.markers.positions_m, plain.markers.positions_m)
+        < 1e-12
+    )

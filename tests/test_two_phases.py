@@ -14,7 +14,11 @@ from problems_small import IDEAL, point_markers, smooth_poses, times
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.refinement import refine_body
-from collocation_sysid.fem.two_phase import ElementLogarithms, PhaseSummary, TwoPhaseModes
+from collocation_sysid.fem.two_phase import (
+    ElementLogarithms,
+    PhaseSummary,
+    TwoPhaseModes,
+)
 from collocation_sysid.live.estimator import LiveEstimator
 from collocation_sysid.runs.two_phases import solve_two_phases
 from collocation_sysid.statistics.field_estimates import (
@@ -53,7 +57,9 @@ def swung(body: Body, steps: int = 12) -> cs.Experiment:
     x = body.nodes_m
     places = x[x[:, 2] < 0.119]
     grasp = cs.Grasp(np.flatnonzero(x[:, 2] > 0.119), smooth_poses(t_s))
-    markers = replace(point_markers(body, places, t_s), sigma_m=np.full(len(places), SIGMA_M))
+    markers = replace(
+        point_markers(body, places, t_s), sigma_m=np.full(len(places), SIGMA_M)
+    )
     return cs.Experiment(body, t_s, [grasp], markers, nuisance=IDEAL)
 
 
@@ -61,10 +67,16 @@ def swung(body: Body, steps: int = 12) -> cs.Experiment:
 def problem(ratio: float) -> cs.Problem:
     """A bar whose lower half is stiffer, which no description tells."""
     values = {**KNOWN, "young_pa": YOUNG_PA, "stiff.young_pa": ratio * YOUNG_PA}
-    tracks = cs.simulate(swung(bar(stiff=lower_half())), values, "midpoint", substeps=1).markers_m
+    tracks = cs.simulate(
+        swung(bar(stiff=lower_half())), values, "midpoint", substeps=1
+    ).markers_m
     noise = SIGMA_M * np.random.default_rng(5).normal(size=tracks.shape)
     measured = cs.with_markers(swung(bar(TWO_PHASES)), tracks + noise)
-    return cs.Problem([measured], {**KNOWN, "young_pa": cs.Unknown(0.7 * YOUNG_PA)}, substeps=1)
+    return cs.Problem(
+        [measured],
+        {**KNOWN, "young_pa": cs.Unknown(0.7 * YOUNG_PA)},
+        substeps=1,
+    )
 
 
 @cache
@@ -77,7 +89,9 @@ def answer(ratio: float) -> cs.Solution:
 def field_of(solution: cs.Solution) -> FieldEstimate:
     known = uncertainty_at(solution.collocation, solution.z)
     body = solution.collocation.transcriptions[0].body
-    (field,) = field_estimates(body, solution.collocation.parameters, solution.q, known)
+    (field,) = field_estimates(
+        body, solution.collocation.parameters, solution.q, known
+    )
     return field
 
 
@@ -85,7 +99,9 @@ def test_a_stiff_half_has_its_boundary_and_its_contrast():
     solution = answer(3.0)
     field = field_of(solution)
     assert isinstance(field.modes, TwoPhaseModes)
-    estimate = uncertainty_at(solution.collocation, solution.z).estimates["contrast"]
+    estimate = uncertainty_at(solution.collocation, solution.z).estimates[
+        "contrast"
+    ]
     low, high = estimate.statistical95
     assert low < 3.0 < high
     assert high / low < 2.0
@@ -96,7 +112,10 @@ def test_a_stiff_half_has_its_boundary_and_its_contrast():
     assert (field.modes.phase == lower_half()).mean() >= 0.9
     # The half of a coarse mesh has too few elements to rely on intervals.
     assert [concern.code for concern in field.concerns] == ["field/few"]
-    assert any("two phases of young_pa: started from a smooth field" in n for n in solution.notes)
+    assert any(
+        "two phases of young_pa: started from a smooth field" in n
+        for n in solution.notes
+    )
 
 
 def test_an_even_body_shows_no_second_material():
@@ -121,24 +140,38 @@ def test_unknown_phases_widen_the_interval_of_the_contrast():
     solution = answer(3.0)
     body = solution.collocation.transcriptions[0].body
     (samples,) = body.phase_samples
-    more = replace(samples, deviations=samples.deviations + 0.04 * np.eye(len(samples.names)))
+    more = replace(
+        samples,
+        deviations=samples.deviations + 0.04 * np.eye(len(samples.names)),
+    )
     (field,) = (part.field for part in body.parts)
     wider = body.with_fields({"young_pa": replace(field, samples=more)})
-    experiments = [replace(e, body=wider) for e in solution.collocation.experiments]
+    experiments = [
+        replace(e, body=wider) for e in solution.collocation.experiments
+    ]
     collocation = replace(solution.collocation, experiments=experiments)
     before, after = (
-        uncertainty_at(each, solution.z).covariance for each in (solution.collocation, collocation)
+        uncertainty_at(each, solution.z).covariance
+        for each in (solution.collocation, collocation)
     )
-    place = [item.name for item in collocation.parameters.free].index("contrast")
-    assert after[place, place] - before[place, place] == pytest.approx(0.04, rel=1e-6)
+    place = [item.name for item in collocation.parameters.free].index(
+        "contrast"
+    )
+    assert after[place, place] - before[place, place] == pytest.approx(
+        0.04, rel=1e-6
+    )
 
 
 @pytest.mark.parametrize("by_elements", [False, True])
-def test_slopes_by_the_contrast_and_by_elements_are_those_of_differences(by_elements: bool, rng):
+def test_slopes_by_the_contrast_and_by_elements_are_those_of_differences(
+    by_elements: bool, rng
+):
     body = bar(TWO_PHASES)
     field = replace(body.parts[0].field, phase=lower_half().astype(float))
     if by_elements:
-        field = ElementLogarithms.relative_to(field, rng.normal(size=len(field.phase)))
+        field = ElementLogarithms.relative_to(
+            field, rng.normal(size=len(field.phase))
+        )
     own = body.with_fields({"young_pa": field})
     count = len(field.constants)
     x = body.nodes_m + 1e-3 * rng.normal(size=body.nodes_m.shape)
@@ -182,7 +215,9 @@ def small_posterior(rng) -> tuple[ElementInformation, InternalFaces]:
 
 def test_samples_are_of_the_posterior_that_enumeration_gives(rng):
     data, faces = small_posterior(rng)
-    settings = SamplerSettings(face_nats=0.5, least_steps=6000, steps_per_sample=5)
+    settings = SamplerSettings(
+        face_nats=0.5, least_steps=6000, steps_per_sample=5
+    )
     draws = sample_phases(data, faces, np.array([1.0, 1, 0, 0, 0, 0]), settings)
     logarithms, means, labels = [], [], []
     constant = data.score_z - data.of_z @ data.base
@@ -190,17 +225,26 @@ def test_samples_are_of_the_posterior_that_enumeration_gives(rng):
         h = np.array(label)
         coupling = data.mixed.T @ h
         own = h @ data.of_z @ h + 1 / data.deviation**2
-        information = np.block([[data.of_p, coupling[:, None]], [coupling, np.array([[own]])]])
+        information = np.block(
+            [[data.of_p, coupling[:, None]], [coupling, np.array([[own]])]]
+        )
         score = np.r_[data.score_p - data.mixed.T @ data.base, h @ constant]
         mean = -np.linalg.solve(information, score)
         jumps = np.abs(np.diff(h)).sum()
-        logarithms.append(-(score @ mean + np.linalg.slogdet(information)[1]) / 2 - 0.5 * jumps)
+        logarithms.append(
+            -(score @ mean + np.linalg.slogdet(information)[1]) / 2
+            - 0.5 * jumps
+        )
         means.append(mean[-1])
         labels.append(h)
     weights = np.exp(np.array(logarithms) - max(logarithms))
     weights /= weights.sum()
-    np.testing.assert_allclose(draws.probability, weights @ np.array(labels), atol=0.09)
-    assert draws.contrasts.mean() == pytest.approx(weights @ np.array(means), abs=0.12)
+    np.testing.assert_allclose(
+        draws.probability, weights @ np.array(labels), atol=0.09
+    )
+    assert draws.contrasts.mean() == pytest.approx(
+        weights @ np.array(means), abs=0.12
+    )
 
 
 def test_the_start_finds_a_block_in_values_that_are_measured_one_by_one(rng):
@@ -224,7 +268,9 @@ def test_the_start_finds_a_block_in_values_that_are_measured_one_by_one(rng):
 
 
 def test_a_third_material_is_a_concern():
-    phases = PhaseSummary((2.0, 2.5, 3.0), (1e-6, 2e-6, 3e-6), 0.5, 1.6, 1.01, 80)
+    phases = PhaseSummary(
+        (2.0, 2.5, 3.0), (1e-6, 2e-6, 3e-6), 0.5, 1.6, 1.01, 80
+    )
     (concern,) = phase_concerns(phases, "young_pa")
     assert concern.code == "field/phases"
     assert "more than two materials" in concern.message
@@ -232,7 +278,9 @@ def test_a_third_material_is_a_concern():
 
 
 def test_an_inclusion_of_few_elements_is_a_concern():
-    phases = PhaseSummary((1.7, 1.9, 2.1), (1e-6, 2e-6, 3e-6), 0.3, 1.0, 1.0, 12)
+    phases = PhaseSummary(
+        (1.7, 1.9, 2.1), (1e-6, 2e-6, 3e-6), 0.3, 1.0, 1.0, 12
+    )
     (concern,) = phase_concerns(phases, "young_pa")
     assert concern.code == "field/few"
     assert "only 12 elements" in concern.message
@@ -241,22 +289,43 @@ def test_an_inclusion_of_few_elements_is_a_concern():
 @pytest.mark.parametrize(
     ("stated", "message"),
     [
-        ({"parameter": "density_kg_m3"}, "expected 'smooth', or regions with densities"),
-        ({"length_m": (0.02, 0.05)}, "length_m of a two-phase field has 2 values; expected one"),
+        (
+            {"parameter": "density_kg_m3"},
+            "expected 'smooth', or regions with densities",
+        ),
+        (
+            {"length_m": (0.02, 0.05)},
+            "length_m of a two-phase field has 2 values; expected one",
+        ),
         ({"prior": "three-phase"}, "prior of a field is 'three-phase'"),
     ],
 )
-def test_a_two_phase_field_that_cannot_be_is_refused(stated: dict, message: str):
+def test_a_two_phase_field_that_cannot_be_is_refused(
+    stated: dict, message: str
+):
     with pytest.raises(cs.InputError, match=message):
-        bar(cs.Field(**({"length_m": 0.05, "modes": 4, "prior": "two-phase"} | stated)))
+        bar(
+            cs.Field(
+                **(
+                    {"length_m": 0.05, "modes": 4, "prior": "two-phase"}
+                    | stated
+                )
+            )
+        )
 
 
 def test_two_fields_of_two_phases_are_refused():
     few = cs.Field(0.05, modes=3, prior="two-phase")
     core = cs.Region("core", np.arange(12), field=few)
-    body = Body(bar().mesh, density_kg_m3=100.0, field=TWO_PHASES, regions=[core])
-    both = cs.Problem([swung(body)], {**KNOWN, "young_pa": cs.Unknown(YOUNG_PA)}, substeps=1)
-    with pytest.raises(cs.InputError, match=r"2 two-phase fields \(young_pa, core.young_pa\)"):
+    body = Body(
+        bar().mesh, density_kg_m3=100.0, field=TWO_PHASES, regions=[core]
+    )
+    both = cs.Problem(
+        [swung(body)], {**KNOWN, "young_pa": cs.Unknown(YOUNG_PA)}, substeps=1
+    )
+    with pytest.raises(
+        cs.InputError, match=r"2 two-phase fields \(young_pa, core.young_pa\)"
+    ):
         solve_two_phases(both, None, lambda *_: pytest.fail("solved"))
 
 
@@ -266,18 +335,28 @@ def test_live_refuses_phases_that_nobody_knows_yet():
 
 
 def test_a_contrast_that_is_not_stated_has_the_prior_of_its_field():
-    (contrast,) = (i for i in problem(3.0).parameters.free if i.name == "contrast")
+    (contrast,) = (
+        i for i in problem(3.0).parameters.free if i.name == "contrast"
+    )
     assert contrast.prior == (1.0, 1.0)
     stated = {**KNOWN, "young_pa": 1e4, "contrast": cs.Unknown(2.0, lower=1.0)}
     given = cs.Problem([swung(bar(TWO_PHASES))], stated, substeps=1).parameters
     (contrast,) = (i for i in given.free if i.name == "contrast")
-    assert (contrast.guess, contrast.lower, contrast.prior) == (2.0, 1.0, (1.0, 1.0))
+    assert (contrast.guess, contrast.lower, contrast.prior) == (
+        2.0,
+        1.0,
+        (1.0, 1.0),
+    )
 
 
 def test_a_finer_mesh_has_the_same_phases():
-    field = replace(bar(TWO_PHASES).parts[0].field, phase=lower_half().astype(float))
+    field = replace(
+        bar(TWO_PHASES).parts[0].field, phase=lower_half().astype(float)
+    )
     finer = refine_body(bar(TWO_PHASES).with_fields({"young_pa": field}))
-    np.testing.assert_array_equal(finer.parts[0].field.phase, np.repeat(field.phase, 8))
+    np.testing.assert_array_equal(
+        finer.parts[0].field.phase, np.repeat(field.phase, 8)
+    )
 
 
 @pytest.mark.long

@@ -18,7 +18,9 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import Nuisance, Wrench
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.assessment import cause_concerns
-from collocation_sysid.statistics.fit_misspecifications import find_misspecifications
+from collocation_sysid.statistics.fit_misspecifications import (
+    find_misspecifications,
+)
 from collocation_sysid.statistics.misspecification_hypothesis import rank
 from collocation_sysid.statistics.wrench_causes import wrench_mistakes
 
@@ -46,13 +48,17 @@ MISTAKES = {
     "wrench-unit": in_kilograms,
     "wrench-clock": lambda w: replace(w, t_s=w.t_s + 0.04),
     "wrench-axes": lambda w: replace(w, values=w.values[:, [0, 2, 1, 3, 5, 4]]),
-    "wrench-sign/part": lambda w: replace(w, values=w.values * [-1, -1, -1, 1, 1, 1]),
+    "wrench-sign/part": lambda w: replace(
+        w, values=w.values * [-1, -1, -1, 1, 1, 1]
+    ),
 }
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("cause", "change"), MISTAKES.items(), ids=MISTAKES)
-def test_a_mistake_is_the_likeliest_cause(cause: str, change: Callable[[Wrench], Wrench]):
+def test_a_mistake_is_the_likeliest_cause(
+    cause: str, change: Callable[[Wrench], Wrench]
+):
     collocation = changed(change)
     found = find_misspecifications(ReducedSpace()(collocation), budget=0)
     assert found[0].code == cause
@@ -60,7 +66,9 @@ def test_a_mistake_is_the_likeliest_cause(cause: str, change: Callable[[Wrench],
 
 
 def test_a_wrench_that_fits_has_no_cause():
-    assert not find_misspecifications(ReducedSpace()(changed(lambda w: w)), budget=0)
+    assert not find_misspecifications(
+        ReducedSpace()(changed(lambda w: w)), budget=0
+    )
 
 
 # Before solving -----------------------------------------------------------------------------------
@@ -69,7 +77,11 @@ def test_a_wrench_that_fits_has_no_cause():
 def sensed(fault: str | None, seed: int = 0) -> Problem:
     """The swung cube with a sensor and a mistake of its wrench."""
     right = Problem([swung(seed)], UNKNOWN)
-    return right if fault is None else WRENCH_FAULTS[fault](right, np.random.default_rng(0))
+    return (
+        right
+        if fault is None
+        else WRENCH_FAULTS[fault](right, np.random.default_rng(0))
+    )
 
 
 @pytest.mark.long
@@ -91,7 +103,9 @@ def test_a_large_tare_is_named_although_its_prior_can_follow_it():
     experiment = swung(nuisance=Nuisance())
     (grasp,) = experiment.grasps
     assert grasp.wrench is not None
-    offset = replace(grasp.wrench, values=grasp.wrench.values + 40 * grasp.wrench.sigmas)
+    offset = replace(
+        grasp.wrench, values=grasp.wrench.values + 40 * grasp.wrench.sigmas
+    )
     given = replace(experiment, grasps=[replace(grasp, wrench=offset)])
     (cause,) = wrench_mistakes(Collocation([given], GUESS))
     assert cause.cause == "wrench-tare"

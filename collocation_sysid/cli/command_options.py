@@ -45,7 +45,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-ProblemPath = Annotated[Path, typer.Argument(metavar="PROBLEM.toml", help="The problem file.")]
+ProblemPath = Annotated[
+    Path, typer.Argument(metavar="PROBLEM.toml", help="The problem file.")
+]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(
@@ -57,21 +59,32 @@ Overrides = Annotated[
 AllowCode = Annotated[
     bool,
     typer.Option(
-        "--allow-code", help="Allow the Python files named in the problem file to be executed."
+        "--allow-code",
+        help="Allow the Python files named in the problem file to be executed.",
     ),
 ]
 OneExperiment = Annotated[
     str | None,
     typer.Option(
-        "--experiment", metavar="NAME", help="Name of the experiment; by default the first one."
+        "--experiment",
+        metavar="NAME",
+        help="Name of the experiment; by default the first one.",
     ),
 ]
-OutputFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Output folder.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Do not show progress.")]
+OutputFolder = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="Output folder.")
+]
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Print the result as JSON.")
+]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Do not show progress.")
+]
 
 
-def command(group: typer.Typer, *examples: str) -> Callable[[Callable[[Any], None]], Any]:
+def command(
+    group: typer.Typer, *examples: str
+) -> Callable[[Callable[[Any], None]], Any]:
     """Return a decorator that registers a function of a dataclass of options as a command.
 
     Parameters
@@ -84,7 +97,11 @@ def command(group: typer.Typer, *examples: str) -> Callable[[Callable[[Any], Non
 
     def registered(function: Callable[[Any], None]) -> Callable[[Any], None]:
         """Register the function in `group`, and return it unchanged."""
-        (kind,) = (each for name, each in get_type_hints(function).items() if name != "return")
+        (kind,) = (
+            each
+            for name, each in get_type_hints(function).items()
+            if name != "return"
+        )
         parameters = [*_typer_parameters(kind)]
 
         def called(**values: Any) -> None:
@@ -93,9 +110,13 @@ def command(group: typer.Typer, *examples: str) -> Callable[[Callable[[Any], Non
         called.__name__ = function.__name__
         called.__doc__ = function.__doc__
         called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        called.__annotations__ = {each.name: each.annotation for each in parameters}
+        called.__annotations__ = {
+            each.name: each.annotation for each in parameters
+        }
         lines = "".join(f"\n  collocation-sysid {each}" for each in examples)
-        group.command(epilog=f"\b\nExamples:{lines}")(called)  # kept as they are
+        group.command(epilog=f"\b\nExamples:{lines}")(
+            called
+        )  # kept as they are
         return function
 
     return registered
@@ -111,12 +132,19 @@ def _typer_parameters(kind: type) -> Iterator[inspect.Parameter]:
         if is_dataclass(hint):
             yield from _typer_parameters(hint)  # type: ignore[arg-type]
             continue
-        infos = (copy(mark) for mark in marks if isinstance(mark, ParameterInfo))
+        infos = (
+            copy(mark) for mark in marks if isinstance(mark, ParameterInfo)
+        )
         info = next(infos, None) or typer.Option()
         if info.help is None:
             written, info.help = documented[name]
             info.metavar = next(
-                (w for w in written.split() if w[0].isupper() or w[0].isdigit()), None
+                (
+                    w
+                    for w in written.split()
+                    if w[0].isupper() or w[0].isdigit()
+                ),
+                None,
             )
             if isinstance(info, OptionInfo):
                 info.param_decls = _option_names(name, default, written)
@@ -162,7 +190,9 @@ def _options_from_values(kind: type[T], values: Mapping[str, Any]) -> T:
         Naming the option as it is written on the command line.
     """
     content = {
-        name: _options_from_values(hint, values) if is_dataclass(hint) else values[name]  # type: ignore[arg-type]
+        name: _options_from_values(hint, values)  # type: ignore[arg-type]
+        if is_dataclass(hint)
+        else values[name]
         for name, _, hint, _ in _typed_fields(kind)
     }
     try:
@@ -184,14 +214,17 @@ def _typed_fields(kind: type) -> list[tuple[str, Any, Any, tuple[Any, ...]]]:
     """
     hints = get_type_hints(kind, include_extras=True)
     defaults = {field.name: field.default for field in fields(kind)}  # type: ignore[arg-type]
-    order = (name for base in kind.__mro__ for name in inspect.get_annotations(base))
+    order = (
+        name for base in kind.__mro__ for name in inspect.get_annotations(base)
+    )
     listed = []
     for name in dict.fromkeys(name for name in order if name in defaults):
         annotated = get_origin(hints[name]) is Annotated
         hint, *marks = get_args(hints[name]) if annotated else (hints[name],)
         if get_origin(hint) in (Union, UnionType):  # of what may be None
             kinds = (
-                get_args(one)[0] if get_origin(one) is Annotated else one for one in get_args(hint)
+                get_args(one)[0] if get_origin(one) is Annotated else one
+                for one in get_args(hint)
             )
             hint = reduce(or_, kinds)
         listed.append((name, defaults[name], hint, tuple(marks)))
@@ -217,10 +250,16 @@ class ProblemOptions:
 
             def say(sentence: str) -> None:
                 if not getattr(self, "quiet", False):
-                    error_console.print(Text(sentence, style="dim"), soft_wrap=True)
+                    error_console.print(
+                        Text(sentence, style="dim"), soft_wrap=True
+                    )
 
             return Problem.read(
-                self.problem, self.set_ or (), self.allow_code, simulation=simulation, say=say
+                self.problem,
+                self.set_ or (),
+                self.allow_code,
+                simulation=simulation,
+                say=say,
             )
 
 
@@ -254,7 +293,9 @@ class OutputOptions(Options):
     as_json: AsJson = False
     quiet: Quiet = False
 
-    def print_result(self, answer: Any, content: Shown | Iterable[Shown]) -> None:
+    def print_result(
+        self, answer: Any, content: Shown | Iterable[Shown]
+    ) -> None:
         """Print the result as JSON if requested, or else its tables and lines `content`."""
         if self.as_json:
             typer.echo(as_json(answer))

@@ -30,7 +30,10 @@ def interruption_exit(saved_results: str) -> typer.Exit:
     raise.
     """
     again = shlex.join(["collocation-sysid", *sys.argv[1:]])
-    error_console.print(Text(f"interrupted: {saved_results}; go on with: {again}"), soft_wrap=True)
+    error_console.print(
+        Text(f"interrupted: {saved_results}; go on with: {again}"),
+        soft_wrap=True,
+    )
     return typer.Exit(EXIT_INTERRUPTED)
 
 

@@ -14,7 +14,13 @@ from ..plan.design import DesignCriterion, DesignOptions, Limits
 from ..plan.design import design_motion as designed
 from ..plan.design.predicted_information import Kind, Over
 from ..result.run_writers import require_replaceable
-from .command_options import OneExperiment, OutputFolder, OutputOptions, ProblemOptions, command
+from .command_options import (
+    OneExperiment,
+    OutputFolder,
+    OutputOptions,
+    ProblemOptions,
+    command,
+)
 from .common import EXIT_INTERRUPTED, error_console
 
 commands = typer.Typer()
@@ -69,18 +75,30 @@ def design(options: DesignCommand) -> None:
     after, pictures, a film and a problem file that simulates the motion. Ctrl-C stops the search
     and keeps the best motion so far.
     """
-    from ..plan.design.design_folder import DESIGN_FILE, design_json, write_design
+    from ..plan.design.design_folder import (
+        DESIGN_FILE,
+        design_json,
+        write_design,
+    )
     from ..plan.design.design_page import design_summary
     from ..plan.study_progress import DesignProgress
 
     folder = options.out or Path("runs") / f"{run_name(options.problem)}-design"
-    names = () if options.for_ is None else tuple(n.strip() for n in options.for_.split(","))
-    criterion = DesignCriterion(cast("Kind", options.criterion), names, cast("Over", options.over))
+    names = (
+        ()
+        if options.for_ is None
+        else tuple(n.strip() for n in options.for_.split(","))
+    )
+    criterion = DesignCriterion(
+        cast("Kind", options.criterion), names, cast("Over", options.over)
+    )
     limits = Limits.read(options.limits)
     problem = options.read_problem(simulation=not options.add)
     require_possible(folder)
     require_replaceable(folder, marker_file=DESIGN_FILE, content_word="design")
-    with DesignProgress(error_console, options.search.evaluations, options.quiet) as progress:
+    with DesignProgress(
+        error_console, options.search.evaluations, options.quiet
+    ) as progress:
         try:
             answer = designed(
                 problem,

@@ -9,7 +9,11 @@ from typing import Annotated
 import typer
 
 from ..display import Line, Shown, Table, labelled, number
-from ..installation_check import Dependency, InstallationReport, check_installation
+from ..installation_check import (
+    Dependency,
+    InstallationReport,
+    check_installation,
+)
 from .command_options import OutputOptions, command
 from .common import EXIT_BAD_INPUT, error_console
 
@@ -98,7 +102,11 @@ def installation_sections(report: InstallationReport) -> list[Shown]:
             "Required packages",
             (),
             tuple(
-                (f"  {each.name} ", each.installed or "missing", _requirement_text(each))
+                (
+                    f"  {each.name} ",
+                    each.installed or "missing",
+                    _requirement_text(each),
+                )
                 for each in report.dependencies
             ),
             names=2,
@@ -130,7 +138,11 @@ def _solver_rows(report: InstallationReport) -> dict[str, str]:
     if report.solvers is None:
         return {"solvers": "unknown, because CasADi cannot be imported"}
     linear = ", ".join(report.solvers.ipopt_linear) or "none that works"
-    mkl = "available" if report.solvers.supernodal else "not available (extra: large)"
+    mkl = (
+        "available"
+        if report.solvers.supernodal
+        else "not available (extra: large)"
+    )
     return {
         "nonlinear solvers": ", ".join(report.solvers.nonlinear) or "none",
         "IPOPT's linear solvers": linear,
@@ -147,7 +159,9 @@ def _kernel_rows(report: InstallationReport) -> dict[str, str]:
             "which is slower"
         }
     stored = f"{kernels.count} kernels, {number(kernels.size_mb, 3)} MB"
-    state = "writable" if kernels.fault is None else f"not used: {kernels.fault}"
+    state = (
+        "writable" if kernels.fault is None else f"not used: {kernels.fault}"
+    )
     return {
         "compiler": kernels.compiler,
         "C compiler": f"{kernels.c_compiler or 'none'} (not needed)",
@@ -172,6 +186,8 @@ def _conclusion(report: InstallationReport) -> Line:
     text = f"Self test {outcome} in {test.time_s:.1f} s: {test.message}."
     if report.is_working:
         return Line(f"{text} The installation works.", "good")
-    unsuitable = [each.name for each in report.dependencies if not each.is_suitable]
+    unsuitable = [
+        each.name for each in report.dependencies if not each.is_suitable
+    ]
     remedy = f" Install {', '.join(unsuitable)}." if unsuitable else ""
     return Line(f"{text} The installation does not work.{remedy}", "doubtful")

@@ -24,8 +24,19 @@ from ..runs.check import check_problem, quick_check
 from ..runs.result_content import Result
 from ..serialisation import as_json
 from ..signal_handling import INTERRUPTS
-from .command_options import OutputFolder, OutputOptions, ProblemOptions, command
-from .common import EXIT_DOUBTFUL, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, error_console, print_result
+from .command_options import (
+    OutputFolder,
+    OutputOptions,
+    ProblemOptions,
+    command,
+)
+from .common import (
+    EXIT_DOUBTFUL,
+    EXIT_INTERRUPTED,
+    EXIT_NOT_CONVERGED,
+    error_console,
+    print_result,
+)
 
 if TYPE_CHECKING:
     from ..problem import Problem
@@ -96,7 +107,9 @@ def solve(options: SolveCommand) -> None:
     require_possible(folder)
     require_replaceable(folder)
     with ExitStack() as until_shown:
-        with SolveProgress(error_console, problem, options.verbose, options.quiet) as progress:
+        with SolveProgress(
+            error_console, problem, options.verbose, options.quiet
+        ) as progress:
             finished = run(
                 problem,
                 options.method,
@@ -111,12 +124,20 @@ def solve(options: SolveCommand) -> None:
             print_result(run_summary(finished.result, budget=options.budget))
         # Notes of the problem were shown before.
         with SolveProgress(
-            error_console, None, options.verbose, options.quiet, "writing the run folder"
+            error_console,
+            None,
+            options.verbose,
+            options.quiet,
+            "writing the run folder",
         ):
             finished.save(folder, pictures=False)
         if not options.as_json:
             print_result(f"written to {folder}")
-    result = _draw_pictures(finished, folder, options) if options.pictures else finished.result
+    result = (
+        _draw_pictures(finished, folder, options)
+        if options.pictures
+        else finished.result
+    )
     if options.as_json:
         typer.echo(as_json(result))
     elif result.elapsed_s.pictures is not None:
@@ -131,7 +152,9 @@ def solve(options: SolveCommand) -> None:
     raise typer.Exit(0 if status.converged else EXIT_NOT_CONVERGED)
 
 
-def _draw_pictures(finished: Run, folder: Path, options: SolveCommand) -> Result:
+def _draw_pictures(
+    finished: Run, folder: Path, options: SolveCommand
+) -> Result:
     """Draw the pictures of a run, and return its result with the time that they took.
 
     After an interrupt the result without that time is returned, and a message says how to go on.
@@ -139,12 +162,16 @@ def _draw_pictures(finished: Run, folder: Path, options: SolveCommand) -> Result
     from ..result.solve_progress import SolveProgress
 
     try:
-        with SolveProgress(error_console, verbose=options.verbose, quiet=options.quiet) as progress:
+        with SolveProgress(
+            error_console, verbose=options.verbose, quiet=options.quiet
+        ) as progress:
             return draw_run(finished, folder, progress.say)
     except KeyboardInterrupt:
         again = shlex.join(["collocation-sysid", "plot", str(folder)])
         message = f"interrupted: the result is kept in {folder}, but some pictures are missing"
-        error_console.print(Text(f"{message}; draw them with: {again}"), soft_wrap=True)
+        error_console.print(
+            Text(f"{message}; draw them with: {again}"), soft_wrap=True
+        )
         return finished.result
 
 
@@ -181,7 +208,9 @@ def simulate(options: SimulateCommand) -> None:
         error_console, problem, quiet=options.quiet, activity="simulating"
     ) as progress:
         try:
-            written = write_data(problem, options.out, options.recipe, progress.share)
+            written = write_data(
+                problem, options.out, options.recipe, progress.share
+            )
         except SimulationError as error:
             if error.stability_loss is not None:
                 _draw_instability(error, options.out)
@@ -204,7 +233,9 @@ def _draw_instability(error: SimulationError, folder: Path) -> None:
     file = folder / "instability.png"
     folder.mkdir(parents=True, exist_ok=True)
     with replaced_file(file) as draft:
-        instability_picture(error.stability_loss).savefig(draft, dpi=RESOLUTION_DPI)
+        instability_picture(error.stability_loss).savefig(
+            draft, dpi=RESOLUTION_DPI
+        )
     error_console.print(f"the mode is drawn in {file}")
 
 
@@ -247,7 +278,8 @@ def check(options: CheckCommand) -> None:
     if not options.as_json:
         print_result(quick_check_tables(quick_check(problem)))
         _write_depth_overlays(
-            problem, options.out or Path("runs") / f"{run_name(options.problem)}_check"
+            problem,
+            options.out or Path("runs") / f"{run_name(options.problem)}_check",
         )
     with SolveProgress(error_console, quiet=options.quiet) as progress:
         findings = check_problem(problem, progress.say, options.full)

@@ -26,7 +26,9 @@ from .command_options import (
 from .common import error_console, interruption_exit, print_result
 
 if TYPE_CHECKING:
-    from ..result.export import ExportDestination  # which takes a second to import
+    from ..result.export import (
+        ExportDestination,
+    )  # which takes a second to import
 
 commands = typer.Typer()
 
@@ -62,13 +64,17 @@ def refine(options: RefineCommand) -> None:
             error_console.print(Text(what, style="dim"), soft_wrap=True)
 
     try:
-        refinement, result = refine_run(options.run_folder, options.levels, options.allow_code, say)
+        refinement, result = refine_run(
+            options.run_folder, options.levels, options.allow_code, say
+        )
     except KeyboardInterrupt:
         raise interruption_exit(
             f"the solves that were completed are kept in {options.run_folder}"
         ) from None
     report = {**content(refinement), "trust": result.trust}
-    options.print_result(report, [refinement_table(result), verdict_section(result.trust)])
+    options.print_result(
+        report, [refinement_table(result), verdict_section(result.trust)]
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,14 +119,18 @@ def export(options: ExportCommand) -> None:
     from ..result.export import MAIN_FILES, parse_destination
     from ..result.export.rerun_recording import TARGET as RECORDING
 
-    destination = parse_destination(options.to, MAIN_FILES, options.run_folder, options.out)
+    destination = parse_destination(
+        options.to, MAIN_FILES, options.run_folder, options.out
+    )
     if destination.format_name == RECORDING:
         _export_recording(options, destination)
     else:
         _export_body(options, destination)
 
 
-def _export_body(options: ExportCommand, destination: ExportDestination) -> None:
+def _export_body(
+    options: ExportCommand, destination: ExportDestination
+) -> None:
     """Write the body of a run for a simulator, and print what the simulator cannot express."""
     from ..result.export import (
         TARGETS,
@@ -133,7 +143,9 @@ def _export_body(options: ExportCommand, destination: ExportDestination) -> None
     name = destination.format_name
     target = TARGETS[name]
     destination.require_possible()
-    body = IdentifiedBody.read(options.run_folder, options.experiment, options.allow_code)
+    body = IdentifiedBody.read(
+        options.run_folder, options.experiment, options.allow_code
+    )
     with destination.export_folder() as folder:
         exported = write_export(body, name, folder)
         destination.place_files(folder, target.main_file)
@@ -145,7 +157,8 @@ def _export_body(options: ExportCommand, destination: ExportDestination) -> None
             "warnings": body.warnings,
             "not_expressed": exported.limitations,
             "verified": [
-                {**asdict(each), "relative": each.relative_difference} for each in compared
+                {**asdict(each), "relative": each.relative_difference}
+                for each in compared
             ],
         }
         typer.echo(as_json(report))
@@ -154,10 +167,14 @@ def _export_body(options: ExportCommand, destination: ExportDestination) -> None
     print_result(f"not expressed: {each}" for each in exported.limitations)
     if options.verify:
         print_result(comparison_table(target.name, compared))
-    typer.echo(destination.folder if destination.is_folder else destination.main_file)
+    typer.echo(
+        destination.folder if destination.is_folder else destination.main_file
+    )
 
 
-def _export_recording(options: ExportCommand, destination: ExportDestination) -> None:
+def _export_recording(
+    options: ExportCommand, destination: ExportDestination
+) -> None:
     """Write the recording of a run for the Rerun viewer, and print what is missing in it.
 
     Raises
@@ -227,7 +244,9 @@ class ReportCommand:
     to: Path | None = None
 
 
-@command(commands, "report runs/swing", "report runs/swing-sweep --to sweep.html")
+@command(
+    commands, "report runs/swing", "report runs/swing-sweep --to sweep.html"
+)
 def report(options: ReportCommand) -> None:
     """Write a report of a run or a study as one HTML page or a Markdown file.
 
@@ -266,17 +285,25 @@ class AnimateCommand(RunFolderOptions):
     quiet: Quiet = False
 
 
-@command(commands, "animate runs/swing --to swing.mp4", "animate runs/swing --slow 4")
+@command(
+    commands, "animate runs/swing --to swing.mp4", "animate runs/swing --slow 4"
+)
 def animate(options: AnimateCommand) -> None:
     """Make a film of a run: the fitted body beside its forward simulation."""
     from rich.progress import Progress
 
     from ..result.animation import animate as film
 
-    require_possible(options.run_folder if options.to is None else options.to.parent)
+    require_possible(
+        options.run_folder if options.to is None else options.to.parent
+    )
     bar = Progress(console=error_console, transient=True)
     task = bar.add_task("filming", total=1.0)
-    with bar if error_console.is_terminal and not options.quiet else nullcontext():
+    with (
+        bar
+        if error_console.is_terminal and not options.quiet
+        else nullcontext()
+    ):
         file = film(
             options.run_folder,
             options.to,

@@ -70,7 +70,9 @@ def completion_script(shell: str, root: Any) -> str:
     context = root.make_context(PROGRAM, ["schema"], resilient_parsing=True)
     values = named_values()
     commands = [
-        _completed_command(root.get_command(context, name), context, values.get(name, {}))
+        _completed_command(
+            root.get_command(context, name), context, values.get(name, {})
+        )
         for name in root.list_commands(context)
     ]
     return SCRIPTS[shell](commands, _options(root, context, {}))
@@ -94,7 +96,11 @@ def _completed_command(
     command: Any, context: Any, values: Mapping[str, tuple[str, ...]]
 ) -> CompletedCommand:
     """Return a command of typer with its options; `values` are by name of the parameter."""
-    arguments = [p for p in command.get_params(context) if p.param_type_name == "argument"]
+    arguments = [
+        p
+        for p in command.get_params(context)
+        if p.param_type_name == "argument"
+    ]
     known = (_values(argument, context, values) for argument in arguments)
     return CompletedCommand(
         name=command.name,
@@ -125,12 +131,16 @@ def _options(
     return tuple(options)
 
 
-def _values(parameter: Any, context: Any, values: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+def _values(
+    parameter: Any, context: Any, values: Mapping[str, tuple[str, ...]]
+) -> tuple[str, ...]:
     """Return the possible values of a parameter; empty for files and free text."""
     if parameter.name in values:
         return values[parameter.name]
     items = parameter.shell_complete(context, "")
-    return tuple(str(each.value) for each in items if each.type == "plain" and each.value)
+    return tuple(
+        str(each.value) for each in items if each.type == "plain" and each.value
+    )
 
 
 def _summary(text: str) -> str:
@@ -142,7 +152,9 @@ def _summary(text: str) -> str:
     return line[: LONGEST_DESCRIPTION - 1].rsplit(" ", 1)[0].rstrip(",;:") + "…"
 
 
-def bash_script(commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]) -> str:
+def bash_script(
+    commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]
+) -> str:
     """Return the script for bash; values that are not known are completed as files."""
     first = [*(each.name for each in commands), *_names(root)]
     lines = [
@@ -160,10 +172,14 @@ def bash_script(commands: Sequence[CompletedCommand], root: Sequence[CompletedOp
     for command in commands:
         for option in command.options:
             if option.takes_value:
-                patterns = "|".join(f'"{command.name} {name}"' for name in option.names)
+                patterns = "|".join(
+                    f'"{command.name} {name}"' for name in option.names
+                )
                 words = shlex.quote(" ".join(option.values))
                 reply = (
-                    f'COMPREPLY=($(compgen -W {words} -- "$current")); ' if option.values else ""
+                    f'COMPREPLY=($(compgen -W {words} -- "$current")); '
+                    if option.values
+                    else ""
                 )
                 lines.append(f"            {patterns}) {reply}return ;;")
     lines += ["        esac", '        case "$command" in']
@@ -185,7 +201,9 @@ def bash_script(commands: Sequence[CompletedCommand], root: Sequence[CompletedOp
     return "\n".join(lines)
 
 
-def zsh_script(commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]) -> str:
+def zsh_script(
+    commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]
+) -> str:
     """Return the script for zsh, to be evaluated, or put into a folder of ``fpath``."""
     lines = [
         f"#compdef {PROGRAM}",
@@ -193,7 +211,10 @@ def zsh_script(commands: Sequence[CompletedCommand], root: Sequence[CompletedOpt
         "    local -a known",
         "    if (( CURRENT == 2 )); then",
         "        known=(",
-        *(f"            {_described(each.name, each.description)}" for each in commands),
+        *(
+            f"            {_described(each.name, each.description)}"
+            for each in commands
+        ),
         *(f"            {_described(o.names[0], o.description)}" for o in root),
         "        )",
         "        _describe command known",
@@ -211,7 +232,11 @@ def zsh_script(commands: Sequence[CompletedCommand], root: Sequence[CompletedOpt
             for option in command.options
             for name in option.names
         ]
-        action = f"({' '.join(command.arguments)})" if command.arguments else "_files"
+        action = (
+            f"({' '.join(command.arguments)})"
+            if command.arguments
+            else "_files"
+        )
         lines.append(f"            {shlex.quote(f'*:argument:{action}')} ;;")
     lines += [
         "    esac",
@@ -235,11 +260,15 @@ def _zsh_option(name: str, option: CompletedOption) -> str:
     text = re.sub(r"([\[\]\\:])", r"\\\1", option.description)
     value = ""
     if option.takes_value:
-        value = ":value:" + (f"({' '.join(option.values)})" if option.values else "_files")
+        value = ":value:" + (
+            f"({' '.join(option.values)})" if option.values else "_files"
+        )
     return shlex.quote(f"*{name}[{text}]{value}")
 
 
-def fish_script(commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]) -> str:
+def fish_script(
+    commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]
+) -> str:
     """Return the script for fish."""
     begin = f"complete -c {PROGRAM}"
     lines = [f"# Completion of {PROGRAM} for fish."]
@@ -247,21 +276,35 @@ def fish_script(commands: Sequence[CompletedCommand], root: Sequence[CompletedOp
         lines.append(f"{begin} -n __fish_use_subcommand {_fish_option(option)}")
     for command in commands:
         text = _fish_quote(command.description)
-        lines.append(f"{begin} -n __fish_use_subcommand -f -a {command.name} -d {text}")
-        condition = f"-n {_fish_quote(f'__fish_seen_subcommand_from {command.name}')}"
+        lines.append(
+            f"{begin} -n __fish_use_subcommand -f -a {command.name} -d {text}"
+        )
+        condition = (
+            f"-n {_fish_quote(f'__fish_seen_subcommand_from {command.name}')}"
+        )
         if command.arguments:
             values = _fish_quote(" ".join(command.arguments))
             lines.append(f"{begin} {condition} -f -a {values}")
-        lines += [f"{begin} {condition} {_fish_option(option)}" for option in command.options]
+        lines += [
+            f"{begin} {condition} {_fish_option(option)}"
+            for option in command.options
+        ]
     return "\n".join(lines)
 
 
 def _fish_option(option: CompletedOption) -> str:
     """Return the arguments of fish's `complete` for an option."""
-    names = [f"-l {n[2:]}" if n.startswith("--") else f"-s {n[1:]}" for n in option.names]
+    names = [
+        f"-l {n[2:]}" if n.startswith("--") else f"-s {n[1:]}"
+        for n in option.names
+    ]
     value = ""
     if option.takes_value:
-        value = f" -x -a {_fish_quote(' '.join(option.values))}" if option.values else " -r -F"
+        value = (
+            f" -x -a {_fish_quote(' '.join(option.values))}"
+            if option.values
+            else " -r -F"
+        )
     return f"{' '.join(names)}{value} -d {_fish_quote(option.description)}"
 
 
@@ -276,7 +319,9 @@ def _names(options: Sequence[CompletedOption]) -> list[str]:
     return [name for option in options for name in option.names]
 
 
-SCRIPTS: dict[str, Callable[[Sequence[CompletedCommand], Sequence[CompletedOption]], str]] = {
+SCRIPTS: dict[
+    str, Callable[[Sequence[CompletedCommand], Sequence[CompletedOption]], str]
+] = {
     "bash": bash_script,
     "zsh": zsh_script,
     "fish": fish_script,

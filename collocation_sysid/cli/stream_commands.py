@@ -16,7 +16,13 @@ from ..files import require_possible
 from ..live import LiveEstimator, LiveOptions
 from ..live.sources import read_problem
 from ..validated_types import NotNegative, Options, Positive
-from .command_options import AllowCode, OutputOptions, Overrides, ProblemPath, command
+from .command_options import (
+    AllowCode,
+    OutputOptions,
+    Overrides,
+    ProblemPath,
+    command,
+)
 from .common import EXIT_BAD_INPUT, error_console, print_result
 
 commands = typer.Typer()
@@ -61,7 +67,9 @@ class LiveCommand(LiveEstimationOptions):
 
 
 @command(
-    commands, "live problem.toml < frames.jsonl", "live problem.toml --udp 9870 > estimates.jsonl"
+    commands,
+    "live problem.toml < frames.jsonl",
+    "live problem.toml --udp 9870 > estimates.jsonl",
 )
 def live(options: LiveCommand) -> None:
     """Estimate the parameters while a recording is made.
@@ -80,7 +88,9 @@ def live(options: LiveCommand) -> None:
         without_garbage_of_startup,
     )
 
-    if options.udp is None and sys.stdin is None:  # closed by whoever started the process
+    if (
+        options.udp is None and sys.stdin is None
+    ):  # closed by whoever started the process
         raise InputError(
             "is closed; expected frames, as in live problem.toml < frames.jsonl, or --udp PORT",
             "standard input",
@@ -152,7 +162,11 @@ def replay(options: ReplayCommand) -> None:
 
     from ..display import on_terminal
     from ..live import live_display
-    from ..live.sources import frames_of_recording, paced_frames, without_garbage_of_startup
+    from ..live.sources import (
+        frames_of_recording,
+        paced_frames,
+        without_garbage_of_startup,
+    )
     from ..live.sources import update_as_json as json_line
 
     rate = options.rate
@@ -165,7 +179,9 @@ def replay(options: ReplayCommand) -> None:
     frames = frames_of_recording(experiment, estimator.model)
     pace = 1.0 / experiment.timestep_s if rate is None else rate
     updates = []
-    watched = error_console.is_terminal and not options.quiet and not options.as_json
+    watched = (
+        error_console.is_terminal and not options.quiet and not options.as_json
+    )
     shown = Live(console=error_console, refresh_per_second=10)
     with without_garbage_of_startup(), shown if watched else nullcontext():
         for frame in paced_frames(frames, pace) if pace else frames:

@@ -21,13 +21,28 @@ from ..plan import (
     plan_sweep,
     run_all,
 )
-from ..plan.model_variants import models, parse_branches, parse_dampings, parse_materials
+from ..plan.model_variants import (
+    models,
+    parse_branches,
+    parse_dampings,
+    parse_materials,
+)
 from ..plan.study_arguments import parse_methods, parse_varied_keys, read_truth
-from ..plan.study_kinds import METHOD_STUDY, MODEL_STUDY, STUDY_TITLES, SWEEP_STUDY
+from ..plan.study_kinds import (
+    METHOD_STUDY,
+    MODEL_STUDY,
+    STUDY_TITLES,
+    SWEEP_STUDY,
+)
 from ..plan.study_rows import SuccessCriterion
 from ..problem import Problem
 from ..validated_types import Positive
-from .command_options import OutputFolder, OutputOptions, ProblemOptions, command
+from .command_options import (
+    OutputFolder,
+    OutputOptions,
+    ProblemOptions,
+    command,
+)
 from .common import error_console, interruption_exit, print_result
 
 commands = typer.Typer()
@@ -93,7 +108,12 @@ def compare_methods(options: CompareMethodsCommand) -> None:
         truth=truth,
         allow_code=options.allow_code,
     )
-    _run_study(METHOD_STUDY, options, planned, yardstick=SuccessCriterion(truth, options.within))
+    _run_study(
+        METHOD_STUDY,
+        options,
+        planned,
+        yardstick=SuccessCriterion(truth, options.within),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,22 +161,39 @@ def compare_models(options: CompareModelsCommand) -> None:
 
     Finished runs are kept in the output folder: the same command resumes the study.
     """
-    if not options.with_ and {options.materials, options.damping, options.prony} == {None}:
-        raise InputError("no models to compare; expected --materials, --damping, --prony or --with")
+    if not options.with_ and {
+        options.materials,
+        options.damping,
+        options.prony,
+    } == {None}:
+        raise InputError(
+            "no models to compare; expected --materials, --damping, --prony or --with"
+        )
     method = _single_method(options.method)
     problem = options.read_problem()
-    others = [replace(options, problem=file).read_problem() for file in options.with_ or ()]
+    others = [
+        replace(options, problem=file).read_problem()
+        for file in options.with_ or ()
+    ]
     variants = models(
         [problem, *others],
         options.set_ or (),
-        materials=parse_materials(options.materials) if options.materials is not None else (),
-        branches=parse_branches(options.prony) if options.prony is not None else (),
+        materials=parse_materials(options.materials)
+        if options.materials is not None
+        else (),
+        branches=parse_branches(options.prony)
+        if options.prony is not None
+        else (),
         region=options.region,
-        dampings=parse_dampings(options.damping) if options.damping is not None else (),
+        dampings=parse_dampings(options.damping)
+        if options.damping is not None
+        else (),
     )
     for variant in variants:  # a model that cannot be would fail every run
         Problem.read(variant.path, variant.overrides, options.allow_code)
-    planned = plan_models(problem, variants, method=method, allow_code=options.allow_code)
+    planned = plan_models(
+        problem, variants, method=method, allow_code=options.allow_code
+    )
     _run_study(MODEL_STUDY, options, planned)
 
 
@@ -186,7 +223,9 @@ def sweep(options: SweepCommand) -> None:
     method = _single_method(options.method)
     over = parse_varied_keys(options.over)
     overrides = options.set_ or ()
-    planned = plan_sweep(options.problem, over, overrides, method, options.allow_code)
+    planned = plan_sweep(
+        options.problem, over, overrides, method, options.allow_code
+    )
     # A missing file would fail every run.
     Problem.read(options.problem, planned[0].overrides, options.allow_code)
     _run_study(SWEEP_STUDY, options, planned)
@@ -243,10 +282,17 @@ def _run_study(
     folder = options.out or Path("runs") / f"{name}-{kind}"
     store = RunStore(folder / "runs")
     limits = options.limits
-    finished = [run.key for run in planned if store.load_finished(run.key, limits.time_limit_s)]
+    finished = [
+        run.key
+        for run in planned
+        if store.load_finished(run.key, limits.time_limit_s)
+    ]
     if options.dry_run:
         if options.as_json:
-            listed = [{**run.as_dict(), "finished": run.key in finished} for run in planned]
+            listed = [
+                {**run.as_dict(), "finished": run.key in finished}
+                for run in planned
+            ]
             typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
         else:
             print_result(plan_table(planned, finished))
@@ -255,11 +301,15 @@ def _run_study(
     remaining = [run for run in planned if run.key not in finished]
     is_complete = True
     try:
-        with StudyProgress(error_console, remaining, len(planned), options.quiet) as progress:
+        with StudyProgress(
+            error_console, remaining, len(planned), options.quiet
+        ) as progress:
             run_all(remaining, store, limits, progress.count_run)
     except KeyboardInterrupt:
         is_complete = False
-    report = load_report(f"{STUDY_TITLES[kind]}: {name}", kind, planned, store, yardstick)
+    report = load_report(
+        f"{STUDY_TITLES[kind]}: {name}", kind, planned, store, yardstick
+    )
     if report.records:
         write_report(report, folder)
     if not is_complete:

@@ -22,7 +22,12 @@ from .common import error_console, print_result
 
 commands = typer.Typer()
 
-TYPE_WORDS = {"number": "number", "integer": "whole number", "string": "text", "object": "table"}
+TYPE_WORDS = {
+    "number": "number",
+    "integer": "whole number",
+    "string": "text",
+    "object": "table",
+}
 
 
 class NewProblemKind(StrEnum):
@@ -50,7 +55,12 @@ class MethodsCommand:
 @command(commands, "methods", "methods interior-point")
 def methods(options: MethodsCommand) -> None:
     """List the methods, or the options of one method: defaults, allowed values and meaning."""
-    from ..methods import METHODS, method_options_schema, method_summary, require_method
+    from ..methods import (
+        METHODS,
+        method_options_schema,
+        method_summary,
+        require_method,
+    )
 
     name = options.name
     if name is not None:
@@ -88,7 +98,13 @@ class ExplainCommand:
     topics: Annotated[list[str] | None, typer.Argument()] = None
 
 
-@command(commands, "explain", "explain verdict", "explain trust scheme", "explain theory | less")
+@command(
+    commands,
+    "explain",
+    "explain verdict",
+    "explain trust scheme",
+    "explain theory | less",
+)
 def explain(options: ExplainCommand) -> None:
     """Show pages of the documentation, or list their topics.
 
@@ -98,7 +114,10 @@ def explain(options: ExplainCommand) -> None:
     if not options.topics:
         print_result(
             Table(
-                "", ("topic", ""), tuple((each, page_title(each)) for each in page_files()), texts=1
+                "",
+                ("topic", ""),
+                tuple((each, page_title(each)) for each in page_files()),
+                texts=1,
             )
         )
         return
@@ -109,7 +128,9 @@ def explain(options: ExplainCommand) -> None:
         if console.is_terminal:
             from .markdown import TerminalPage
 
-            console.print(TerminalPage(page_text(topic), hyperlinks=False), crop=False)
+            console.print(
+                TerminalPage(page_text(topic), hyperlinks=False), crop=False
+            )
         else:
             typer.echo(page_text(topic))
 
@@ -150,7 +171,9 @@ def log(options: LogCommand) -> None:
     )
     heads = ("topic", "type", "messages", "Hz", "use")
     addresses = [f"  {address}" for each in listed for address in each.write]
-    what = ["", "In place of a file name write:", *addresses] if addresses else []
+    what = (
+        ["", "In place of a file name write:", *addresses] if addresses else []
+    )
     print_result([Table("", heads, rows, names=2, texts=1), *what])
 
 
@@ -188,7 +211,11 @@ def new(options: NewCommand) -> None:
     folder = Path(options.name)
     kind = options.kind
     if kind is not None and options.dataset is not None:
-        raise InputError("found --kind and --dataset; expected one of them", None, "--dataset")
+        raise InputError(
+            "found --kind and --dataset; expected one of them",
+            None,
+            "--dataset",
+        )
     if options.dataset is not None:
         file, *data = copy_dataset(options.dataset, folder)
     else:
@@ -204,9 +231,14 @@ def new(options: NewCommand) -> None:
     is_empty = kind is None and options.dataset is None
     if options.dataset is not None:
         example = "the problem runs as it is; its comments state the source of the data"
-    error_console.print(f"Next: {yours if is_empty else example}.", soft_wrap=True)
+    error_console.print(
+        f"Next: {yours if is_empty else example}.", soft_wrap=True
+    )
     for next_ in ("check", "solve"):
-        error_console.print(f"  collocation-sysid {next_} {shlex.quote(str(file))}", soft_wrap=True)
+        error_console.print(
+            f"  collocation-sysid {next_} {shlex.quote(str(file))}",
+            soft_wrap=True,
+        )
 
 
 def _methods_table() -> Table:
@@ -214,7 +246,10 @@ def _methods_table() -> Table:
     from ..methods import METHODS, method_summary
 
     return Table(
-        "", ("method", ""), tuple((name, method_summary(name)) for name in METHODS), texts=1
+        "",
+        ("method", ""),
+        tuple((name, method_summary(name)) for name in METHODS),
+        texts=1,
     )
 
 
@@ -246,7 +281,9 @@ def _default_text(option: Mapping[str, Any]) -> str:
     """Return the default of an option as text."""
     default = option["default"]
     items = default if isinstance(default, tuple) else [default]
-    text = ", ".join(f"{item:g}" if isinstance(item, float) else str(item) for item in items)
+    text = ", ".join(
+        f"{item:g}" if isinstance(item, float) else str(item) for item in items
+    )
     return f"[{text}]" if isinstance(default, tuple) else text
 
 
@@ -257,5 +294,9 @@ def _allowed_values_text(option: Mapping[str, Any]) -> str:
     if option["type"] == "array":
         return f"list, each a {_allowed_values_text(option['items'])}"
     limits = {"exclusiveMinimum": "above", "minimum": "of at least"}
-    ranges = [f" {word} {option[key]:g}" for key, word in limits.items() if key in option]
+    ranges = [
+        f" {word} {option[key]:g}"
+        for key, word in limits.items()
+        if key in option
+    ]
     return TYPE_WORDS[option["type"]] + "".join(ranges)

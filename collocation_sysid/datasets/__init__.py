@@ -208,10 +208,15 @@ def _rubber(
     table = read_specimen(file, SpecimenLayout(test=test, columns={}))
     limit = float("inf") if largest_stretch is None else largest_stretch
     largest = (
-        table.strain if table.second_strain is None else table.strain.clip(min=table.second_strain)
+        table.strain
+        if table.second_strain is None
+        else table.strain.clip(min=table.second_strain)
     )
     exact = {"strain_zero": 0.0, "area_error": 0.0} if is_exact else {}
     specimen = Specimen(
-        test, **table.rows((1 + largest <= limit).nonzero()[0]), sigma_pa=sigma_pa, **exact
+        test,
+        **table.rows((1 + largest <= limit).nonzero()[0]),
+        sigma_pa=sigma_pa,
+        **exact,
     )
     return specimen.experiment(material, name)

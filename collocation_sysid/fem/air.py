@@ -49,7 +49,9 @@ def unit_drag() -> NodeForce:
         speed = ca.sqrt(ca.sumsqr(v) + SMOOTH_BELOW_M_S**2)
         return -0.5 * DRAG_COEFFICIENT * FACING_SHARE * at.area_m2 * speed * v
 
-    return replace(NodeForce.from_law(air_drag, name="air drag"), is_compiled=True)
+    return replace(
+        NodeForce.from_law(air_drag, name="air drag"), is_compiled=True
+    )
 
 
 def placed_unit_drag(nodes: ElementNodes, volume_m3: Array) -> LocatedForce:
@@ -64,5 +66,9 @@ def placed_unit_drag(nodes: ElementNodes, volume_m3: Array) -> LocatedForce:
     on_surface = np.flatnonzero(surface_shares(nodes)[0] > 0)
     no_constants = np.zeros(0, dtype=np.int64)
     return LocatedForce.on_mesh(
-        unit_drag(), nodes, chosen=on_surface, volume_m3=volume_m3, columns=no_constants
+        unit_drag(),
+        nodes,
+        chosen=on_surface,
+        volume_m3=volume_m3,
+        columns=no_constants,
     )

@@ -38,7 +38,12 @@ from .mesh import TetMesh
 from .node_force import LocatedForce, NodeForce
 from .pattern import JointPattern, SymmetricPattern
 from .regions import BodyPart, ConstantsModel, Region, Theta, parts_from_regions
-from .rest_shape import InverseEquilibrium, RestShapeError, UnderGravity, require_supported
+from .rest_shape import (
+    InverseEquilibrium,
+    RestShapeError,
+    UnderGravity,
+    require_supported,
+)
 from .selection import Selection
 from .spatial_field import Field, FieldModes
 from .stress import StressEvaluator
@@ -197,27 +202,37 @@ class Body(Discretisation):
             prony=prony,
             field=field,
         )
-        generated: Literal["stress_free"] | None = "stress_free" if mesh.is_generated else None
+        generated: Literal["stress_free"] | None = (
+            "stress_free" if mesh.is_generated else None
+        )
         self.rest_shape: UnderGravity | Literal["stress_free"] | None = (
             generated if rest_shape is None else rest_shape
         )
-        if rest_shape not in (None, "stress_free") and not isinstance(rest_shape, UnderGravity):
+        if rest_shape not in (None, "stress_free") and not isinstance(
+            rest_shape, UnderGravity
+        ):
             raise InputError(
                 f"found {rest_shape!r}; expected 'stress_free' or UnderGravity(nodes, gravity)",
                 where="rest_shape",
             )
         if self.scan_conditions is not None:
             require_supported(parts)
-        super().__init__(parts, tuple(forces), mesh, element, evaluator, threads)
+        super().__init__(
+            parts, tuple(forces), mesh, element, evaluator, threads
+        )
         # Lumped volume of every dof (3n,) for each part.
-        self._lumped_m3 = [np.repeat(self._lumped_volume(part), 3) for part in self.parts]
-        self.has_declared_mass = mass_kg is not None
-        self.node_mass: Array = self._masses_with_densities([p.density_kg_m3 for p in self.parts])[
-            ::3
+        self._lumped_m3 = [
+            np.repeat(self._lumped_volume(part), 3) for part in self.parts
         ]
+        self.has_declared_mass = mass_kg is not None
+        self.node_mass: Array = self._masses_with_densities(
+            [p.density_kg_m3 for p in self.parts]
+        )[::3]
 
     def __repr__(self) -> str:
-        materials = ", ".join(f"{p.name or 'body'}: {p.material.name}" for p in self.parts)
+        materials = ", ".join(
+            f"{p.name or 'body'}: {p.material.name}" for p in self.parts
+        )
         return (
             f"Body({len(self.nodes_m)} nodes, {len(self.cells)} {self.element.name}, "
             f"{self.mass_kg:.4g} kg, {materials})"
@@ -229,12 +244,18 @@ class Body(Discretisation):
 
         None if the mesh counts as stress-free.
         """
-        return self.rest_shape if isinstance(self.rest_shape, UnderGravity) else None
+        return (
+            self.rest_shape
+            if isinstance(self.rest_shape, UnderGravity)
+            else None
+        )
 
     @cached_property
     def inverse_equilibrium(self) -> InverseEquilibrium | None:
         """Solver of the stress-free shape; None if the mesh is stress-free."""
-        return None if self.scan_conditions is None else InverseEquilibrium(self)
+        return (
+            None if self.scan_conditions is None else InverseEquilibrium(self)
+        )
 
     def rest_shape_failure(self, theta: Theta) -> str | None:
         """Return why there is no stress-free shape at θ, with a remedy; None if there is one."""
@@ -250,7 +271,9 @@ class Body(Discretisation):
         """Return shape gradients and volumes (E, q, 3·nodes + 1) of the stress-free shape at θ."""
         if self.inverse_equilibrium is None:
             return self.geometry
-        return self._geometry_at(self.inverse_equilibrium.solve(theta).positions_m)
+        return self._geometry_at(
+            self.inverse_equilibrium.solve(theta).positions_m
+        )
 
     def with_stress_free(self, positions_m: Array) -> Body:
         """Return this body with the same masses and another stress-free shape.
@@ -276,9 +299,9 @@ class Body(Discretisation):
         count, points = self.geometry.shape[:2]
         slopes = self.geometry[..., :-1].reshape(count, points, -1, 3)
         G = np.einsum("ean,eqai->eqni", positions_m[self.cells], slopes)
-        gradients = np.einsum("eqai,eqin->eqan", slopes, np.linalg.inv(G)).reshape(
-            count, points, -1
-        )
+        gradients = np.einsum(
+            "eqai,eqin->eqan", slopes, np.linalg.inv(G)
+        ).reshape(count, points, -1)
         volumes = self.geometry[..., -1:] * np.linalg.det(G)[..., None]
         return np.concatenate([gradients, volumes], axis=2)
 
@@ -293,7 +316,9 @@ class Body(Discretisation):
         """
         if self.inverse_equilibrium is None:
             return self.mesh
-        positions_m = self.inverse_equilibrium.solve(theta).positions_m[: len(self.mesh.points_m)]
+        positions_m = self.inverse_equilibrium.solve(theta).positions_m[
+            : len(self.mesh.points_m)
+        ]
         mesh = self.mesh
         return TetMesh(
             positions_m,
@@ -311,19 +336,29 @@ class Body(Discretisation):
 
     def __getstate__(self) -> dict[str, Any]:
         # Kernels belong to this process, and cached properties are computed again.
-        state = {n: v for n, v in vars(self).items() if n not in self._cached_names}
+        state = {
+            n: v for n, v in vars(self).items() if n not in self._cached_names
+        }
         return state | {"_evaluators": {}, "_framed": {}}
 
     @property
     def _cached_names(self) -> set[str]:
         """Names of the cached properties that have been computed."""
-        return {n for n in vars(self) if isinstance(getattr(type(self), n, None), cached_property)}
+        return {
+            n
+            for n in vars(self)
+            if isinstance(getattr(type(self), n, None), cached_property)
+        }
 
     def _lumped_volume(self, part: BodyPart, shares: ArrayLike = 1.0) -> Array:
         """Return the lumped volume (n,) of a part [m³], or of given fractions (E,) of its cells."""
         volumes_m3 = self.mesh.volumes_m3[part.cells] * shares
         volume = np.zeros(len(self.nodes_m))
-        np.add.at(volume, self.cells[part.cells], volumes_m3[:, None] * self.element.mass_shares)
+        np.add.at(
+            volume,
+            self.cells[part.cells],
+            volumes_m3[:, None] * self.element.mass_shares,
+        )
         return volume
 
     def with_free_densities(self, parts: Collection[str]) -> Body:
@@ -345,17 +380,25 @@ class Body(Discretisation):
     @property
     def field_lengths_m(self) -> dict[str, float]:
         """Correlation lengths of the fields, by the names of their constants."""
-        return {part.field_name: part.field.length_m for part in self.parts if part.field}
+        return {
+            part.field_name: part.field.length_m
+            for part in self.parts
+            if part.field
+        }
 
     def with_field_lengths(self, lengths_m: Mapping[str, float]) -> Body:
         """Return this body with other correlation lengths [m] of its fields, by the names of the
         fields' constants; every field must be named.
         """
         fields = (
-            part.field and part.field.with_length(lengths_m[part.field_name]) for part in self.parts
+            part.field and part.field.with_length(lengths_m[part.field_name])
+            for part in self.parts
         )
         return self.with_parts(
-            tuple(replace(part, field=own) for part, own in zip(self.parts, fields, strict=True))
+            tuple(
+                replace(part, field=own)
+                for part, own in zip(self.parts, fields, strict=True)
+            )
         )
 
     @property
@@ -375,14 +418,19 @@ class Body(Discretisation):
         """
         return self.with_parts(
             tuple(
-                replace(part, field=fields.get(part.field_name, part.field)) for part in self.parts
+                replace(part, field=fields.get(part.field_name, part.field))
+                for part in self.parts
             )
         )
 
     def with_parts(self, parts: tuple[BodyPart, ...]) -> Body:
         """Return this body with other parts, which have the same cells as before."""
         other = copy(self)
-        for name in self._cached_names - {"pattern", "shape_gradients", "part_of_cells"}:
+        for name in self._cached_names - {
+            "pattern",
+            "shape_gradients",
+            "part_of_cells",
+        }:
             vars(other).pop(name, None)
         ConstantsModel.__init__(other, parts, self.forces, self.frictions)
         other._evaluators = {}
@@ -390,7 +438,10 @@ class Body(Discretisation):
         return other
 
     def with_frames(
-        self, count: int, has_skew_contact: bool = False, frictions: tuple[Constant, ...] = ()
+        self,
+        count: int,
+        has_skew_contact: bool = False,
+        frictions: tuple[Constant, ...] = (),
     ) -> Body:
         """Return this body with the frames of obstacles: four further nodes each, which no cell
         has.
@@ -422,9 +473,12 @@ class Body(Discretisation):
             other.frames = first + np.arange(4 * count).reshape(count, 4)
             other.nodes_m = np.vstack([self.nodes.points_m, added])
             other._lumped_m3 = [
-                np.append(each[: 3 * first], np.zeros(added.size)) for each in self._lumped_m3
+                np.append(each[: 3 * first], np.zeros(added.size))
+                for each in self._lumped_m3
             ]
-            other.node_mass = np.append(self.node_mass[:first], np.zeros(len(added)))
+            other.node_mass = np.append(
+                self.node_mass[:first], np.zeros(len(added))
+            )
             self._framed[key] = other
         return self._framed[key]
 
@@ -448,9 +502,13 @@ class Body(Discretisation):
     def elastic_indices(self) -> list[int]:
         """Indices in θ on which the stress depends: constants of the materials, and of fields."""
         indices: list[int] = []
-        for part, start, modes in zip(self.parts, self.starts, self.field_slices, strict=False):
+        for part, start, modes in zip(
+            self.parts, self.starts, self.field_slices, strict=False
+        ):
             indices += [*range(start, start + len(part.material.constants))]
-            indices += [*range(modes.start, modes.stop)] if part.stress_field else []
+            indices += (
+                [*range(modes.start, modes.stop)] if part.stress_field else []
+            )
         return indices
 
     @property
@@ -465,7 +523,11 @@ class Body(Discretisation):
         These are ∂M/∂ρ [m³] for free densities, and the derivatives by the coefficients of the
         field of a density [kg].
         """
-        return {place: slope for own in self._mass_slopes for place, slope in own.items()}
+        return {
+            place: slope
+            for own in self._mass_slopes
+            for place, slope in own.items()
+        }
 
     @cached_property
     def _mass_slopes(self) -> list[dict[int, Array]]:
@@ -474,19 +536,30 @@ class Body(Discretisation):
         """
         slopes: list[dict[int, Array]] = []
         places = zip(self._gamma_m_indices, self.field_slices, strict=True)
-        for part, (gamma, modes), volume in zip(self.parts, places, self._lumped_m3, strict=True):
+        for part, (gamma, modes), volume in zip(
+            self.parts, places, self._lumped_m3, strict=True
+        ):
             slopes.append({gamma + 1: volume} if part.has_free_density else {})
             if part.field is not None and part.stress_field is None:
                 shares = part.density_kg_m3 * part.field.shapes.T
-                lumped = (np.repeat(self._lumped_volume(part, share), 3) for share in shares)
-                slopes[-1] |= dict(zip(range(modes.start, modes.stop), lumped, strict=True))
+                lumped = (
+                    np.repeat(self._lumped_volume(part, share), 3)
+                    for share in shares
+                )
+                slopes[-1] |= dict(
+                    zip(range(modes.start, modes.stop), lumped, strict=True)
+                )
         return slopes
 
     def densities(self, theta: Theta) -> list[float]:
         """Return the mean density of each part at θ (k,) [kg/m³]."""
         return [
-            float(theta[place + 1]) if part.has_free_density else part.density_kg_m3
-            for part, place in zip(self.parts, self._gamma_m_indices, strict=True)
+            float(theta[place + 1])
+            if part.has_free_density
+            else part.density_kg_m3
+            for part, place in zip(
+                self.parts, self._gamma_m_indices, strict=True
+            )
         ]
 
     def mass_of_dofs(self, theta: Theta) -> Array:
@@ -503,7 +576,9 @@ class Body(Discretisation):
             return None
         masses = np.array(self._part_masses(theta))[:, ::3]
         # Nodes of obstacle frames have no mass.
-        total = np.where(self.dof_volume_m3[::3] > 0, masses.sum(axis=0), np.inf)
+        total = np.where(
+            self.dof_volume_m3[::3] > 0, masses.sum(axis=0), np.inf
+        )
         node = int(total.argmin())
         if total[node] > 0:
             return None
@@ -526,14 +601,22 @@ class Body(Discretisation):
             self.parts, self._lumped_m3, self._mass_slopes, strict=True
         ):
             density = 0.0 if part.has_free_density else part.density_kg_m3
-            masses.append(sum((theta[k] * slope for k, slope in slopes.items()), density * volume))
+            masses.append(
+                sum(
+                    (theta[k] * slope for k, slope in slopes.items()),
+                    density * volume,
+                )
+            )
         return masses
 
     def _masses_with_densities(self, densities: Sequence[float]) -> Array:
         """Return the mass of every dof (3n,) [kg] for given densities of the parts [kg/m³], without
         fields and tied masses.
         """
-        return np.sum([d * v for d, v in zip(densities, self._lumped_m3, strict=True)], axis=0)
+        return np.sum(
+            [d * v for d, v in zip(densities, self._lumped_m3, strict=True)],
+            axis=0,
+        )
 
     @cached_property
     def placed_forces(self) -> tuple[LocatedForce, ...]:
@@ -544,11 +627,23 @@ class Body(Discretisation):
         for force in self.forces:
             columns = first + np.arange(len(force.constants))
             first += len(columns)
-            nodes = np.arange(len(self.nodes_m)) if force.nodes is None else force.nodes
-            nodes = self.select(nodes) if isinstance(nodes, Selection) else np.unique(nodes)
+            nodes = (
+                np.arange(len(self.nodes_m))
+                if force.nodes is None
+                else force.nodes
+            )
+            nodes = (
+                self.select(nodes)
+                if isinstance(nodes, Selection)
+                else np.unique(nodes)
+            )
             placed.append(
                 LocatedForce.on_mesh(
-                    force, self.nodes, chosen=nodes, volume_m3=volume, columns=columns
+                    force,
+                    self.nodes,
+                    chosen=nodes,
+                    volume_m3=volume,
+                    columns=columns,
                 )
             )
         return tuple(placed)
@@ -568,7 +663,9 @@ class Body(Discretisation):
         """Lumped mass (3n,) of every degree of freedom with the stated densities [kg]."""
         return np.repeat(self.node_mass, 3)
 
-    def joint_pattern_with(self, couplings: Sequence[SymmetricPattern]) -> JointPattern:
+    def joint_pattern_with(
+        self, couplings: Sequence[SymmetricPattern]
+    ) -> JointPattern:
         """Return the union of the mesh graph, other couplings and the couplings of custom
         forces.
         """
@@ -589,7 +686,9 @@ class Body(Discretisation):
             If an elastic constant is missing or unknown, or there are several states.
         """
         x = self._state(positions)
-        return float(self._evaluate("energy", [x], self.elastic_theta(constants))[0, 0])
+        return float(
+            self._evaluate("energy", [x], self.elastic_theta(constants))[0, 0]
+        )
 
     def elastic_force(self, positions: ArrayLike, **constants: float) -> Array:
         """Return the elastic force −∂Ψ/∂x, (n, 3) [N], at (n, 3) node positions [m].
@@ -597,17 +696,23 @@ class Body(Discretisation):
         See `energy` for the constants.
         """
         x = self._state(positions)
-        force = self._evaluate("force", [x, np.zeros_like(x)], self.elastic_theta(constants))
+        force = self._evaluate(
+            "force", [x, np.zeros_like(x)], self.elastic_theta(constants)
+        )
         return force.reshape(-1, 3)
 
-    def stiffness(self, positions: ArrayLike, **constants: float) -> sp.csc_array:
+    def stiffness(
+        self, positions: ArrayLike, **constants: float
+    ) -> sp.csc_array:
         """Return the stiffness K = ∂²Ψ/∂x², sparse (3n, 3n) [N/m], at (n, 3) node positions [m].
 
         Row 3i + j is coordinate j of node i. See `energy` for the constants.
         """
         x = self._state(positions)
         theta = self.elastic_theta(constants)
-        return self.pattern.matrix(-self.linearise(x, np.zeros_like(x), theta).by_position[0])
+        return self.pattern.matrix(
+            -self.linearise(x, np.zeros_like(x), theta).by_position[0]
+        )
 
     # Many states ----------------------------------------------------------------------------
 
@@ -633,7 +738,9 @@ class Body(Discretisation):
             Internal variables of a body with memory; zero overstress by default.
         """
         x, v = self._states(positions, velocities)
-        internal = self._evaluate("force", [x, v], theta, memory_input=memory_input)
+        internal = self._evaluate(
+            "force", [x, v], theta, memory_input=memory_input
+        )
         return internal - self._damping_coefficients(theta, tied_kg) * v
 
     def linearise(
@@ -671,7 +778,8 @@ class Body(Discretisation):
         ends = list(accumulate([0, size, entries, entries, width]))
         end = self._width_without_fields("linearisation")
         force, by_position, by_velocity, by_theta, skew = (
-            rows[:, start:stop] for start, stop in zip(ends, [*ends[1:], end], strict=True)
+            rows[:, start:stop]
+            for start, stop in zip(ends, [*ends[1:], end], strict=True)
         )
         drag = self._damping_coefficients(theta, tied_kg)
         force -= drag * v
@@ -681,7 +789,9 @@ class Body(Discretisation):
             columns = self.field_slices[number]
             spread = self.field_assemblies[number]
             slopes = spread.field.jacobian(np.asarray(theta)[columns])
-            spread.assemble_nodal(outputs["by_theta"], slopes, by_theta[:, :, columns])
+            spread.assemble_nodal(
+                outputs["by_theta"], slopes, by_theta[:, :, columns]
+            )
         for column, slope in self._damping_derivatives(theta, tied_kg):
             # A density also changes the stress-free shape of a mesh made under gravity.
             by_theta[:, :, column] += -slope * v
@@ -695,7 +805,9 @@ class Body(Discretisation):
             by_velocity_skew=skew[:, :0],
         )
 
-    def _field_outputs(self, name: str, rows: Array) -> Iterator[tuple[int, dict[str, Array]]]:
+    def _field_outputs(
+        self, name: str, rows: Array
+    ) -> Iterator[tuple[int, dict[str, Array]]]:
         """Yield the index of each part with a field, and the outputs by the logarithm of each cell.
 
         Parameters
@@ -707,7 +819,14 @@ class Body(Discretisation):
         """
         places = self.field_output_slices(name)
         for number in self.field_assemblies:
-            yield number, {out: rows[:, at] for (of, out), at in places.items() if of == number}
+            yield (
+                number,
+                {
+                    out: rows[:, at]
+                    for (of, out), at in places.items()
+                    if of == number
+                },
+            )
 
     def _apply_stiffening_chain_rule(
         self, by_theta: Array, memory_input: MemoryInput | None
@@ -733,9 +852,16 @@ class Body(Discretisation):
     @cached_property
     def _memory_columns(self) -> list[tuple[int, slice]]:
         """Index in θ of each part's first branch constant, and the slice of all of them."""
-        firsts = [s + p.law_constant_count for p, s in zip(self.parts, self.starts, strict=False)]
+        firsts = [
+            s + p.law_constant_count
+            for p, s in zip(self.parts, self.starts, strict=False)
+        ]
         counts = [2 * len(part.prony) for part in self.parts]
-        return [(f, slice(f, f + n)) for f, n in zip(firsts, counts, strict=True) if n]
+        return [
+            (f, slice(f, f + n))
+            for f, n in zip(firsts, counts, strict=True)
+            if n
+        ]
 
     def second_derivatives(
         self,
@@ -773,7 +899,8 @@ class Body(Discretisation):
                 stress_weights = np.zeros_like(memory_input.overstress)
             # The kernel reads H and σ as one row.
             past = replace(
-                memory_input, overstress=np.hstack([memory_input.overstress, stress_weights])
+                memory_input,
+                overstress=np.hstack([memory_input.overstress, stress_weights]),
             )
             rows = self._evaluate("curvature", [x, v, w], theta, out, past)
         else:
@@ -786,7 +913,9 @@ class Body(Discretisation):
             np.cumsum([entries, entries, k * size, k * size, k * k, k]),
             axis=1,
         )
-        x_theta, v_theta = (part.reshape(len(x), size, k) for part in (x_theta, v_theta))
+        x_theta, v_theta = (
+            part.reshape(len(x), size, k) for part in (x_theta, v_theta)
+        )
         for column, slope in self._damping_derivatives(theta, tied_kg):
             drag = -slope * w
             v_theta[:, :, column] += drag
@@ -797,31 +926,56 @@ class Body(Discretisation):
             spread = self.field_assemblies[number]
             coefficients = np.asarray(theta)[field_columns]
             slopes = spread.field.jacobian(coefficients)
-            spread.assemble_nodal(outputs["position_theta"], slopes, x_theta[:, :, field_columns])
-            spread.assemble_nodal(outputs["velocity_theta"], slopes, v_theta[:, :, field_columns])
+            spread.assemble_nodal(
+                outputs["position_theta"], slopes, x_theta[:, :, field_columns]
+            )
+            spread.assemble_nodal(
+                outputs["velocity_theta"], slopes, v_theta[:, :, field_columns]
+            )
             by_theta[:, field_columns] = outputs["gradient_theta"] @ slopes
             first = self.starts[number]
             points = self.parts[number].point_constant_count
-            second_by_theta = outputs["theta_theta"].reshape(len(x), len(slopes), -1)
-            mixed = np.einsum("tek,em->tkm", second_by_theta[:, :, :points], slopes)
+            second_by_theta = outputs["theta_theta"].reshape(
+                len(x), len(slopes), -1
+            )
+            mixed = np.einsum(
+                "tek,em->tkm", second_by_theta[:, :, :points], slopes
+            )
             theta_theta[:, first : first + points, field_columns] = mixed
-            theta_theta[:, field_columns, first : first + points] = mixed.swapaxes(1, 2)
+            theta_theta[:, field_columns, first : first + points] = (
+                mixed.swapaxes(1, 2)
+            )
             weighted_slopes = second_by_theta[:, :, points, None] * slopes
-            by_coefficients = spread.field.weighted_hessian(coefficients, outputs["gradient_theta"])
+            by_coefficients = spread.field.weighted_hessian(
+                coefficients, outputs["gradient_theta"]
+            )
             theta_theta[:, field_columns, field_columns] = (
                 slopes.T @ weighted_slopes + by_coefficients
             )
-        for values in (x_theta, v_theta, theta_theta, theta_theta.swapaxes(1, 2)):
+        for values in (
+            x_theta,
+            v_theta,
+            theta_theta,
+            theta_theta.swapaxes(1, 2),
+        ):
             self._apply_stiffening_chain_rule(values, memory_input)
         if memory_input is not None:
             for first, columns in self._memory_columns:
-                bends = memory_input.stiffening_second_derivatives[:, columns, columns]
-                theta_theta[:, columns, columns] += by_theta[:, first, None, None] * bends
+                bends = memory_input.stiffening_second_derivatives[
+                    :, columns, columns
+                ]
+                theta_theta[:, columns, columns] += (
+                    by_theta[:, first, None, None] * bends
+                )
         self._apply_stiffening_chain_rule(by_theta[:, None], memory_input)
-        for gamma, mass_slopes in zip(self._gamma_m_indices, self._mass_slopes, strict=True):
+        for gamma, mass_slopes in zip(
+            self._gamma_m_indices, self._mass_slopes, strict=True
+        ):
             for place, slope in mass_slopes.items():
                 mixed = -np.einsum("ti,ti,i->t", w, v, slope)
-                theta_theta[:, place, gamma] = theta_theta[:, gamma, place] = mixed
+                theta_theta[:, place, gamma] = theta_theta[:, gamma, place] = (
+                    mixed
+                )
         empty = np.zeros((len(x), 0))
         return SecondDerivatives(
             xx,
@@ -847,9 +1001,13 @@ class Body(Discretisation):
 
     def tied_damping_rate(self, theta: Theta) -> Array:
         """Return the mass-proportional damping rate γ_m (3n,) of tied masses at every dof [1/s]."""
-        return np.sum([theta[k] * share for k, share in self.tied_shares.items()], axis=0)
+        return np.sum(
+            [theta[k] * share for k, share in self.tied_shares.items()], axis=0
+        )
 
-    def _damped_masses(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
+    def _damped_masses(
+        self, theta: Theta, tied_kg: Array | None
+    ) -> Iterator[tuple[int, Array]]:
         """Yield for each part the index in θ of its γ_m, and the mass (3n,) or (T, 3n) [kg] damped
         by it.
 
@@ -866,15 +1024,27 @@ class Body(Discretisation):
     def _tied_shares(self) -> list[Array]:
         """Fraction (3n,) of each part in the stated mass at every dof."""
         parts = zip(self.parts, self._lumped_m3, strict=True)
-        total_kg = np.where(self.dof_mass == 0, 1.0, self.dof_mass)  # frames have none
-        return [part.density_kg_m3 * volume / total_kg for part, volume in parts]
+        total_kg = np.where(
+            self.dof_mass == 0, 1.0, self.dof_mass
+        )  # frames have none
+        return [
+            part.density_kg_m3 * volume / total_kg for part, volume in parts
+        ]
 
-    def _damping_coefficients(self, theta: Theta, tied_kg: Array | None) -> Array:
+    def _damping_coefficients(
+        self, theta: Theta, tied_kg: Array | None
+    ) -> Array:
         """Return the coefficients Σ γ_m M (3n,) or (T, 3n) of mass-proportional damping [N·s/m];
         see `_damped_masses` for the tied masses.
         """
         # `numpy.sum` of a list takes longer than the products.
-        return reduce(np.add, (theta[k] * mass for k, mass in self._damped_masses(theta, tied_kg)))
+        return reduce(
+            np.add,
+            (
+                theta[k] * mass
+                for k, mass in self._damped_masses(theta, tied_kg)
+            ),
+        )
 
     def _damping_derivatives(
         self, theta: Theta, tied_kg: Array | None
@@ -883,5 +1053,9 @@ class Body(Discretisation):
         a density; an index can occur more than once, then derivatives add up.
         """
         yield from self._damped_masses(theta, tied_kg)
-        for gamma, own in zip(self._gamma_m_indices, self._mass_slopes, strict=True):
-            yield from ((place, theta[gamma] * slope) for place, slope in own.items())
+        for gamma, own in zip(
+            self._gamma_m_indices, self._mass_slopes, strict=True
+        ):
+            yield from (
+                (place, theta[gamma] * slope) for place, slope in own.items()
+            )

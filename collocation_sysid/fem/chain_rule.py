@@ -48,15 +48,26 @@ class SymbolicFunction:
         """Return the indices of the partial derivatives that occur in expressions."""
         if not self.symbols:
             return []
-        occurring = {each.__hash__() for each in ca.symvar(ca.veccat(*expressions))}
-        return [key for key, each in self.symbols.items() if each.__hash__() in occurring]
+        occurring = {
+            each.__hash__() for each in ca.symvar(ca.veccat(*expressions))
+        }
+        return [
+            key
+            for key, each in self.symbols.items()
+            if each.__hash__() in occurring
+        ]
 
-    def shifted(self, indices: Sequence[PartialIndex], arguments: Sequence[int]) -> ca.SX:
+    def shifted(
+        self, indices: Sequence[PartialIndex], arguments: Sequence[int]
+    ) -> ca.SX:
         """Return the symbols (k, a) of the derivatives of k partial derivatives by a of the
         arguments, which are given by index.
         """
         return ca.vertcat(
-            *(ca.horzcat(*(self.symbol((*index, a)) for a in arguments)) for index in indices)
+            *(
+                ca.horzcat(*(self.symbol((*index, a)) for a in arguments))
+                for index in indices
+            )
         )
 
 
@@ -84,9 +95,9 @@ class ChainRule:
             arguments = sorted(set(slopes.sparsity().row()))
             if indices and arguments:
                 symbols = ca.vertcat(*map(function.symbol, indices))
-                by_argument = ca.jacobian(expression, symbols) @ function.shifted(
-                    indices, arguments
-                )
+                by_argument = ca.jacobian(
+                    expression, symbols
+                ) @ function.shifted(indices, arguments)
                 total += by_argument @ slopes[arguments, :]
         return total
 
@@ -96,7 +107,9 @@ class ChainRule:
             return ca.gradient(scalar, by)
         return ca.densify(self.jacobian(scalar, by)).T
 
-    def directional_derivative(self, expression: ca.SX, by: ca.SX, direction: ca.SX) -> ca.SX:
+    def directional_derivative(
+        self, expression: ca.SX, by: ca.SX, direction: ca.SX
+    ) -> ca.SX:
         """Return the total derivative (m,) of an expression (m,) by symbols (k,) along a direction
         (k,), including the dependence through functions that occur in the expression as symbols.
         """
@@ -114,8 +127,13 @@ class ChainRule:
         functions.
         """
         symbols = [function.symbol() for function in self.functions]
-        rates = [self._rates(function, [()], by, direction) for function in self.functions]
-        return ca.vertcat(ca.SX(0, 1), *symbols), ca.vertcat(ca.SX(0, 1), *rates)
+        rates = [
+            self._rates(function, [()], by, direction)
+            for function in self.functions
+        ]
+        return ca.vertcat(ca.SX(0, 1), *symbols), ca.vertcat(
+            ca.SX(0, 1), *rates
+        )
 
     def _rates(
         self,

@@ -75,16 +75,34 @@ LAMBDA = Constant("lambda_pa", "λ", "first Lamé parameter", STIFFNESS)
 MU = Constant("mu_pa", "μ", "shear modulus", STIFFNESS)
 KAPPA = Constant("kappa_pa", "κ", "bulk modulus", (1.0, 1e10))
 YOUNG = Constant("young_pa", "E", "Young's modulus", STIFFNESS)
-POISSON = Constant("poisson", "ν", "Poisson's ratio", (1e-3, 0.495), "linear", 0.1, 0.3, 0.5)
-GAMMA_R = Constant("gamma_r_s", "γ_r", "stiffness-proportional damping", (1e-7, 10.0), usual=3e-3)
-GAMMA_M = Constant("gamma_m_1_s", "γ_m", "mass-proportional damping", (1e-4, 1e4), usual=0.3)
-C10 = Constant("c10_pa", "C₁₀", "half the shear modulus, or a part of it", STIFFNESS)
+POISSON = Constant(
+    "poisson", "ν", "Poisson's ratio", (1e-3, 0.495), "linear", 0.1, 0.3, 0.5
+)
+GAMMA_R = Constant(
+    "gamma_r_s",
+    "γ_r",
+    "stiffness-proportional damping",
+    (1e-7, 10.0),
+    usual=3e-3,
+)
+GAMMA_M = Constant(
+    "gamma_m_1_s", "γ_m", "mass-proportional damping", (1e-4, 1e4), usual=0.3
+)
+C10 = Constant(
+    "c10_pa", "C₁₀", "half the shear modulus, or a part of it", STIFFNESS
+)
 C01 = Constant("c01_pa", "C₀₁", "factor of the second invariant", STIFFNESS)
 C20 = Constant("c20_pa", "C₂₀", "factor of (Ī₁ − 3)²", (-1e9, 1e9), "linear")
 C30 = Constant("c30_pa", "C₃₀", "factor of (Ī₁ − 3)³", (-1e9, 1e9), "linear")
-GENT_LIMIT = Constant("gent_limit", "J_m", "largest Ī₁ − 3", (1e-2, 1e4), usual=50.0)
+GENT_LIMIT = Constant(
+    "gent_limit", "J_m", "largest Ī₁ − 3", (1e-2, 1e4), usual=50.0
+)
 CHAIN_STRETCH = Constant(
-    "chain_stretch", "λ_m", "stretch at which the chains lock", (1.01, 100.0), usual=5.0
+    "chain_stretch",
+    "λ_m",
+    "stretch at which the chains lock",
+    (1.01, 100.0),
+    usual=5.0,
 )
 # Most terms of a law in powers of the stretches, see `ogden`.
 MOST_TERMS = 4
@@ -94,9 +112,17 @@ _SUBSCRIPTS = "₁₂₃₄"
 # The first term gives the scale of the stiffness and is positive. Those after it may be negative,
 # as in Ogden's own constants of rubber.
 MU_TERMS = (
-    Constant("mu_1_pa", "μ₁", "factor of the first power of the stretches", STIFFNESS),
+    Constant(
+        "mu_1_pa", "μ₁", "factor of the first power of the stretches", STIFFNESS
+    ),
     *(
-        Constant(f"mu_{p}_pa", f"μ{_SUBSCRIPTS[p - 1]}", "factor of a power", (-1e9, 1e9), "linear")
+        Constant(
+            f"mu_{p}_pa",
+            f"μ{_SUBSCRIPTS[p - 1]}",
+            "factor of a power",
+            (-1e9, 1e9),
+            "linear",
+        )
         for p in range(2, MOST_TERMS + 1)
     ),
 )
@@ -145,16 +171,31 @@ DENSITY = Constant("density_kg_m3", "ρ", "density", (1.0, 1e5))
 MASS = Constant("mass_kg", "m", "mass of the whole body", (1e-6, 1e3))
 # Friction coefficient of an obstacle, preceded by the obstacle's name: ``table_friction``.
 FRICTION = Constant(
-    "friction", "friction", "coefficient of friction", (0.0, 2.0), "linear", 0.1, 0.3, at_least=0.0
+    "friction",
+    "friction",
+    "coefficient of friction",
+    (0.0, 2.0),
+    "linear",
+    0.1,
+    0.3,
+    at_least=0.0,
 )
 # Coefficient of a shape of a field, see `spatial_field`; names are field_1, field_2, ….
-MODE = Constant("field", "", "coefficient of a shape", (-1e3, 1e3), "linear", 1.0, 0.0)
+MODE = Constant(
+    "field", "", "coefficient of a shape", (-1e3, 1e3), "linear", 1.0, 0.0
+)
 # Contrast of a field with prior "two-phase", see `two_phase`; 1 in a body of one material.
 CONTRAST = Constant(
-    "contrast", "contrast", "ratio of inclusion to surroundings", (0.02, 50.0), usual=1.0
+    "contrast",
+    "contrast",
+    "ratio of inclusion to surroundings",
+    (0.02, 50.0),
+    usual=1.0,
 )
 INSTANTANEOUS = Constant(
-    "instantaneous_young_pa", "E₀", "instantaneous Young's modulus, before relaxation"
+    "instantaneous_young_pa",
+    "E₀",
+    "instantaneous Young's modulus, before relaxation",
 )
 
 # The constants that have a symbol, by name: what tables and pictures look up.
@@ -195,7 +236,9 @@ def without_region(name: str) -> str:
 
 def unit_of(name: str) -> str:
     """Return the unit with which a name ends, or "" if it has none."""
-    return next((unit for ending, unit in _UNITS.items() if name.endswith(ending)), "")
+    return next(
+        (unit for ending, unit in _UNITS.items() if name.endswith(ending)), ""
+    )
 
 
 def symbol_of(name: str) -> str:
@@ -204,7 +247,9 @@ def symbol_of(name: str) -> str:
     """
     region, _, name_in_region = name.rpartition(".")
     symbol = (
-        KNOWN[name_in_region].symbol if name_in_region in KNOWN else without_unit(name_in_region)
+        KNOWN[name_in_region].symbol
+        if name_in_region in KNOWN
+        else without_unit(name_in_region)
     )
     return f"{symbol} {region}".strip()
 
@@ -218,7 +263,9 @@ def constant_named(name: str) -> Constant:
     """Return the known constant of this name, or one with default properties if it is unknown."""
     bare_name = without_region(name)
     if bare_name not in KNOWN and bare_name.endswith(f"_{FRICTION.name}"):
-        return replace(FRICTION, name=bare_name, symbol=bare_name.replace("_", " "))
+        return replace(
+            FRICTION, name=bare_name, symbol=bare_name.replace("_", " ")
+        )
     return (
         replace(MODE, name=bare_name)
         if is_field_coefficient(bare_name)
@@ -252,7 +299,9 @@ def is_damping(name: str) -> bool:
     return without_region(name) in (GAMMA_R.name, GAMMA_M.name)
 
 
-def usual_value(name: str, young_pa: float, poisson: float = 0.3) -> float | None:
+def usual_value(
+    name: str, young_pa: float, poisson: float = 0.3
+) -> float | None:
     """Return a plausible value of a constant in a material of given stiffness; None if unknown.
 
     A modulus that is not known by name gets the size of the shear modulus.
@@ -274,11 +323,16 @@ def usual_value(name: str, young_pa: float, poisson: float = 0.3) -> float | Non
         "c01_pa": 0.1,
         "c20_pa": 0.0,
         "c30_pa": 0.0,
-        **{term.name: share for term, share in zip(MU_TERMS, USUAL_SHARES, strict=True)},
+        **{
+            term.name: share
+            for term, share in zip(MU_TERMS, USUAL_SHARES, strict=True)
+        },
     }
     return shear * shares.get(without_region(name), 1.0)
 
 
 def without_unit(name: str) -> str:
     """Return a name without the unit with which it ends."""
-    return next((name.removesuffix(e) for e in _UNITS if name.endswith(e)), name)
+    return next(
+        (name.removesuffix(e) for e in _UNITS if name.endswith(e)), name
+    )

@@ -60,7 +60,9 @@ class ContactSurface:
     faces: Index
 
     @classmethod
-    def from_body(cls, body: Body, frame: Index, chosen: Selection | None) -> ContactSurface:
+    def from_body(
+        cls, body: Body, frame: Index, chosen: Selection | None
+    ) -> ContactSurface:
         """Return the contact points of a body and the frame of an obstacle.
 
         Parameters
@@ -88,10 +90,13 @@ class ContactSurface:
         mix[:, 1:, faces.shape[1] + 1 :] = np.eye(3)
         mix[:, :, faces.shape[1]] = -1
         points = ForcePoints(
-            np.repeat(nodes, count, axis=0), np.tile(mix, (len(faces), 1, 1)), len(body.nodes_m)
+            np.repeat(nodes, count, axis=0),
+            np.tile(mix, (len(faces), 1, 1)),
+            len(body.nodes_m),
         )
         in_part = [
-            np.isin(triangles, body.mesh.tetrahedra[p.cells]).all(axis=1) for p in body.parts
+            np.isin(triangles, body.mesh.tetrahedra[p.cells]).all(axis=1)
+            for p in body.parts
         ]
         part = int(np.argmax([area[each].sum() for each in in_part]))
         edges_m = np.linalg.norm(sides, axis=2).mean(axis=1)
@@ -123,5 +128,9 @@ def face_shape_functions(places: Array, nodes: int) -> tuple[Array, Array]:
         return places, unit
     next_places = np.roll(places, -1, axis=1)
     weights = np.hstack([places * (2 * places - 1), 4 * places * next_places])
-    side_slopes = next_places[:, :, None] * unit + places[:, :, None] * np.roll(unit, 1, axis=2)
-    return weights, np.hstack([(4 * places - 1)[:, :, None] * unit, 4 * side_slopes])
+    side_slopes = next_places[:, :, None] * unit + places[:, :, None] * np.roll(
+        unit, 1, axis=2
+    )
+    return weights, np.hstack(
+        [(4 * places - 1)[:, :, None] * unit, 4 * side_slopes]
+    )

@@ -19,11 +19,22 @@ from ..array_types import Array, Index
 from ..errors import InputError
 from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS, PointLaw, energy_kernel
-from .kernels import COMPILING, Evaluator, EvaluatorChoice, KernelBatch, available_threads
+from .kernels import (
+    COMPILING,
+    Evaluator,
+    EvaluatorChoice,
+    KernelBatch,
+    available_threads,
+)
 from .memory import MemoryInput, MemoryLayout
 from .mesh import ElementNodes, TetMesh
 from .node_force import NodeForce
-from .pattern import SymmetricPattern, dofs_of, element_destinations, with_ascending_nodes
+from .pattern import (
+    SymmetricPattern,
+    dofs_of,
+    element_destinations,
+    with_ascending_nodes,
+)
 from .regions import BodyPart, ConstantsModel, Theta
 from .rest_shape import InverseEquilibrium
 from .selection import Selection
@@ -32,7 +43,12 @@ from .spatial_field import FieldAssembly
 # Outputs with columns for θ; a field adds derivatives by the logarithm of each cell.
 BY_FIELD = {
     "linearisation": ("by_theta",),
-    "curvature": ("position_theta", "velocity_theta", "theta_theta", "gradient_theta"),
+    "curvature": (
+        "position_theta",
+        "velocity_theta",
+        "theta_theta",
+        "gradient_theta",
+    ),
 }
 
 
@@ -84,12 +100,16 @@ class Discretisation(ConstantsModel):
         self._framed: dict[tuple[Any, ...], Any] = {}
         self.cells: Index = self.nodes.cells
         self.threads = threads or available_threads()
-        self.geometry = reference_geometry(self.nodes_m, self.cells, self.element)
+        self.geometry = reference_geometry(
+            self.nodes_m, self.cells, self.element
+        )
         self._evaluators: dict[str, list[Evaluator]] = {}
         self._choice = EvaluatorChoice(evaluator)
         # Derivatives need no operations but those of the energy and the ones every evaluator has.
         for number in range(len(self.parts)):
-            self._choice.check(energy_kernel(self.element, self.law(number)).pieces)
+            self._choice.check(
+                energy_kernel(self.element, self.law(number)).pieces
+            )
 
     def select(self, selection: Selection) -> Index:
         """Return the nodes of a `selection.Selection`, sorted.
@@ -138,9 +158,17 @@ class Discretisation(ConstantsModel):
         """
         part = self.parts[number]
         scaled = part.field.scaled_indices if part.field else ()
-        rest = self.inverse_equilibrium.layout if self.inverse_equilibrium else None
+        rest = (
+            self.inverse_equilibrium.layout
+            if self.inverse_equilibrium
+            else None
+        )
         return PointLaw(
-            part.material, part.damping, has_memory=memory, scaled_indices=scaled, rest=rest
+            part.material,
+            part.damping,
+            has_memory=memory,
+            scaled_indices=scaled,
+            rest=rest,
         )
 
     @cached_property
@@ -154,11 +182,13 @@ class Discretisation(ConstantsModel):
         For a stress-free shape that is not the mesh, changes of its inputs follow; they are zero,
         because the shape has been computed at this θ.
         """
-        part_constants = np.asarray(self.split_theta(theta)[number], dtype=float)[
-            : self.parts[number].point_constant_count
-        ]
+        part_constants = np.asarray(
+            self.split_theta(theta)[number], dtype=float
+        )[: self.parts[number].point_constant_count]
         changes = np.zeros(
-            self.inverse_equilibrium.layout.input_count if self.inverse_equilibrium else 0
+            self.inverse_equilibrium.layout.input_count
+            if self.inverse_equilibrium
+            else 0
         )
         return np.concatenate([part_constants, changes])
 
@@ -186,15 +216,22 @@ class Discretisation(ConstantsModel):
             Whether to include second derivatives of the stress-free shape.
         """
         if self.inverse_equilibrium is not None:
-            return self.inverse_equilibrium.point_data(theta, with_second_derivatives)[number]
+            return self.inverse_equilibrium.point_data(
+                theta, with_second_derivatives
+            )[number]
         field = self.parts[number].stress_field
         if field is None:
             return internal_variables
-        logs = field.logarithms(np.asarray(theta)[self.field_slices[number]])[None]
+        logs = field.logarithms(np.asarray(theta)[self.field_slices[number]])[
+            None
+        ]
         if internal_variables is None:
             return logs
         return np.hstack(
-            [internal_variables, np.broadcast_to(logs, (len(internal_variables), logs.shape[1]))]
+            [
+                internal_variables,
+                np.broadcast_to(logs, (len(internal_variables), logs.shape[1])),
+            ]
         )
 
     @cached_property
@@ -256,9 +293,15 @@ class Discretisation(ConstantsModel):
     def memory(self) -> MemoryLayout:
         """Layout of the internal variables of the parts with memory."""
         first_indices = [
-            s + p.law_constant_count for p, s in zip(self.parts, self.starts, strict=False)
+            s + p.law_constant_count
+            for p, s in zip(self.parts, self.starts, strict=False)
         ]
-        return MemoryLayout(self.parts, first_indices, self.geometry.shape[1], len(self.constants))
+        return MemoryLayout(
+            self.parts,
+            first_indices,
+            self.geometry.shape[1],
+            len(self.constants),
+        )
 
     @cached_property
     def is_unsymmetric(self) -> bool:
@@ -269,7 +312,9 @@ class Discretisation(ConstantsModel):
         return (
             laws
             or self.has_skew_contact
-            or any(f.has_skew_stiffness or f.has_skew_damping for f in self.forces)
+            or any(
+                f.has_skew_stiffness or f.has_skew_damping for f in self.forces
+            )
         )
 
     @cached_property
@@ -298,7 +343,9 @@ class Discretisation(ConstantsModel):
         count, points = self.geometry.shape[:2]
         x = self._states(positions)[0].reshape(-1, nodes, 3)
         by_node = np.ascontiguousarray(x.transpose(1, 2, 0)).reshape(nodes, -1)
-        slopes = (self.shape_gradients @ by_node).reshape(3, count * points, 3, len(x))
+        slopes = (self.shape_gradients @ by_node).reshape(
+            3, count * points, 3, len(x)
+        )
         a, b, c = slopes.transpose(0, 2, 1, 3)
         ratios = (
             a[0] * (b[1] * c[2] - b[2] * c[1])
@@ -311,12 +358,16 @@ class Discretisation(ConstantsModel):
     def shape_gradients(self) -> sp.csr_array:
         """Derivatives of the shape functions (3 E q, n), axis by axis at all quadrature points."""
         count, points = self.geometry.shape[:2]
-        gradients = self.geometry[..., :-1].reshape(count, points, self.element.nodes, 3)
+        gradients = self.geometry[..., :-1].reshape(
+            count, points, self.element.nodes, 3
+        )
         values = np.moveaxis(gradients, 3, 0)
         columns = np.broadcast_to(self.cells[:, None], values.shape)
         starts = np.arange(0, values.size + 1, self.element.nodes)
         shape = (3 * count * points, len(self.nodes_m))
-        return sp.csr_array((values.ravel(), columns.ravel(), starts), shape=shape)
+        return sp.csr_array(
+            (values.ravel(), columns.ravel(), starts), shape=shape
+        )
 
     # Assembly -------------------------------------------------------------------------------
 
@@ -385,25 +436,42 @@ class Discretisation(ConstantsModel):
         with COMPILING:
             if name not in self._evaluators:
                 batches = [self._batch(name, k) for k in range(len(self.parts))]
-                self._evaluators[name] = [self.make_evaluator(batch) for batch in batches]
+                self._evaluators[name] = [
+                    self.make_evaluator(batch) for batch in batches
+                ]
         width = self._width(name)
         shape = (len(fields[0]), width)
         if out is None:
             out = np.empty(shape)
-        elif out.shape != shape or out.dtype != float or not out.flags.c_contiguous:
-            raise InputError(f"out is {out.dtype} {out.shape}; expected contiguous float64 {shape}")
+        elif (
+            out.shape != shape
+            or out.dtype != float
+            or not out.flags.c_contiguous
+        ):
+            raise InputError(
+                f"out is {out.dtype} {out.shape}; expected contiguous float64 {shape}"
+            )
         theta = np.asarray(theta, dtype=float)
         for k, evaluate in enumerate(self._evaluators[name]):
             values = self.point_constants(k, theta)
             if not self.parts[k].prony or name == "energy":
-                point_data = self.point_data(k, theta, with_second_derivatives=name == "curvature")
+                point_data = self.point_data(
+                    k, theta, with_second_derivatives=name == "curvature"
+                )
                 evaluate(fields, values, out, self.threads, k > 0, point_data)
                 continue
             past = memory_input or self.memory.relaxed(len(out))
             for rows, values[-1] in past.equal_stiffening_rows(k):
                 row_fields = [field[rows] for field in fields]
                 point_data = self.point_data(k, theta, past.overstress[rows])
-                evaluate(row_fields, values, out[rows], self.threads, k > 0, point_data)
+                evaluate(
+                    row_fields,
+                    values,
+                    out[rows],
+                    self.threads,
+                    k > 0,
+                    point_data,
+                )
         return out
 
     def _width(self, name: str) -> int:
@@ -441,7 +509,9 @@ class Discretisation(ConstantsModel):
         if self.inverse_equilibrium is not None:
             # The inputs of the stress-free shape are entries of θ.
             columns = np.concatenate([columns, self.inverse_equilibrium.places])
-        by_theta = (columns[:, None] + total * vector[:, None, :]).reshape(count, -1)
+        by_theta = (columns[:, None] + total * vector[:, None, :]).reshape(
+            count, -1
+        )
         square = (columns[:, None] + total * columns).ravel()
         first_entry = np.zeros((count, 1), dtype=np.int64)
         places = {
@@ -454,8 +524,14 @@ class Discretisation(ConstantsModel):
             "position_velocity": (lower, self.pattern.entry_count),
             "position_theta": (by_theta, total * self.pattern.size),
             "velocity_theta": (by_theta, total * self.pattern.size),
-            "theta_theta": (np.broadcast_to(square, (count, len(square))), total**2),
-            "gradient_theta": (np.broadcast_to(columns, (count, len(columns))), total),
+            "theta_theta": (
+                np.broadcast_to(square, (count, len(square))),
+                total**2,
+            ),
+            "gradient_theta": (
+                np.broadcast_to(columns, (count, len(columns))),
+                total,
+            ),
             "by_position_skew": (lower, self.pattern.entry_count),
             "position_velocity_skew": (lower, self.pattern.entry_count),
         }
@@ -463,41 +539,61 @@ class Discretisation(ConstantsModel):
         starts = np.cumsum([0] + [length for _, length in used.values()])
         positions = {
             output: place + start
-            for (output, (place, _)), start in zip(used.items(), starts, strict=False)
+            for (output, (place, _)), start in zip(
+                used.items(), starts, strict=False
+            )
         }
-        for (part_index, output), field_slice in self.field_output_slices(name).items():
+        for (part_index, output), field_slice in self.field_output_slices(
+            name
+        ).items():
             if part_index == number:
-                field_positions = np.arange(field_slice.start, field_slice.stop).reshape(count, -1)
+                field_positions = np.arange(
+                    field_slice.start, field_slice.stop
+                ).reshape(count, -1)
                 positions[output] = _with_field_columns(
-                    positions[output], field_positions, output, part.point_constant_count
+                    positions[output],
+                    field_positions,
+                    output,
+                    part.point_constant_count,
                 )
         destinations = np.hstack(list(positions.values()))
-        internal_columns = np.zeros((count, geometry.shape[1], 0), dtype=np.int64)
+        internal_columns = np.zeros(
+            (count, geometry.shape[1], 0), dtype=np.int64
+        )
         width = 0
         if memory:
             places_of = self.memory.part_columns(number)
             width = self.memory.width
             sets = 2 if name == "curvature" else 1
-            internal_columns = np.concatenate([places_of + k * width for k in range(sets)], axis=-1)
+            internal_columns = np.concatenate(
+                [places_of + k * width for k in range(sets)], axis=-1
+            )
             width *= sets
         if part.stress_field is not None:
             logs = np.broadcast_to(
-                width + np.arange(count)[:, None, None], (*internal_columns.shape[:2], 1)
+                width + np.arange(count)[:, None, None],
+                (*internal_columns.shape[:2], 1),
             )
             internal_columns = np.concatenate([internal_columns, logs], axis=-1)
         if self.inverse_equilibrium is not None:
-            internal_columns = self.inverse_equilibrium.point_data_columns(number)
+            internal_columns = self.inverse_equilibrium.point_data_columns(
+                number
+            )
         return KernelBatch(
             kernel,
             cells,
             geometry=geometry,
             destinations=destinations,
             width=self._width(name),
-            data_columns=internal_columns if internal_columns.shape[-1] else None,
+            data_columns=internal_columns
+            if internal_columns.shape[-1]
+            else None,
         )
 
 
-def _with_field_columns(places: Index, own: Index, output: str, constants: int) -> Index:
+def _with_field_columns(
+    places: Index, own: Index, output: str, constants: int
+) -> Index:
     """Return the positions (E, …) of derivatives by θ and by the logarithm of each cell.
 
     Parameters

@@ -143,11 +143,15 @@ def element_named(name: str) -> Element:
         If there is no such element.
     """
     if name not in ELEMENTS:
-        raise InputError(f"no element {name!r}; available: {', '.join(ELEMENTS)}")
+        raise InputError(
+            f"no element {name!r}; available: {', '.join(ELEMENTS)}"
+        )
     return ELEMENTS[name]
 
 
-def reference_geometry(points_m: Array, cells: NDArray[np.int64], element: Element) -> Array:
+def reference_geometry(
+    points_m: Array, cells: NDArray[np.int64], element: Element
+) -> Array:
     """Return shape gradients and volumes at every quadrature point of the undeformed mesh.
 
     Parameters
@@ -164,12 +168,22 @@ def reference_geometry(points_m: Array, cells: NDArray[np.int64], element: Eleme
         ∂N_a/∂X_j at column 3a + j, then the volume assigned to the point [m³].
     """
     corners = points_m[cells[:, :4]]
-    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)  # columns are edge vectors
+    edges = np.swapaxes(
+        corners[:, 1:] - corners[:, :1], 1, 2
+    )  # columns are edge vectors
     inverse = np.linalg.inv(edges)  # rows are ∂L1..L3/∂X
-    barycentric_gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
+    barycentric_gradients = np.concatenate(
+        [-inverse.sum(axis=1, keepdims=True), inverse], axis=1
+    )
     volumes = np.linalg.det(edges) / 6.0
     gradients = np.einsum(
-        "qal,elj->eqaj", element.shape_gradients(element.points), barycentric_gradients
+        "qal,elj->eqaj",
+        element.shape_gradients(element.points),
+        barycentric_gradients,
     )
-    gradient_rows = gradients.reshape(len(cells), len(element.points), 3 * element.nodes)
-    return np.concatenate([gradient_rows, (volumes[:, None] * element.weights)[..., None]], axis=2)
+    gradient_rows = gradients.reshape(
+        len(cells), len(element.points), 3 * element.nodes
+    )
+    return np.concatenate(
+        [gradient_rows, (volumes[:, None] * element.weights)[..., None]], axis=2
+    )

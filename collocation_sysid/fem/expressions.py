@@ -73,7 +73,11 @@ class PointLaw:
         """Number of entries of θ at a point: constants of material and damping law, the stiffening
         by memory, and changes of the inputs of the stress-free shape.
         """
-        count = len(self.material.constants) + len(self.damping.constants) + self.has_memory
+        count = (
+            len(self.material.constants)
+            + len(self.damping.constants)
+            + self.has_memory
+        )
         return count + (self.rest.input_count if self.rest else 0)
 
     @property
@@ -87,7 +91,9 @@ class PointLaw:
         """
         return self.material.psi(F, theta[: len(self.material.constants)])
 
-    def damping_potential(self, psi: ca.SX, F: ca.SX, rate: ca.SX, theta: ca.SX) -> ca.SX:
+    def damping_potential(
+        self, psi: ca.SX, F: ca.SX, rate: ca.SX, theta: ca.SX
+    ) -> ca.SX:
         """Return the potential of the damping law; 0 if it has none.
 
         Parameters
@@ -99,9 +105,15 @@ class PointLaw:
         theta : (k,) SX
         """
         potential = self.damping.potential
-        return potential(psi, F, rate, **self._damping_constants(theta)) if potential else ca.SX(0)
+        return (
+            potential(psi, F, rate, **self._damping_constants(theta))
+            if potential
+            else ca.SX(0)
+        )
 
-    def damping_stress(self, F: ca.SX, rate: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX] | None:
+    def damping_stress(
+        self, F: ca.SX, rate: ca.SX, theta: ca.SX
+    ) -> tuple[ca.SX, ca.SX] | None:
         """Return P_v (9,) and ∂P_v/∂F (9, 9) of the damping law.
 
         None if it has a potential instead.
@@ -130,11 +142,16 @@ class PointLaw:
         those of the material.
         """
         constants = theta[len(self.material.constants) :]
-        return {c.name: constants[k] for k, c in enumerate(self.damping.constants)}
+        return {
+            c.name: constants[k] for k, c in enumerate(self.damping.constants)
+        }
 
 
 def quadrature_point(
-    element: Element, law: PointLaw, *fields: str, internal_variable_count: int | None = None
+    element: Element,
+    law: PointLaw,
+    *fields: str,
+    internal_variable_count: int | None = None,
 ) -> QuadraturePoint:
     """Return the symbols of a quadrature point of an element that obeys a law.
 
@@ -148,7 +165,9 @@ def quadrature_point(
         Number of internal variables; by default that of the law.
     """
     count = (
-        law.internal_variable_count if internal_variable_count is None else internal_variable_count
+        law.internal_variable_count
+        if internal_variable_count is None
+        else internal_variable_count
     )
     point = QuadraturePoint.from_element(
         element,
@@ -158,11 +177,15 @@ def quadrature_point(
         scaled=law.scaled_indices,
         rest=law.rest,
     )
-    rule = law.material.chain_rule(point.material_gradient, _material_constants(point, law))
+    rule = law.material.chain_rule(
+        point.material_gradient, _material_constants(point, law)
+    )
     return replace(point, rule=rule)
 
 
-def kernel_from_outputs(name: str, point: QuadraturePoint, outputs: Outputs) -> ElementKernel:
+def kernel_from_outputs(
+    name: str, point: QuadraturePoint, outputs: Outputs
+) -> ElementKernel:
     """Return the kernel of a name whose outputs are sums of derivatives of scalars of a quadrature
     point.
 
@@ -216,7 +239,9 @@ def _potential(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     return damped + point.theta[-1] * energy + memory_energy(point)
 
 
-def _damping_potential(point: QuadraturePoint, law: PointLaw, energy: ca.SX) -> ca.SX:
+def _damping_potential(
+    point: QuadraturePoint, law: PointLaw, energy: ca.SX
+) -> ca.SX:
     """Return the damping potential V ψ_d of a point from its elastic energy V ψ; 0 if it has none.
 
     A law that treats all symbols alike also gets the symbols of energies and their rates. Any
@@ -236,7 +261,11 @@ def _damping_potential(point: QuadraturePoint, law: PointLaw, energy: ca.SX) -> 
 def memory_energy(point: QuadraturePoint) -> ca.SX:
     """Return ½ V H : FᵀF, the energy of the overstress, whose derivative by F is V F H."""
     F = point.material_gradient
-    return point.volume * ca.trace(symmetric_matrix(point.point_data[:6]) @ F.T @ F) / 2
+    return (
+        point.volume
+        * ca.trace(symmetric_matrix(point.point_data[:6]) @ F.T @ F)
+        / 2
+    )
 
 
 def symmetric_matrix(six: ca.SX) -> ca.SX:
@@ -262,22 +291,30 @@ def first_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 def second_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return the second Piola–Kirchhoff stress S = F⁻¹ P by its entries (6,)."""
     return six_entries(
-        ca.inv_minor(point.material_gradient) @ ca.reshape(first_piola(point, law), 3, 3)
+        ca.inv_minor(point.material_gradient)
+        @ ca.reshape(first_piola(point, law), 3, 3)
     )
 
 
-def _damping(point: QuadraturePoint, law: PointLaw) -> tuple[ca.SX, ca.SX] | None:
+def _damping(
+    point: QuadraturePoint, law: PointLaw
+) -> tuple[ca.SX, ca.SX] | None:
     """Return V P_v (9,) of a point and its derivative (9, 9) by F, with the viscous first
     Piola–Kirchhoff stress P_v and the volume V of the point; None if the damping law is none or has
     a potential.
     """
     stress_and_slope = law.damping_stress(
-        ca.vec(point.material_gradient), point.material_gradient_rate, point.local_constants
+        ca.vec(point.material_gradient),
+        point.material_gradient_rate,
+        point.local_constants,
     )
     return (
         None
         if stress_and_slope is None
-        else (point.volume * stress_and_slope[0], point.volume * stress_and_slope[1])
+        else (
+            point.volume * stress_and_slope[0],
+            point.volume * stress_and_slope[1],
+        )
     )
 
 
@@ -285,7 +322,9 @@ def _damping(point: QuadraturePoint, law: PointLaw) -> tuple[ca.SX, ca.SX] | Non
 def energy_kernel(element: Element, law: PointLaw) -> ElementKernel:
     """Return the kernel of the elastic energy Ψ [J]."""
     point = quadrature_point(element, law, "x", internal_variable_count=0)
-    return kernel_from_outputs("energy", point, {"energy": (Derivative(_energy(point, law), ()),)})
+    return kernel_from_outputs(
+        "energy", point, {"energy": (Derivative(_energy(point, law), ()),)}
+    )
 
 
 @lru_cache(CACHED_KERNELS)
@@ -296,7 +335,11 @@ def force_kernel(element: Element, law: PointLaw) -> ElementKernel:
     if damping := _damping(point, law):
         stress = -damping[0]
         force += (
-            Derivative(ca.dot(stress, point.material_gradient_rate) / 2, ("v",), known=stress),
+            Derivative(
+                ca.dot(stress, point.material_gradient_rate) / 2,
+                ("v",),
+                known=stress,
+            ),
         )
     return kernel_from_outputs("force", point, {"force": force})
 
@@ -324,10 +367,18 @@ def linearisation_kernel(element: Element, law: PointLaw) -> ElementKernel:
         by_rate = ca.jacobian(stress, point.gradients["v"])
         by_theta = ca.jacobian(stress, point.differentiated_constants)
         outputs["force"] += (Derivative(half_power, ("v",), known=stress),)
-        outputs["by_position"] += (Derivative(half_power, ("v", "x"), "symmetric", slope),)
-        outputs["by_velocity"] += (Derivative(half_power, ("v", "v"), known=by_rate),)
-        outputs["by_theta"] += (Derivative(half_power, ("v", "theta"), known=by_theta),)
-        outputs["by_position_skew"] = (Derivative(half_power, ("v", "x"), "skew", slope),)
+        outputs["by_position"] += (
+            Derivative(half_power, ("v", "x"), "symmetric", slope),
+        )
+        outputs["by_velocity"] += (
+            Derivative(half_power, ("v", "v"), known=by_rate),
+        )
+        outputs["by_theta"] += (
+            Derivative(half_power, ("v", "theta"), known=by_theta),
+        )
+        outputs["by_position_skew"] = (
+            Derivative(half_power, ("v", "x"), "skew", slope),
+        )
     return kernel_from_outputs("linearisation", point, outputs)
 
 
@@ -339,7 +390,12 @@ def curvature_kernel(element: Element, law: PointLaw) -> ElementKernel:
     D_wK).
     """
     point = quadrature_point(
-        element, law, "x", "v", "w", internal_variable_count=2 * law.internal_variable_count
+        element,
+        law,
+        "x",
+        "v",
+        "w",
+        internal_variable_count=2 * law.internal_variable_count,
     )
     power = -point.weighted_derivative(_potential(point, law))
     if law.has_memory:

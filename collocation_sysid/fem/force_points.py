@@ -44,7 +44,11 @@ class ForcePoints:
     def at_nodes(cls, nodes: Index, node_count: int) -> ForcePoints:
         """Return instances (i, K) whose vectors are the node positions."""
         count = nodes.shape[1]
-        return cls(nodes, np.broadcast_to(np.eye(count), (len(nodes), count, count)), node_count)
+        return cls(
+            nodes,
+            np.broadcast_to(np.eye(count), (len(nodes), count, count)),
+            node_count,
+        )
 
     @property
     def count(self) -> int:
@@ -72,7 +76,9 @@ class ForcePoints:
             Indices of the instances; all by default.
         """
         stacked = self._operator_for("operator", chosen) @ x.T
-        return stacked.reshape(len(stacked) // self.dofs, self.dofs, len(x)).transpose(1, 2, 0)
+        return stacked.reshape(
+            len(stacked) // self.dofs, self.dofs, len(x)
+        ).transpose(1, 2, 0)
 
     def assemble(self, forces: Array, chosen: Index | None = None) -> Array:
         """Return the nodal forces (T, 3n) of forces (3L, T, i) on the vectors.
@@ -86,7 +92,9 @@ class ForcePoints:
         force_rows = forces.transpose(2, 0, 1).reshape(
             len(forces) * forces.shape[2], forces.shape[1]
         )
-        return (self._operator_for("transposed operator", chosen) @ force_rows).T
+        return (
+            self._operator_for("transposed operator", chosen) @ force_rows
+        ).T
 
     def add_matrices(
         self,
@@ -114,9 +122,15 @@ class ForcePoints:
         skew : bool
         """
         columns, rows = np.triu_indices(len(blocks))
-        values = blocks[rows, columns] + (-1 if skew else 1) * blocks[columns, rows]
-        assembly, nonempty = self._operator_for("skew" if skew else "couplings", chosen)
-        values = np.moveaxis(values, 0, 2).reshape(values.shape[1], assembly.shape[1])
+        values = (
+            blocks[rows, columns] + (-1 if skew else 1) * blocks[columns, rows]
+        )
+        assembly, nonempty = self._operator_for(
+            "skew" if skew else "couplings", chosen
+        )
+        values = np.moveaxis(values, 0, 2).reshape(
+            values.shape[1], assembly.shape[1]
+        )
         to[:, places[nonempty]] += (assembly @ values.T).T / 2
 
     def _operator_for(self, what: str, chosen: Index | None) -> Any:
@@ -136,21 +150,37 @@ class ForcePoints:
             if len(self._operators) >= CACHED_MATRICES:
                 self._operators.pop(next(iter(self._operators)), None)
             if what == "operator":
-                rows = slice(None) if chosen is None else _expanded_indices(chosen, self.dofs)
+                rows = (
+                    slice(None)
+                    if chosen is None
+                    else _expanded_indices(chosen, self.dofs)
+                )
                 self._operators[key] = self._operator[rows]
             elif what == "transposed operator":
                 self._operators[key] = self._operator_for("operator", chosen).T
             else:
-                matrix: Any = self._onto_skew if what == "skew" else self._onto_couplings
+                matrix: Any = (
+                    self._onto_skew if what == "skew" else self._onto_couplings
+                )
                 if chosen is not None:
-                    matrix = matrix[:, _expanded_indices(chosen, self.dofs * (self.dofs + 1) // 2)]
+                    matrix = matrix[
+                        :,
+                        _expanded_indices(
+                            chosen, self.dofs * (self.dofs + 1) // 2
+                        ),
+                    ]
                 # Of few instances most rows are empty.
-                is_nonempty = np.bincount(matrix.indices, minlength=matrix.shape[0]) > 0
+                is_nonempty = (
+                    np.bincount(matrix.indices, minlength=matrix.shape[0]) > 0
+                )
                 number = np.cumsum(is_nonempty) - 1
                 nonempty = np.flatnonzero(is_nonempty)
                 parts = matrix.data, number[matrix.indices], matrix.indptr
                 shape = len(nonempty), matrix.shape[1]
-                self._operators[key] = sp.csc_array(parts, shape=shape), nonempty
+                self._operators[key] = (
+                    sp.csc_array(parts, shape=shape),
+                    nonempty,
+                )
         return self._operators[key]
 
     @cached_property
@@ -163,7 +193,9 @@ class ForcePoints:
         """Sparse matrix (i · 3L, 3n) from node positions to vectors."""
         instance, local, node, weight = self.nonzero_weights
         shape = self.count * self.dofs, 3 * self.node_count
-        return sp.csr_array((weight, (instance * self.dofs + local, node)), shape=shape)
+        return sp.csr_array(
+            (weight, (instance * self.dofs + local, node)), shape=shape
+        )
 
     @cached_property
     def nonzero_weights(self) -> tuple[Index, Index, Index, Array]:
@@ -220,10 +252,17 @@ class ForcePoints:
             low = np.minimum(r, s)
             high = np.maximum(r, s)
             lower = low * d - low * (low - 1) // 2 + high - low
-            place = self.couplings.positions_of(row[lower_pairs], column[lower_pairs])
-            parts.append((place, instance[first] * (d * (d + 1) // 2) + lower, value))
+            place = self.couplings.positions_of(
+                row[lower_pairs], column[lower_pairs]
+            )
+            parts.append(
+                (place, instance[first] * (d * (d + 1) // 2) + lower, value)
+            )
         places, sources, values = map(np.concatenate, zip(*parts, strict=True))
-        shape = self.couplings.entry_count, self.count * self.dofs * (self.dofs + 1) // 2
+        shape = (
+            self.couplings.entry_count,
+            self.count * self.dofs * (self.dofs + 1) // 2,
+        )
         return sp.csc_array((values, (places, sources)), shape=shape)
 
 

@@ -58,14 +58,20 @@ class Phase:
         """Contribution of one point, with the contractions written out."""
         sx = self.pieces
         names = sx.name_in()
-        inputs = [ca.SX.sym(name, sx.size1_in(k)) for k, name in enumerate(names)]
+        inputs = [
+            ca.SX.sym(name, sx.size1_in(k)) for k, name in enumerate(names)
+        ]
         gradients = node_gradients(inputs[names.index("geometry")], self.nodes)
         outputs = [
             _contracted(piece, how, gradients)
-            for piece, how in zip(sx.call(inputs), self.contractions.values(), strict=True)
+            for piece, how in zip(
+                sx.call(inputs), self.contractions.values(), strict=True
+            )
         ]
         dense = [ca.densify(ca.vec(output)) for output in outputs]
-        return ca.Function(sx.name(), inputs, dense, names, sx.name_out(), {"cse": True})
+        return ca.Function(
+            sx.name(), inputs, dense, names, sx.name_out(), {"cse": True}
+        )
 
     def sum_over_points(self, *inputs: Any) -> list[Any]:
         """Return the sums over the points of an element, one column for each output.
@@ -75,7 +81,9 @@ class Phase:
         """
         names = self.pieces.name_in()
         point_columns = {
-            k: ca.horzsplit(inputs[k]) for k, name in enumerate(names) if name in OF_POINTS
+            k: ca.horzsplit(inputs[k])
+            for k, name in enumerate(names)
+            if name in OF_POINTS
         }
         count = len(point_columns[names.index("geometry")])
         points = [
@@ -87,7 +95,10 @@ class Phase:
             )
             for p in range(count)
         ]
-        return [sum(outputs[1:], outputs[0]) for outputs in zip(*points, strict=True)]
+        return [
+            sum(outputs[1:], outputs[0])
+            for outputs in zip(*points, strict=True)
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,12 +133,19 @@ class ElementKernel:
     def point_data_count(self) -> int:
         """Number of internal variables and other data of a point."""
         names = self.pieces.name_in()
-        return self.pieces.nnz_in(names.index("carried")) if "carried" in names else 0
+        return (
+            self.pieces.nnz_in(names.index("carried"))
+            if "carried" in names
+            else 0
+        )
 
     @cached_property
     def phases(self) -> tuple[Phase, ...]:
         """All phases, the last one included."""
-        return (*self.previous_phases, Phase(self.pieces, self.contractions | self.coupled))
+        return (
+            *self.previous_phases,
+            Phase(self.pieces, self.contractions | self.coupled),
+        )
 
     @cached_property
     def serialized(self) -> str:
@@ -135,7 +153,9 @@ class ElementKernel:
         functions = [phase.pieces for phase in self.phases]
         functions += [self.coupling] if self.coupling else []
         contractions = f"{[phase.contractions for phase in self.phases]}"
-        return contractions + " ".join(function.serialize() for function in functions)
+        return contractions + " ".join(
+            function.serialize() for function in functions
+        )
 
     def element_function(self, points: int) -> ca.Function:
         """Return the sum over an element of `points` points as a CasADi function.
@@ -144,15 +164,21 @@ class ElementKernel:
         points.
         """
         names = self.phases[0].pieces.name_in()
-        inputs = [ca.MX.sym(n, self.pieces.size1_in(k)) for k, n in enumerate(names)]
+        inputs = [
+            ca.MX.sym(n, self.pieces.size1_in(k)) for k, n in enumerate(names)
+        ]
         for place in (k for k, name in enumerate(names) if name in OF_POINTS):
-            inputs[place] = ca.MX.sym(names[place], self.pieces.size1_in(place), points)
+            inputs[place] = ca.MX.sym(
+                names[place], self.pieces.size1_in(place), points
+            )
         size = 3 * self.phases[0].nodes
         sums = ca.MX(0, 1)
         vectors = ca.MX(size, 0)
         outputs: list[ca.MX] = []
         for phase in self.phases:
-            totals = phase.sum_over_points(*inputs, *([sums] if sums.numel() else []))
+            totals = phase.sum_over_points(
+                *inputs, *([sums] if sums.numel() else [])
+            )
             for key, total in zip(phase.contractions, totals, strict=True):
                 if key in self.contractions:
                     outputs.append(total)
@@ -167,7 +193,9 @@ class ElementKernel:
                 _coupled(*each, vectors)
                 for each in zip(outputs, couplings, contractions, strict=True)
             ]
-        return ca.Function(self.pieces.name(), inputs, outputs, names, list(self.contractions))
+        return ca.Function(
+            self.pieces.name(), inputs, outputs, names, list(self.contractions)
+        )
 
 
 def node_gradients(geometry: ca.SX, nodes: int) -> ca.SX:
@@ -182,7 +210,9 @@ def from_lower_triangle(matrix: ca.SX) -> ca.SX:
     return ca.tril2symm(ca.tril(ca.densify(matrix)))
 
 
-def _coupled(output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX) -> ca.MX:
+def _coupled(
+    output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX
+) -> ca.MX:
     """Return an output of an element with the contribution of the coupling between points, see the
     module; unchanged for the contraction "none".
     """
@@ -190,7 +220,9 @@ def _coupled(output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX) -
         return output
     if how == "nodes":
         return output + ca.vec(vectors @ coupling)
-    lower = ca.project(vectors @ coupling @ vectors.T, ca.Sparsity.lower(vectors.shape[0]))
+    lower = ca.project(
+        vectors @ coupling @ vectors.T, ca.Sparsity.lower(vectors.shape[0])
+    )
     return output + lower.nz[:]
 
 
@@ -218,7 +250,10 @@ def _at_node(stress: ca.SX, gradient: ca.SX) -> ca.SX:
     """Return the columns of (9, k), conjugate to F, times the shape gradient of one node: (3,
     k).
     """
-    columns = [ca.reshape(stress[:, k], 3, 3) @ gradient.T for k in range(stress.shape[1])]
+    columns = [
+        ca.reshape(stress[:, k], 3, 3) @ gradient.T
+        for k in range(stress.shape[1])
+    ]
     return ca.horzcat(*columns)
 
 
@@ -350,7 +385,10 @@ class QuadraturePoint:
             {name: ca.SX.sym(f"gradient_{name}", 9) for name in fields},
             tuple(ca.SX.sym(f"stretch_{k}") for k in range(stretches)),
             ca.SX.sym(
-                "carried", internal_variable_count + bool(scaled) + (rest.count if rest else 0)
+                "carried",
+                internal_variable_count
+                + bool(scaled)
+                + (rest.count if rest else 0),
             ),
             scaled,
             rest,
@@ -367,7 +405,11 @@ class QuadraturePoint:
     @property
     def differentiated_constants(self) -> ca.SX:
         """Variables of derivatives by "theta": θ, and the logarithm of the field."""
-        return ca.vertcat(self.theta, self.point_data[-1]) if self.scaled_indices else self.theta
+        return (
+            ca.vertcat(self.theta, self.point_data[-1])
+            if self.scaled_indices
+            else self.theta
+        )
 
     @property
     def internal_variables(self) -> ca.SX:
@@ -384,7 +426,9 @@ class QuadraturePoint:
         """Volume assigned to the point in the stress-free shape [m³]."""
         if self.rest is None:
             return self.mesh_volume
-        return self.mesh_volume * ca.det(ca.reshape(self._rest_values[:9], 3, 3))
+        return self.mesh_volume * ca.det(
+            ca.reshape(self._rest_values[:9], 3, 3)
+        )
 
     @property
     def _rest_values(self) -> ca.SX:
@@ -424,7 +468,9 @@ class QuadraturePoint:
         """
         return self.rule.jacobian(expression, by)
 
-    def directional_derivative(self, expression: ca.SX, by: ca.SX, direction: ca.SX) -> ca.SX:
+    def directional_derivative(
+        self, expression: ca.SX, by: ca.SX, direction: ca.SX
+    ) -> ca.SX:
         """Return the derivative of an expression by symbols (k,) along a direction (k,), including
         that through `rule`.
         """
@@ -439,14 +485,18 @@ class QuadraturePoint:
     def material_gradient_rate(self) -> ca.SX:
         """Derivative of `material_gradient` along v, stacked (9,)."""
         return ca.jtimes(
-            ca.vec(self.material_gradient), self.strain_symbols, self.strain_rate_symbols
+            ca.vec(self.material_gradient),
+            self.strain_symbols,
+            self.strain_rate_symbols,
         )
 
     @property
     def weighted_material_gradient(self) -> ca.SX:
         """Derivative of `material_gradient` along w, stacked (9,)."""
         weights = ca.vertcat(self.gradients["w"], *self.stretches[2:3])
-        return ca.jtimes(ca.vec(self.material_gradient), self.strain_symbols, weights)
+        return ca.jtimes(
+            ca.vec(self.material_gradient), self.strain_symbols, weights
+        )
 
     def weighted_derivative(self, scalar: ca.SX) -> ca.SX:
         """Return the directional derivative of a scalar that depends on x and v: its derivative by
@@ -463,7 +513,9 @@ class QuadraturePoint:
         It is the scalar itself, a gradient as a column, or the matrix of second derivatives.
         """
         inputs = [
-            self.differentiated_constants if name == "theta" else self.gradients[name]
+            self.differentiated_constants
+            if name == "theta"
+            else self.gradients[name]
             for name in by
         ]
         if not inputs:
@@ -472,7 +524,9 @@ class QuadraturePoint:
             return self.jacobian(scalar, inputs[0]).T
         return self.jacobian(self.gradient(scalar, inputs[0]), inputs[1])
 
-    def make_phase(self, name: str, pieces: Pieces, sums: ca.SX | None = None) -> Phase:
+    def make_phase(
+        self, name: str, pieces: Pieces, sums: ca.SX | None = None
+    ) -> Phase:
         """Return a phase with these pieces.
 
         Parameters
@@ -501,6 +555,11 @@ class QuadraturePoint:
             [ca.vertcat(*gradients)],
         )
         function = ca.Function(
-            name, list(inputs.values()), outputs, list(inputs), list(pieces), {"cse": True}
+            name,
+            list(inputs.values()),
+            outputs,
+            list(inputs),
+            list(pieces),
+            {"cse": True},
         )
         return Phase(function, {key: how for key, (how, _) in pieces.items()})

@@ -63,7 +63,9 @@ class Material:
     constants: tuple[Constant, ...]
 
     @classmethod
-    def from_energy(cls, energy: Energy, name: str = "", *constants: Constant) -> Material:
+    def from_energy(
+        cls, energy: Energy, name: str = "", *constants: Constant
+    ) -> Material:
         """Return a material from an energy function; its arguments after F are the constants.
 
         Parameters
@@ -93,7 +95,9 @@ class Material:
                 f"material {name!r} has no constant {unused[0]!r}{hint_at(unused[0], arguments)}"
             )
         material = cls(
-            name, energy, tuple(definitions.get(a) or constant_named(a) for a in arguments)
+            name,
+            energy,
+            tuple(definitions.get(a) or constant_named(a) for a in arguments),
         )
         material._check_at_rest()
         return material
@@ -122,7 +126,11 @@ class Material:
         """Return the energy density as the symbol of a rule from `chain_rule`, if it has one, else
         as an expression in F (3, 3) and the constants (c,).
         """
-        return rule.functions[0].symbol() if rule.functions else self.psi(F, values)
+        return (
+            rule.functions[0].symbol()
+            if rule.functions
+            else self.psi(F, values)
+        )
 
     def _named(self, values: ca.SX) -> dict[str, ca.SX]:
         """Return the constants by name, from a vector in their order."""
@@ -152,11 +160,17 @@ class Material:
             ) from error
         law = ca.Function("law", [F, values], [psi, stress, tangent])
         sample_values = [
-            float(np.sqrt(max(c.bounds[0], 1e-3) * c.bounds[1])) for c in self.constants
+            float(np.sqrt(max(c.bounds[0], 1e-3) * c.bounds[1]))
+            for c in self.constants
         ]
-        energy, force, stiffness = (o.full() for o in law(np.eye(3).ravel(), sample_values))
+        energy, force, stiffness = (
+            o.full() for o in law(np.eye(3).ravel(), sample_values)
+        )
         scale = np.abs(stiffness).max()
-        for what, unit, residual in (("energy", "J/m³", energy), ("stress", "Pa", force)):
+        for what, unit, residual in (
+            ("energy", "J/m³", energy),
+            ("stress", "Pa", force),
+        ):
             worst = np.abs(residual).max()
             if not worst <= REST_TOLERANCE * scale:
                 raise InputError(
@@ -167,10 +181,15 @@ class Material:
 
     def _describe_values(self, values: list[float]) -> str:
         """Return the constants with given values as text."""
-        return ", ".join(f"{c.name} = {v:.3g}" for c, v in zip(self.constants, values, strict=True))
+        return ", ".join(
+            f"{c.name} = {v:.3g}"
+            for c, v in zip(self.constants, values, strict=True)
+        )
 
 
-def lame_constants(psi: ca.SX, F: ca.SX, rule: ChainRule | None = None) -> ca.SX:
+def lame_constants(
+    psi: ca.SX, F: ca.SX, rule: ChainRule | None = None
+) -> ca.SX:
     """Return the small-strain (λ, μ), C₁₁₂₂ and C₁₂₁₂ at F = I, of an energy density of F stacked
     (9,).
 
@@ -188,7 +207,9 @@ def lame_constants(psi: ca.SX, F: ca.SX, rule: ChainRule | None = None) -> ca.SX
     else:
         tangent, _ = ca.hessian(psi, F)
     entries = ca.vertcat(tangent[0, 4], tangent[1, 1])
-    return ca.simplify(ca.substitute(entries, F, ca.SX(ca.DM(np.eye(3).ravel()))))
+    return ca.simplify(
+        ca.substitute(entries, F, ca.SX(ca.DM(np.eye(3).ravel())))
+    )
 
 
 def neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
@@ -196,7 +217,11 @@ def neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
     6.27).
     """
     log_j = ca.log(ca.det(F))
-    return 0.5 * lambda_pa * log_j**2 - mu_pa * log_j + 0.5 * mu_pa * (ca.sumsqr(F) - 3)
+    return (
+        0.5 * lambda_pa * log_j**2
+        - mu_pa * log_j
+        + 0.5 * mu_pa * (ca.sumsqr(F) - 3)
+    )
 
 
 def stable_neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
@@ -231,19 +256,27 @@ def linear_elastic(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
     return 0.5 * lambda_pa * ca.trace(strain) ** 2 + mu_pa * ca.sumsqr(strain)
 
 
-def mooney_rivlin(F: ca.SX, c10_pa: ca.SX, c01_pa: ca.SX, kappa_pa: ca.SX) -> ca.SX:
+def mooney_rivlin(
+    F: ca.SX, c10_pa: ca.SX, c01_pa: ca.SX, kappa_pa: ca.SX
+) -> ca.SX:
     """Mooney–Rivlin energy ψ = C₁₀ (Ī₁ − 3) + C₀₁ (Ī₂ − 3) + U, with μ = 2 (C₁₀ + C₀₁).
 
     See Bonet & Wood 2008, sec. 6.5.
     """
     first, second = isochoric_invariants(F)
-    return c10_pa * (first - 3) + c01_pa * (second - 3) + _volumetric(F, kappa_pa)
+    return (
+        c10_pa * (first - 3) + c01_pa * (second - 3) + _volumetric(F, kappa_pa)
+    )
 
 
-def yeoh(F: ca.SX, c10_pa: ca.SX, c20_pa: ca.SX, c30_pa: ca.SX, kappa_pa: ca.SX) -> ca.SX:
+def yeoh(
+    F: ca.SX, c10_pa: ca.SX, c20_pa: ca.SX, c30_pa: ca.SX, kappa_pa: ca.SX
+) -> ca.SX:
     """Yeoh's energy ψ = Σ_i C_i0 (Ī₁ − 3)^i + U, i = 1 … 3, with μ = 2 C₁₀ (Yeoh 1993)."""
     excess = isochoric_invariants(F)[0] - 3
-    return excess * (c10_pa + excess * (c20_pa + excess * c30_pa)) + _volumetric(F, kappa_pa)
+    return excess * (
+        c10_pa + excess * (c20_pa + excess * c30_pa)
+    ) + _volumetric(F, kappa_pa)
 
 
 def gent(F: ca.SX, mu_pa: ca.SX, gent_limit: ca.SX, kappa_pa: ca.SX) -> ca.SX:
@@ -254,10 +287,14 @@ def gent(F: ca.SX, mu_pa: ca.SX, gent_limit: ca.SX, kappa_pa: ca.SX) -> ca.SX:
     remaining = 1 - (isochoric_invariants(F)[0] - 3) / gent_limit
     # The square root makes the derivatives NaN beyond the limit, too; otherwise a solver that
     # evaluates forces alone could converge there.
-    return -mu_pa * gent_limit * ca.log(ca.sqrt(remaining)) + _volumetric(F, kappa_pa)
+    return -mu_pa * gent_limit * ca.log(ca.sqrt(remaining)) + _volumetric(
+        F, kappa_pa
+    )
 
 
-def arruda_boyce(F: ca.SX, mu_pa: ca.SX, chain_stretch: ca.SX, kappa_pa: ca.SX) -> ca.SX:
+def arruda_boyce(
+    F: ca.SX, mu_pa: ca.SX, chain_stretch: ca.SX, kappa_pa: ca.SX
+) -> ca.SX:
     """Arruda–Boyce energy ψ = C Σ_i α_i λ_m^(2−2i) (Ī₁^i − 3^i) + U.
 
     Five terms of the inverse Langevin function; C is such that μ is the shear modulus at small
@@ -266,7 +303,9 @@ def arruda_boyce(F: ca.SX, mu_pa: ca.SX, chain_stretch: ca.SX, kappa_pa: ca.SX) 
     first = isochoric_invariants(F)[0]
     series = ca.SX(0)
     slope = ca.SX(0)
-    for i, coefficient in enumerate((1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750), start=1):
+    for i, coefficient in enumerate(
+        (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750), start=1
+    ):
         weight = coefficient / chain_stretch ** (2 * i - 2)
         series += weight * (first**i - 3**i)
         slope += 2 * weight * i * 3 ** (i - 1)
@@ -300,7 +339,9 @@ MATERIALS: dict[str, Material] = {
 }
 MATERIALS |= {
     f"{name}-{terms}": Material(
-        f"{name}-{terms}", energy(terms), tuple(map(constant_named, energy(terms).names))
+        f"{name}-{terms}",
+        energy(terms),
+        tuple(map(constant_named, energy(terms).names)),
     )
     for name, energy in (("ogden", ogden), ("hyperfoam", hyperfoam))
     for terms in range(1, MOST_TERMS + 1)
@@ -336,7 +377,9 @@ def _look_up(kind: str, name: str, table: Mapping[str, T]) -> T:
     table : mapping
     """
     if name not in table:
-        raise InputError(f"no {kind} {name!r}; available: {', '.join(table)}{hint_at(name, table)}")
+        raise InputError(
+            f"no {kind} {name!r}; available: {', '.join(table)}{hint_at(name, table)}"
+        )
     return table[name]
 
 
@@ -374,7 +417,9 @@ class DampingLaw:
     accepts_symbols: bool = False
 
 
-def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:
+def kelvin_voigt(
+    psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX
+) -> tuple[ca.SX, ca.SX]:
     """Kelvin–Voigt damping P_v = F S_v with S_v = 2η C⁻¹ Ė C⁻¹ + ζ (C⁻¹:Ė) C⁻¹.
 
     Return P_v and ∂P_v/∂F.
@@ -394,11 +439,16 @@ def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[c
     P = (shear * (L + L.T) + lame * ca.trace(L) * one) @ inverse.T
     stress = ca.vec(P)
     # dF changes L as a rate −L dF would, and F⁻ᵀ by −F⁻ᵀ dFᵀ F⁻ᵀ.
-    slope = -ca.jacobian(stress, rate) @ ca.kron(one, L) - ca.kron(inverse, P)[:, TRANSPOSED]
+    slope = (
+        -ca.jacobian(stress, rate) @ ca.kron(one, L)
+        - ca.kron(inverse, P)[:, TRANSPOSED]
+    )
     return stress, slope
 
 
-def material_form(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:
+def material_form(
+    psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX
+) -> tuple[ca.SX, ca.SX]:
     """Damping in material form, P_v = F S_v with S_v = γ_r (λ tr(Ė) I + 2μ Ė).
 
     Return P_v and ∂P_v/∂F.
@@ -408,13 +458,17 @@ def material_form(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[
     S_v is γ_r times the rate of the elastic second Piola–Kirchhoff stress.
     """
     stiffness, _ = ca.hessian(psi, F)
-    if not ca.depends_on(stiffness, F):  # a linear material does not distinguish the shapes
+    if not ca.depends_on(
+        stiffness, F
+    ):  # a linear material does not distinguish the shapes
         return gamma_r_s * from_lower_triangle(stiffness) @ rate, ca.SX(9, 9)
     lame, shear = ca.vertsplit(gamma_r_s * lame_constants(psi, F))
     deformation = ca.reshape(F, 3, 3)
     product = deformation.T @ ca.reshape(rate, 3, 3)
     strain_rate = (product + product.T) / 2
-    second_piola = lame * ca.trace(strain_rate) * ca.SX.eye(3) + 2 * shear * strain_rate
+    second_piola = (
+        lame * ca.trace(strain_rate) * ca.SX.eye(3) + 2 * shear * strain_rate
+    )
     stress = ca.vec(deformation @ second_piola)
     return stress, ca.jacobian(stress, F)
 
@@ -427,7 +481,9 @@ def rayleigh(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:
 DAMPINGS: dict[str, DampingLaw] = {
     "kelvin-voigt": DampingLaw("kelvin-voigt", (GAMMA_R,), stress=kelvin_voigt),
     "material": DampingLaw("material", (GAMMA_R,), stress=material_form),
-    "rayleigh": DampingLaw("rayleigh", (GAMMA_R,), rayleigh, accepts_symbols=True),
+    "rayleigh": DampingLaw(
+        "rayleigh", (GAMMA_R,), rayleigh, accepts_symbols=True
+    ),
 }
 
 
@@ -439,7 +495,11 @@ def as_damping(damping: str | DampingLaw) -> DampingLaw:
     InputError
         If there is no damping law of that name.
     """
-    return damping if isinstance(damping, DampingLaw) else _look_up("damping", damping, DAMPINGS)
+    return (
+        damping
+        if isinstance(damping, DampingLaw)
+        else _look_up("damping", damping, DAMPINGS)
+    )
 
 
 @dataclass(frozen=True)
@@ -455,7 +515,10 @@ class Prony:
     name: str
 
     def __post_init__(self) -> None:
-        if not self.name or not self.name.replace("_", "").replace("-", "").isalnum():
+        if (
+            not self.name
+            or not self.name.replace("_", "").replace("-", "").isalnum()
+        ):
             raise InputError(
                 f"the branch's name is {self.name!r}; expected letters, digits, - and _, which "
                 "stand before the names of its parameters"
@@ -464,7 +527,9 @@ class Prony:
     @property
     def constants(self) -> tuple[Constant, Constant]:
         """Constants of the branch: its share g and its relaxation time τ."""
-        share, tau = (replace(c, name=f"{self.name}.{c.name}") for c in (SHARE, TAU))
+        share, tau = (
+            replace(c, name=f"{self.name}.{c.name}") for c in (SHARE, TAU)
+        )
         return share, tau
 
 
@@ -478,10 +543,16 @@ def as_branches(branches_or_names: Sequence[str | Prony]) -> tuple[Prony, ...]:
         For a string in place of a sequence, an invalid name, or a name that occurs twice.
     """
     if isinstance(branches_or_names, str):
-        raise InputError(f"prony is {branches_or_names!r}; expected a sequence of names")
-    branches = tuple(b if isinstance(b, Prony) else Prony(b) for b in branches_or_names)
+        raise InputError(
+            f"prony is {branches_or_names!r}; expected a sequence of names"
+        )
+    branches = tuple(
+        b if isinstance(b, Prony) else Prony(b) for b in branches_or_names
+    )
     names = [branch.name for branch in branches]
     for name in names:
         if names.count(name) > 1:
-            raise InputError(f"two branches of a part are named {name!r}; names must differ")
+            raise InputError(
+                f"two branches of a part are named {name!r}; names must differ"
+            )
     return branches

@@ -46,7 +46,9 @@ from .kernel import (
 )
 
 
-def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> ElementKernel:
+def averaging_kernel(
+    name: str, point: QuadraturePoint, outputs: Outputs
+) -> ElementKernel:
     """Return the kernel of derivatives of scalars that depend on `QuadraturePoint.stretches`.
 
     Parameters
@@ -62,23 +64,36 @@ def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> Ele
     order = max(len(term.by) for terms in outputs.values() for term in terms)
     output_pieces: Pieces = {}
     for key, terms in outputs.items():
-        summands = [term.select_part(chains[id(term.scalar)].piece(term.by)) for term in terms]
-        output_pieces[key] = terms[0].contraction, sum(summands[1:], summands[0])
+        summands = [
+            term.select_part(chains[id(term.scalar)].piece(term.by))
+            for term in terms
+        ]
+        output_pieces[key] = (
+            terms[0].contraction,
+            sum(summands[1:], summands[0]),
+        )
     slopes: Pieces = {}
     if order:
-        slopes = {chain.sum_name("slopes"): ("none", chain.by_stretch) for chain in chains.values()}
+        slopes = {
+            chain.sum_name("slopes"): ("none", chain.by_stretch)
+            for chain in chains.values()
+        }
     sums = ca.vertcat(shape.volume, shape.volumes)
     previous_phases = [point.make_phase("volumes", shape.volume_pieces(order))]
     coupled = slopes
     if order > 1:
-        previous_phases.append(point.make_phase("slopes", shape.with_stretches(slopes), sums))
+        previous_phases.append(
+            point.make_phase("slopes", shape.with_stretches(slopes), sums)
+        )
         sums = ca.vertcat(sums, *(chain.slopes for chain in chains.values()))
         coupled = {
             key: p
             for chain in chains.values()
             for key, p in chain.second_derivative_pieces().items()
         }
-    last = point.make_phase(name, shape.with_stretches(output_pieces | coupled), sums)
+    last = point.make_phase(
+        name, shape.with_stretches(output_pieces | coupled), sums
+    )
     return ElementKernel(
         last.pieces,
         tuple(point.fields),
@@ -116,7 +131,12 @@ class _VolumeSums:
         volumes = point.mesh_volume * ca.det(ca.reshape(F, 3, 3))
         for rate in rates:
             volumes = ca.vertcat(volumes, ca.jtimes(volumes, F, rate))
-        return cls(point, ca.SX.sym("volume"), ca.SX.sym("volumes", len(point.stretches)), volumes)
+        return cls(
+            point,
+            ca.SX.sym("volume"),
+            ca.SX.sym("volumes", len(point.stretches)),
+            volumes,
+        )
 
     @property
     def stretches(self) -> ca.SX:
@@ -135,10 +155,14 @@ class _VolumeSums:
         """
         m = _volume_logarithms(self.volumes, self.volume)
         m -= _volume_logarithms(self.own_volumes, self.point.mesh_volume)
-        expanded = self.point.rule.eliminate([piece for _, piece in pieces.values()])
+        expanded = self.point.rule.eliminate(
+            [piece for _, piece in pieces.values()]
+        )
         return {
             key: (how, ca.substitute(piece, self.stretches, m))
-            for (key, (how, _)), piece in zip(pieces.items(), expanded, strict=True)
+            for (key, (how, _)), piece in zip(
+                pieces.items(), expanded, strict=True
+            )
         }
 
     def volume_pieces(self, order: int) -> Pieces:
@@ -167,7 +191,9 @@ class _VolumeSums:
         if field == "x":
             return ca.SX.eye(self.count)
         # Every second one is the rate of the one before.
-        rates = [ca.SX(ca.sparsify(ca.DM([[0, 0], [1, 0]])))] * (self.count // 2)
+        rates = [ca.SX(ca.sparsify(ca.DM([[0, 0], [1, 0]])))] * (
+            self.count // 2
+        )
         return ca.diagcat(*rates)
 
 
@@ -210,14 +236,23 @@ class _ScalarDerivatives:
         point = self.shape.point
         by_m = point.jacobian(self.by_stretch, self.shape.stretches)
         pieces: Pieces = {
-            self.sum_name("second"): ("none", ca.vec(from_lower_triangle(by_m))),
+            self.sum_name("second"): (
+                "none",
+                ca.vec(from_lower_triangle(by_m)),
+            ),
             self.sum_name("slopes_by_theta"): (
                 "none",
-                ca.vec(point.jacobian(self.by_stretch, point.differentiated_constants)),
+                ca.vec(
+                    point.jacobian(
+                        self.by_stretch, point.differentiated_constants
+                    )
+                ),
             ),
         }
         for field in self.fields:
-            slopes = (self._with_stretch(field).T @ self._hessian(field, "x"))[:, 9:]
+            slopes = (self._with_stretch(field).T @ self._hessian(field, "x"))[
+                :, 9:
+            ]
             pieces[self.sum_name(f"slopes_by_{field}")] = "nodes", slopes
         return pieces
 
@@ -232,7 +267,9 @@ class _ScalarDerivatives:
             return point.derivative(self.scalar, by)
         if len(nodal) == 1:
             gradient = point.gradient(self.scalar, point.gradients[nodal[0]])
-            gradient += (self._with_stretch(nodal[0])[9:, :]).T @ self.by_stretch
+            gradient += (
+                (self._with_stretch(nodal[0])[9:, :]).T @ self.by_stretch
+            )
             return (
                 gradient
                 if len(by) == 1
@@ -240,46 +277,63 @@ class _ScalarDerivatives:
             )
         alpha, beta = nodal
         weights = ca.SX.sym("weights", shape.count)
-        by_s, _ = _logarithm_derivatives(shape.volumes, shape.volume, self.slopes)
+        by_s, _ = _logarithm_derivatives(
+            shape.volumes, shape.volume, self.slopes
+        )
         by_own, second_by_own = _logarithm_derivatives(
             shape.own_volumes, point.mesh_volume, self.by_stretch
         )
         second_volumes = ca.jacobian(
-            ca.gradient(ca.dot(weights, shape.own_volumes), point.gradients[alpha]),
+            ca.gradient(
+                ca.dot(weights, shape.own_volumes), point.gradients[alpha]
+            ),
             point.gradients[beta],
         )
         weight_values = by_s.T @ self.slopes - by_own.T @ self.by_stretch
         return (
-            self._with_stretch(alpha).T @ self._hessian(alpha, beta) @ self._with_stretch(beta)
-            - shape.volume_derivative(alpha).T @ second_by_own @ shape.volume_derivative(beta)
+            self._with_stretch(alpha).T
+            @ self._hessian(alpha, beta)
+            @ self._with_stretch(beta)
+            - shape.volume_derivative(alpha).T
+            @ second_by_own
+            @ shape.volume_derivative(beta)
             + ca.substitute(second_volumes, weights, weight_values)
         )
 
     def _with_stretch(self, field: str) -> ca.SX:
         """Return ∂(F, m)/∂F at fixed s, or the same for the gradient of another field."""
         by_own, _ = _logarithm_derivatives(
-            self.shape.own_volumes, self.shape.point.mesh_volume, self.by_stretch
+            self.shape.own_volumes,
+            self.shape.point.mesh_volume,
+            self.by_stretch,
         )
-        return ca.vertcat(ca.SX.eye(9), -by_own @ self.shape.volume_derivative(field))
+        return ca.vertcat(
+            ca.SX.eye(9), -by_own @ self.shape.volume_derivative(field)
+        )
 
     def _hessian(self, alpha: str, beta: str) -> ca.SX:
         """Return the second derivatives of g by (gradient, m) of two fields."""
         point = self.shape.point
         first, second = (
-            ca.vertcat(point.gradients[field], self.shape.stretches) for field in (alpha, beta)
+            ca.vertcat(point.gradients[field], self.shape.stretches)
+            for field in (alpha, beta)
         )
         hessian = point.jacobian(point.gradient(self.scalar, first), second)
         return from_lower_triangle(hessian) if alpha == beta else hessian
 
 
-def _scalar_derivatives(shape: _VolumeSums, outputs: Outputs) -> dict[int, _ScalarDerivatives]:
+def _scalar_derivatives(
+    shape: _VolumeSums, outputs: Outputs
+) -> dict[int, _ScalarDerivatives]:
     """Return the chain rule of each scalar in the outputs, by the identity of the scalar."""
     terms = [term for those in outputs.values() for term in those]
     chains: dict[int, _ScalarDerivatives] = {}
     for term in terms:
         if id(term.scalar) not in chains:
             number = len(chains)
-            parts = {other.part for other in terms if other.scalar is term.scalar}
+            parts = {
+                other.part for other in terms if other.scalar is term.scalar
+            }
             # Where all is symmetric, what is by v is among what is by x.
             fields = ("x",) if parts == {"whole"} else ("x", "v")
             slopes = ca.SX.sym(f"slopes_{number}", shape.count)
@@ -290,14 +344,21 @@ def _scalar_derivatives(shape: _VolumeSums, outputs: Outputs) -> dict[int, _Scal
 
 
 def _coupling(
-    shape: _VolumeSums, chains: dict[int, _ScalarDerivatives], outputs: Outputs, order: int
+    shape: _VolumeSums,
+    chains: dict[int, _ScalarDerivatives],
+    outputs: Outputs,
+    order: int,
 ) -> ca.Function:
     """Return the coupling of each output as a function of all sums over the points: C of order 1 or
     D of order 2, see `kernel`.
     """
     count = shape.count
     constants = shape.point.differentiated_constants.numel()
-    sums = [shape.volume, shape.volumes, *(chain.slopes for chain in chains.values())]
+    sums = [
+        shape.volume,
+        shape.volumes,
+        *(chain.slopes for chain in chains.values()),
+    ]
     blocks = {"volumes": slice(0, count)}
     seconds = {}
     by_thetas = {}
@@ -315,7 +376,9 @@ def _coupling(
         total = ca.SX(0, 0)
         if terms[0].contraction != "none":
             width = constants if "theta" in terms[0].by else 1
-            total = ca.SX(size, size if terms[0].contraction == "pairs" else width)
+            total = ca.SX(
+                size, size if terms[0].contraction == "pairs" else width
+            )
         for term in terms:
             chain = chains[id(term.scalar)]
             by_s, second_of_logarithm = _logarithm_derivatives(
@@ -323,15 +386,30 @@ def _coupling(
             )
             if term.contraction == "nodes":
                 relation = shape.relation_to_x(term.by[0])
-                slopes = by_thetas[id(term.scalar)] if "theta" in term.by else chain.slopes
+                slopes = (
+                    by_thetas[id(term.scalar)]
+                    if "theta" in term.by
+                    else chain.slopes
+                )
                 total[:count, :] += (by_s @ relation).T @ slopes
             elif term.contraction == "pairs":
-                second = by_s.T @ seconds[id(term.scalar)] @ by_s + second_of_logarithm
+                second = (
+                    by_s.T @ seconds[id(term.scalar)] @ by_s
+                    + second_of_logarithm
+                )
                 total += _pair_coupling(
-                    shape, chain, blocks=blocks, size=size, term=term, by_s=by_s, second=second
+                    shape,
+                    chain,
+                    blocks=blocks,
+                    size=size,
+                    term=term,
+                    by_s=by_s,
+                    second=second,
                 )
         couplings.append(total)
-    return ca.Function("coupling", [ca.vertcat(*sums)], couplings, ["sums"], list(outputs))
+    return ca.Function(
+        "coupling", [ca.vertcat(*sums)], couplings, ["sums"], list(outputs)
+    )
 
 
 def _pair_coupling(
@@ -367,12 +445,20 @@ def _pair_coupling(
     coupling[volume_block, volume_block] = of_alpha.T @ second @ of_beta
     coupling[blocks[chain.sum_name(alpha)], volume_block] = by_s @ of_beta
     if beta in chain.fields:
-        coupling[volume_block, blocks[chain.sum_name(beta)]] = of_alpha.T @ by_s.T
+        coupling[volume_block, blocks[chain.sum_name(beta)]] = (
+            of_alpha.T @ by_s.T
+        )
     else:
-        coupling[volume_block, blocks[chain.sum_name(alpha)]] = of_beta.T @ by_s.T
+        coupling[volume_block, blocks[chain.sum_name(alpha)]] = (
+            of_beta.T @ by_s.T
+        )
     if term.part == "whole":
         return coupling
-    return (coupling + coupling.T if term.part == "symmetric" else coupling - coupling.T) / 2
+    return (
+        coupling + coupling.T
+        if term.part == "symmetric"
+        else coupling - coupling.T
+    ) / 2
 
 
 def _volume_logarithms(volumes: ca.SX, volume: ca.SX) -> ca.SX:
@@ -394,7 +480,9 @@ def _volume_logarithms(volumes: ca.SX, volume: ca.SX) -> ca.SX:
     return ca.substitute(n, s, volumes)
 
 
-def _logarithm_derivatives(volumes: ca.SX, volume: ca.SX, weights: ca.SX) -> tuple[ca.SX, ca.SX]:
+def _logarithm_derivatives(
+    volumes: ca.SX, volume: ca.SX, weights: ca.SX
+) -> tuple[ca.SX, ca.SX]:
     """Return ∂n/∂s and Σ_k weights_k ∂²n_k/∂s² of the function n of `_volume_logarithms`, with s =
     `volumes`, at the undeformed `volume`.
     """

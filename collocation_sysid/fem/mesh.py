@@ -30,7 +30,12 @@ from .mesh_checks import (
     signed_volumes,
     unique_edges,
 )
-from .mesh_files import length_in_metres, read_tetrahedra, read_triangles, write_tetrahedra
+from .mesh_files import (
+    length_in_metres,
+    read_tetrahedra,
+    read_triangles,
+    write_tetrahedra,
+)
 from .surface import tetrahedralize_surface
 
 
@@ -105,8 +110,12 @@ class TetMesh:
     ) -> None:
         raw_points = checked_points(points_m)
         elements = checked_tetrahedra(tetrahedra, len(raw_points))
-        arrays = checked_arrays(point_arrays or {}, len(raw_points), "point", "nodes")
-        element_arrays = checked_arrays(cell_arrays or {}, len(elements), "cell", "elements")
+        arrays = checked_arrays(
+            point_arrays or {}, len(raw_points), "point", "nodes"
+        )
+        element_arrays = checked_arrays(
+            cell_arrays or {}, len(elements), "cell", "elements"
+        )
         points, elements, used, notes = clean_mesh(raw_points, elements)
         new_index = np.full(len(raw_points), -1)
         new_index[used] = np.arange(len(used))
@@ -117,9 +126,17 @@ class TetMesh:
         self._set(
             points_m=_read_only(points),
             tetrahedra=_read_only(elements),
-            point_arrays={name: _read_only(values[used]) for name, values in arrays.items()},
-            cell_arrays={name: _read_only(values) for name, values in element_arrays.items()},
-            face_sets={name: _read_only(corners) for name, corners in faces.items()},
+            point_arrays={
+                name: _read_only(values[used])
+                for name, values in arrays.items()
+            },
+            cell_arrays={
+                name: _read_only(values)
+                for name, values in element_arrays.items()
+            },
+            face_sets={
+                name: _read_only(corners) for name, corners in faces.items()
+            },
             file_index=_read_only(used),
             file_node_count=len(raw_points),
             notes=notes,
@@ -160,8 +177,8 @@ class TetMesh:
             If the file cannot be read, contains no tetrahedra, has sides curved by more than 5 % of
             their length, or its mesh is invalid.
         """
-        points_m, tetrahedra, point_arrays, cell_arrays, faces, notes = read_tetrahedra(
-            path, length_unit
+        points_m, tetrahedra, point_arrays, cell_arrays, faces, notes = (
+            read_tetrahedra(path, length_unit)
         )
         try:
             mesh = cls(points_m, tetrahedra, point_arrays, cell_arrays, faces)
@@ -204,7 +221,9 @@ class TetMesh:
             points = checked_points(surface[0]) * length_in_metres(length_unit)
             triangles = surface[1]
         try:
-            return cls(*tetrahedralize_surface(points, triangles, edge_length_m, cache))
+            return cls(
+                *tetrahedralize_surface(points, triangles, edge_length_m, cache)
+            )
         except InputError as error:
             raise error.located(path) from error.__cause__
 
@@ -278,14 +297,18 @@ class TetMesh:
     @cached_property
     def sha256(self) -> str:
         """Hash of the points and tetrahedra, as 64 hexadecimal digits."""
-        digest = hashlib.sha256(f"{self.points_m.shape} {self.tetrahedra.shape}".encode())
+        digest = hashlib.sha256(
+            f"{self.points_m.shape} {self.tetrahedra.shape}".encode()
+        )
         digest.update(self.points_m.astype("<f8").tobytes())
         digest.update(self.tetrahedra.astype("<i8").tobytes())
         return digest.hexdigest()
 
     def quality(self) -> MeshQuality:
         """Return edge lengths and mean ratios of the elements."""
-        lengths = np.linalg.norm(np.diff(self.points_m[self.edges], axis=1), axis=2)
+        lengths = np.linalg.norm(
+            np.diff(self.points_m[self.edges], axis=1), axis=2
+        )
         ratios = mean_ratios(self.points_m, self.tetrahedra)
         return MeshQuality(
             edge_min_m=float(lengths.min()),
@@ -340,16 +363,25 @@ class ElementNodes:
     @classmethod
     def corners(cls, mesh: TetMesh) -> ElementNodes:
         """Return the nodes of the mesh only."""
-        return cls(mesh, mesh.points_m, mesh.tetrahedra, np.empty((0, 2), dtype=np.int64))
+        return cls(
+            mesh,
+            mesh.points_m,
+            mesh.tetrahedra,
+            np.empty((0, 2), dtype=np.int64),
+        )
 
     @classmethod
     def for_element(cls, mesh: TetMesh, element: Element) -> ElementNodes:
         """Return the nodes of a kind of element: corners, and mid nodes if it has any."""
         if not element.edges:
             return cls.corners(mesh)
-        points = _read_only(np.vstack([mesh.points_m, mesh.points_m[mesh.edges].mean(axis=1)]))
+        points = _read_only(
+            np.vstack([mesh.points_m, mesh.points_m[mesh.edges].mean(axis=1)])
+        )
         middles = mesh.mid_node_indices(mesh.tetrahedra[:, element.edges])
-        return cls(mesh, points, np.hstack([mesh.tetrahedra, middles]), mesh.edges)
+        return cls(
+            mesh, points, np.hstack([mesh.tetrahedra, middles]), mesh.edges
+        )
 
     def with_mid_nodes(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Extend a mask of mesh nodes to mid nodes, which are selected if both ends of the edge

@@ -41,7 +41,9 @@ def checked_points(points_m: ArrayLike) -> np.ndarray:
     try:
         points = np.array(points_m, dtype=np.float64)
     except (TypeError, ValueError):
-        raise InputError("points_m must be an (n, 3) array of numbers") from None
+        raise InputError(
+            "points_m must be an (n, 3) array of numbers"
+        ) from None
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"points_m must have shape (n, 3), not {points.shape}")
     if (np.abs(points) > LARGEST_M).any():
@@ -60,11 +62,17 @@ def checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
     try:
         array = np.array(tetrahedra)
     except ValueError:
-        raise InputError("tetrahedra must be an (E, 4) array of node numbers") from None
+        raise InputError(
+            "tetrahedra must be an (E, 4) array of node numbers"
+        ) from None
     if array.ndim != 2 or array.shape[1] != 4 or not len(array):
-        raise InputError(f"tetrahedra must have shape (E, 4) with E > 0, not {array.shape}")
+        raise InputError(
+            f"tetrahedra must have shape (E, 4) with E > 0, not {array.shape}"
+        )
     if array.dtype.kind not in "iu":
-        raise InputError(f"tetrahedra must hold integer node numbers, not {array.dtype}")
+        raise InputError(
+            f"tetrahedra must hold integer node numbers, not {array.dtype}"
+        )
     require_known_nodes(array, node_count)
     return array.astype(np.int64)
 
@@ -85,7 +93,9 @@ def require_known_nodes(cells: np.ndarray, node_count: int) -> None:
     bad = np.flatnonzero(((cells < 0) | (cells >= node_count)).any(axis=1))
     if len(bad):
         hint = (
-            "; they seem to count from 1" if (cells.min(), cells.max()) == (1, node_count) else ""
+            "; they seem to count from 1"
+            if (cells.min(), cells.max()) == (1, node_count)
+            else ""
         )
         raise InputError(
             f"element {bad[0]} has nodes {cells[bad[0]].tolist()}, but there are {node_count} "
@@ -144,7 +154,9 @@ def clean_mesh(
     _require_no_duplicates(tetrahedra)
     _require_not_degenerate(points_m, tetrahedra)
     used_points = points_m[used]
-    oriented, reversed_elements = orient_elements(used_points, renumbered.reshape(-1, 4))
+    oriented, reversed_elements = orient_elements(
+        used_points, renumbered.reshape(-1, 4)
+    )
     notes = []
     dropped = np.setdiff1d(np.arange(len(points_m)), used)
     if len(dropped):
@@ -157,10 +169,17 @@ def clean_mesh(
             f"{len(reversed_elements)} of {len(oriented)} elements had a negative volume and were "
             "re-oriented."
         )
-    return used_points, oriented, used, (*notes, *_note_parts(used_points, oriented))
+    return (
+        used_points,
+        oriented,
+        used,
+        (*notes, *_note_parts(used_points, oriented)),
+    )
 
 
-def orient_elements(points_m: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def orient_elements(
+    points_m: np.ndarray, tetrahedra: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return a copy of the tetrahedra (E, 4) in which all volumes are positive, and the indices of
     those whose last two nodes were exchanged for it.
     """
@@ -182,7 +201,9 @@ def signed_volumes(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 def unique_edges(tetrahedra: np.ndarray) -> np.ndarray:
     """Return the pairs of nodes that share an element, (m, 2), each once, sorted."""
-    return np.unique(np.sort(tetrahedra[:, EDGES].reshape(-1, 2), axis=1), axis=0)
+    return np.unique(
+        np.sort(tetrahedra[:, EDGES].reshape(-1, 2), axis=1), axis=0
+    )
 
 
 @dataclass(frozen=True)
@@ -234,7 +255,10 @@ def _require_finite(points: np.ndarray, used: np.ndarray) -> None:
 def _require_no_duplicates(tetrahedra: np.ndarray) -> None:
     """Raise an `InputError` if two elements have the same nodes."""
     _, first, inverse = np.unique(
-        np.sort(tetrahedra, axis=1), axis=0, return_index=True, return_inverse=True
+        np.sort(tetrahedra, axis=1),
+        axis=0,
+        return_index=True,
+        return_inverse=True,
     )
     twin = first[inverse.ravel()]
     again = np.flatnonzero(twin != np.arange(len(tetrahedra)))
@@ -268,11 +292,19 @@ def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
         return ()
     sizes = ", ".join(str(size) for size in np.sort(np.bincount(label))[:-6:-1])
     twins = n - len(np.unique(points, axis=0))
-    hint = f"; {twins} of {n} nodes coincide with others: merge them" if twins else ""
-    return (f"The mesh is in {parts} unconnected parts (the largest have {sizes} nodes){hint}.",)
+    hint = (
+        f"; {twins} of {n} nodes coincide with others: merge them"
+        if twins
+        else ""
+    )
+    return (
+        f"The mesh is in {parts} unconnected parts (the largest have {sizes} nodes){hint}.",
+    )
 
 
-def straightening_notes(points_m: np.ndarray, cells: np.ndarray) -> tuple[str, ...]:
+def straightening_notes(
+    points_m: np.ndarray, cells: np.ndarray
+) -> tuple[str, ...]:
     """Return notes on curved sides that are lost when quadratic tetrahedra are reduced to corners.
 
     Parameters

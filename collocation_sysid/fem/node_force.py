@@ -138,7 +138,9 @@ class NodeForce:
         """
         name = name or str(getattr(law, "__name__", "force")).replace("_", "-")
         definitions = {constant.name: constant for constant in constants}
-        arguments = list(inspect.signature(law).parameters)[4 if carries else 3 :]
+        arguments = list(inspect.signature(law).parameters)[
+            4 if carries else 3 :
+        ]
         if "at" in arguments:
             raise InputError(
                 f"force {name!r} has an argument before `at`, as forces with internal variables "
@@ -148,8 +150,14 @@ class NodeForce:
             raise InputError(
                 f"force {name!r} has no constant {unused[0]!r}{hint_at(unused[0], arguments)}"
             )
-        known = tuple(definitions.get(a) or constant_named(a) for a in arguments)
-        chosen = nodes if nodes is None or isinstance(nodes, Selection) else np.asarray(nodes)
+        known = tuple(
+            definitions.get(a) or constant_named(a) for a in arguments
+        )
+        chosen = (
+            nodes
+            if nodes is None or isinstance(nodes, Selection)
+            else np.asarray(nodes)
+        )
         if on not in get_args(On):
             raise InputError(
                 f"force {name!r} is on {on!r}; expected one of {', '.join(get_args(On))}"
@@ -172,13 +180,23 @@ class NodeForce:
         data : SX
             Entries of an `ForceContext`.
         """
-        dofs = (u.numel() - len(self.constants) - self.internal_variable_count) // 2
-        ends = [0, dofs, 2 * dofs, u.numel() - self.internal_variable_count, u.numel()]
+        dofs = (
+            u.numel() - len(self.constants) - self.internal_variable_count
+        ) // 2
+        ends = [
+            0,
+            dofs,
+            2 * dofs,
+            u.numel() - self.internal_variable_count,
+            u.numel(),
+        ]
         x, v, values, before = ca.vertsplit(u, ends)
         at = ForceContext(*ca.vertsplit(data, [*CONTEXT_OFFSETS]))
         named = {c.name: values[k] for k, c in enumerate(self.constants)}
         if self.on == "nodes":
-            return ca.vertcat(*self._evaluate_law(x, v, before=before, at=at, named=named))
+            return ca.vertcat(
+                *self._evaluate_law(x, v, before=before, at=at, named=named)
+            )
         places = ca.horzsplit(ca.reshape(x, 3, dofs // 3))
         area = area_vector(places)
         size = ca.norm_2(area)
@@ -186,10 +204,17 @@ class NodeForce:
         force, after = self._evaluate_law(
             face_middle(x), face_middle(v), before=before, at=at, named=named
         )
-        return ca.vertcat(*[ca.SX.zeros(3)] * (len(places) - 3), *[force / 3] * 3, after)
+        return ca.vertcat(
+            *[ca.SX.zeros(3)] * (len(places) - 3), *[force / 3] * 3, after
+        )
 
     def _evaluate_law(
-        self, x: ca.SX, v: ca.SX, before: ca.SX, at: ForceContext, named: dict[str, ca.SX]
+        self,
+        x: ca.SX,
+        v: ca.SX,
+        before: ca.SX,
+        at: ForceContext,
+        named: dict[str, ca.SX],
     ) -> tuple[ca.SX, ca.SX]:
         """Return the force (3,) and the internal variables (h,) after the evaluation, empty without
         memory.
@@ -248,10 +273,15 @@ class NodeForce:
         largest = np.zeros(2)
         dofs = self._smallest_dofs
         for _ in range(3):
-            sample = [rng.uniform(0.5, 1.0, size) for size in (self.input_size(dofs), CONTEXT_SIZE)]
+            sample = [
+                rng.uniform(0.5, 1.0, size)
+                for size in (self.input_size(dofs), CONTEXT_SIZE)
+            ]
             values = self._force_and_jacobian(*sample)[1].full()
             values = values[:dofs]
-            for k, part in enumerate((values[:, :dofs], values[:, dofs : 2 * dofs])):
+            for k, part in enumerate(
+                (values[:, :dofs], values[:, dofs : 2 * dofs])
+            ):
                 size = np.abs(part).max() or 1.0
                 largest[k] = max(largest[k], np.abs(part - part.T).max() / size)
         return float(largest[0]), float(largest[1])
@@ -267,14 +297,23 @@ class NodeForce:
         """
         dofs = self._smallest_dofs
         named = {c.name: ca.SX.sym(c.name) for c in self.constants}
-        x, v, before = (ca.SX.sym("u", size) for size in (3, 3, self.internal_variable_count))
-        at = ForceContext(*ca.vertsplit(ca.SX.sym("data", CONTEXT_SIZE), [*CONTEXT_OFFSETS]))
+        x, v, before = (
+            ca.SX.sym("u", size)
+            for size in (3, 3, self.internal_variable_count)
+        )
+        at = ForceContext(
+            *ca.vertsplit(ca.SX.sym("data", CONTEXT_SIZE), [*CONTEXT_OFFSETS])
+        )
         try:
-            force, after = self._evaluate_law(x, v, before=before, at=at, named=named)
+            force, after = self._evaluate_law(
+                x, v, before=before, at=at, named=named
+            )
             _ = self._symbols
         except (Exception, SystemExit) as error:
             internal_text = (
-                " and the new internal variables" if self.internal_variable_count else ""
+                " and the new internal variables"
+                if self.internal_variable_count
+                else ""
             )
             raise InputError(
                 f"force {self.name!r} cannot be evaluated ({reason(error)}); expected a function "
@@ -282,7 +321,9 @@ class NodeForce:
                 + internal_text
             ) from error
         if force.shape != (3, 1):
-            raise InputError(f"force {self.name!r} has the shape {force.shape}; expected (3, 1)")
+            raise InputError(
+                f"force {self.name!r} has the shape {force.shape}; expected (3, 1)"
+            )
         if after.shape != (self.internal_variable_count, 1):
             raise InputError(
                 f"force {self.name!r} returns {after.numel()} internal variables; expected "
@@ -309,7 +350,8 @@ class NodeForce:
             Nodes of the refined body, used where a selection cannot select anew.
         """
         finds = self.nodes is None or (
-            isinstance(self.nodes, Selection) and not isinstance(self.nodes, Indices)
+            isinstance(self.nodes, Selection)
+            and not isinstance(self.nodes, Indices)
         )
         return self if finds else replace(self, nodes=nodes)
 
@@ -336,7 +378,12 @@ class LocatedForce:
 
     @classmethod
     def on_mesh(
-        cls, force: NodeForce, mesh: ElementNodes, chosen: Index, volume_m3: Array, columns: Index
+        cls,
+        force: NodeForce,
+        mesh: ElementNodes,
+        chosen: Index,
+        volume_m3: Array,
+        columns: Index,
     ) -> LocatedForce:
         """Place a force on selected nodes of a mesh.
 
@@ -357,7 +404,9 @@ class LocatedForce:
             If the force is on faces and no face has all of its nodes selected.
         """
         area, normal = surface_shares(mesh)
-        data = np.vstack([mesh.points_m.T, area, volume_m3[: len(area)], normal.T])
+        data = np.vstack(
+            [mesh.points_m.T, area, volume_m3[: len(area)], normal.T]
+        )
         if force.on == "nodes":
             nodes = chosen[:, None]
             data = data[:, chosen]
@@ -371,12 +420,16 @@ class LocatedForce:
                 )
             data = data[:, nodes[:, -3:]].mean(axis=2)
             data[3:] = 0.0
-        return cls(force, ForcePoints.at_nodes(nodes, len(volume_m3)), data, columns)
+        return cls(
+            force, ForcePoints.at_nodes(nodes, len(volume_m3)), data, columns
+        )
 
 
 def _as_column(values: Any) -> ca.SX:
     """Return a list or a single expression as a column vector."""
-    return ca.SX(ca.vertcat(*values) if isinstance(values, (list, tuple)) else values)
+    return ca.SX(
+        ca.vertcat(*values) if isinstance(values, (list, tuple)) else values
+    )
 
 
 def face_middle(values: ca.SX) -> ca.SX:
@@ -397,10 +450,16 @@ def area_vector(places: Sequence[ca.SX]) -> ca.SX:
     """
     corners = places[:3]
     middles = places[3:]
-    pairs = zip(corners, middles, strict=True) if middles else ((corner,) for corner in corners)
+    pairs = (
+        zip(corners, middles, strict=True)
+        if middles
+        else ((corner,) for corner in corners)
+    )
     ring = [place - places[0] for pair in pairs for place in pair]
     neighbours = pairwise(ring)
-    return sum((ca.cross(a, b) for a, b in neighbours), start=ca.SX.zeros(3)) / 2
+    return (
+        sum((ca.cross(a, b) for a, b in neighbours), start=ca.SX.zeros(3)) / 2
+    )
 
 
 def surface_shares(mesh: ElementNodes) -> tuple[Array, Array]:
@@ -417,4 +476,6 @@ def surface_shares(mesh: ElementNodes) -> tuple[Array, Array]:
         np.add.at(normal, node, share)
         np.add.at(area, node, np.linalg.norm(share, axis=1))
     length = np.linalg.norm(normal, axis=1, keepdims=True)
-    return area, np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+    return area, np.divide(
+        normal, length, out=np.zeros_like(normal), where=length > 0
+    )

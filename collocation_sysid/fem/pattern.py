@@ -41,12 +41,16 @@ class SymmetricPattern:
         return cls.from_entries(row[lower], column[lower], nodes)
 
     @classmethod
-    def from_entries(cls, rows: Index, columns: Index, nodes: int) -> SymmetricPattern:
+    def from_entries(
+        cls, rows: Index, columns: Index, nodes: int
+    ) -> SymmetricPattern:
         """Return the pattern of size 3 · `nodes` with these entries of the lower triangle, rows ≥
         columns, and the diagonal; repetitions are merged.
         """
         size = 3 * nodes
-        codes = np.unique(np.append(columns * size + rows, np.arange(size) * (size + 1)))
+        codes = np.unique(
+            np.append(columns * size + rows, np.arange(size) * (size + 1))
+        )
         return cls(size, codes % size, codes // size)
 
     @property
@@ -72,7 +76,9 @@ class SymmetricPattern:
         codes = self.columns * self.size + self.rows
         requested_codes = low * self.size + high
         positions = np.searchsorted(codes, requested_codes)
-        if (positions >= len(codes)).any() or (codes[positions] != requested_codes).any():
+        if (positions >= len(codes)).any() or (
+            codes[positions] != requested_codes
+        ).any():
             raise IndexError("an entry lies outside the mesh graph")
         return positions
 
@@ -82,21 +88,27 @@ class SymmetricPattern:
         strict = self.rows != self.columns
         rows = np.concatenate([self.rows, self.columns[strict]])
         columns = np.concatenate([self.columns, self.rows[strict]])
-        source = np.concatenate([np.arange(self.entry_count), np.flatnonzero(strict)])
+        source = np.concatenate(
+            [np.arange(self.entry_count), np.flatnonzero(strict)]
+        )
         order = np.lexsort((rows, columns))
         return rows[order], columns[order], source[order]
 
     def matrix(self, values: NDArray[np.float64]) -> sp.csc_array:
         """Return the full symmetric matrix with the lower-triangle values (m,)."""
         rows, columns, source = self.full
-        return sp.csc_array((values[source], (rows, columns)), shape=(self.size, self.size))
+        return sp.csc_array(
+            (values[source], (rows, columns)), shape=(self.size, self.size)
+        )
 
     def products(self, values: Array, vectors: Array) -> Array:
         """Return for each t the product (3n,) of the symmetric matrix with lower-triangle values
         (T, m) and a vector (T, 3n), (T, 3n).
         """
         pairs = zip(values, vectors, strict=True)
-        return np.stack([self.matrix(value) @ vector for value, vector in pairs])
+        return np.stack(
+            [self.matrix(value) @ vector for value, vector in pairs]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,9 +132,18 @@ class JointPattern:
         """Return the union of patterns of one size; the latest 16 are cached."""
         rows = np.concatenate([pattern.rows for pattern in patterns])
         columns = np.concatenate([pattern.columns for pattern in patterns])
-        union = SymmetricPattern.from_entries(rows, columns, patterns[0].size // 3)
-        union = patterns[0] if union.entry_count == patterns[0].entry_count else union
-        return JointPattern(union, tuple(union.positions_of(p.rows, p.columns) for p in patterns))
+        union = SymmetricPattern.from_entries(
+            rows, columns, patterns[0].size // 3
+        )
+        union = (
+            patterns[0]
+            if union.entry_count == patterns[0].entry_count
+            else union
+        )
+        return JointPattern(
+            union,
+            tuple(union.positions_of(p.rows, p.columns) for p in patterns),
+        )
 
     def expand(self, values: Array) -> Array:
         """Return values (T, m) of the first pattern as values (T, M) of the union, with zeros
@@ -140,7 +161,9 @@ def dofs_of(nodes: Index) -> Index:
     return (3 * nodes[..., None] + np.arange(3)).reshape(*nodes.shape[:-1], -1)
 
 
-def element_destinations(pattern: SymmetricPattern, cells: Index) -> tuple[Index, Index]:
+def element_destinations(
+    pattern: SymmetricPattern, cells: Index
+) -> tuple[Index, Index]:
     """Return the positions of an element's vector and lower-triangle entries in global arrays.
 
     Returns
@@ -153,7 +176,9 @@ def element_destinations(pattern: SymmetricPattern, cells: Index) -> tuple[Index
     dofs = dofs_of(cells)
     size = dofs.shape[1]
     local_columns, local_rows = np.triu_indices(size)
-    return dofs, pattern.positions_of(dofs[:, local_rows], dofs[:, local_columns])
+    return dofs, pattern.positions_of(
+        dofs[:, local_rows], dofs[:, local_columns]
+    )
 
 
 def with_ascending_nodes(cells: Index, geometry: Array) -> tuple[Index, Array]:
@@ -162,7 +187,9 @@ def with_ascending_nodes(cells: Index, geometry: Array) -> tuple[Index, Array]:
     """
     order = np.argsort(cells, axis=1)
     gradients = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3)
-    sorted_gradients = np.take_along_axis(gradients, order[:, None, :, None], axis=2)
+    sorted_gradients = np.take_along_axis(
+        gradients, order[:, None, :, None], axis=2
+    )
     gradient_rows = sorted_gradients.reshape(*geometry.shape[:2], -1)
     return np.take_along_axis(cells, order, axis=1), np.append(
         gradient_rows, geometry[..., -1:], axis=2

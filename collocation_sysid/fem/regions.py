@@ -17,8 +17,23 @@ from numpy.typing import ArrayLike
 
 from ..array_types import Array, Index
 from ..errors import InputError, hint_at
-from .constants import CONTRAST, DENSITY, GAMMA_M, MASS, Constant, is_field_coefficient
-from .materials import DampingLaw, Energy, Material, Prony, as_branches, as_damping, as_material
+from .constants import (
+    CONTRAST,
+    DENSITY,
+    GAMMA_M,
+    MASS,
+    Constant,
+    is_field_coefficient,
+)
+from .materials import (
+    DampingLaw,
+    Energy,
+    Material,
+    Prony,
+    as_branches,
+    as_damping,
+    as_material,
+)
 from .mesh import TetMesh
 from .moduli import ConstantSource, elastic_names, find_source
 from .node_force import NodeForce
@@ -52,7 +67,10 @@ class Region:
     field: Field | None = None
 
     def __post_init__(self) -> None:
-        if not self.name or not self.name.replace("_", "").replace("-", "").isalnum():
+        if (
+            not self.name
+            or not self.name.replace("_", "").replace("-", "").isalnum()
+        ):
             raise InputError(
                 f"the region's name is {self.name!r}; expected letters, digits, - and _, because "
                 "it precedes the names of its parameters"
@@ -99,7 +117,9 @@ class BodyPart:
     @cached_property
     def constants(self) -> tuple[Constant, ...]:
         """Constants of material, damping law, memory, mass and field, in the order of θ."""
-        memory = [constant for branch in self.prony for constant in branch.constants]
+        memory = [
+            constant for branch in self.prony for constant in branch.constants
+        ]
         density = (DENSITY,) if self.has_free_density else ()
         return (
             *self.material.constants,
@@ -175,10 +195,15 @@ def parts_from_regions(
     """
     claimed = _cells_of_regions(mesh, regions)
     densities = _densities(
-        mesh, regions, claimed=claimed, density_kg_m3=density_kg_m3, mass_kg=mass_kg
+        mesh,
+        regions,
+        claimed=claimed,
+        density_kg_m3=density_kg_m3,
+        mass_kg=mass_kg,
     )
     rest = np.setdiff1d(
-        np.arange(len(mesh.tetrahedra)), np.concatenate([np.zeros(0, int), *claimed])
+        np.arange(len(mesh.tetrahedra)),
+        np.concatenate([np.zeros(0, int), *claimed]),
     )
     branches = as_branches(prony)
     remainder = BodyPart(
@@ -195,13 +220,23 @@ def parts_from_regions(
             "the field of a region"
         )
     parts = [_with_field(remainder, field, mesh)] if rest.size else []
-    for region, cells, density in zip(regions, claimed, densities[1:], strict=True):
+    for region, cells, density in zip(
+        regions, claimed, densities[1:], strict=True
+    ):
         try:
-            law = remainder.material if region.material is None else as_material(region.material)
-            region_damping = (
-                remainder.damping if region.damping is None else as_damping(region.damping)
+            law = (
+                remainder.material
+                if region.material is None
+                else as_material(region.material)
             )
-            memory = branches if region.prony is None else as_branches(region.prony)
+            region_damping = (
+                remainder.damping
+                if region.damping is None
+                else as_damping(region.damping)
+            )
+            memory = (
+                branches if region.prony is None else as_branches(region.prony)
+            )
             has_own = region.density_kg_m3 is not None
             part = BodyPart(
                 region.name,
@@ -215,8 +250,13 @@ def parts_from_regions(
             parts.append(_with_field(part, region.field, mesh))
         except InputError as error:
             raise error.located(None, f"region '{region.name}'") from error
-    mass = sum(part.density_kg_m3 * float(mesh.volumes_m3[part.cells].sum()) for part in parts)
-    return tuple(replace(part, per_mass_1_m3=part.density_kg_m3 / mass) for part in parts)
+    mass = sum(
+        part.density_kg_m3 * float(mesh.volumes_m3[part.cells].sum())
+        for part in parts
+    )
+    return tuple(
+        replace(part, per_mass_1_m3=part.density_kg_m3 / mass) for part in parts
+    )
 
 
 def _with_field(part: BodyPart, field: Field | None, mesh: TetMesh) -> BodyPart:
@@ -256,12 +296,22 @@ def _densities(
         raise InputError("give exactly one of density_kg_m3 and mass_kg")
     for region in regions:
         if region.density_kg_m3 is not None and not region.density_kg_m3 > 0:
-            raise InputError("density_kg_m3 must be positive", None, f"region '{region.name}'")
+            raise InputError(
+                "density_kg_m3 must be positive",
+                None,
+                f"region '{region.name}'",
+            )
     if density_kg_m3 is None:
         volumes = [float(mesh.volumes_m3[cells].sum()) for cells in claimed]
-        known = [(r.density_kg_m3, v) for r, v in zip(regions, volumes, strict=True)]
-        known_kg = sum(density * v for density, v in known if density is not None)
-        remaining_m3 = mesh.volume_m3 - sum(v for density, v in known if density is not None)
+        known = [
+            (r.density_kg_m3, v) for r, v in zip(regions, volumes, strict=True)
+        ]
+        known_kg = sum(
+            density * v for density, v in known if density is not None
+        )
+        remaining_m3 = mesh.volume_m3 - sum(
+            v for density, v in known if density is not None
+        )
         if remaining_m3 <= 1e-12 * mesh.volume_m3:
             raise InputError(
                 "every cell is in a region with a density of its own, so mass_kg has no effect; "
@@ -281,7 +331,9 @@ def _densities(
         )
         raise InputError(f"{key} must be positive{hint}")
     region_densities = [
-        default_density if region.density_kg_m3 is None else region.density_kg_m3
+        default_density
+        if region.density_kg_m3 is None
+        else region.density_kg_m3
         for region in regions
     ]
     return [default_density, *region_densities]
@@ -293,7 +345,9 @@ def _cells_of_regions(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
     claimed: list[Index] = []
     for k, region in enumerate(regions):
         if region.name in [other.name for other in regions[:k]]:
-            raise InputError(f"two regions are named {region.name!r}; names must differ")
+            raise InputError(
+                f"two regions are named {region.name!r}; names must differ"
+            )
         try:
             cells = _resolve_cells(mesh, region.cells)
         except InputError as error:
@@ -330,7 +384,9 @@ def _resolve_cells(mesh: TetMesh, cells: Selection | ArrayLike) -> Index:
         )
     outside = array[(array < 0) | (array >= count)]
     if outside.size:
-        raise InputError(f"cell {outside[0]} does not exist; the mesh has {count}, from 0 on")
+        raise InputError(
+            f"cell {outside[0]} does not exist; the mesh has {count}, from 0 on"
+        )
     return np.unique(array).astype(np.int64)
 
 
@@ -405,7 +461,8 @@ class ConstantsModel:
                 part.name,
                 part.material,
                 part.constants[
-                    len(part.material.constants) : len(part.constants) - len(part.field_constants)
+                    len(part.material.constants) : len(part.constants)
+                    - len(part.field_constants)
                 ],
                 known,
             )
@@ -427,10 +484,16 @@ class ConstantsModel:
             The names among `known` that give constants of the parts, and always those of field
             coefficients, contrasts, custom forces and coefficients of friction.
         """
-        used = {name for source in self.constant_sources(known) for name in source.names.values()}
+        used = {
+            name
+            for source in self.constant_sources(known)
+            for name in source.names.values()
+        }
         used.update(self.field_coefficient_names, self.contrast_deviations)
         further = (force.constants for force in self.forces)
-        return used.union(*({c.name for c in some} for some in (*further, self.frictions)))
+        return used.union(
+            *({c.name for c in some} for some in (*further, self.frictions))
+        )
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -439,9 +502,13 @@ class ConstantsModel:
         """
         names = []
         for part in self.parts:
-            part_names = [c.name for c in part.constants] + list(elastic_names(part.material))
+            part_names = [c.name for c in part.constants] + list(
+                elastic_names(part.material)
+            )
             part_names.append(DENSITY.name)
-            names += [part.full_name(part_name) for part_name in part_names] + part_names
+            names += [
+                part.full_name(part_name) for part_name in part_names
+            ] + part_names
         return tuple(dict.fromkeys([*names, MASS.name, *self.constants]))
 
     def assemble_theta(self, values: Mapping[str, Any]) -> list[Any]:
@@ -456,18 +523,27 @@ class ConstantsModel:
             If a constant is missing or given twice.
         """
         theta = []
-        for part, source in zip(self.parts, self.constant_sources(list(values)), strict=True):
+        for part, source in zip(
+            self.parts, self.constant_sources(list(values)), strict=True
+        ):
             constants = source.evaluate(values)
             if source.names.get(DENSITY.name) == MASS.name:
                 constants[DENSITY.name] *= part.per_mass_1_m3
             # A field that nothing is said of is as its mean everywhere.
-            own_constants = part.constants[: len(part.constants) - len(part.field_constants)]
+            own_constants = part.constants[
+                : len(part.constants) - len(part.field_constants)
+            ]
             theta += [constants[constant.name] for constant in own_constants]
-            theta += [values.get(part.full_name(c.name), c.usual) for c in part.field_constants]
+            theta += [
+                values.get(part.full_name(c.name), c.usual)
+                for c in part.field_constants
+            ]
         for name in list(self.constants)[len(theta) :]:
             if name not in values:
                 raise InputError(
-                    "no value is given of this constant of a force or friction", None, name
+                    "no value is given of this constant of a force or friction",
+                    None,
+                    name,
                 )
             theta.append(values[name])
         return theta
@@ -488,10 +564,16 @@ class ConstantsModel:
         """
         by_part = {}
         for part, part_constants in zip(
-            self.parts, self.split_theta(np.asarray(theta, dtype=float)), strict=True
+            self.parts,
+            self.split_theta(np.asarray(theta, dtype=float)),
+            strict=True,
         ):
             values = (
-                part.material.lame(part_constants[: len(part.material.constants)]).full().ravel()
+                part.material.lame(
+                    part_constants[: len(part.material.constants)]
+                )
+                .full()
+                .ravel()
             )
             by_part[part.name] = (float(values[0]), float(values[1]))
         return by_part
@@ -517,7 +599,9 @@ class ConstantsModel:
     @property
     def field_coefficient_names(self) -> tuple[str, ...]:
         """Names of the coefficients of the shapes of fields."""
-        return tuple(name for name in self.constants if is_field_coefficient(name))
+        return tuple(
+            name for name in self.constants if is_field_coefficient(name)
+        )
 
     @property
     def contrast_deviations(self) -> dict[str, float]:
@@ -533,12 +617,18 @@ class ConstantsModel:
         """Slice in θ of the coefficients of each part's field."""
         counts = (len(part.field_constants) for part in self.parts)
         ends = self.starts[1:]
-        return [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
+        return [
+            slice(end - count, end)
+            for end, count in zip(ends, counts, strict=True)
+        ]
 
     @cached_property
     def starts(self) -> list[int]:
         """Index in θ of the first constant of each part, and that after the last part."""
-        return [0, *np.cumsum([len(part.constants) for part in self.parts]).tolist()]
+        return [
+            0,
+            *np.cumsum([len(part.constants) for part in self.parts]).tolist(),
+        ]
 
     def elastic_theta(self, constants: Mapping[str, float]) -> Array:
         """Return θ (k,) from elastic constants by name, with all other constants zero.
@@ -554,7 +644,11 @@ class ConstantsModel:
                 raise InputError(
                     f"no constant {name!r}; expected {', '.join(self.constants)}{hint}"
                 )
-        stored = {p.full_name(c.name) for p in self.parts for c in p.material.constants}
+        stored = {
+            p.full_name(c.name)
+            for p in self.parts
+            for c in p.material.constants
+        }
         return self.theta_from_values(
             {**dict.fromkeys(set(self.constants) - stored, 0.0), **constants}
         )

@@ -48,11 +48,18 @@ class RestPointLayout:
         `data` contains column after column the D values, their k first derivatives, and their
         second derivatives in the order of `input_pairs`.
         """
-        columns = ca.reshape(data, self.value_count, 1 + self.input_count + len(self.input_pairs))
+        columns = ca.reshape(
+            data, self.value_count, 1 + self.input_count + len(self.input_pairs)
+        )
         values = columns[:, 0]
         for i in range(self.input_count):
             values += columns[:, 1 + i] * changes[i]
         for number, (i, j) in enumerate(self.input_pairs):
             factor = 0.5 if i == j else 1.0
-            values += factor * changes[i] * changes[j] * columns[:, 1 + self.input_count + number]
+            values += (
+                factor
+                * changes[i]
+                * changes[j]
+                * columns[:, 1 + self.input_count + number]
+            )
         return values

@@ -152,7 +152,9 @@ class UnderGravity:
                 where="scan.nodes",
             )
         points_m = nodes.points_m[chosen]
-        spread = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)
+        spread = np.linalg.svd(
+            points_m - points_m.mean(axis=0), compute_uv=False
+        )
         if len(spread) < 2 or spread[1] <= 1e-9 * max(spread[0], 1e-300):
             raise InputError(
                 f"found {chosen.size} nodes on one line, about which the body could turn; expected "
@@ -179,7 +181,9 @@ class RestShape:
 
 
 @lru_cache(32)
-def _point_stress(material: Material, averages: bool, slopes: bool) -> ca.Function:
+def _point_stress(
+    material: Material, averages: bool, slopes: bool
+) -> ca.Function:
     """Return the function of the Kirchhoff stress per volume of the mesh at a point.
 
     Inputs: G (9,), column after column; the mean m of det G over the element; the constants (c,) of
@@ -208,9 +212,13 @@ def _point_stress(material: Material, averages: bool, slopes: bool) -> ca.Functi
     stress = ca.vec(ca.det(G) * piola @ F.T)
     outputs = [stress]
     if slopes:
-        outputs += [ca.jacobian(stress, each) for each in (gradient, mean, theta)]
+        outputs += [
+            ca.jacobian(stress, each) for each in (gradient, mean, theta)
+        ]
     dense = [ca.densify(output) for output in outputs]
-    return ca.Function("inverse_stress", [gradient, mean, theta], dense, {"cse": True})
+    return ca.Function(
+        "inverse_stress", [gradient, mean, theta], dense, {"cse": True}
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,14 +280,18 @@ def _part_forces(
     mean = np.einsum("eq,eq->e", shares, ratios)
     point_gradients = G.reshape(count * points, 9).T
     function = _point_stress(material, averages, slopes)
-    outputs = function(point_gradients, np.repeat(mean, points)[None], constants)
+    outputs = function(
+        point_gradients, np.repeat(mean, points)[None], constants
+    )
     outputs = [np.array(each) for each in (outputs if slopes else [outputs])]
     stress = outputs[0].T.reshape(count, points, 3, 3)
     size = 3 * cells.shape[1]
     dofs = (3 * cells[:, :, None] + np.arange(3)).reshape(count, size)
     if averages:
         _average_pressure(stress[..., None], shares)
-    force = -np.einsum("eq,eqaj,eqji->eai", volumes, shape_slopes, stress).reshape(count, size)
+    force = -np.einsum(
+        "eq,eqaj,eqji->eai", volumes, shape_slopes, stress
+    ).reshape(count, size)
     if not slopes:
         empty = np.zeros((0, size, 0))
         return _PartForces(dofs, force, empty, empty)
@@ -291,16 +303,27 @@ def _part_forces(
     by_X = by_X.reshape(count, points, 3, 3, size)
     if averages:
         weights = shares * ratios
-        mean_by_X = np.einsum("eq,eqkl,eqbl->ebk", weights, np.linalg.inv(G), shape_slopes)
+        mean_by_X = np.einsum(
+            "eq,eqkl,eqbl->ebk", weights, np.linalg.inv(G), shape_slopes
+        )
         by_mean = outputs[2].T.reshape(count, points, 3, 3)
-        by_X = by_X + by_mean[..., None] * mean_by_X.reshape(count, 1, 1, 1, size)
+        by_X = by_X + by_mean[..., None] * mean_by_X.reshape(
+            count, 1, 1, 1, size
+        )
         _average_pressure(by_X, shares)
         _average_pressure(by_theta, shares)
     weighted_slopes = -volumes[..., None, None] * shape_slopes
-    matrices = np.einsum("eqaj,eqjim->eaim", weighted_slopes, by_X, optimize=True)
-    columns = np.einsum("eqaj,eqjic->eaic", weighted_slopes, by_theta, optimize=True)
+    matrices = np.einsum(
+        "eqaj,eqjim->eaim", weighted_slopes, by_X, optimize=True
+    )
+    columns = np.einsum(
+        "eqaj,eqjic->eaic", weighted_slopes, by_theta, optimize=True
+    )
     return _PartForces(
-        dofs, force, matrices.reshape(count, size, size), columns.reshape(count, size, -1)
+        dofs,
+        force,
+        matrices.reshape(count, size, size),
+        columns.reshape(count, size, -1),
     )
 
 
@@ -356,7 +379,9 @@ class InverseEquilibrium:
         assert body.scan_conditions is not None
         self.body = body
         self.points_m: Array = body.nodes.points_m
-        self.gravity_m_s2 = np.asarray(body.scan_conditions.gravity_m_s2, dtype=float)
+        self.gravity_m_s2 = np.asarray(
+            body.scan_conditions.gravity_m_s2, dtype=float
+        )
         size = self.points_m.size
         grasped_nodes = body.scan_conditions.grasped_nodes(body.nodes)
         self.free: Index = np.setdiff1d(
@@ -365,7 +390,9 @@ class InverseEquilibrium:
         self.places: Index = np.array(
             [*body.elastic_indices, *body.density_indices], dtype=np.int64
         )
-        self.layout = RestPointLayout(len(self.places), body.element.mean_dilatation)
+        self.layout = RestPointLayout(
+            len(self.places), body.element.mean_dilatation
+        )
         self._shapes: dict[bytes, RestShape] = {}
         self._data: dict[tuple[bytes, bool], list[Array]] = {}
         self._size_m = float(np.linalg.norm(np.ptp(self.points_m, axis=0)))
@@ -395,17 +422,24 @@ class InverseEquilibrium:
         constants = np.asarray(theta, dtype=float)
         columns = []
         for place in self.places:
-            step = RELATIVE_DIFFERENCE_STEP * max(abs(float(constants[place])), 1e-12)
+            step = RELATIVE_DIFFERENCE_STEP * max(
+                abs(float(constants[place])), 1e-12
+            )
             ends = []
             for offset in (step, -step):
                 shifted = constants.copy()
                 shifted[place] += offset
                 ends.append(self.solve(shifted).by_input)
             columns.append((ends[0] - ends[1]) / (2 * step))
-        pairs = [(columns[j][i] + columns[i][j]) / 2 for i, j in self.layout.input_pairs]
+        pairs = [
+            (columns[j][i] + columns[i][j]) / 2
+            for i, j in self.layout.input_pairs
+        ]
         return np.array(pairs).reshape(-1, *self.points_m.shape)
 
-    def point_data(self, theta: ArrayLike, with_second_derivatives: bool = False) -> list[Array]:
+    def point_data(
+        self, theta: ArrayLike, with_second_derivatives: bool = False
+    ) -> list[Array]:
         """Return the data of the points of each part of the body, (1, cells · q · count) each.
 
         Parameters
@@ -414,14 +448,19 @@ class InverseEquilibrium:
         with_second_derivatives : bool
             Whether to include second derivatives; they are zero otherwise.
         """
-        key = np.asarray(theta, dtype=float)[self.places].tobytes(), with_second_derivatives
+        key = (
+            np.asarray(theta, dtype=float)[self.places].tobytes(),
+            with_second_derivatives,
+        )
         if key not in self._data:
             shape = self.solve(theta)
             fields = [shape.positions_m, *shape.by_input]
             if with_second_derivatives:
                 fields += [*self.second_derivatives(theta)]
             else:
-                fields += [np.zeros_like(self.points_m)] * len(self.layout.input_pairs)
+                fields += [np.zeros_like(self.points_m)] * len(
+                    self.layout.input_pairs
+                )
             while len(self._data) >= 2:
                 self._data.pop(next(iter(self._data)), None)
             self._data[key] = self._fields_at_points(fields)
@@ -444,7 +483,9 @@ class InverseEquilibrium:
             If no stress-free shape is found at the constants θ, or its equations are singular.
         """
         constants = np.asarray(theta, dtype=float)
-        at = self._assemble_forces(self.solve(constants).positions_m, constants, slopes=True)
+        at = self._assemble_forces(
+            self.solve(constants).positions_m, constants, slopes=True
+        )
         factor = self._factorise(at.by_position)
         if factor is None:
             raise RestShapeError(self._failure_message(constants, 1.0))
@@ -455,7 +496,9 @@ class InverseEquilibrium:
         given and do not depend on θ: all derivatives are zero.
         """
         others = self.layout.input_count + len(self.layout.input_pairs)
-        return self._fields_at_points([positions_m, *[np.zeros_like(positions_m)] * others])
+        return self._fields_at_points(
+            [positions_m, *[np.zeros_like(positions_m)] * others]
+        )
 
     def _fields_at_points(self, fields: Sequence[Array]) -> list[Array]:
         """Return G and its derivatives at the points of each part.
@@ -470,10 +513,16 @@ class InverseEquilibrium:
         for cells, geometry in self._parts:
             slopes = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3)
             # (cells, q, columns of G, rows of G): column after column.
-            columns = [np.einsum("ean,eqai->eqin", f[cells], slopes) for f in fields]
-            values = np.stack([c.reshape(*c.shape[:2], 9) for c in columns], axis=2)
+            columns = [
+                np.einsum("ean,eqai->eqin", f[cells], slopes) for f in fields
+            ]
+            values = np.stack(
+                [c.reshape(*c.shape[:2], 9) for c in columns], axis=2
+            )
             if layout.averages_dilatation:
-                values = np.concatenate([values, self._volume_logarithms(values, geometry)], axis=3)
+                values = np.concatenate(
+                    [values, self._volume_logarithms(values, geometry)], axis=3
+                )
             data.append(np.ascontiguousarray(values).reshape(1, -1))
         return data
 
@@ -503,7 +552,9 @@ class InverseEquilibrium:
             ratios
             * (
                 traces[..., i] * traces[..., j]
-                - np.einsum("eqab,eqba->eq", relative[:, :, i], relative[:, :, j])
+                - np.einsum(
+                    "eqab,eqba->eq", relative[:, :, i], relative[:, :, j]
+                )
                 + traces[..., k + number]
             )
             for number, (i, j) in enumerate(layout.input_pairs)
@@ -512,9 +563,12 @@ class InverseEquilibrium:
             [ratios[..., None], first, np.stack(second, axis=-1)], axis=-1
         )
         mean = np.broadcast_to(
-            np.einsum("eq,eqk->ek", shares, determinants)[:, None], determinants.shape
+            np.einsum("eq,eqk->ek", shares, determinants)[:, None],
+            determinants.shape,
         )
-        return (self._logarithm(determinants) - self._logarithm(mean))[..., None]
+        return (self._logarithm(determinants) - self._logarithm(mean))[
+            ..., None
+        ]
 
     def _logarithm(self, values: Array) -> Array:
         """Return the logarithm of positive numbers with its derivatives, from numbers with their
@@ -527,7 +581,9 @@ class InverseEquilibrium:
         for number, (i, j) in enumerate(self.layout.input_pairs):
             column = k + 1 + number
             product = logarithm[..., 1 + i] * logarithm[..., 1 + j]
-            logarithm[..., column] = values[..., column] / values[..., 0] - product
+            logarithm[..., column] = (
+                values[..., column] / values[..., 0] - product
+            )
         return logarithm
 
     @cached_property
@@ -576,7 +632,9 @@ class InverseEquilibrium:
         change = target - known
         if (np.abs(change) > LARGEST_EXTRAPOLATION * np.abs(known)).any():
             return None
-        predicted = shape.positions_m + np.tensordot(change, shape.by_input, axes=1)
+        predicted = shape.positions_m + np.tensordot(
+            change, shape.by_input, axes=1
+        )
         return predicted if self._is_admissible(predicted) else None
 
     def _solve_with_load_steps(self, theta: Array, weight_n: Array) -> Array:
@@ -609,7 +667,9 @@ class InverseEquilibrium:
         mass_kg = self.body.mass_of_dofs(theta)[: self.points_m.size]
         return mass_kg * np.tile(self.gravity_m_s2, len(self.points_m))
 
-    def _newton(self, start: Array, theta: Array, weight_n: Array) -> Array | None:
+    def _newton(
+        self, start: Array, theta: Array, weight_n: Array
+    ) -> Array | None:
         """Return X (n, 3) [m] at a given weight (3n,) [N], from `start` (n, 3); None if Newton's
         method does not converge.
 
@@ -634,7 +694,9 @@ class InverseEquilibrium:
             for _ in range(OPTIONS.halvings):
                 trial = x + share * step
                 if self._is_admissible(trial):
-                    after = self._assemble_forces(trial, theta, slopes=False).force_n
+                    after = self._assemble_forces(
+                        trial, theta, slopes=False
+                    ).force_n
                     next_step = self._newton_step(factor, after + weight_n)
                     if np.linalg.norm(next_step) <= (1 - share / 4) * length:
                         break
@@ -671,7 +733,9 @@ class InverseEquilibrium:
                 return False
         return True
 
-    def _assemble_forces(self, positions_m: Array, theta: Array, slopes: bool) -> _AssembledForces:
+    def _assemble_forces(
+        self, positions_m: Array, theta: Array, slopes: bool
+    ) -> _AssembledForces:
         """Return the elastic forces at the mesh if the stress-free positions X are `positions_m`
         (n, 3), with derivatives by X and θ if `slopes`, else with zeros in their place.
         """
@@ -679,7 +743,9 @@ class InverseEquilibrium:
         force = np.zeros(size)
         by_theta = np.zeros((size, len(self.places)))
         by_position = sp.csc_array((size, size))
-        places = {int(place): number for number, place in enumerate(self.places)}
+        places = {
+            int(place): number for number, place in enumerate(self.places)
+        }
         body = self.body
         for part, start, (cells, geometry) in zip(
             body.parts, body.starts, self._parts, strict=False
@@ -695,17 +761,23 @@ class InverseEquilibrium:
                 slopes=slopes,
             )
             dofs = part_forces.dofs
-            force += np.bincount(dofs.ravel(), part_forces.force_n.ravel(), size)
+            force += np.bincount(
+                dofs.ravel(), part_forces.force_n.ravel(), size
+            )
             if not slopes:
                 continue
             shape = part_forces.by_position.shape
             rows = np.broadcast_to(dofs[:, :, None], shape).ravel()
             columns = np.broadcast_to(dofs[:, None, :], shape).ravel()
-            entries = sp.coo_array((part_forces.by_position.ravel(), (rows, columns)), (size, size))
+            entries = sp.coo_array(
+                (part_forces.by_position.ravel(), (rows, columns)), (size, size)
+            )
             by_position = by_position + sp.csc_array(entries)
             for number in range(elastic):
                 values = part_forces.by_theta[..., number].ravel()
-                by_theta[:, places[start + number]] += np.bincount(dofs.ravel(), values, size)
+                by_theta[:, places[start + number]] += np.bincount(
+                    dofs.ravel(), values, size
+                )
         return _AssembledForces(force, by_position, by_theta)
 
     def _failure_message(self, theta: Array, reached: float) -> str:

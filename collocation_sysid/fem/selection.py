@@ -39,12 +39,17 @@ class _PositionSelection:
         """
         hint = self._nearest_hint(nodes.points_m)
         return _indices_or_error(
-            self._contains(nodes.points_m), nodes.mesh, str(self), "nodes" + hint
+            self._contains(nodes.points_m),
+            nodes.mesh,
+            str(self),
+            "nodes" + hint,
         )
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Return the indices of the selected cells, sorted."""
-        return _indices_or_error(self._contains(mesh.centres_m), mesh, str(self), OF_CELLS)
+        return _indices_or_error(
+            self._contains(mesh.centres_m), mesh, str(self), OF_CELLS
+        )
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected rows of `mesh.surface`, sorted."""
@@ -92,7 +97,10 @@ class Box(_PositionSelection):
         return np.all(above & below, axis=1)
 
     def __str__(self) -> str:
-        low, high = (", ".join(f"{x:g}" for x in corner) for corner in (self.low_m, self.high_m))
+        low, high = (
+            ", ".join(f"{x:g}" for x in corner)
+            for corner in (self.low_m, self.high_m)
+        )
         return f"the box from ({low}) to ({high}) m"
 
 
@@ -112,9 +120,13 @@ class Ball(_PositionSelection):
     radius_m: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center_m", _vector(self.center_m, "ball: center_m"))
+        object.__setattr__(
+            self, "center_m", _vector(self.center_m, "ball: center_m")
+        )
         if not _is_number(self.radius_m) or not self.radius_m > 0:
-            raise InputError(f"ball: radius_m must be a positive number, not {self.radius_m!r}")
+            raise InputError(
+                f"ball: radius_m must be a positive number, not {self.radius_m!r}"
+            )
 
     def _nearest_hint(self, points_m: np.ndarray) -> str:
         """Return the distance of the nearest node as a hint."""
@@ -127,7 +139,9 @@ class Ball(_PositionSelection):
 
     def _contains(self, points_m: np.ndarray) -> np.ndarray:
         """Return the mask of the points inside, with a tolerance for rounding."""
-        return self._distance_m(points_m) <= self.radius_m + _tolerance_m(points_m)
+        return self._distance_m(points_m) <= self.radius_m + _tolerance_m(
+            points_m
+        )
 
     def __str__(self) -> str:
         center = ", ".join(f"{x:g}" for x in self.center_m)
@@ -166,7 +180,10 @@ class Face(_PositionSelection):
         points_m = nodes.points_m
         mask = self._contains(points_m)
         if self.name.startswith("side"):
-            mask &= ~(Face("top")._contains(points_m) | Face("bottom")._contains(points_m))
+            mask &= ~(
+                Face("top")._contains(points_m)
+                | Face("bottom")._contains(points_m)
+            )
         return _indices_or_error(mask, nodes.mesh, str(self))
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
@@ -179,11 +196,16 @@ class Face(_PositionSelection):
         """Return the mask (n,) of the points in the plane through the outermost point, within a
         tolerance relative to the diagonal of the points (n, 3).
         """
-        axis, sign = {"top": (2, -1), "bottom": (2, 1), "side_x": (0, 1), "side_y": (1, 1)}[
-            self.name
-        ]
+        axis, sign = {
+            "top": (2, -1),
+            "bottom": (2, 1),
+            "side_x": (0, 1),
+            "side_y": (1, 1),
+        }[self.name]
         inwards_m = sign * points_m[:, axis]
-        tolerance_m = FACE_TOLERANCE * float(np.linalg.norm(np.ptp(points_m, axis=0)))
+        tolerance_m = FACE_TOLERANCE * float(
+            np.linalg.norm(np.ptp(points_m, axis=0))
+        )
         return np.asarray(inwards_m <= inwards_m.min() + tolerance_m)
 
     def __str__(self) -> str:
@@ -206,8 +228,12 @@ class Indices:
 
     def __post_init__(self) -> None:
         indices = np.atleast_1d(np.asarray(self.indices))
-        if indices.ndim != 1 or (indices.size and indices.dtype.kind not in "iu"):
-            raise InputError(f"indices must be a list of whole node numbers, not {self.indices!r}")
+        if indices.ndim != 1 or (
+            indices.size and indices.dtype.kind not in "iu"
+        ):
+            raise InputError(
+                f"indices must be a list of whole node numbers, not {self.indices!r}"
+            )
         object.__setattr__(self, "indices", tuple(indices.tolist()))
 
     def resolve(self, nodes: ElementNodes) -> np.ndarray:
@@ -222,7 +248,9 @@ class Indices:
         """
         mesh = nodes.mesh
         requested = np.unique(np.array(self.indices, dtype=np.int64))
-        outside = requested[(requested < 0) | (requested >= mesh.file_node_count)]
+        outside = requested[
+            (requested < 0) | (requested >= mesh.file_node_count)
+        ]
         if len(outside):
             raise InputError(
                 f"indices: node {outside[0]} does not exist; the mesh has "
@@ -254,7 +282,9 @@ class Indices:
                 f"numbered 0 to {count - 1}"
             )
         chosen = np.isin(np.arange(count), self.indices)
-        return _indices_or_error(chosen, mesh, "an empty list of indices", OF_CELLS)
+        return _indices_or_error(
+            chosen, mesh, "an empty list of indices", OF_CELLS
+        )
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the rows of `mesh.surface` whose corners are all selected, sorted.
@@ -297,7 +327,9 @@ class Named:
             none is true.
         """
         what = f'point array "{self.name}"'
-        mask = self._mask(nodes.mesh.point_arrays, len(nodes.mesh.points_m), what)
+        mask = self._mask(
+            nodes.mesh.point_arrays, len(nodes.mesh.points_m), what
+        )
         return _indices_or_error(nodes.with_mid_nodes(mask), nodes.mesh, what)
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
@@ -339,7 +371,11 @@ class Named:
         return np.sort(rows)
 
     def _mask(
-        self, arrays: Mapping[str, np.ndarray], count: int, what: str, lacking: str = ""
+        self,
+        arrays: Mapping[str, np.ndarray],
+        count: int,
+        what: str,
+        lacking: str = "",
     ) -> np.ndarray:
         """Return an array of the mesh as a mask, or raise an `InputError` if it cannot be one.
 
@@ -355,7 +391,9 @@ class Named:
         """
         kind = what.split(" ", 1)[0]
         if self.name not in arrays:
-            names = ", ".join(f'"{name}"' for name in arrays if not name.startswith("gmsh:"))
+            names = ", ".join(
+                f'"{name}"' for name in arrays if not name.startswith("gmsh:")
+            )
             available = f"it has {names}" if names else "it has none"
             hint = hint_at(self.name, arrays)
             raise InputError(
@@ -372,7 +410,9 @@ class Named:
         values = values.ravel()
         odd = values[~np.isin(values, (0, 1))]
         if len(odd):
-            raise InputError(f"{what} holds {odd[0]}; a selection needs only 0 and 1")
+            raise InputError(
+                f"{what} holds {odd[0]}; a selection needs only 0 and 1"
+            )
         return values.astype(bool)
 
 
@@ -383,12 +423,20 @@ def rows_of_faces(faces: np.ndarray, surface: np.ndarray) -> np.ndarray:
     """Return for each of the faces (k, 3) the row of the surface (F, 3) with the same three nodes
     in any order, (k,); −1 if there is none.
     """
-    row_of_face = {tuple(face): row for row, face in enumerate(np.sort(surface, axis=1).tolist())}
+    row_of_face = {
+        tuple(face): row
+        for row, face in enumerate(np.sort(surface, axis=1).tolist())
+    }
     sorted_faces = np.sort(faces, axis=1).tolist()
-    return np.array([row_of_face.get(tuple(face), -1) for face in sorted_faces], dtype=np.int64)
+    return np.array(
+        [row_of_face.get(tuple(face), -1) for face in sorted_faces],
+        dtype=np.int64,
+    )
 
 
-def _select_faces(chosen_nodes: np.ndarray, mesh: TetMesh, what: str) -> np.ndarray:
+def _select_faces(
+    chosen_nodes: np.ndarray, mesh: TetMesh, what: str
+) -> np.ndarray:
     """Return the rows of `mesh.surface` whose corners are all in the mask `chosen_nodes` (n,).
 
     Raises
@@ -398,12 +446,19 @@ def _select_faces(chosen_nodes: np.ndarray, mesh: TetMesh, what: str) -> np.ndar
     """
     mask = np.asarray(chosen_nodes[mesh.surface].all(axis=1))
     return _indices_or_error(
-        mask, mesh, what, missed="holds no face of the boundary with all its corners"
+        mask,
+        mesh,
+        what,
+        missed="holds no face of the boundary with all its corners",
     )
 
 
 def _indices_or_error(
-    mask: np.ndarray, mesh: TetMesh, what: str, of: str = "nodes", missed: str = ""
+    mask: np.ndarray,
+    mesh: TetMesh,
+    what: str,
+    of: str = "nodes",
+    missed: str = "",
 ) -> np.ndarray:
     """Return the indices of a mask, or raise an `InputError` if it is false everywhere.
 
@@ -420,7 +475,9 @@ def _indices_or_error(
     """
     if not mask.any():  # no mid node lies beyond the corners
         missed = missed or f"selects none of the {len(mask)} {of}"
-        raise InputError(f"{what} {missed}; the body spans {_describe_bounds(mesh.bounds_m)}")
+        raise InputError(
+            f"{what} {missed}; the body spans {_describe_bounds(mesh.bounds_m)}"
+        )
     return np.flatnonzero(mask).astype(np.int64)
 
 
@@ -429,7 +486,9 @@ def _describe_bounds(bounds_m: np.ndarray) -> str:
     coordinates (2, 3) [m].
     """
     axes = zip("xyz", *bounds_m, strict=True)
-    return ", ".join(f"{axis} from {low:.4g} to {high:.4g} m" for axis, low, high in axes)
+    return ", ".join(
+        f"{axis} from {low:.4g} to {high:.4g} m" for axis, low, high in axes
+    )
 
 
 def _tolerance_m(points_m: np.ndarray) -> float:
@@ -439,7 +498,9 @@ def _tolerance_m(points_m: np.ndarray) -> float:
 
 def _is_number(value: object) -> bool:
     """Return whether a value is a number and not a boolean."""
-    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    return isinstance(value, (int, float, np.number)) and not isinstance(
+        value, bool
+    )
 
 
 def _vector(values: Iterable[float], what: str) -> tuple[float, float, float]:
@@ -452,9 +513,15 @@ def _vector(values: Iterable[float], what: str) -> tuple[float, float, float]:
         allowed. The message begins with `what`.
     """
     components = (
-        list(values) if isinstance(values, Iterable) and not isinstance(values, str) else []
+        list(values)
+        if isinstance(values, Iterable) and not isinstance(values, str)
+        else []
     )
-    if len(components) != 3 or not all(_is_number(x) and not np.isnan(x) for x in components):
-        raise InputError(f"{what} must be three numbers [x, y, z] in metres, not {values!r}")
+    if len(components) != 3 or not all(
+        _is_number(x) and not np.isnan(x) for x in components
+    ):
+        raise InputError(
+            f"{what} must be three numbers [x, y, z] in metres, not {values!r}"
+        )
     x, y, z = (float(value) for value in components)
     return x, y, z

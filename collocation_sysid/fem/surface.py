@@ -82,25 +82,35 @@ def tetrahedralize_surface(
     mesher = _pytetwild_version()
     if cache_dir is None:
         return _run_ftetwild(points, faces, edge_length_m)
-    digest = hashlib.sha256(f"{mesher} {_RECIPE} {float(edge_length_m)!r} {points.shape}".encode())
-    digest.update(points.astype("<f8").tobytes() + faces.astype("<i8").tobytes())
+    digest = hashlib.sha256(
+        f"{mesher} {_RECIPE} {float(edge_length_m)!r} {points.shape}".encode()
+    )
+    digest.update(
+        points.astype("<f8").tobytes() + faces.astype("<i8").tobytes()
+    )
     cached = Path(cache_dir) / f"mesh-{digest.hexdigest()[:16]}.vtu"
     if not cached.exists():
         with replaced_file(cached) as draft:
             # A mesh that is refused must not be kept.
-            nodes, tetrahedra, *_ = clean_mesh(*_run_ftetwild(points, faces, edge_length_m))
+            nodes, tetrahedra, *_ = clean_mesh(
+                *_run_ftetwild(points, faces, edge_length_m)
+            )
             write_tetrahedra(draft, nodes, tetrahedra)
     nodes, tetrahedra, *_ = read_tetrahedra(cached)
     return nodes, tetrahedra
 
 
-def merge_coincident(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def merge_coincident(
+    points: np.ndarray, triangles: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices and triangles with vertices merged that coincide in single precision (10⁻⁶ of
     the diagonal), and without the triangles that become degenerate.
     """
     tolerance = 1e-6 * np.linalg.norm(np.ptp(points, axis=0))
     pairs = KDTree(points).query_pairs(tolerance, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
+    links = coo_array(
+        (np.ones(len(pairs)), pairs.T), shape=(len(points), len(points))
+    )
     label = connected_components(links, directed=False)[1]
     _, first = np.unique(label, return_index=True)
     merged = label[triangles].astype(np.int64)
@@ -108,14 +118,29 @@ def merge_coincident(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndar
     return points[first], merged[~is_degenerate]
 
 
-def _checked_surface(points_m: ArrayLike, triangles: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def _checked_surface(
+    points_m: ArrayLike, triangles: ArrayLike
+) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices and triangles as arrays, or raise an `InputError` if they are invalid."""
     points = np.asarray(points_m, dtype=float)
     faces = np.asarray(triangles)
-    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise InputError(f"a surface needs (p, 3) finite vertex coordinates, not {points.shape}")
-    if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces) or faces.dtype.kind not in "iu":
-        raise InputError(f"a surface needs (F, 3) integer triangles, F > 0, not {faces.shape}")
+    if (
+        points.ndim != 2
+        or points.shape[1] != 3
+        or not np.isfinite(points).all()
+    ):
+        raise InputError(
+            f"a surface needs (p, 3) finite vertex coordinates, not {points.shape}"
+        )
+    if (
+        faces.ndim != 2
+        or faces.shape[1] != 3
+        or not len(faces)
+        or faces.dtype.kind not in "iu"
+    ):
+        raise InputError(
+            f"a surface needs (F, 3) integer triangles, F > 0, not {faces.shape}"
+        )
     if faces.min() < 0 or faces.max() >= len(points):
         raise InputError(
             f"the triangles name vertices {faces.min()} to {faces.max()}, "
@@ -126,7 +151,9 @@ def _checked_surface(points_m: ArrayLike, triangles: ArrayLike) -> tuple[np.ndar
 
 def _require_closed(triangles: np.ndarray) -> None:
     """Raise an `InputError` unless every edge belongs to exactly two triangles."""
-    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges = np.sort(
+        triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1
+    )
     _, count = np.unique(edges, axis=0, return_counts=True)
     open_edges = int((count == 1).sum())
     crowded = int((count > 2).sum())
@@ -145,7 +172,9 @@ def _require_suitable_edge_length(
     body.
     """
     if not 0 < edge_length_m < np.inf:
-        raise InputError(f"the edge length must be a positive number of metres: {edge_length_m!r}")
+        raise InputError(
+            f"the edge length must be a positive number of metres: {edge_length_m!r}"
+        )
     extent = " × ".join(f"{length:.4g}" for length in np.ptp(points, axis=0))
     remedy = f"the surface measures {extent} m: check the edge length and the length unit"
     # fTetWild takes minutes, or forever, over edges longer than the body.
@@ -153,7 +182,9 @@ def _require_suitable_edge_length(
         raise InputError(
             f"the edge length {edge_length_m:g} m is over half the surface's diagonal; {remedy}"
         )
-    volume = abs(np.linalg.det(points[triangles] - points.mean(axis=0)).sum()) / 6
+    volume = (
+        abs(np.linalg.det(points[triangles] - points.mean(axis=0)).sum()) / 6
+    )
     elements = 6 * np.sqrt(2) * volume / edge_length_m**3
     if elements > MOST_ELEMENTS:
         raise InputError(
@@ -185,12 +216,21 @@ def _run_ftetwild(
         If it fails or is not installed.
     """
     diagonal = np.linalg.norm(np.ptp(points, axis=0))
-    lengths = (ASKED_LENGTH * edge_length_m, TOLERANCE * edge_length_m / diagonal)
+    lengths = (
+        ASKED_LENGTH * edge_length_m,
+        TOLERANCE * edge_length_m / diagonal,
+    )
     words = [repr(float(length)) for length in lengths]
     try:
-        mesh = run_isolated(_WORKER, *words, points_m=points, triangles=triangles.astype("i4"))
+        mesh = run_isolated(
+            _WORKER, *words, points_m=points, triangles=triangles.astype("i4")
+        )
     except Failed as error:
-        raise InputError(f"pytetwild could not fill the surface ({error})") from error
+        raise InputError(
+            f"pytetwild could not fill the surface ({error})"
+        ) from error
     if not len(mesh["tetrahedra"]):
-        raise InputError("pytetwild found no interior: the surface encloses no volume")
+        raise InputError(
+            "pytetwild found no interior: the surface encloses no volume"
+        )
     return mesh["points_m"], mesh["tetrahedra"].astype(np.int64)

@@ -97,7 +97,11 @@ class TwoPhaseModes(FieldModes):
 
     @classmethod
     def from_field(
-        cls, field: Field, mesh: TetMesh, cells: Index, law: tuple[Constant, ...]
+        cls,
+        field: Field,
+        mesh: TetMesh,
+        cells: Index,
+        law: tuple[Constant, ...],
     ) -> TwoPhaseModes:
         """Return the two-phase field of some cells, see `FieldModes.from_field`.
 
@@ -161,7 +165,9 @@ class TwoPhaseModes(FieldModes):
         assert isinstance(finer, TwoPhaseModes)
         samples = self.samples
         if samples is not None:
-            samples = replace(samples, logarithms=np.repeat(samples.logarithms, 8, axis=1))
+            samples = replace(
+                samples, logarithms=np.repeat(samples.logarithms, 8, axis=1)
+            )
         return replace(finer, phase=np.repeat(self.phase, 8), samples=samples)
 
     def logarithms(self, coefficients: Array) -> Array:
@@ -204,7 +210,14 @@ class ElementLogarithms(FieldModes):
         """
         field = replace(modes.field, prior=SMOOTH, modes=len(base))
         volumes_m3 = modes.volumes_m3
-        return cls(field, modes.laplacian, modes.scaled_indices, modes.length_m, volumes_m3, base)
+        return cls(
+            field,
+            modes.laplacian,
+            modes.scaled_indices,
+            modes.length_m,
+            volumes_m3,
+            base,
+        )
 
     @cached_property
     def shapes(self) -> Array:

@@ -58,18 +58,27 @@ def recording_from_log(
     markers = replace(experiment.markers, t_s=t_s, positions_m=tracks_m)
     readings = []
     for number, gauge in enumerate((*experiment.readings, *model.wrenches), 1):
-        samples = {when: values for of, when, values in intake.all_samples(log) if of == number}
+        samples = {
+            when: values
+            for of, when, values in intake.all_samples(log)
+            if of == number
+        }
         inside = [when for when in sorted(samples) if when <= len(t_s) - 1]
         values = np.array([samples[when] for when in inside])
         if len(inside) < FEWEST or not np.isfinite(values).any():
             continue
-        series = {"t_s": t_s[0] + model.interval_s * np.array(inside), "values": values}
+        series = {
+            "t_s": t_s[0] + model.interval_s * np.array(inside),
+            "values": values,
+        }
         if isinstance(gauge, Gauge):
             readings.append(replace(gauge, **series))
         else:
             wrench = replace(model.wrenches[gauge], **series)
             grasps[gauge - 1] = replace(grasps[gauge - 1], wrench=wrench)
-    return replace(experiment, t_s=t_s, grasps=grasps, markers=markers, readings=readings)
+    return replace(
+        experiment, t_s=t_s, grasps=grasps, markers=markers, readings=readings
+    )
 
 
 def solve_recording(problem: Problem, recording: Experiment) -> Run:
@@ -82,5 +91,9 @@ def solve_recording(problem: Problem, recording: Experiment) -> Run:
         If the recording is refused, see `run`.
     """
     options = replace(problem.uncertainty, profile=())
-    batch_problem = replace(problem, experiments=[recording], uncertainty=options)
-    return run(batch_problem, problem.solver(ReducedSpace.name), seek_causes=False)
+    batch_problem = replace(
+        problem, experiments=[recording], uncertainty=options
+    )
+    return run(
+        batch_problem, problem.solver(ReducedSpace.name), seek_causes=False
+    )

@@ -27,7 +27,12 @@ from ..errors import InputError, SimulationError
 from ..fem.constants import is_field_coefficient
 from ..pipeline import Run
 from ..problem import Problem
-from ..program.streaming import LoggedRow, Sample, SquareRootInformation, one_blas_thread
+from ..program.streaming import (
+    LoggedRow,
+    Sample,
+    SquareRootInformation,
+    one_blas_thread,
+)
 from ..recording.poses import Poses
 from ..statistics.assessment import GROSS_MISFIT, Assessment
 from ..statistics.concerns import concern_if
@@ -150,7 +155,10 @@ class LiveUpdate:
     relinearised: int
 
     def __repr__(self) -> str:
-        values = ", ".join(f"{name} = {each.value:.4g}" for name, each in self.estimates.items())
+        values = ", ".join(
+            f"{name} = {each.value:.4g}"
+            for name, each in self.estimates.items()
+        )
         return f"Update(t = {self.t_s:.4g} s: {values}; {self.trust.verdict})"
 
 
@@ -223,9 +231,14 @@ class LiveEstimator:
         self.samples = 0
         self.budget_s = options.budget_s or BUDGET_FRACTION * model.interval_s
         self.rows = options.rows
-        samples = max(LARGEST_GAP, round(options.window_s / model.interval_s / WINDOW_BLOCKS))
+        samples = max(
+            LARGEST_GAP,
+            round(options.window_s / model.interval_s / WINDOW_BLOCKS),
+        )
         self._block_rows = samples * model.substeps
-        self._blocks = max(2, round(options.window_s / model.interval_s / samples))
+        self._blocks = max(
+            2, round(options.window_s / model.interval_s / samples)
+        )
         self._set_bounds()
         self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
         self.prior = SquareRootInformation.empty(model.parameter_count)
@@ -234,7 +247,11 @@ class LiveEstimator:
         self._last_positions_m = np.full((1, 3), np.nan)
         self.second_pass: WindowPass | None = None
         self.log: list[LoggedRow] = []
-        self.search = self._new_search() if problem.parameters.names_without_guess else None
+        self.search = (
+            self._new_search()
+            if problem.parameters.names_without_guess
+            else None
+        )
         self.scatter = ResidualScatter()
         self._trust = INITIAL_RADIUS
         self._rejected = 0
@@ -279,7 +296,9 @@ class LiveEstimator:
         poses = parse_pose(pose, self.model.moving_grasps + 1)
         tracks = parse_markers(markers, self.names)
         gauges = self.model.experiment.readings
-        instrument_samples = parse_custom_readings(readings, gauges, parse_time(t_s))
+        instrument_samples = parse_custom_readings(
+            readings, gauges, parse_time(t_s)
+        )
         instrument_samples += parse_wrenches(
             wrench, self.model.wrenches, len(gauges), parse_time(t_s)
         )
@@ -322,16 +341,27 @@ class LiveEstimator:
             rows = rows[done:]
         notes += self._add_samples(readings, squares)
         self._update_estimate()
-        if self.first_pass is not None and not self.first_pass.has_failed and self.search is None:
+        if (
+            self.first_pass is not None
+            and not self.first_pass.has_failed
+            and self.search is None
+        ):
             self._relinearise_if_moved(
-                self.first_pass, self.first_pass, began, RELINEARISE_DISTANCE_FIRST
+                self.first_pass,
+                self.first_pass,
+                began,
+                RELINEARISE_DISTANCE_FIRST,
             )
         self.budget.frame_s = self.clock() - before
         done = self._repeat_rows(began, notes, caught_up)
         before = self.clock()
         self._drop_old_rows()
         squared_distances = np.concatenate([*squares, np.zeros(0)])
-        rms_m = float(np.sqrt(squared_distances.mean())) if len(squared_distances) else float("nan")
+        rms_m = (
+            float(np.sqrt(squared_distances.mean()))
+            if len(squared_distances)
+            else float("nan")
+        )
         estimates, trust = self._estimates_and_trust(frame.t_s)
         self.budget.record_remainder(self.clock() - before)
         latency_s = self.clock() - began
@@ -373,7 +403,9 @@ class LiveEstimator:
             estimates, trust = self._estimates_and_trust(last.t_s)
         else:
             rows = len(batch_run.solution.history) * len(self.log)
-            estimates = {name: batch_run.estimates[name] for name in last.estimates}
+            estimates = {
+                name: batch_run.estimates[name] for name in last.estimates
+            }
             unassessed = Assessment.from_concerns(
                 data_concerns(ResidualScatter(), self.counts, self.samples)
             )
@@ -395,12 +427,20 @@ class LiveEstimator:
         to `notes`.
         """
         recording = (
-            None if track.prior.row_count else recording_from_log(self.model, self.intake, self.log)
+            None
+            if track.prior.row_count
+            else recording_from_log(self.model, self.intake, self.log)
         )
         try:
-            return None if recording is None else solve_recording(self.problem, recording)
+            return (
+                None
+                if recording is None
+                else solve_recording(self.problem, recording)
+            )
         except InputError as error:
-            notes.append(f"the final estimate from the complete recording failed: {error.message}")
+            notes.append(
+                f"the final estimate from the complete recording failed: {error.message}"
+            )
             return None
 
     def _repeat_until_settled(self, began: float, notes: list[str]) -> int:
@@ -422,16 +462,23 @@ class LiveEstimator:
         if frame.has_wrench and not self.model.wrenches:
             self.counts["with a wrench"] += 1
             if self.counts["with a wrench"] == 1:
-                notes.append("wrenches are ignored: no grasp of the problem has a sensor")
+                notes.append(
+                    "wrenches are ignored: no grasp of the problem has a sensor"
+                )
         if frame.pose is not None:
             self._last_positions_m = frame.pose[0]
-        distances_m = np.linalg.norm(frame.tracks_m[:, None] - self._last_positions_m, axis=2)
+        distances_m = np.linalg.norm(
+            frame.tracks_m[:, None] - self._last_positions_m, axis=2
+        )
         self.samples += int(np.isfinite(frame.tracks_m[:, 0]).sum())
         is_implausible = (distances_m > self._reach_m).all(axis=1)
         if is_implausible.any():
             notes.append(self._note_outliers(is_implausible))
             frame = replace(
-                frame, tracks_m=np.where(is_implausible[:, None], np.nan, frame.tracks_m)
+                frame,
+                tracks_m=np.where(
+                    is_implausible[:, None], np.nan, frame.tracks_m
+                ),
             )
         return frame, notes
 
@@ -471,13 +518,19 @@ class LiveEstimator:
             if track is None:
                 self._start_pass(rows[0])
             elif not track.has_failed:
-                done = track.add_rows([row.poses for row in rows[: track.remaining_rows_of_block]])
+                done = track.add_rows(
+                    [row.poses for row in rows[: track.remaining_rows_of_block]]
+                )
         except SimulationError as error:
             if track is None:
                 self.intake.reset()
-                return 1, [f"the initial state of the motion cannot be computed: {error}"]
+                return 1, [
+                    f"the initial state of the motion cannot be computed: {error}"
+                ]
             track.has_failed = True
-            notes = [f"the body cannot be simulated with these parameters: {error}"]
+            notes = [
+                f"the body cannot be simulated with these parameters: {error}"
+            ]
         for k, row in enumerate(rows[:done], 1):
             self.log.append(LoggedRow(row.poses, []))
             notes += self._add_samples(row.samples, squares, done - k)
@@ -505,14 +558,20 @@ class LiveEstimator:
         if track.has_failed:
             self.log[-1].samples.extend(readings)
             return notes
-        all_linearised = track.sweep.linearise_samples([(reading, rows) for reading in readings])
+        all_linearised = track.sweep.linearise_samples(
+            [(reading, rows) for reading in readings]
+        )
         for reading, linearised in zip(readings, all_linearised, strict=True):
             if not reading.instrument:
-                residual = linearised.evaluate_at(self.model.transformed(self.p))
+                residual = linearised.evaluate_at(
+                    self.model.transformed(self.p)
+                )
                 outliers = self._outliers(residual)
                 if outliers.any():
                     notes.append(self._note_outliers(outliers))
-                    remaining = np.where(outliers[:, None], np.nan, reading.values)
+                    remaining = np.where(
+                        outliers[:, None], np.nan, reading.values
+                    )
                     reading = reading._replace(values=remaining)
                     linearised.at_zero[outliers] = residual[outliers] = np.nan
                 squared = np.sum((residual * sigma_m) ** 2, axis=1)
@@ -573,10 +632,16 @@ class LiveEstimator:
         of several measurements.
         """
         took_s: dict[int, float] = {}
-        most = min(trial.rows - 1, self.model.rows_per_chunk, self._block_rows - 1)
+        most = min(
+            trial.rows - 1, self.model.rows_per_chunk, self._block_rows - 1
+        )
         for count in (1, most) * TIMING_REPETITIONS:
             again = WindowPass(
-                self.model, self.p, prior=self.prior, block_rows=self._block_rows, base=trial
+                self.model,
+                self.p,
+                prior=self.prior,
+                block_rows=self._block_rows,
+                base=trial,
             )
             again.repeat_rows([row])
             began = self.clock()
@@ -596,13 +661,26 @@ class LiveEstimator:
             x = self._rest[1]
             (rotation, position) = poses[0]
             guesses = [
-                ((x.reshape(-1, 3) - old_position) @ old_rotation @ rotation.T + position).ravel()
+                (
+                    (x.reshape(-1, 3) - old_position)
+                    @ old_rotation
+                    @ rotation.T
+                    + position
+                ).ravel()
             ]
         track = WindowPass(model, self.p, self.prior, self._block_rows)
         track.add_rows([row.poses], guesses)
-        marker_samples = [reading.values for reading in row.samples if not reading.instrument]
-        first = marker_samples[0] if marker_samples else np.full((len(self.names), 3), np.nan)
-        self.model = model.with_marker_places(first, track.blocks[0].stored_rows[0].x)
+        marker_samples = [
+            reading.values for reading in row.samples if not reading.instrument
+        ]
+        first = (
+            marker_samples[0]
+            if marker_samples
+            else np.full((len(self.names), 3), np.nan)
+        )
+        self.model = model.with_marker_places(
+            first, track.blocks[0].stored_rows[0].x
+        )
         if self.model is not model:
             self._set_bounds()
             places = self.model.collocation.guess_p[model.collocation.nq :]
@@ -634,9 +712,13 @@ class LiveEstimator:
         """
         if self.first_pass is None or self.first_pass.has_failed:
             return np.inf
-        return self._largest_distance(self.first_pass, self.p, self._combined.points)
+        return self._largest_distance(
+            self.first_pass, self.p, self._combined.points
+        )
 
-    def _largest_distance(self, track: WindowPass, p: Array, points: Sequence[Array]) -> float:
+    def _largest_distance(
+        self, track: WindowPass, p: Array, points: Sequence[Array]
+    ) -> float:
         """Return the largest distance of p from some points, in the standard errors of a pass; 0
         without points.
 
@@ -652,24 +734,36 @@ class LiveEstimator:
         """
         nq = self.model.collocation.nq
         distances = np.abs(np.array(points) - self.model.transformed(p))[:, :nq]
-        return float(np.max(distances / track.information.standard_errors[:nq], initial=0.0))
+        return float(
+            np.max(
+                distances / track.information.standard_errors[:nq], initial=0.0
+            )
+        )
 
     def _update_estimate(self) -> None:
         """Set the estimate p, in place, to the minimum of the joint quadratic loss of the first and
         the second pass; without effect before the first pass, or if it failed.
         """
         if self.first_pass is not None and not self.first_pass.has_failed:
-            self._combined = CombinedPasses.from_passes(self.first_pass, self.second_pass)
-            self.p = self._constrained_minimum(self.first_pass, self._combined.information)
+            self._combined = CombinedPasses.from_passes(
+                self.first_pass, self.second_pass
+            )
+            self.p = self._constrained_minimum(
+                self.first_pass, self._combined.information
+            )
 
-    def _constrained_minimum(self, track: WindowPass, known: SquareRootInformation) -> Array:
+    def _constrained_minimum(
+        self, track: WindowPass, known: SquareRootInformation
+    ) -> Array:
         """Return the p (P,) that minimises the quadratic loss of `known`, within the bounds and the
         trust region about the linearisation point of a pass.
         """
         reach = self._trust * self.model.collocation.reach_p
         low = np.maximum(self.lower, track.linearisation_point - reach)
         high = np.minimum(self.upper, track.linearisation_point + reach)
-        best = known.minimiser(self.model.transformed(low), self.model.transformed(high))
+        best = known.minimiser(
+            self.model.transformed(low), self.model.transformed(high)
+        )
         return np.clip(self.model.physical(best), low, high)
 
     def _next_linearisation_point(self, track: WindowPass) -> Array:
@@ -682,13 +776,17 @@ class LiveEstimator:
         size = self.model.parameter_count
         samples = len(self.log) / self.model.substeps
         deviation = POINT_PRIOR_DEVIATION * max(1.0, samples / TRIAL_SAMPLES)
-        slopes = np.diag(1 / (deviation * self.model.collocation.reach_p * track.sweep.rates))
+        slopes = np.diag(
+            1 / (deviation * self.model.collocation.reach_p * track.sweep.rates)
+        )
         information = self._combined.information.with_rows(
             np.zeros(size), slopes, track.sweep.transformed
         )
         return self._constrained_minimum(track, information)
 
-    def _estimates_and_trust(self, t_s: float) -> tuple[Mapping[str, Estimate], Assessment]:
+    def _estimates_and_trust(
+        self, t_s: float
+    ) -> tuple[Mapping[str, Estimate], Assessment]:
         """Return estimates by name and the verdict at the time t_s; without a successful pass the
         estimates have no intervals.
         """
@@ -703,37 +801,55 @@ class LiveEstimator:
             code = "solve/seeking"
         grave = concern_if(bool(code), True, code)
         if self.first_pass is None or self.first_pass.has_failed:
-            values = self.model.collocation.parameters.values(self.p[: self.model.collocation.nq])
+            values = self.model.collocation.parameters.values(
+                self.p[: self.model.collocation.nq]
+            )
             estimates_only = {
-                name: Estimate(v) for name, v in values.items() if not is_field_coefficient(name)
+                name: Estimate(v)
+                for name, v in values.items()
+                if not is_field_coefficient(name)
             }
             return estimates_only, Assessment.from_concerns(grave)
         if self.counts["looked"] % SCATTER_INTERVAL_FRAMES == 0:
-            self.scatter = self._combined.scatter(self.model.transformed(self.p))
+            self.scatter = self._combined.scatter(
+                self.model.transformed(self.p)
+            )
         self.counts["looked"] += 1
         estimates = self._estimates_at(self._combined.information, self.p)
         grave += data_concerns(self.scatter, self.counts, self.samples)
         grave += estimate_concerns(estimates, self.linearisation_distance)
         return estimates, Assessment.from_concerns(grave)
 
-    def _estimates_at(self, known: SquareRootInformation, p: Array) -> dict[str, Estimate]:
+    def _estimates_at(
+        self, known: SquareRootInformation, p: Array
+    ) -> dict[str, Estimate]:
         """Return the estimates with intervals from given information, at p."""
         collocation = self.model.collocation
         nq = self.model.collocation.nq
         transformed = self.model.transformed(p)
         parameter_count = self.model.parameter_count
-        factor, quantile = variance_factor(known, transformed, parameter_count, self.scatter)
+        factor, quantile = variance_factor(
+            known, transformed, parameter_count, self.scatter
+        )
         rates = self.model.transformation_derivatives(transformed)[:nq]
         of_q = factor * known.covariance()[:nq, :nq] / np.outer(rates, rates)
-        bounded = ((p - self.lower < AT_BOUND) | (self.upper - p < AT_BOUND))[:nq]
+        bounded = ((p - self.lower < AT_BOUND) | (self.upper - p < AT_BOUND))[
+            :nq
+        ]
         quantiles = np.full(nq, quantile)
         return user_estimates(
-            collocation.parameters, p[:nq], covariance_q=of_q, at_bound=bounded, quantiles=quantiles
+            collocation.parameters,
+            p[:nq],
+            covariance_q=of_q,
+            at_bound=bounded,
+            quantiles=quantiles,
         )
 
     # Passing again ----------------------------------------------------------------------------
 
-    def _repeat_rows(self, began: float, notes: list[str], done: int = 0) -> int:
+    def _repeat_rows(
+        self, began: float, notes: list[str], done: int = 0
+    ) -> int:
         """Continue or start a second pass within the rest of the budget.
 
         Parameters
@@ -755,15 +871,20 @@ class LiveEstimator:
             if self.second_pass is None and self._affordable_rows(
                 done, pass_began - began + self.budget.turn_s
             ):
-                self.second_pass = self._start_second_pass(self.first_pass, notes)
+                self.second_pass = self._start_second_pass(
+                    self.first_pass, notes
+                )
                 self.budget.record_relinearisation(self.clock() - pass_began)
             again = self.second_pass
             if again is None:
                 break
             if not done and again.base is not None:
-                self._relinearise_if_moved(self.first_pass, again, began, RELINEARISE_DISTANCE)
+                self._relinearise_if_moved(
+                    self.first_pass, again, began, RELINEARISE_DISTANCE
+                )
             affordable = min(
-                self._affordable_rows(done, self.clock() - began), again.repeatable_rows
+                self._affordable_rows(done, self.clock() - began),
+                again.repeatable_rows,
             )
             if not affordable:
                 break
@@ -781,12 +902,15 @@ class LiveEstimator:
         lag = len(self.log) - again.rows
         elapsed_s = self.clock() - began
         if lag > min(
-            again.repeatable_rows, self._affordable_rows(0, elapsed_s + self.budget.frame_s)
+            again.repeatable_rows,
+            self._affordable_rows(0, elapsed_s + self.budget.frame_s),
         ):
             return 0
         return self._advance_second_pass(again, lag, notes)
 
-    def _advance_second_pass(self, again: WindowPass, count: int, notes: list[str]) -> int:
+    def _advance_second_pass(
+        self, again: WindowPass, count: int, notes: list[str]
+    ) -> int:
         """Compute up to `count` rows of the second pass; if it has caught up or failed, accept or
         reject it, or record it as a trial of the search.
 
@@ -800,10 +924,14 @@ class LiveEstimator:
             again.has_failed = True
         self.budget.record_steps(count, self.clock() - before)
         if self.search is not None and not self.search.is_done:
-            if again.has_failed or again.rows >= min(self.search.rows, len(self.log)):
+            if again.has_failed or again.rows >= min(
+                self.search.rows, len(self.log)
+            ):
                 self.search.record_trial(again)
                 self.second_pass = None
-        elif (again.has_failed or again.rows == len(self.log)) and self.first_pass is not None:
+        elif (
+            again.has_failed or again.rows == len(self.log)
+        ) and self.first_pass is not None:
             self._accept_or_reject(self.first_pass, again, notes)
         return again.rows - first_row
 
@@ -817,7 +945,9 @@ class LiveEstimator:
             return self.rows - done
         return self.budget.affordable_steps(self.budget_s - elapsed_s)
 
-    def _start_second_pass(self, track: WindowPass, notes: list[str]) -> WindowPass | None:
+    def _start_second_pass(
+        self, track: WindowPass, notes: list[str]
+    ) -> WindowPass | None:
         """Return a new second pass if one is needed, otherwise None.
 
         One is needed for the next trial of a search for initial values, which begins if the first
@@ -828,31 +958,48 @@ class LiveEstimator:
         at_start = track.start[0] is None
         if search is None and track.has_failed and at_start:
             search = self.search = self._new_search()
-            notes.append("searching for initial values over a range of stiffnesses")
+            notes.append(
+                "searching for initial values over a range of stiffnesses"
+            )
         p = self.p
         base = track
         if search is not None:
-            if not search.is_done and (len(self.log) < search.rows or not at_start):
+            if not search.is_done and (
+                len(self.log) < search.rows or not at_start
+            ):
                 return None
             p = search.best if search.is_done else search.next_trial()
             base = None
             if p is None:
                 self.search = None
-                notes.append("found no initial values over a range of stiffnesses")
+                notes.append(
+                    "found no initial values over a range of stiffnesses"
+                )
                 return None
         elif track.has_failed:
             return None
         else:
             p = self._next_linearisation_point(track)
             if (
-                self._largest_distance(track, p, track.linearisation_points) <= REPEAT_DISTANCE
+                self._largest_distance(track, p, track.linearisation_points)
+                <= REPEAT_DISTANCE
                 and not track.sweep.needs_another_pass
             ):
                 return None
-        return WindowPass(self.model, p, prior=track.prior, block_rows=self._block_rows, base=base)
+        return WindowPass(
+            self.model,
+            p,
+            prior=track.prior,
+            block_rows=self._block_rows,
+            base=base,
+        )
 
     def _relinearise_if_moved(
-        self, track: WindowPass, pass_to_move: WindowPass, began: float, distance: float
+        self,
+        track: WindowPass,
+        pass_to_move: WindowPass,
+        began: float,
+        distance: float,
     ) -> None:
         """Move the linearisation point of a pass to the estimate if it is far and there is time.
 
@@ -869,19 +1016,24 @@ class LiveEstimator:
         """
         current_point = [pass_to_move.sweep.transformed]
         if (
-            pass_to_move.rows < pass_to_move.last_relinearised_row + self.model.rows_per_chunk
+            pass_to_move.rows
+            < pass_to_move.last_relinearised_row + self.model.rows_per_chunk
             or self._largest_distance(track, self.p, current_point) <= distance
         ):
             return
         before = self.clock()
-        if self.rows is None and not self._affordable_rows(0, before - began + self.budget.turn_s):
+        if self.rows is None and not self._affordable_rows(
+            0, before - began + self.budget.turn_s
+        ):
             return
         p = self._next_linearisation_point(track)
         if self._largest_distance(track, p, current_point) > distance:
             pass_to_move.relinearise_at(p)
             self.budget.record_relinearisation(self.clock() - before)
 
-    def _accept_or_reject(self, track: WindowPass, again: WindowPass, notes: list[str]) -> None:
+    def _accept_or_reject(
+        self, track: WindowPass, again: WindowPass, notes: list[str]
+    ) -> None:
         """Replace the first pass `track` by the second one, `again`, if that fits about as well as
         expected, and enlarge the trust region; otherwise discard it and shrink the region. `notes`
         are extended in place.
@@ -894,7 +1046,9 @@ class LiveEstimator:
         # Of a pass that turned the sum of squares is not that of a simulation.
         is_within_trust_region = (
             track.last_relinearised_row
-            and self._largest_distance(track, track.linearisation_point, again.linearisation_points)
+            and self._largest_distance(
+                track, track.linearisation_point, again.linearisation_points
+            )
             <= REPEAT_DISTANCE
         )
         fits = (
@@ -905,19 +1059,31 @@ class LiveEstimator:
         if not again.has_failed and fits:
             again.base = None
             self.first_pass = again
-            self._trust = INITIAL_RADIUS if was_search else min(2 * self._trust, LARGEST_RADIUS)
+            self._trust = (
+                INITIAL_RADIUS
+                if was_search
+                else min(2 * self._trust, LARGEST_RADIUS)
+            )
             self._rejected = 0
             if was_search:
                 notes.append("restarted with another stiffness")
-            self.scatter = CombinedPasses.from_passes(again, None).scatter(again.sweep.transformed)
+            self.scatter = CombinedPasses.from_passes(again, None).scatter(
+                again.sweep.transformed
+            )
         else:
             reach = self.model.collocation.reach_p
             length = float(
-                np.abs((again.linearisation_point - track.linearisation_point) / reach).max()
+                np.abs(
+                    (again.linearisation_point - track.linearisation_point)
+                    / reach
+                ).max()
             )
             self._trust = max(RADIUS_REDUCTION * length, 1e-6)
             self._rejected += 1
-            is_stuck = self._rejected >= LARGEST_REJECTIONS and self.scatter.rms > GROSS_MISFIT
+            is_stuck = (
+                self._rejected >= LARGEST_REJECTIONS
+                and self.scatter.rms > GROSS_MISFIT
+            )
             if (
                 is_stuck
                 and not was_search

@@ -102,14 +102,18 @@ def parse_pose(
     if any(one is None for one in each):
         return None
     parts = [_parse_single_pose(one) for one in each]
-    return np.array([part[0] for part in parts]), np.array([part[1] for part in parts])
+    return np.array([part[0] for part in parts]), np.array(
+        [part[1] for part in parts]
+    )
 
 
 def _parse_single_pose(pose: Pose) -> tuple[Array, Array]:
     """Return position (3,) and unit quaternion (4,) of one pose."""
     if isinstance(pose, Mapping):
         if missing := [key for key in _POSE_KEYS if key not in pose]:
-            raise InputError(f"the pose has no {missing[0]}; expected {' and '.join(_POSE_KEYS)}")
+            raise InputError(
+                f"the pose has no {missing[0]}; expected {' and '.join(_POSE_KEYS)}"
+            )
         pose = tuple(pose[key] for key in _POSE_KEYS)
     if isinstance(pose, tuple) and len(pose) == 2:
         position = _parse_array(pose[0], (3,))
@@ -125,7 +129,9 @@ def _parse_single_pose(pose: Pose) -> tuple[Array, Array]:
     return matrix[:3, 3], Rotation.from_matrix(matrix[:3, :3]).as_quat()
 
 
-def parse_markers(markers: ArrayLike | Mapping[str, Any] | None, names: Sequence[str]) -> Array:
+def parse_markers(
+    markers: ArrayLike | Mapping[str, Any] | None, names: Sequence[str]
+) -> Array:
     """Return marker positions (M, 3), NaN where missing.
 
     Parameters
@@ -147,10 +153,14 @@ def parse_markers(markers: ArrayLike | Mapping[str, Any] | None, names: Sequence
     else:
         for name, place in markers.items():
             if name not in names:
-                raise InputError(f"a marker {reprlib.repr(name)}; expected {', '.join(names)}")
+                raise InputError(
+                    f"a marker {reprlib.repr(name)}; expected {', '.join(names)}"
+                )
             if place is not None:
                 tracks[list(names).index(name)] = _parse_array(place, (3,))
-    return np.where(np.isfinite(tracks).all(axis=1, keepdims=True), tracks, np.nan)
+    return np.where(
+        np.isfinite(tracks).all(axis=1, keepdims=True), tracks, np.nan
+    )
 
 
 def parse_custom_readings(
@@ -175,22 +185,32 @@ def parse_custom_readings(
     if readings is None:
         return ()
     if not isinstance(readings, Mapping):
-        raise InputError(f"readings are {reprlib.repr(readings)}; expected samples by name")
+        raise InputError(
+            f"readings are {reprlib.repr(readings)}; expected samples by name"
+        )
     names = [gauge.name for gauge in gauges]
     collected = []
     for name, samples in readings.items():
         if name not in names:
             known = ", ".join(names) or "none, as the problem has none"
-            raise InputError(f"a reading {reprlib.repr(name)}; expected {known}")
+            raise InputError(
+                f"a reading {reprlib.repr(name)}; expected {known}"
+            )
         number = names.index(name)
         count = gauges[number].measured_values.shape[1]
         what = f"the reading '{name}'"
-        collected += [(number + 1, *sample) for sample in _parse_samples(samples, what, count, t_s)]
+        collected += [
+            (number + 1, *sample)
+            for sample in _parse_samples(samples, what, count, t_s)
+        ]
     return tuple(collected)
 
 
 def parse_wrenches(
-    wrench_data: Any, wrenches: Mapping[int, Wrench], instruments_before: int, t_s: float
+    wrench_data: Any,
+    wrenches: Mapping[int, Wrench],
+    instruments_before: int,
+    t_s: float,
 ) -> tuple[InstrumentSample, ...]:
     """Return samples of the sensors of grasps, each as number of the instrument, time and values; a
     sample without a time has the time of the frame.
@@ -213,7 +233,9 @@ def parse_wrenches(
     if wrench_data is None or not wrenches:
         return ()
     known = {str(number): k for k, number in enumerate(wrenches)}
-    if not isinstance(wrench_data, Mapping) or set(wrench_data) & set(_SAMPLE_KEYS):
+    if not isinstance(wrench_data, Mapping) or set(wrench_data) & set(
+        _SAMPLE_KEYS
+    ):
         if len(known) > 1:
             raise InputError(
                 f"found one wrench; expected those of the grasps {' and '.join(known)}, by number"
@@ -221,15 +243,23 @@ def parse_wrenches(
         wrench_data = dict.fromkeys(known, wrench_data)
     if unknown := [name for name in wrench_data if name not in known]:
         expected = ", ".join(known)
-        raise InputError(f"a wrench of grasp {reprlib.repr(unknown[0])}; expected {expected}")
+        raise InputError(
+            f"a wrench of grasp {reprlib.repr(unknown[0])}; expected {expected}"
+        )
     collected = []
     for name, samples in wrench_data.items():
         measured = wrenches[int(name)].measured_components
         what = f"the wrench of grasp {name}"
-        for at_s, values in _parse_samples(samples, what, len(measured), t_s, alternative_count=3):
-            wrench_values = np.where(measured, np.pad(values, (0, 6 - len(values))), np.nan)
+        for at_s, values in _parse_samples(
+            samples, what, len(measured), t_s, alternative_count=3
+        ):
+            wrench_values = np.where(
+                measured, np.pad(values, (0, 6 - len(values))), np.nan
+            )
             wrench_values[len(values) :] = np.nan
-            collected.append((instruments_before + known[name] + 1, at_s, wrench_values))
+            collected.append(
+                (instruments_before + known[name] + 1, at_s, wrench_values)
+            )
     return tuple(collected)
 
 
@@ -251,14 +281,18 @@ def _parse_samples(
     alternative_count : int
         Second admissible number of values; 0 for none.
     """
-    several = isinstance(samples, Sequence) and any(isinstance(s, Mapping) for s in samples)
+    several = isinstance(samples, Sequence) and any(
+        isinstance(s, Mapping) for s in samples
+    )
     for sample in samples if several else [samples]:
         at_s = t_s
         values = sample
         if isinstance(sample, Mapping):
             if set(sample) != set(_SAMPLE_KEYS):
                 keys = ", ".join(map(reprlib.repr, sample)) or "nothing"
-                raise InputError(f"a sample of {what} has {keys}; expected t_s and values")
+                raise InputError(
+                    f"a sample of {what} has {keys}; expected t_s and values"
+                )
             at_s = parse_time(sample["t_s"])
             values = sample["values"]
         one = isinstance(values, (int, float)) and not isinstance(values, bool)
@@ -268,7 +302,8 @@ def _parse_samples(
                 yield (
                     at_s,
                     _parse_array(
-                        [values] if one else values, (alternative_count if few else count,)
+                        [values] if one else values,
+                        (alternative_count if few else count,),
                     ),
                 )
             except InputError as error:
@@ -287,12 +322,16 @@ def _parse_array(raw_values: Any, shape: tuple[int, ...]) -> Array:
     try:
         values = np.array(raw_values, dtype=float)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"found {reprlib.repr(raw_values)}; expected {size} numbers") from None
+        raise InputError(
+            f"found {reprlib.repr(raw_values)}; expected {size} numbers"
+        ) from None
     if values.shape != shape:
         sizes = " × ".join(map(str, values.shape)) or "single"
         raise InputError(f"found {sizes} numbers; expected {size} numbers")
     if (beyond := np.abs(values) > LARGEST_NUMBER).any():
-        raise InputError(f"found {values[beyond][0]:g}; expected numbers up to {LARGEST_NUMBER:g}")
+        raise InputError(
+            f"found {values[beyond][0]:g}; expected numbers up to {LARGEST_NUMBER:g}"
+        )
     return values
 
 
@@ -364,10 +403,16 @@ class FrameReader:
         tracks = parse_markers(json_object.get("markers"), self.names)
         t_s = parse_time(json_object["t_s"])
         wrench = json_object.get("wrench")
-        samples = parse_custom_readings(json_object.get("readings"), self.gauges, t_s)
+        samples = parse_custom_readings(
+            json_object.get("readings"), self.gauges, t_s
+        )
         samples += parse_wrenches(wrench, self.wrenches, len(self.gauges), t_s)
         return Frame(
-            t_s, pose, tracks_m=tracks, has_wrench=wrench is not None, instrument_samples=samples
+            t_s,
+            pose,
+            tracks_m=tracks,
+            has_wrench=wrench is not None,
+            instrument_samples=samples,
         )
 
     def _parse_row(self, cells: list[str]) -> Frame | None:
@@ -376,17 +421,31 @@ class FrameReader:
             self._columns = self._checked_header(cells)
             return None
         if len(cells) != len(self._columns):
-            raise InputError(f"{len(cells)} cells; expected {len(self._columns)}")
+            raise InputError(
+                f"{len(cells)} cells; expected {len(self._columns)}"
+            )
         by_name = dict(zip(self._columns, map(_parse_cell, cells), strict=True))
-        poses = [[by_name[name] for name in self._pose_columns(k)] for k in self.grasps]
+        poses = [
+            [by_name[name] for name in self._pose_columns(k)]
+            for k in self.grasps
+        ]
         each = [(values[:3], values[3:]) for values in poses]
         is_complete = not np.isnan(poses).any()
-        pose = parse_pose(each[0] if len(each) == 1 else each, self.grasps) if is_complete else None
-        tracks = [[by_name.get(f"{m}_{a}", np.nan) for a in ("x", "y", "z")] for m in self.names]
+        pose = (
+            parse_pose(each[0] if len(each) == 1 else each, self.grasps)
+            if is_complete
+            else None
+        )
+        tracks = [
+            [by_name.get(f"{m}_{a}", np.nan) for a in ("x", "y", "z")]
+            for m in self.names
+        ]
         t_s = parse_time(by_name["t_s"])
         instrument_samples = list[InstrumentSample]()
         for number, columns in enumerate(self._instrument_columns, 1):
-            values = np.array([by_name.get(column, np.nan) for column in columns])
+            values = np.array(
+                [by_name.get(column, np.nan) for column in columns]
+            )
             if np.isfinite(values).any():
                 instrument_samples.append((number, t_s, values))
         return Frame(
@@ -404,20 +463,33 @@ class FrameReader:
     @property
     def _instrument_columns(self) -> list[Sequence[str]]:
         """Column names of each instrument."""
-        before = ["" if len(self.wrenches) == 1 else f"{number}." for number in self.wrenches]
-        of_wrenches = [[each + name for name in WRENCH_COLUMNS] for each in before]
+        before = [
+            "" if len(self.wrenches) == 1 else f"{number}."
+            for number in self.wrenches
+        ]
+        of_wrenches = [
+            [each + name for name in WRENCH_COLUMNS] for each in before
+        ]
         return [*(gauge.columns for gauge in self.gauges), *of_wrenches]
 
     def _checked_header(self, columns: list[str]) -> list[str]:
         """Return the columns of a header, or raise an `InputError` if one is missing or unknown."""
-        needed = ["t_s", *(name for k in self.grasps for name in self._pose_columns(k))]
+        needed = [
+            "t_s",
+            *(name for k in self.grasps for name in self._pose_columns(k)),
+        ]
         if missing := [name for name in needed if name not in columns]:
             raise InputError(
                 f"neither a JSON object nor a header with the column {missing[0]!r}; "
                 f"expected {', '.join(needed)} and the markers' columns"
             )
-        known = {*needed, *(f"{m}_{a}" for m in self.names for a in ("x", "y", "z"))}
-        known |= {column for each in self._instrument_columns for column in each}
+        known = {
+            *needed,
+            *(f"{m}_{a}" for m in self.names for a in ("x", "y", "z")),
+        }
+        known |= {
+            column for each in self._instrument_columns for column in each
+        }
         if unknown := [name for name in columns if name not in known]:
             raise InputError(
                 f"a column {reprlib.repr(unknown[0])}; expected {', '.join(sorted(known))}"
@@ -430,8 +502,13 @@ def _parse_json(text: str) -> Mapping[str, Any]:
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
-        raise InputError(f"not valid JSON: {error.msg} at column {error.colno}") from error
-    except (ValueError, RecursionError) as error:  # Python's limits of digits and of depth
+        raise InputError(
+            f"not valid JSON: {error.msg} at column {error.colno}"
+        ) from error
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # Python's limits of digits and of depth
         raise InputError(
             "not a frame: a number is too long, or brackets are nested too deeply"
         ) from error
@@ -439,7 +516,9 @@ def _parse_json(text: str) -> Mapping[str, Any]:
 
 def parse_time(time: Any) -> float:
     """Return a time [s] as a float, or raise an `InputError` if it is not a finite number."""
-    number = isinstance(time, (int, float, np.number)) and not isinstance(time, bool)
+    number = isinstance(time, (int, float, np.number)) and not isinstance(
+        time, bool
+    )
     if not number or not abs(time) <= LARGEST_NUMBER:
         expected = f"a finite number of seconds, up to {LARGEST_NUMBER:g}"
         raise InputError(f"t_s is {reprlib.repr(time)}; expected {expected}")
@@ -459,4 +538,6 @@ def _parse_cell(text: str) -> float:
     try:
         return number_from_text(text)
     except ValueError:
-        raise InputError(f"found {reprlib.repr(text)}; expected a number") from None
+        raise InputError(
+            f"found {reprlib.repr(text)}; expected a number"
+        ) from None

@@ -10,7 +10,13 @@ import numpy as np
 
 from ..array_types import Array
 from ..program.streaming import SquareRootInformation
-from ..statistics.assessment import GROSS_MISFIT, HARDLY_TAME, MISFIT, PERSISTENT, WILD
+from ..statistics.assessment import (
+    GROSS_MISFIT,
+    HARDLY_TAME,
+    MISFIT,
+    PERSISTENT,
+    WILD,
+)
 from ..statistics.concerns import Concern, concern_if
 from ..statistics.distributions import chi2_sf, student_ppf
 from ..statistics.estimates import Estimate
@@ -63,12 +69,16 @@ class ResidualScatter:
         lag1 = float(np.nanmean(products) / square)
         is_significant = lag1 > max(CORRELATED, DEVIATIONS / np.sqrt(count))
         return cls(
-            float(np.sqrt(square)), min(lag1, LARGEST_AUTOCORRELATION) if is_significant else 0.0
+            float(np.sqrt(square)),
+            min(lag1, LARGEST_AUTOCORRELATION) if is_significant else 0.0,
         )
 
 
 def variance_factor(
-    known: SquareRootInformation, p: Array, parameter_count: float, scatter: ResidualScatter
+    known: SquareRootInformation,
+    p: Array,
+    parameter_count: float,
+    scatter: ResidualScatter,
 ) -> tuple[float, float]:
     """Return the factor of all variances, and the half width of 95 % intervals in standard
     deviations.
@@ -93,7 +103,9 @@ def variance_factor(
     return factor * (1 + scatter.lag1) / (1 - scatter.lag1), quantile
 
 
-def data_concerns(scatter: ResidualScatter, counts: Counter[str], samples: int) -> list[Concern]:
+def data_concerns(
+    scatter: ResidualScatter, counts: Counter[str], samples: int
+) -> list[Concern]:
     """Return the concerns due to residuals, and to samples that were left out.
 
     Parameters
@@ -109,9 +121,17 @@ def data_concerns(scatter: ResidualScatter, counts: Counter[str], samples: int) 
     size = {"factor": scatter.rms, "stated": "sigma_m"}
     times = "once" if restarts == 1 else f"{restarts} times"
     return [
-        *concern_if(scatter.rms > MISFIT, scatter.rms > GROSS_MISFIT, "noise/larger", **size),
         *concern_if(
-            scatter.lag1 > PERSISTENT, False, "residuals/persist", autocorrelation=scatter.lag1
+            scatter.rms > MISFIT,
+            scatter.rms > GROSS_MISFIT,
+            "noise/larger",
+            **size,
+        ),
+        *concern_if(
+            scatter.lag1 > PERSISTENT,
+            False,
+            "residuals/persist",
+            autocorrelation=scatter.lag1,
         ),
         *concern_if(
             outlier_share > WILD,
@@ -123,7 +143,9 @@ def data_concerns(scatter: ResidualScatter, counts: Counter[str], samples: int) 
     ]
 
 
-def estimate_concerns(estimates: Mapping[str, Estimate], distance: float) -> list[Concern]:
+def estimate_concerns(
+    estimates: Mapping[str, Estimate], distance: float
+) -> list[Concern]:
     """Return the concerns due to the estimates themselves.
 
     Parameters
@@ -132,11 +154,17 @@ def estimate_concerns(estimates: Mapping[str, Estimate], distance: float) -> lis
     distance : float
         Distance of the estimate from the linearisation point, in standard errors.
     """
-    concerns = concern_if(distance > LARGEST_SETTLED_DISTANCE, False, "solve/moves")
+    concerns = concern_if(
+        distance > LARGEST_SETTLED_DISTANCE, False, "solve/moves"
+    )
     for name, estimate in estimates.items():
         if estimate.at_bound:
-            concerns += concern_if(True, False, "information/at-bound", name=name)
+            concerns += concern_if(
+                True, False, "information/at-bound", name=name
+            )
         elif estimate.reason is not None:
             reason = estimate.reason
-            concerns += concern_if(True, False, "information/not-yet", name=name, reason=reason)
+            concerns += concern_if(
+                True, False, "information/not-yet", name=name, reason=reason
+            )
     return concerns

@@ -35,7 +35,9 @@ def decode_lines(lines: Iterable[bytes]) -> Iterator[str]:
     return (line.decode("utf-8", errors="replace") for line in lines)
 
 
-def receive_datagrams(port: int, opened: Callable[[int], None] | None = None) -> Iterator[str]:
+def receive_datagrams(
+    port: int, opened: Callable[[int], None] | None = None
+) -> Iterator[str]:
     """Yield lines that arrive as UDP datagrams at a port of this machine, until an empty datagram.
 
     Parameters
@@ -58,7 +60,9 @@ def receive_datagrams(port: int, opened: Callable[[int], None] | None = None) ->
             yield from decode_lines(datagram.splitlines())
 
 
-def read_problem(recording: Path, overrides: Sequence[str], allow_code: bool) -> Problem:
+def read_problem(
+    recording: Path, overrides: Sequence[str], allow_code: bool
+) -> Problem:
     """Return the problem of a file, or that of the folder of a run.
 
     Raises
@@ -68,33 +72,56 @@ def read_problem(recording: Path, overrides: Sequence[str], allow_code: bool) ->
     """
     if not recording.is_dir():
         return Problem.read(recording, overrides, allow_code)
-    home = Result.read(recording).problem_folder(recording, "which a replay needs")
-    return Problem.read(recording / "problem.toml", overrides, allow_code, folder=home)
+    home = Result.read(recording).problem_folder(
+        recording, "which a replay needs"
+    )
+    return Problem.read(
+        recording / "problem.toml", overrides, allow_code, folder=home
+    )
 
 
-def frames_of_recording(experiment: Experiment, model: StreamingModel) -> Iterator[Frame]:
+def frames_of_recording(
+    experiment: Experiment, model: StreamingModel
+) -> Iterator[Frame]:
     """Yield the frames of an experiment's recording in the order of time; samples of instruments
     come with the first frame that is not earlier.
     """
-    poses = [experiment.grasps[k].poses.at(experiment.t_s) for k in model.moving_grasps]
-    quaternion_series = [Rotation.from_matrix(rotations).as_quat() for rotations, _ in poses]
-    series = [(gauge.sample_times_s, gauge.measured_values) for gauge in experiment.readings]
-    series += [(wrench.t_s, wrench.values) for wrench in model.wrenches.values()]
+    poses = [
+        experiment.grasps[k].poses.at(experiment.t_s)
+        for k in model.moving_grasps
+    ]
+    quaternion_series = [
+        Rotation.from_matrix(rotations).as_quat() for rotations, _ in poses
+    ]
+    series = [
+        (gauge.sample_times_s, gauge.measured_values)
+        for gauge in experiment.readings
+    ]
+    series += [
+        (wrench.t_s, wrench.values) for wrench in model.wrenches.values()
+    ]
     samples = [
         (number, float(at_s), values)
         for number, each in enumerate(series, 1)
         for at_s, values in zip(*each, strict=True)
     ]
-    frame_of = np.searchsorted(experiment.t_s, [at_s - TIME_TOLERANCE_S for _, at_s, _ in samples])
+    frame_of = np.searchsorted(
+        experiment.t_s, [at_s - TIME_TOLERANCE_S for _, at_s, _ in samples]
+    )
     for k, t_s in enumerate(experiment.t_s):
         positions_m = np.array([translations[k] for _, translations in poses])
         quaternions = np.array([each[k] for each in quaternion_series])
         frame_samples = tuple(
-            each for each, frame in zip(samples, frame_of, strict=True) if frame == k
+            each
+            for each, frame in zip(samples, frame_of, strict=True)
+            if frame == k
         )
         tracks_m = experiment.markers.positions_m[k]
         yield Frame(
-            float(t_s), (positions_m, quaternions), tracks_m, instrument_samples=frame_samples
+            float(t_s),
+            (positions_m, quaternions),
+            tracks_m,
+            instrument_samples=frame_samples,
         )
 
 
@@ -150,7 +177,10 @@ def update_as_json(update: LiveUpdate) -> str:
         {
             "t_s": update.t_s,
             "parameters": parameters,
-            "trust": {"verdict": update.trust.verdict, "reasons": update.trust.reasons},
+            "trust": {
+                "verdict": update.trust.verdict,
+                "reasons": update.trust.reasons,
+            },
             "marker_rms_m": rms_m if np.isfinite(rms_m) else None,
             "latency_s": round(update.latency_s, 6),
             "notes": update.notes,

@@ -8,7 +8,11 @@ from __future__ import annotations
 import numpy as np
 
 from ..array_types import Array
-from ..methods.stiffness_scan import STIFFEST_PA, typical_parameters, without_guesses
+from ..methods.stiffness_scan import (
+    STIFFEST_PA,
+    typical_parameters,
+    without_guesses,
+)
 from ..program.streaming import StreamingModel
 from .window_pass import WindowPass
 
@@ -38,7 +42,9 @@ class StiffnessSearch:
     def __init__(self, model: StreamingModel, phi: Array) -> None:
         self.rows = (TRIAL_SAMPLES - 1) * model.substeps + 1
         forgotten = without_guesses(model.collocation).parameters
-        self._waiting = [typical_parameters(forgotten, young).guess_q for young in TRIED_PA]
+        self._waiting = [
+            typical_parameters(forgotten, young).guess_q for young in TRIED_PA
+        ]
         self._phi = phi
         self._tried: list[tuple[float, Array]] = []
 
@@ -51,7 +57,11 @@ class StiffnessSearch:
         """Return the parameters p of the next trial; None if no trial is left. `record_trial`
         advances to the one after it.
         """
-        return np.concatenate([self._waiting[0], self._phi]) if self._waiting else None
+        return (
+            np.concatenate([self._waiting[0], self._phi])
+            if self._waiting
+            else None
+        )
 
     def record_trial(self, track: WindowPass) -> None:
         """Record the loss of a pass as the result of the next trial.
@@ -60,7 +70,12 @@ class StiffnessSearch:
         the best end the search.
         """
         self._waiting.pop(0)
-        self._tried.append((np.inf if track.has_failed else track.loss, track.linearisation_point))
+        self._tried.append(
+            (
+                np.inf if track.has_failed else track.loss,
+                track.linearisation_point,
+            )
+        )
         least = min(loss for loss, _ in self._tried)
         worse = [not loss <= FAILURE_RATIO * least for loss, _ in self._tried]
         if np.isfinite(least) and all(worse[-2:]) and len(worse) > 2:

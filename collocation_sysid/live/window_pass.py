@@ -88,7 +88,9 @@ class WindowPass:
         block_rows: int,
         base: WindowPass | None = None,
     ) -> None:
-        first_block = base.blocks[0] if base is not None and base.blocks else None
+        first_block = (
+            base.blocks[0] if base is not None and base.blocks else None
+        )
         self.prior = prior
         self.base = base
         self.block_rows = block_rows
@@ -99,7 +101,10 @@ class WindowPass:
         )
         self.model = model
         self.sweep = StreamingSweep(
-            model, p, prior.with_problem(model.prior_information(p)), *self.start
+            model,
+            p,
+            prior.with_problem(model.prior_information(p)),
+            *self.start,
         )
         self.blocks: list[WindowBlock] = []
         self._base_changes = [(0, self.sweep.transformed)]
@@ -122,7 +127,9 @@ class WindowPass:
         """Loss of measurements and prior at p."""
         return self.information.loss(self.sweep.transformed)
 
-    def add_rows(self, poses: Sequence[Poses], guesses: Sequence[Array] = ()) -> int:
+    def add_rows(
+        self, poses: Sequence[Poses], guesses: Sequence[Array] = ()
+    ) -> int:
         """Compute further rows of one block and return how many; `add_residuals` adds their
         samples.
 
@@ -138,12 +145,21 @@ class WindowPass:
             If a row cannot be solved.
         """
         if self.rows % self.block_rows == 0:
-            new = self.start if not self.blocks else (self.sweep.state, self.linearisation_point)
+            new = (
+                self.start
+                if not self.blocks
+                else (self.sweep.state, self.linearisation_point)
+            )
             self.blocks.append(WindowBlock(*new))
         rows_of_base = self._rows_of_base(len(poses))
-        computed = self.sweep.advance(poses, guesses or self._initial_guesses(rows_of_base))
+        computed = self.sweep.advance(
+            poses, guesses or self._initial_guesses(rows_of_base)
+        )
         last_rows = list(zip(computed, rows_of_base, strict=False))[-2:]
-        errors = [stored.x - self._predicted_positions(base) for stored, base in last_rows]
+        errors = [
+            stored.x - self._predicted_positions(base)
+            for stored, base in last_rows
+        ]
         self._off = [*self._off, *errors][-2:]
         self.blocks[-1].stored_rows += computed
         self.rows += len(computed)
@@ -177,10 +193,18 @@ class WindowPass:
         """Return the transformed parameters (P,) at which the rows from the index `row` of the
         window on are linearised, in order of the rows; one for each change.
         """
-        before = [transformed for first, transformed in self._base_changes if first <= row]
+        before = [
+            transformed
+            for first, transformed in self._base_changes
+            if first <= row
+        ]
         return [
             *before[-1:],
-            *[transformed for first, transformed in self._base_changes if first > row],
+            *[
+                transformed
+                for first, transformed in self._base_changes
+                if first > row
+            ],
         ]
 
     def add_residuals(self, residuals: Sequence[LinearisedResidual]) -> None:
@@ -191,20 +215,31 @@ class WindowPass:
     @property
     def residuals(self) -> list[LinearisedResidual]:
         """Linearised residuals of all samples in the window."""
-        return [residual for block in self.blocks for residual in block.residuals]
+        return [
+            residual for block in self.blocks for residual in block.residuals
+        ]
 
     def repeat_rows(self, rows: Sequence[LoggedRow]) -> None:
         """Compute logged rows and add their samples, as many at once as the block allows; raise
         `SimulationError` if one cannot be solved.
         """
-        done = self.add_rows([row.poses for row in rows[: self.repeatable_rows]])
-        pairs = [(each, done - k) for k, row in enumerate(rows[:done], 1) for each in row.samples]
+        done = self.add_rows(
+            [row.poses for row in rows[: self.repeatable_rows]]
+        )
+        pairs = [
+            (each, done - k)
+            for k, row in enumerate(rows[:done], 1)
+            for each in row.samples
+        ]
         self.add_residuals(self.sweep.linearise_samples(pairs))
 
     @property
     def remaining_rows_of_block(self) -> int:
         """Largest number of rows that can be computed at once: those left in the block."""
-        return min(self.model.rows_per_chunk, self.block_rows - self.rows % self.block_rows)
+        return min(
+            self.model.rows_per_chunk,
+            self.block_rows - self.rows % self.block_rows,
+        )
 
     @property
     def repeatable_rows(self) -> int:
@@ -217,7 +252,10 @@ class WindowPass:
         if self.base is None or self.rows + count > self.base.rows:
             return []
         places = (divmod(self.rows + k, self.block_rows) for k in range(count))
-        return [self.base.blocks[block].stored_rows[place] for block, place in places]
+        return [
+            self.base.blocks[block].stored_rows[place]
+            for block, place in places
+        ]
 
     def _initial_guesses(self, known: Sequence[StoredRow]) -> list[Array]:
         """Return initial guesses of positions, (3n,) each, from rows of the pass that is repeated.
@@ -228,12 +266,13 @@ class WindowPass:
         if not known:
             return []
         # Straight on from the last two, where there are two.
-        previous_error, last_error = ([np.zeros_like(known[0].x)] * 2 + self._off[:1] + self._off)[
-            -2:
-        ]
+        previous_error, last_error = (
+            [np.zeros_like(known[0].x)] * 2 + self._off[:1] + self._off
+        )[-2:]
         predicted = map(self._predicted_positions, known)
         return [
-            x + last_error + k * (last_error - previous_error) for k, x in enumerate(predicted, 1)
+            x + last_error + k * (last_error - previous_error)
+            for k, x in enumerate(predicted, 1)
         ]
 
     def _predicted_positions(self, base: StoredRow) -> Array:
@@ -265,7 +304,9 @@ class WindowPass:
         """Information of all samples within the window and before it, without stated priors."""
         information = self.prior
         for block in self.blocks:
-            information = self.sweep.with_residuals(information, block.residuals)
+            information = self.sweep.with_residuals(
+                information, block.residuals
+            )
         return information
 
 
@@ -288,14 +329,20 @@ class CombinedPasses(NamedTuple):
     points: list[Array]
 
     @classmethod
-    def from_passes(cls, track: WindowPass, again: WindowPass | None) -> CombinedPasses:
+    def from_passes(
+        cls, track: WindowPass, again: WindowPass | None
+    ) -> CombinedPasses:
         """Return the joint information of a pass and of a repetition that has nearly caught up with
         it.
 
         If the repetition is None, has failed or lags behind too far, that of the pass alone.
         """
         residuals = track.residuals
-        repeated = again.residuals if again is not None and again.base is not None else []
+        repeated = (
+            again.residuals
+            if again is not None and again.base is not None
+            else []
+        )
         remaining = residuals[len(repeated) :]
         if (
             again is None
@@ -304,7 +351,10 @@ class CombinedPasses(NamedTuple):
             or len(remaining) > min(LARGEST_LAG, len(repeated))
         ):
             return cls(track.information, residuals, track.linearisation_points)
-        points = [*again.linearisation_points, *track.linearisation_points_from(again.rows)]
+        points = [
+            *again.linearisation_points,
+            *track.linearisation_points_from(again.rows),
+        ]
         return cls(
             track.sweep.with_residuals(again.information, remaining),
             [*repeated, *remaining],

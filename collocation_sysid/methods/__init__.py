@@ -75,7 +75,10 @@ def method_options_schema(method: str) -> dict[str, Any]:
     options = TypeAdapter(kind).json_schema()["properties"]
     for name, option in options.items():
         del option["title"]
-        option |= {"default": getattr(defaults, name), "description": descriptions[name]}
+        option |= {
+            "default": getattr(defaults, name),
+            "description": descriptions[name],
+        }
     return {
         "type": "object",
         "description": method_summary(method),

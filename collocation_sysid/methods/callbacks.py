@@ -100,7 +100,10 @@ class TimedFunction(ca.Callback):
             return 1
         try:
             self._evaluate(
-                [np.frombuffer(a) if a is not None else np.zeros(0) for a in arguments],
+                [
+                    np.frombuffer(a) if a is not None else np.zeros(0)
+                    for a in arguments
+                ],
                 [np.frombuffer(r) if r is not None else None for r in results],
             )
         except RestShapeError:
@@ -128,7 +131,11 @@ class LagrangianGradient(TimedFunction):
         """Return the function of the directional derivative (CasADi's interface)."""
         inputs = [*self._inputs, *self._outputs, *self._inputs]
         self._forward = TimedFunction(
-            name, inputs, outputs=self._outputs, evaluate=self.hessian_product, errors=self._errors
+            name,
+            inputs,
+            outputs=self._outputs,
+            evaluate=self.hessian_product,
+            errors=self._errors,
         )
         return self._forward
 
@@ -157,7 +164,10 @@ class NlpFunctions:
     """
 
     def __init__(
-        self, collocation: Collocation, hessian: HessianValues, errors: list[BaseException]
+        self,
+        collocation: Collocation,
+        hessian: HessianValues,
+        errors: list[BaseException],
     ) -> None:
         self.collocation = collocation
         self.errors = errors
@@ -194,9 +204,13 @@ class NlpFunctions:
             overwritten.
             """
             requests = zip(outputs, buffers, strict=True)
-            self._evaluate(inputs, {output: b for output, b in requests if b is not None})
+            self._evaluate(
+                inputs, {output: b for output, b in requests if b is not None}
+            )
 
-        needs_multipliers = any(output in ("grad_l", "triu_hess", "hess") for output in outputs)
+        needs_multipliers = any(
+            output in ("grad_l", "triu_hess", "hess") for output in outputs
+        )
         inputs = self._inputs if needs_multipliers else self._inputs[:2]
         kind = LagrangianGradient if outputs == ("grad_l",) else TimedFunction
         sparsities = [self._sparsity(output) for output in outputs]
@@ -231,13 +245,19 @@ class NlpFunctions:
         if "triu_hess" in outputs:
             self._upper_values(z, weight, multipliers, outputs["triu_hess"])
         if "hess" in outputs:
-            outputs["hess"][:] = self._upper_triangle(z, weight, multipliers)[self._full[1]]
+            outputs["hess"][:] = self._upper_triangle(z, weight, multipliers)[
+                self._full[1]
+            ]
 
-    def _forward(self, inputs: list[Array], outputs: list[Array | None]) -> None:
+    def _forward(
+        self, inputs: list[Array], outputs: list[Array | None]
+    ) -> None:
         """Write the directional derivative of the Lagrangian's gradient to the only output, in
         place, unless that is None; the inputs are in CasADi's order.
         """
-        z, _, weight, multipliers, _, by_z, _, by_weight, by_multipliers = inputs
+        z, _, weight, multipliers, _, by_z, _, by_weight, by_multipliers = (
+            inputs
+        )
         (product,) = outputs
         if product is None:
             return
@@ -245,14 +265,18 @@ class NlpFunctions:
         if len(by_z):
             structure, order = self._full
             rows, columns = structure.get_triplet()
-            values = self._upper_triangle(z, *self._weights(weight, multipliers))[order]
+            values = self._upper_triangle(
+                z, *self._weights(weight, multipliers)
+            )[order]
             np.add.at(product, rows, values * by_z[columns])
         if by_weight.any():
             product += by_weight * self.collocation.gradient(z)
         if by_multipliers.any():
             product += self.collocation.jacobian(z).T @ by_multipliers
 
-    def _upper_triangle(self, z: Array, weight: float, multipliers: Array) -> Array:
+    def _upper_triangle(
+        self, z: Array, weight: float, multipliers: Array
+    ) -> Array:
         """Return the values of the upper triangle of the Hessian at z, in the order of
         `hessian_structure`.
         """
@@ -260,7 +284,9 @@ class NlpFunctions:
         self._upper_values(z, weight, multipliers, values)
         return values
 
-    def _weights(self, weight: Array, multipliers: Array) -> tuple[float, Array]:
+    def _weights(
+        self, weight: Array, multipliers: Array
+    ) -> tuple[float, Array]:
         """Return the weight w of the objective and the multipliers y (constraints,), from arrays
         that CasADi leaves empty for zeros.
         """
@@ -274,7 +300,12 @@ class NlpFunctions:
         dense = ca.Sparsity.dense
         variables = self.collocation.variable_count
         rows = self.collocation.constraint_count
-        return [dense(variables, 1), ca.Sparsity(0, 1), dense(1, 1), dense(rows, 1)]
+        return [
+            dense(variables, 1),
+            ca.Sparsity(0, 1),
+            dense(1, 1),
+            dense(rows, 1),
+        ]
 
     @cached_property
     def _full(self) -> tuple[ca.Sparsity, NDArray[np.int64]]:
@@ -284,14 +315,20 @@ class NlpFunctions:
         upper = self._sparsity("triu_hess")
         numbered = ca.DM(upper, np.arange(1.0, upper.nnz() + 1))
         symmetric = ca.triu2symm(numbered)
-        return symmetric.sparsity(), np.array(symmetric.nonzeros(), dtype=np.int64) - 1
+        return symmetric.sparsity(), np.array(
+            symmetric.nonzeros(), dtype=np.int64
+        ) - 1
 
     def _sparsity(self, output: str) -> ca.Sparsity:
         """Return the sparsity of an output, by name."""
         variables = self.collocation.variable_count
         rows = self.collocation.constraint_count
         if output == "jac_g":
-            return ca.Sparsity(rows, variables, *map(_ints, self.collocation.jacobian_structure))
+            return ca.Sparsity(
+                rows,
+                variables,
+                *map(_ints, self.collocation.jacobian_structure),
+            )
         if output == "triu_hess":
             structure = self.collocation.hessian_structure
             return ca.Sparsity(variables, variables, *map(_ints, structure))
@@ -332,7 +369,10 @@ class IterationMonitor(ca.Callback):
     """
 
     def __init__(
-        self, recorder: Recorder, program: Collocation, errors: list[BaseException]
+        self,
+        recorder: Recorder,
+        program: Collocation,
+        errors: list[BaseException],
     ) -> None:
         ca.Callback.__init__(self)
         self.recorder = recorder
@@ -387,7 +427,9 @@ class IterationMonitor(ca.Callback):
         The best has the smallest sum of the objective and the largest violation of a constraint.
         `arguments` are the outputs of `nlpsol` in CasADi's order.
         """
-        z, value, rows, _, multipliers, *_ = (argument.full().ravel() for argument in arguments)
+        z, value, rows, _, multipliers, *_ = (
+            argument.full().ravel() for argument in arguments
+        )
         # Objective and constraints are both of order one.
         merit = float(value[0] + np.abs(rows).max(initial=0.0))
         if merit < self._best_merit:

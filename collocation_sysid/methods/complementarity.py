@@ -63,16 +63,24 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
         Last solution; an earlier one if its solve did not converge.
     """
     obstacles_by_experiment = {
-        segment.experiment.name: reachable_obstacles(segment.experiment, x.reshape(len(x), -1))
-        for segment, x in zip(first.collocation.transcriptions, first.positions_m, strict=True)
+        segment.experiment.name: reachable_obstacles(
+            segment.experiment, x.reshape(len(x), -1)
+        )
+        for segment, x in zip(
+            first.collocation.transcriptions, first.positions_m, strict=True
+        )
     }
     solution = first
     relaxed = _relax(first.collocation, obstacles_by_experiment, share=0.0)
     for share in RELAXED:
         # Its pressures are those of the solve before, not such as the smaller product asks for.
-        z = relaxed.with_lifted_variables().pack(*solution.collocation.unpack(solution.z))
+        z = relaxed.with_lifted_variables().pack(
+            *solution.collocation.unpack(solution.z)
+        )
         relaxed = _relax(first.collocation, obstacles_by_experiment, share)
-        solution = replace(solve(relaxed, z).after(solution, ""), notes=first.notes)
+        solution = replace(
+            solve(relaxed, z).after(solution, ""), notes=first.notes
+        )
         if not solution.status.converged:
             break
     note = (
@@ -80,7 +88,9 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
         f"further solves reduced pressure times gap to {share:g} κδ²"
     )
     # Multipliers that balance pressures which follow from gaps: the solver's leave its rounding.
-    return replace(solution, initial_multipliers=None, notes=(*solution.notes, note))
+    return replace(
+        solution, initial_multipliers=None, notes=(*solution.notes, note)
+    )
 
 
 def reachable_obstacles(experiment: Experiment, x: Array) -> list[Obstacle]:
@@ -101,23 +111,38 @@ def reachable_obstacles(experiment: Experiment, x: Array) -> list[Obstacle]:
     """
     obstacles = []
     mesh = experiment.body.mesh
-    for contact, obstacle in zip(contact_terms(experiment), experiment.obstacles, strict=True):
+    for contact, obstacle in zip(
+        contact_terms(experiment), experiment.obstacles, strict=True
+    ):
         surface = contact.law_of_contact.surface
         faces = mesh.surface[surface.faces]
-        gaps = smallest_gaps(contact, x).reshape(-1, surface.points_per_face).min(axis=1)
-        if len(reachable_faces := np.unique(faces[gaps < REACH * surface.edge_m])):
-            obstacle = replace(obstacle, faces=Indices(mesh.file_index[reachable_faces].tolist()))
+        gaps = (
+            smallest_gaps(contact, x)
+            .reshape(-1, surface.points_per_face)
+            .min(axis=1)
+        )
+        if len(
+            reachable_faces := np.unique(faces[gaps < REACH * surface.edge_m])
+        ):
+            obstacle = replace(
+                obstacle,
+                faces=Indices(mesh.file_index[reachable_faces].tolist()),
+            )
         obstacles.append(obstacle)
     return obstacles
 
 
 def with_contact_energy(experiment: Experiment) -> Experiment:
     """Return the experiment with the contact energy for all obstacles."""
-    return experiment.with_obstacles([replace(o, relaxed=None) for o in experiment.obstacles])
+    return experiment.with_obstacles(
+        [replace(o, relaxed=None) for o in experiment.obstacles]
+    )
 
 
 def _relax(
-    collocation: Collocation, obstacles_by_experiment: Mapping[str, list[Obstacle]], share: float
+    collocation: Collocation,
+    obstacles_by_experiment: Mapping[str, list[Obstacle]],
+    share: float,
 ) -> Collocation:
     """Return the program with relaxed complementarity.
 
@@ -131,7 +156,12 @@ def _relax(
         Product of pressure and gap, in κδ² of each obstacle.
     """
     experiments = [
-        each.with_obstacles([replace(o, relaxed=share) for o in obstacles_by_experiment[each.name]])
+        each.with_obstacles(
+            [
+                replace(o, relaxed=share)
+                for o in obstacles_by_experiment[each.name]
+            ]
+        )
         if each.name in obstacles_by_experiment
         else each
         for each in collocation.experiments

@@ -36,17 +36,21 @@ def condense(complete: Collocation) -> Collocation:
     grasp and no clock is estimated.
     """
     if not any(
-        s.nuisance.affects_grasps or len(s.nuisance.clock_indices) for s in complete.transcriptions
+        s.nuisance.affects_grasps or len(s.nuisance.clock_indices)
+        for s in complete.transcriptions
     ):
         return complete
     program = object.__new__(CondensedCollocation)  # has been checked
     vars(program).update(
-        {f.name: getattr(complete, f.name) for f in fields(complete)}, complete=complete
+        {f.name: getattr(complete, f.name) for f in fields(complete)},
+        complete=complete,
     )
     return program
 
 
-def complete_multipliers(program: Collocation, z: Array, multipliers: Array) -> Array:
+def complete_multipliers(
+    program: Collocation, z: Array, multipliers: Array
+) -> Array:
     """Return the multipliers of all constraints of the complete program, at an optimum.
 
     Parameters
@@ -85,7 +89,9 @@ class EliminatedDofs:
     phi: Index
 
     @classmethod
-    def from_segment(cls, transcription: Transcription, complete: Collocation) -> EliminatedDofs:
+    def from_segment(
+        cls, transcription: Transcription, complete: Collocation
+    ) -> EliminatedDofs:
         """Return the grasped dofs of an experiment whose positions follow from φ: those that
         constraints of the `complete` program prescribe.
         """
@@ -94,7 +100,9 @@ class EliminatedDofs:
         dofs = (
             transcription.dynamics.first_row + time
         ) * transcription.dof_count + transcription.constrained_dofs[place]
-        moving = transcription.nuisance_indices.indices[transcription.nuisance.motion_indices]
+        moving = transcription.nuisance_indices.indices[
+            transcription.nuisance.motion_indices
+        ]
         phi = complete.phi_columns.start - complete.nq + moving
         return cls(
             transcription,
@@ -109,11 +117,13 @@ class EliminatedDofs:
         """
         segment = self.segment
         prescribed = self.segment.prescribed_motion.evaluate_at(phi)
-        time, dof = np.divmod(self.variables - segment.offsets.position, segment.dof_count)
+        time, dof = np.divmod(
+            self.variables - segment.offsets.position, segment.dof_count
+        )
         indices = time, np.searchsorted(prescribed.dofs, dof)
-        return prescribed.positions_m[indices] / segment.length_m, prescribed.by_phi[
+        return prescribed.positions_m[
             indices
-        ] / segment.length_m
+        ] / segment.length_m, prescribed.by_phi[indices] / segment.length_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +149,12 @@ class EliminatedColumns:
 
     @classmethod
     def select(
-        cls, entries: Index, rows: Index, columns: Index, selected: Index, further_rows: Index
+        cls,
+        entries: Index,
+        rows: Index,
+        columns: Index,
+        selected: Index,
+        further_rows: Index,
     ) -> EliminatedColumns:
         """Select columns of a matrix.
 
@@ -170,7 +185,12 @@ class EliminatedColumns:
         matrix.
         """
         shape = (len(self.rows), len(slopes))
-        return sp.csr_array((values[self.entries], (self.row, self.column)), shape=shape) @ slopes
+        return (
+            sp.csr_array(
+                (values[self.entries], (self.row, self.column)), shape=shape
+            )
+            @ slopes
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,9 +238,13 @@ class CondensedPattern:
         """
         codes = [(column * shape[0] + row).ravel() for row, column in pairs]
         unique_codes = np.unique(np.concatenate(codes))
-        indptr = np.searchsorted(unique_codes, np.arange(shape[1] + 1) * shape[0])
+        indptr = np.searchsorted(
+            unique_codes, np.arange(shape[1] + 1) * shape[0]
+        )
         places = [np.searchsorted(unique_codes, each) for each in codes]
-        return cls((indptr, unique_codes % shape[0]), remaining, places, eliminated)
+        return cls(
+            (indptr, unique_codes % shape[0]), remaining, places, eliminated
+        )
 
 
 class CondensedCollocation(Collocation):
@@ -317,11 +341,15 @@ class CondensedCollocation(Collocation):
         """Return the variables of the complete program from z."""
         variables = np.empty(self.complete.variable_count)
         variables[self._remaining[0]] = z
-        for each, (positions, _) in zip(self.eliminated, self._prescribed(z), strict=True):
+        for each, (positions, _) in zip(
+            self.eliminated, self._prescribed(z), strict=True
+        ):
             variables[each.variables] = positions
         return variables
 
-    def complete_multipliers(self, z: Array, loss_weight: float, multipliers: Array) -> Array:
+    def complete_multipliers(
+        self, z: Array, loss_weight: float, multipliers: Array
+    ) -> Array:
         """Return the multipliers of all constraints of the complete program; those of eliminated
         constraints make the Lagrangian stationary in the eliminated positions.
 
@@ -350,7 +378,10 @@ class CondensedCollocation(Collocation):
         at z, see `EliminatedDofs.evaluate`.
         """
         p = self.parameters_from(z)
-        return (each.evaluate(p[each.segment.nuisance_indices.indices]) for each in self.eliminated)
+        return (
+            each.evaluate(p[each.segment.nuisance_indices.indices])
+            for each in self.eliminated
+        )
 
     # Values -------------------------------------------------------------------------------------
 
@@ -361,13 +392,17 @@ class CondensedCollocation(Collocation):
     def gradient(self, z: Array) -> Array:
         """Return ∂objective/∂z (variables,)."""
         slope = self.complete.gradient(self.complete_variables(z))
-        for each, (_, by_phi) in zip(self.eliminated, self._prescribed(z), strict=True):
+        for each, (_, by_phi) in zip(
+            self.eliminated, self._prescribed(z), strict=True
+        ):
             slope[each.phi] += by_phi.T @ slope[each.variables]
         return slope[self._remaining[0]]
 
     def constraint_values(self, z: Array) -> Array:
         """Return the scaled constraints g (constraints,)."""
-        return self.complete.constraint_values(self.complete_variables(z))[self._remaining[1]]
+        return self.complete.constraint_values(self.complete_variables(z))[
+            self._remaining[1]
+        ]
 
     # Matrices -----------------------------------------------------------------------------------
 
@@ -378,7 +413,12 @@ class CondensedCollocation(Collocation):
         rows, columns = _entries(self.complete.jacobian_structure)
         remaining = np.flatnonzero(of_row[rows] >= 0)
         of_free_variables = remaining[of_variable[columns[remaining]] >= 0]
-        pairs = [(of_row[rows[of_free_variables]], of_variable[columns[of_free_variables]])]
+        pairs = [
+            (
+                of_row[rows[of_free_variables]],
+                of_variable[columns[of_free_variables]],
+            )
+        ]
         through = []
         for each in self.eliminated:
             through.append(
@@ -392,7 +432,10 @@ class CondensedCollocation(Collocation):
             )
             pairs.append((through[-1].rows[:, None], of_variable[each.phi]))
         return CondensedPattern.from_pairs(
-            (self.constraint_count, self.variable_count), of_free_variables, pairs, through
+            (self.constraint_count, self.variable_count),
+            of_free_variables,
+            pairs,
+            through,
         )
 
     @property
@@ -400,7 +443,9 @@ class CondensedCollocation(Collocation):
         """Column pointers and row indices of ∂g/∂z, by compressed columns."""
         return self._jacobian.structure
 
-    def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
+    def constraints_and_jacobian(
+        self, z: Array, out: Array | None = None
+    ) -> tuple[Array, Array]:
         """Return the constraints g (constraints,) and the values of ∂g/∂z, including the dependence
         through the eliminated positions, from one evaluation of the elements.
 
@@ -414,9 +459,16 @@ class CondensedCollocation(Collocation):
         layout = self._jacobian
         values = np.empty(len(layout.structure[1])) if out is None else out
         values[:] = 0
-        rows, complete_values = self.complete.constraints_and_jacobian(self.complete_variables(z))
+        rows, complete_values = self.complete.constraints_and_jacobian(
+            self.complete_variables(z)
+        )
         values[layout.targets[0]] = complete_values[layout.remaining]
-        parts = zip(layout.targets[1:], layout.eliminated, self._prescribed(z), strict=True)
+        parts = zip(
+            layout.targets[1:],
+            layout.eliminated,
+            self._prescribed(z),
+            strict=True,
+        )
         for places, through, (_, slopes) in parts:
             values[places] += through.times(complete_values, slopes).ravel()
         return rows[self._remaining[1]], values
@@ -429,7 +481,9 @@ class CondensedCollocation(Collocation):
         number, _ = self._condensed_indices
         rows, columns = _entries(self.complete.hessian_structure)
         are_remaining = (number[rows] >= 0) & (number[columns] >= 0)
-        remaining = np.flatnonzero(are_remaining & ~self._is_loss_coupling(rows, columns))
+        remaining = np.flatnonzero(
+            are_remaining & ~self._is_loss_coupling(rows, columns)
+        )
         pairs = [(number[rows[remaining]], number[columns[remaining]])]
         through = []
         # Of the lower triangle too, whose diagonal is that of the upper one.
@@ -441,23 +495,35 @@ class CondensedCollocation(Collocation):
             own = np.concatenate([each.variables, each.phi])
             through.append(
                 EliminatedColumns.select(
-                    entries, row, columns=column, selected=each.variables, further_rows=own
+                    entries,
+                    row,
+                    columns=column,
+                    selected=each.variables,
+                    further_rows=own,
                 )
             )
             i = number[through[-1].rows[:, None]]
             j = number[each.phi]
-            pairs.append((np.minimum(i, j)[i[:, 0] >= 0], np.maximum(i, j)[i[:, 0] >= 0]))
+            pairs.append(
+                (np.minimum(i, j)[i[:, 0] >= 0], np.maximum(i, j)[i[:, 0] >= 0])
+            )
         size = self.variable_count
-        return CondensedPattern.from_pairs((size, size), remaining, pairs, through)
+        return CondensedPattern.from_pairs(
+            (size, size), remaining, pairs, through
+        )
 
-    def _is_loss_coupling(self, rows: Index, columns: Index) -> NDArray[np.bool_]:
+    def _is_loss_coupling(
+        self, rows: Index, columns: Index
+    ) -> NDArray[np.bool_]:
         """Return a mask (entries,) of those entries of the complete Hessian, by rows and columns,
         that couple positions at times so distant that no equation of motion contains both.
         """
         mask = np.zeros(len(rows), dtype=bool)
         for segment in self.transcriptions:
             time = np.full(self.complete.variable_count, -1)
-            time[segment.columns] = np.arange(segment.variable_count) // segment.dof_count
+            time[segment.columns] = (
+                np.arange(segment.variable_count) // segment.dof_count
+            )
             first = time[rows]
             second = time[columns]
             are_distant = np.abs(first - second) > segment.dynamics.largest_lag
@@ -480,7 +546,11 @@ class CondensedCollocation(Collocation):
         return of_q, of_x[of_x >= 0]
 
     def hessian_values(
-        self, z: Array, loss_weight: float, multipliers: Array | None, out: Array | None = None
+        self,
+        z: Array,
+        loss_weight: float,
+        multipliers: Array | None,
+        out: Array | None = None,
     ) -> Array:
         """Return the values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle.
 
@@ -506,20 +576,29 @@ class CondensedCollocation(Collocation):
         )
         values[layout.targets[0]] = complete_values[layout.remaining]
         parts = zip(
-            self.eliminated, layout.targets[1:], layout.eliminated, self._prescribed(z), strict=True
+            self.eliminated,
+            layout.targets[1:],
+            layout.eliminated,
+            self._prescribed(z),
+            strict=True,
         )
         for each, places, through, (_, slopes) in parts:
             product = through.times(complete_values, slopes)
             eliminated_rows, phi_rows = (
-                np.searchsorted(through.rows, a) for a in (each.variables, each.phi)
+                np.searchsorted(through.rows, a)
+                for a in (each.variables, each.phi)
             )
             # An entry of φ by φ comes twice, from either side; one of the diagonal once.
             product[phi_rows] += slopes.T @ product[eliminated_rows] / 2
             product[phi_rows, np.arange(len(phi_rows))] *= 2
-            np.add.at(values, places, product[number[through.rows] >= 0].ravel())
+            np.add.at(
+                values, places, product[number[through.rows] >= 0].ravel()
+            )
         return values
 
-    def _complete_hessian(self, z: Array, loss_weight: float, multipliers: Array | None) -> Array:
+    def _complete_hessian(
+        self, z: Array, loss_weight: float, multipliers: Array | None
+    ) -> Array:
         """Return the values of the complete program's Hessian, with its Gauss–Newton part evaluated
         at clocks rounded to whole samples and no other clock errors.
 
@@ -539,7 +618,9 @@ class CondensedCollocation(Collocation):
             nuisance = segment.nuisance
             places = segment.nuisance_indices.indices
             clock_places = nuisance.indices_of_rows(TIME)
-            sample = segment.experiment.timestep_s / nuisance.scales[clock_places]
+            sample = (
+                segment.experiment.timestep_s / nuisance.scales[clock_places]
+            )
             samples = np.round(p[places[clock_places]] / sample)
             p[places[nuisance.clock_indices]] = 0
             p[places[clock_places]] = samples * sample

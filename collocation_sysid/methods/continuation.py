@@ -25,7 +25,12 @@ from .comparison.penalty import AugmentedLagrangian, Penalty
 from .comparison.shooting import Shooting
 from .initial_trajectories import complete_variables, simulate_trajectories
 from .interior_point import InteriorPoint
-from .method_options import SHARES, Shares, method_from_options, samples_in_share
+from .method_options import (
+    SHARES,
+    Shares,
+    method_from_options,
+    samples_in_share,
+)
 from .reduced_space import ReducedSpace
 from .solution import Iteration, Method, Solution, Status, Watch
 from .solve_recorder import Recorder
@@ -84,14 +89,19 @@ class Continuation(Options):
         return method_from_options(STAGES[name], options, "stage")
 
     def __call__(
-        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
+        self,
+        collocation: Collocation,
+        watch: Watch | None = None,
+        start: Array | None = None,
     ) -> Solution:
         """Solve the NLP, see `Method`; the first part starts from the first rows of `start`.
 
         Numbers and times of the history continue from part to part. The solve ends with a part that
         was interrupted or refused; the notes contain the result of each part.
         """
-        climb = _ContinuationState(self.method, Recorder(self.name, collocation, watch))
+        climb = _ContinuationState(
+            self.method, Recorder(self.name, collocation, watch)
+        )
         if start is not None:
             climb.known = collocation.unpack(start)
         for share in self.shares:
@@ -112,11 +122,19 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
         depth image.
     """
     markers = experiment.markers
-    stop = min(len(experiment.t_s), max(count, markers.first_visible_sample + 1, 3))
+    stop = min(
+        len(experiment.t_s), max(count, markers.first_visible_sample + 1, 3)
+    )
     fewest = 1 if experiment.is_static else FEWEST_SHARED_SAMPLES
-    stop, depths = until_all_cameras_see(experiment.depths, experiment.t_s, stop, fewest)
-    shorter = replace(markers, t_s=markers.t_s[:stop], positions_m=markers.positions_m[:stop])
-    return replace(experiment, t_s=experiment.t_s[:stop], markers=shorter, depths=depths)
+    stop, depths = until_all_cameras_see(
+        experiment.depths, experiment.t_s, stop, fewest
+    )
+    shorter = replace(
+        markers, t_s=markers.t_s[:stop], positions_m=markers.positions_m[:stop]
+    )
+    return replace(
+        experiment, t_s=experiment.t_s[:stop], markers=shorter, depths=depths
+    )
 
 
 def first_share(collocation: Collocation, share: float) -> Collocation:
@@ -124,7 +142,9 @@ def first_share(collocation: Collocation, share: float) -> Collocation:
     validation recordings are left out.
     """
     fitted = [segment.experiment for segment in collocation.transcriptions]
-    shorter = [first_samples(e, samples_in_share(len(e.t_s), share)) for e in fitted]
+    shorter = [
+        first_samples(e, samples_in_share(len(e.t_s), share)) for e in fitted
+    ]
     return replace(collocation, experiments=shorter)
 
 
@@ -156,16 +176,30 @@ class _ContinuationState:
         refused.
         """
         recorder = self.recorder
-        part = recorder.collocation if share == 1 else first_share(recorder.collocation, share)
-        start = None if self.known is None else _continue_variables(part, *self.known)
-        before = max([self.iterations, *(line.number for line in recorder.history[-1:])])
+        part = (
+            recorder.collocation
+            if share == 1
+            else first_share(recorder.collocation, share)
+        )
+        start = (
+            None
+            if self.known is None
+            else _continue_variables(part, *self.known)
+        )
+        before = max(
+            [self.iterations, *(line.number for line in recorder.history[-1:])]
+        )
         elapsed_s = recorder.elapsed_s
 
         def record(line: Iteration) -> None:
             """Record an iteration with its number, time and share in the whole solve."""
             number = line.number + before
             time_s = line.time_s + elapsed_s
-            recorder.add(replace(line, number=number, time_s=time_s, share=share * line.share))
+            recorder.add(
+                replace(
+                    line, number=number, time_s=time_s, share=share * line.share
+                )
+            )
 
         solution = self.method(part, record, start)
         self._add(solution, share)
@@ -202,8 +236,13 @@ class _ContinuationState:
         self.iterations += solution.iterations
         self.evaluations += solution.evaluations
         spent = solution.timing
-        self.recorder.stopwatch.add(spent.build, spent.evaluations, spent.linear_algebra)
-        values = ", ".join(f"{name} = {value:.4g}" for name, value in solution.parameters.items())
+        self.recorder.stopwatch.add(
+            spent.build, spent.evaluations, spent.linear_algebra
+        )
+        values = ", ".join(
+            f"{name} = {value:.4g}"
+            for name, value in solution.parameters.items()
+        )
         self.recorder.notes.append(
             f"{100 * share:.3g} % of the samples by {solution.method}: {solution.status.value} "
             "after "
@@ -211,7 +250,9 @@ class _ContinuationState:
         )
 
 
-def _continue_variables(collocation: Collocation, p: Array, positions: list[Array]) -> Array:
+def _continue_variables(
+    collocation: Collocation, p: Array, positions: list[Array]
+) -> Array:
     """Return variables z from parameters p (np,) and the first rows of positions [m] of each
     experiment.
 

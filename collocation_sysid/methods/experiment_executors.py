@@ -46,7 +46,9 @@ class ExperimentExecutor(Protocol):
         """Store the transcriptions of a problem, and return them as stored values."""
         ...
 
-    def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
+    def map_experiments(
+        self, run: Callable[..., Any], *columns: Sequence[Any]
+    ) -> list[Any]:
         """Apply a function to every experiment, and return the results as stored values.
 
         Parameters
@@ -85,9 +87,13 @@ class LocalExecutor:
         """Return the transcriptions themselves, which stay in this process."""
         return list(collocation.transcriptions)
 
-    def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
+    def map_experiments(
+        self, run: Callable[..., Any], *columns: Sequence[Any]
+    ) -> list[Any]:
         """Apply a function to every experiment in parallel, and return the results themselves."""
-        return map_experiments(lambda row: run(*row), [*zip(*columns, strict=True)], self.threads)
+        return map_experiments(
+            lambda row: run(*row), [*zip(*columns, strict=True)], self.threads
+        )
 
     def fetch(self, stored: Sequence[Any]) -> list[Any]:
         """Return the stored values unchanged."""
@@ -122,15 +128,20 @@ class DaskExecutor:
         """See `ExperimentExecutor`; each body and experiment is sent only once."""
         segments = collocation.transcriptions
         with self._end_search_if_disconnected():
-            known = all(segment.experiment in self._sent for segment in segments)
+            known = all(
+                segment.experiment in self._sent for segment in segments
+            )
             if not known or len(self._homes) != len(segments):
                 costs = [segment.variable_count for segment in segments]
                 self._homes = _assign_workers(costs, self.client.nthreads())
             return [
-                self._send_segment(s, home) for s, home in zip(segments, self._homes, strict=True)
+                self._send_segment(s, home)
+                for s, home in zip(segments, self._homes, strict=True)
             ]
 
-    def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
+    def map_experiments(
+        self, run: Callable[..., Any], *columns: Sequence[Any]
+    ) -> list[Any]:
         """Apply a function to every experiment on its worker, and return futures of the results."""
         rows = zip(self._homes, *columns, strict=True)
         with self._end_search_if_disconnected():
@@ -180,14 +191,18 @@ class DaskExecutor:
                 "A recording terminated every worker that computed it: check the workers' memory."
             ) from error
         except (Exception, dask.client.CancelledError) as error:
-            is_disconnected = isinstance(error, (OSError, dask.client.CancelledError))
+            is_disconnected = isinstance(
+                error, (OSError, dask.client.CancelledError)
+            )
             if isinstance(error, SearchEnded) or (
                 self.client.status == "running" and not is_disconnected
             ):
                 raise
             raise _disconnection("Its scheduler no longer responds.") from error
 
-    def _submit(self, home: str, run: Callable[..., Any], *arguments: Any) -> Any:
+    def _submit(
+        self, home: str, run: Callable[..., Any], *arguments: Any
+    ) -> Any:
         """Return a future of a function on a worker; Dask may choose another worker if that is
         lost.
 
@@ -196,7 +211,12 @@ class DaskExecutor:
         # By the name of the function dask knows how long such tasks take.
         key = f"{run.__name__}-{secrets.token_hex(16)}"
         return self.client.submit(
-            _run_alone, run, *arguments, key=key, workers=[home], allow_other_workers=True
+            _run_alone,
+            run,
+            *arguments,
+            key=key,
+            workers=[home],
+            allow_other_workers=True,
         )
 
     def _send_segment(self, transcription: Transcription, home: str) -> Any:
@@ -210,7 +230,10 @@ class DaskExecutor:
 
         def experiment(options: Experiment) -> Any:
             return self._submit(
-                home, _with_body, _with_fields(options), send_once(options.body, body)
+                home,
+                _with_body,
+                _with_fields(options),
+                send_once(options.body, body),
             )
 
         def body(options: Body) -> Any:
@@ -263,7 +286,9 @@ def _assign_workers(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
         If there are no workers.
     """
     _require_workers(threads)
-    threads_of_workers = [(address, k) for address, count in threads.items() for k in range(count)]
+    threads_of_workers = [
+        (address, k) for address, count in threads.items() for k in range(count)
+    ]
     loads = dict.fromkeys(threads_of_workers, 0)
     homes = [""] * len(costs)
     for number in sorted(range(len(costs)), key=lambda k: -costs[k]):
@@ -290,7 +315,9 @@ def _require_package(client: Any) -> set[str]:
             f"({reason(error)}); start it again"
         ) from error
     if not versions:
-        raise _refusal("the scheduler has no workers; start some, as with dask worker ADDRESS")
+        raise _refusal(
+            "the scheduler has no workers; start some, as with dask worker ADDRESS"
+        )
     for address, worker_version in versions.items():
         if worker_version != own_version:
             raise _refusal(
@@ -314,7 +341,8 @@ def _require_workers(threads: dict[str, int]) -> None:
 def _disconnection(reason: str) -> SearchEnded:
     """Return the exception that ends the search because the cluster is lost."""
     return SearchEnded(
-        Status.CLUSTER_DISCONNECTED, f"{Status.CLUSTER_DISCONNECTED.sentence} {reason}"
+        Status.CLUSTER_DISCONNECTED,
+        f"{Status.CLUSTER_DISCONNECTED.sentence} {reason}",
     )
 
 
@@ -353,7 +381,8 @@ def _with_fields(instance: T, body: Body | None = None) -> T:
     """Return a copy of an experiment or an association with another body; None removes it
     for transfer.
     """
-    field_values = {field.name: getattr(instance, field.name) for field in fields(instance)}  # pyright: ignore[reportArgumentType]
+    names = [each.name for each in fields(instance)]  # pyright: ignore[reportArgumentType]
+    field_values = {name: getattr(instance, name) for name in names}
     other = object.__new__(type(instance))
     vars(other).update(field_values | {"body": body})
     return other
@@ -370,4 +399,6 @@ def _restore_segment(
     """Return a transcription from its experiment, its association without body, and its
     other arguments.
     """
-    return Transcription(experiment, association=_with_fields(chart, experiment.body), **rest)
+    return Transcription(
+        experiment, association=_with_fields(chart, experiment.body), **rest
+    )

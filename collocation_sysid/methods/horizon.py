@@ -135,7 +135,10 @@ class Horizon:
         self.segments = self.workers.store_segments(collocation)
 
     def evaluate(
-        self, p: Array, trajectories: Sequence[Any], known_iterate: Iterate | None = None
+        self,
+        p: Array,
+        trajectories: Sequence[Any],
+        known_iterate: Iterate | None = None,
     ) -> Iterate:
         """Sweep all experiments at parameters p and trajectories x.
 
@@ -153,10 +156,14 @@ class Horizon:
         SimulationError
             If a time step is singular or not finite.
         """
-        known = known_iterate.trajectories if known_iterate else self._repeat(None)
+        known = (
+            known_iterate.trajectories if known_iterate else self._repeat(None)
+        )
         return self._run(p, sweep, trajectories, known)
 
-    def evaluate_step(self, p: Array, previous: Iterate, step: Array) -> Iterate:
+    def evaluate_step(
+        self, p: Array, previous: Iterate, step: Array
+    ) -> Iterate:
         """Sweep all experiments after a step of the parameters.
 
         Static experiments are solved for their equilibria first, see `trajectory.sweep_after_step`.
@@ -175,7 +182,12 @@ class Horizon:
         SimulationError
             If a time step is singular or not finite.
         """
-        return self._run(p, sweep_after_step, previous.trajectories, self._by_experiment(step))
+        return self._run(
+            p,
+            sweep_after_step,
+            previous.trajectories,
+            self._by_experiment(step),
+        )
 
     def reassociate(self, p: Array, iterate: Iterate) -> Iterate:
         """Return an iterate at parameters p (np,) with the measurements of the present
@@ -184,7 +196,9 @@ class Horizon:
         return self._run(p, reassociate, iterate.trajectories)
 
     @one_blas_thread()
-    def _run(self, p: Array, run: Callable[..., SweepResult], *columns: Sequence[Any]) -> Iterate:
+    def _run(
+        self, p: Array, run: Callable[..., SweepResult], *columns: Sequence[Any]
+    ) -> Iterate:
         """Run a function of `trajectory_sweeps` for every experiment, and return the iterate of the
         joined results.
 
@@ -199,7 +213,12 @@ class Horizon:
         """
         thresholds = self._repeat(self.collocation.huber)
         trajectories = self.workers.map_experiments(
-            run, self.solvers, self.segments, thresholds, self._by_experiment(p), *columns
+            run,
+            self.solvers,
+            self.segments,
+            thresholds,
+            self._by_experiment(p),
+            *columns,
         )
         reports: list[SweepReport] = self.workers.fetch(
             self.workers.map_experiments(_report, trajectories)
@@ -215,16 +234,27 @@ class Horizon:
         prior, prior_slopes = self.collocation.prior_residuals(p)
         priors = [(prior, np.diag(prior_slopes))]
         if self.prior is not None:
-            deviation = (p[:nq] - self.collocation.parameters.guess_q) / self.prior
+            deviation = (
+                p[:nq] - self.collocation.parameters.guess_q
+            ) / self.prior
             priors.append((deviation, np.eye(nq, len(p)) / self.prior))
         for values, by in priors:
             fit = fit.with_rows(values, by)
             # The slopes of priors are the same everywhere.
             crossed += by.T @ values
-        return Iterate(p, trajectories, reports=reports, fit=fit, previous_slopes_residual=crossed)
+        return Iterate(
+            p,
+            trajectories,
+            reports=reports,
+            fit=fit,
+            previous_slopes_residual=crossed,
+        )
 
     def simulate(
-        self, p: Array, trajectories: Sequence[Any] | None = None, guess: Iterate | None = None
+        self,
+        p: Array,
+        trajectories: Sequence[Any] | None = None,
+        guess: Iterate | None = None,
     ) -> tuple[list[Any], SimulationError | None]:
         """Simulate all experiments at parameters p, as far as the simulations succeed.
 
@@ -245,7 +275,12 @@ class Horizon:
         known = trajectories or self._repeat(None)
         guesses = guess.trajectories if guess else self._repeat(None)
         results = self.workers.map_experiments(
-            simulate_rows, self.solvers, self.segments, self._by_experiment(p), known, guesses
+            simulate_rows,
+            self.solvers,
+            self.segments,
+            self._by_experiment(p),
+            known,
+            guesses,
         )
         failures = []
         for failure, spent in self.workers.fetch(
@@ -260,10 +295,15 @@ class Horizon:
         step of the iterate and a step (np,) of the parameters, to first order.
         """
         return self.workers.map_experiments(
-            extrapolate, self.segments, iterate.trajectories, self._by_experiment(step)
+            extrapolate,
+            self.segments,
+            iterate.trajectories,
+            self._by_experiment(step),
         )
 
-    def fit_summaries(self, p: Array, trajectories: Sequence[Any]) -> list[FitSummary]:
+    def fit_summaries(
+        self, p: Array, trajectories: Sequence[Any]
+    ) -> list[FitSummary]:
         """Return the fit of trajectories, as the workers store them, at parameters p (np,), without
         a sweep; one summary for each experiment.
         """
@@ -274,11 +314,17 @@ class Horizon:
 
     def row_counts(self, trajectories: Sequence[Any]) -> list[int]:
         """Return the number of rows of each trajectory."""
-        return self.workers.fetch(self.workers.map_experiments(_row_count, trajectories))
+        return self.workers.fetch(
+            self.workers.map_experiments(_row_count, trajectories)
+        )
 
-    def first_rows(self, trajectories: Sequence[Any], counts: Sequence[int]) -> list[Array]:
+    def first_rows(
+        self, trajectories: Sequence[Any], counts: Sequence[int]
+    ) -> list[Array]:
         """Return the first `counts[i]` rows of each trajectory i, as arrays (counts[i], 3n) [m]."""
-        return self.workers.fetch(self.workers.map_experiments(_first_rows, trajectories, counts))
+        return self.workers.fetch(
+            self.workers.map_experiments(_first_rows, trajectories, counts)
+        )
 
     def _by_experiment(self, p: Array) -> list[Array]:
         """Return the entries of p (np,) that belong to each experiment."""
@@ -308,6 +354,8 @@ def _failure_and_times(
     return result.failure, result.times_s
 
 
-def _first_rows(result: SweepResult | SimulationResult | Array, count: int) -> Array:
+def _first_rows(
+    result: SweepResult | SimulationResult | Array, count: int
+) -> Array:
     """Return the first `count` rows of a trajectory; workers run this function."""
     return trajectory_positions(result)[:count]

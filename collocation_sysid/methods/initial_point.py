@@ -77,11 +77,17 @@ def compute_initial_point(
         if recorder.elapsed_s > max_time_s:
             raise SearchEnded(Status.TIME_LIMIT)
 
-    method = ReducedSpace(tolerance=LARGEST_CORRECTION, max_iterations=MAX_SWEEPS)
+    method = ReducedSpace(
+        tolerance=LARGEST_CORRECTION, max_iterations=MAX_SWEEPS
+    )
     coarse = method(recorder.collocation, record, start)
     # Reduced space gives multipliers only where a part of the trajectory was not simulated.
     reached_end = coarse.initial_multipliers is None
-    is_usable = reached_end and coarse.status not in UNUSABLE and bool(np.isfinite(coarse.z).all())
+    is_usable = (
+        reached_end
+        and coarse.status not in UNUSABLE
+        and bool(np.isfinite(coarse.z).all())
+    )
     is_close = is_usable and coarse.status is Status.CONVERGED
     count = coarse.iterations
     sweeps = (
@@ -96,7 +102,9 @@ def compute_initial_point(
             f"{100 * LARGEST_CORRECTION:g} %; {continuation}"
         )
     elif is_usable:
-        note = f"initial point: {sweeps} ({coarse.status.value}); {continuation}"
+        note = (
+            f"initial point: {sweeps} ({coarse.status.value}); {continuation}"
+        )
     else:
         note = f"initial point: the method reduced-space found none ({coarse.message.rstrip('.')})"
     return InitialPoint(coarse, is_usable, is_close, note)
@@ -141,7 +149,11 @@ def adjoint_multipliers(
         of_motion = constraint_multipliers(collocation, z)
     except SimulationError:
         return None
-    complete_program = program.complete if isinstance(program, CondensedCollocation) else program
+    complete_program = (
+        program.complete
+        if isinstance(program, CondensedCollocation)
+        else program
+    )
     variables = convert_variables(z, collocation, complete_program)
     constraints = np.zeros(complete_program.constraint_count)
     constraints[: len(of_motion)] = of_motion
@@ -161,4 +173,8 @@ def adjoint_multipliers(
     bounded = (lower < upper) & (np.isfinite(lower) | np.isfinite(upper))
     bounds = np.where(bounded, -(gradient + jacobian.T @ constraints), 0.0)
     multipliers = InitialMultipliers(constraints, bounds)
-    return multipliers if np.isfinite(constraints).all() and np.isfinite(bounds).all() else None
+    return (
+        multipliers
+        if np.isfinite(constraints).all() and np.isfinite(bounds).all()
+        else None
+    )

@@ -37,7 +37,9 @@ def associated_at_guess(collocation: Collocation) -> Collocation:
         experiment = segment.experiment
         theta = segment.constants.theta(p[: segment.nq])
         try:
-            first = Forces.from_experiment(experiment, experiment.t_s[:1], theta)
+            first = Forces.from_experiment(
+                experiment, experiment.t_s[:1], theta
+            )
             x, _ = initial_state(experiment, first, NewtonSolver(experiment))
         except SimulationError:
             x = experiment.rigid_positions(experiment.t_s[:1]).ravel()
@@ -59,7 +61,9 @@ def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
         theta = segment.constants.theta(p[: segment.nq])
         try:
             positions.append(
-                simulate_scheme(segment.experiment, segment.dynamics.with_theta(theta))
+                simulate_scheme(
+                    segment.experiment, segment.dynamics.with_theta(theta)
+                )
             )
         except SimulationError as error:
             positions.append(rigid_trajectory(segment, theta))
@@ -107,7 +111,9 @@ def simulate_trajectories(
         Trajectories, which are shorter than requested where the simulation failed, and the first
         failure; None if there was none.
     """
-    parts = collocation.iterates_at(p, known_rows or _empty_trajectories(collocation))
+    parts = collocation.iterates_at(
+        p, known_rows or _empty_trajectories(collocation)
+    )
 
     def simulate_one(k: int) -> tuple[Array, SimulationError | None]:
         """Simulate experiment number k, from 0; return its trajectory as far as it succeeded, and
@@ -116,10 +122,16 @@ def simulate_trajectories(
         count = parts[k].segment.grid_times if rows is None else rows[k]
         own_guess = None if guess is None else guess[k]
         return continue_trajectory(
-            parts[k], count, options=options, stopwatch=stopwatch, guess=own_guess
+            parts[k],
+            count,
+            options=options,
+            stopwatch=stopwatch,
+            guess=own_guess,
         )
 
-    reached = map_experiments(simulate_one, range(len(parts)), collocation.threads)
+    reached = map_experiments(
+        simulate_one, range(len(parts)), collocation.threads
+    )
     failures = [failure for _, failure in reached if failure is not None]
     return [x for x, _ in reached], failures[0] if failures else None
 
@@ -162,7 +174,9 @@ def continue_trajectory(
 
 
 def complete_variables(
-    collocation: Collocation, p: Array, known_rows: Sequence[Array] | None = None
+    collocation: Collocation,
+    p: Array,
+    known_rows: Sequence[Array] | None = None,
 ) -> Array:
     """Return variables z from parameters and the first rows of every trajectory.
 
@@ -178,10 +192,14 @@ def complete_variables(
         First rows of every trajectory [m]; none by default.
     """
     trajectories = []
-    for part in collocation.iterates_at(p, known_rows or _empty_trajectories(collocation)):
+    for part in collocation.iterates_at(
+        p, known_rows or _empty_trajectories(collocation)
+    ):
         x = part.x
         if len(x) < part.segment.grid_times:
-            rigid_positions = rigid_trajectory(part.segment, part.equations.theta)
+            rigid_positions = rigid_trajectory(
+                part.segment, part.equations.theta
+            )
             x = np.concatenate([x, rigid_positions[len(x) :]])
         trajectories.append(x)
     return collocation.pack(p, trajectories)
@@ -189,7 +207,10 @@ def complete_variables(
 
 def _empty_trajectories(collocation: Collocation) -> list[Array]:
     """Return an empty trajectory (0, 3n) of each experiment."""
-    return [np.zeros((0, segment.dof_count)) for segment in collocation.transcriptions]
+    return [
+        np.zeros((0, segment.dof_count))
+        for segment in collocation.transcriptions
+    ]
 
 
 def rigid_trajectory(transcription: Transcription, theta: Array) -> Array:
@@ -206,8 +227,12 @@ def rigid_trajectory(transcription: Transcription, theta: Array) -> Array:
     except SimulationError:
         x0 = experiment.rigid_positions(t_s[:1]).ravel()
     rotations, translations = experiment.rigid_motion(t_s)
-    shape = (x0.reshape(-1, 3) - translations[0]) @ rotations[0]  # in the grasp's frame
-    positions = np.einsum("tij,nj->tni", rotations, shape) + translations[:, None]
+    shape = (x0.reshape(-1, 3) - translations[0]) @ rotations[
+        0
+    ]  # in the grasp's frame
+    positions = (
+        np.einsum("tij,nj->tni", rotations, shape) + translations[:, None]
+    )
     return transcription.with_prescribed_positions(
         positions.reshape(len(t_s), -1), transcription.guess_phi
     )

@@ -18,12 +18,24 @@ from ..array_types import Array
 from ..errors import located
 from ..program.collocation import Collocation
 from ..recording.experiment import Experiment
-from ..validated_types import Count, Finite, NotNegative, Options, Positive, StrictInteger, Text
+from ..validated_types import (
+    Count,
+    Finite,
+    NotNegative,
+    Options,
+    Positive,
+    StrictInteger,
+    Text,
+)
 from . import nlpsol
 from .callbacks import NlpFunctions
 from .complementarity import require_frictionless, solve_complementarity
 from .condensed_program import condense
-from .initial_point import InitialPoint, adjoint_multipliers, compute_initial_point
+from .initial_point import (
+    InitialPoint,
+    adjoint_multipliers,
+    compute_initial_point,
+)
 from .solution import Solution, Status, Watch
 from .solve_recorder import Recorder
 
@@ -38,7 +50,9 @@ def _require_ipopt_value(value: Any) -> Any:
     return value
 
 
-IpoptValue = Annotated[Text | StrictInteger | Finite, BeforeValidator(_require_ipopt_value)]
+IpoptValue = Annotated[
+    Text | StrictInteger | Finite, BeforeValidator(_require_ipopt_value)
+]
 
 IPOPT_STATUS = {
     "Solve_Succeeded": Status.CONVERGED,
@@ -157,7 +171,10 @@ class InteriorPoint(Options):
                     require_frictionless(each.obstacles)
 
     def __call__(
-        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
+        self,
+        collocation: Collocation,
+        watch: Watch | None = None,
+        start: Array | None = None,
     ) -> Solution:
         """Solve the NLP, see `Method`.
 
@@ -166,15 +183,20 @@ class InteriorPoint(Options):
         InputError
             If IPOPT does not know an option, or contact as complementarity meets friction.
         """
-        experiments = [segment.experiment for segment in collocation.transcriptions]
+        experiments = [
+            segment.experiment for segment in collocation.transcriptions
+        ]
         self.require(experiments)
-        is_hard = self.contact == "complementarity" and any(e.obstacles for e in experiments)
+        is_hard = self.contact == "complementarity" and any(
+            e.obstacles for e in experiments
+        )
         solution = self._solve(collocation, watch, start)
         if not is_hard or not solution.status.converged:
             return solution
         relaxed_method = replace(self, initial="simulation")
         return solve_complementarity(
-            solution, lambda relaxed, z: relaxed_method._solve(relaxed, watch, z)
+            solution,
+            lambda relaxed, z: relaxed_method._solve(relaxed, watch, z),
         )
 
     def _solve(
@@ -194,10 +216,14 @@ class InteriorPoint(Options):
         recorder = Recorder(self.name, collocation, watch)
         if self.initial == "simulation":
             return self._solve_by_ipopt(recorder, start)
-        initial = compute_initial_point(recorder, start, max_time_s=self.max_time_s)
+        initial = compute_initial_point(
+            recorder, start, max_time_s=self.max_time_s
+        )
         coarse = initial.coarse
         spent = coarse.timing
-        recorder.stopwatch.add(spent.build, spent.evaluations, spent.linear_algebra)
+        recorder.stopwatch.add(
+            spent.build, spent.evaluations, spent.linear_algebra
+        )
         recorder.notes.append(initial.note)
         if coarse.status in (Status.INTERRUPTED, Status.TIME_LIMIT):
             recorder.collocation = coarse.collocation
@@ -213,10 +239,15 @@ class InteriorPoint(Options):
             return self._solve_by_ipopt(recorder, start)
         recorder.collocation = coarse.collocation
         solution = self._solve_by_ipopt(recorder, coarse.z, initial)
-        return replace(solution, evaluations=solution.evaluations + coarse.evaluations)
+        return replace(
+            solution, evaluations=solution.evaluations + coarse.evaluations
+        )
 
     def _solve_by_ipopt(
-        self, recorder: Recorder, start: Array | None, initial: InitialPoint | None = None
+        self,
+        recorder: Recorder,
+        start: Array | None,
+        initial: InitialPoint | None = None,
     ) -> Solution:
         """Solve the recorder's program by IPOPT.
 
@@ -234,9 +265,13 @@ class InteriorPoint(Options):
         with recorder.stopwatch.building():
             program = condense(recorder.collocation.with_lifted_variables())
             if initial is not None and initial.is_close:
-                multipliers = adjoint_multipliers(program, recorder.collocation, initial.coarse.z)
+                multipliers = adjoint_multipliers(
+                    program, recorder.collocation, initial.coarse.z
+                )
             is_warm = multipliers is not None
-            hessian = _DampedHessian(program, replace(self, warm_up=0.0) if is_warm else self)
+            hessian = _DampedHessian(
+                program, replace(self, warm_up=0.0) if is_warm else self
+            )
 
         def settings(functions: NlpFunctions) -> dict[str, Any]:
             """Return the options of IPOPT with the time that remains."""
@@ -262,7 +297,9 @@ class InteriorPoint(Options):
         )
         return replace(solution, notes=(*solution.notes, missing))
 
-    def _settings(self, functions: NlpFunctions, *, is_warm: bool) -> dict[str, Any]:
+    def _settings(
+        self, functions: NlpFunctions, *, is_warm: bool
+    ) -> dict[str, Any]:
         """Return the options for CasADi and IPOPT, except IPOPT's time limit.
 
         Parameters
@@ -291,7 +328,9 @@ class InteriorPoint(Options):
                 "ipopt.warm_start_mult_bound_push": WARM_PUSH,
                 "ipopt.mu_init": WARM_BARRIER * self.tolerance,
             }
-        if self.linear_solver == "mumps":  # METIS's ordering as it is: IPOPT refines
+        if (
+            self.linear_solver == "mumps"
+        ):  # METIS's ordering as it is: IPOPT refines
             settings |= {"ipopt.mumps_pivot_order": 5, "ipopt.mumps_scaling": 0}
             settings |= {"ipopt.mumps_pivtol": PIVOT_TOLERANCE}
         if self.hessian == "limited-memory":
@@ -302,11 +341,17 @@ class InteriorPoint(Options):
             sharpness = _largest_curvature(collocation)
             settings |= {
                 # Rows of pressures are nearly dependent where a surface lies on another.
-                "ipopt.perturb_always_cd": "no" if collocation.lifted_count("pressure") else "yes",
+                "ipopt.perturb_always_cd": "no"
+                if collocation.lifted_count("pressure")
+                else "yes",
                 "ipopt.jacobian_regularization_exponent": 0.0,
-                "ipopt.jacobian_regularization_value": min(ROW_PIVOT, ROW_SLOWNESS / sharpness),
+                "ipopt.jacobian_regularization_value": min(
+                    ROW_PIVOT, ROW_SLOWNESS / sharpness
+                ),
             }
-        return settings | {f"ipopt.{name}": value for name, value in self.ipopt.items()}
+        return settings | {
+            f"ipopt.{name}": value for name, value in self.ipopt.items()
+        }
 
 
 def _largest_curvature(collocation: Collocation) -> float:
@@ -318,7 +363,10 @@ def _largest_curvature(collocation: Collocation) -> float:
         for segment in collocation.transcriptions
         if segment.experiment.markers.names
     )
-    return max(1.0, collocation.loss_scale * max((unit**2 for unit in units), default=0.0))
+    return max(
+        1.0,
+        collocation.loss_scale * max((unit**2 for unit in units), default=0.0),
+    )
 
 
 class _DampedHessian:
@@ -328,14 +376,18 @@ class _DampedHessian:
     previous call.
     """
 
-    def __init__(self, collocation: Collocation, options: InteriorPoint) -> None:
+    def __init__(
+        self, collocation: Collocation, options: InteriorPoint
+    ) -> None:
         self.collocation = collocation
         self.options = options
         self._last_p = np.full(collocation.nq + collocation.nphi, np.inf)
         self._damping = 1.0
         self._of_q, self._of_x = collocation.hessian_diagonals
 
-    def __call__(self, z: Array, weight: float, multipliers: Array, values: Array) -> None:
+    def __call__(
+        self, z: Array, weight: float, multipliers: Array, values: Array
+    ) -> None:
         """Write the upper triangle of the Hessian at z to `values`.
 
         Parameters
@@ -351,7 +403,9 @@ class _DampedHessian:
         """
         is_settled = self._ends_warm_up(self.collocation.parameters_from(z))
         is_exact = self.options.hessian == "exact" and is_settled
-        self.collocation.hessian_values(z, weight, multipliers if is_exact else None, values)
+        self.collocation.hessian_values(
+            z, weight, multipliers if is_exact else None, values
+        )
         values[self._of_x] += self.options.proximal
         if not is_settled:
             # With S = ∂r/∂q a step (SᵀS + κ) Δq = −Sᵀr is no longer than |r| / 2√κ.
@@ -365,7 +419,10 @@ class _DampedHessian:
         steps = np.abs(p - self._last_p) / self.collocation.reach_p
         self._last_p = p
         of_q = steps[: self.collocation.nq].max(initial=0.0)
-        is_short = steps.max(initial=0.0) < self.options.warm_up and self._damping <= NO_DAMPING
+        is_short = (
+            steps.max(initial=0.0) < self.options.warm_up
+            and self._damping <= NO_DAMPING
+        )
         if np.isfinite(of_q):
             change = np.clip((of_q / STEP_LIMIT) ** 2, *DAMPING_CHANGE)
             self._damping = min(1.0, self._damping * change)

@@ -40,13 +40,19 @@ def secant_update(curvature: Array, previous: Iterate, after: Iterate) -> Array:
     """
     step = after.p - previous.p
     change = after.fit.score - previous.fit.score
-    curvature_step = after.fit.score - after.previous_slopes_residual  # B · step
+    curvature_step = (
+        after.fit.score - after.previous_slopes_residual
+    )  # B · step
     change_dot_step = float(change @ step)
     if change_dot_step <= 0:
         return curvature
     previous_curvature = float(step @ curvature @ step)
-    if previous_curvature != 0:  # a B that has become too large shrinks to what this step saw
-        curvature = curvature * min(1.0, abs(float(step @ curvature_step) / previous_curvature))
+    if (
+        previous_curvature != 0
+    ):  # a B that has become too large shrinks to what this step saw
+        curvature = curvature * min(
+            1.0, abs(float(step @ curvature_step) / previous_curvature)
+        )
     missing = curvature_step - curvature @ step
     rank_two = np.outer(missing, change) / change_dot_step
     return (
@@ -57,7 +63,9 @@ def secant_update(curvature: Array, previous: Iterate, after: Iterate) -> Array:
     )
 
 
-def with_curvature(fit: SquareRootInformation, curvature: Array) -> SquareRootInformation:
+def with_curvature(
+    fit: SquareRootInformation, curvature: Array
+) -> SquareRootInformation:
     """Return a least-squares problem with the normal matrix SᵀS + B instead of SᵀS.
 
     The problem is returned unchanged if B is zero, S is rank-deficient, or B reduces the curvature
@@ -72,7 +80,10 @@ def with_curvature(fit: SquareRootInformation, curvature: Array) -> SquareRootIn
     """
     triangle = fit.jacobian[: len(curvature)]
     right = fit.residual[: len(curvature)]
-    if not curvature.any() or np.abs(np.diag(triangle)).min() < 1e-12 * np.abs(triangle).max():
+    if (
+        not curvature.any()
+        or np.abs(np.diag(triangle)).min() < 1e-12 * np.abs(triangle).max()
+    ):
         return fit
     half = solve_triangular(triangle, curvature, trans=1)
     relative = solve_triangular(triangle, half.T, trans=1)
@@ -106,7 +117,9 @@ def require_second_derivatives(collocation: Collocation) -> None:
 
 
 def exact_curvature(
-    collocation: Collocation, iterate: Iterate, stopwatch: Stopwatch | None = None
+    collocation: Collocation,
+    iterate: Iterate,
+    stopwatch: Stopwatch | None = None,
 ) -> Array:
     """Return B (np, np) at an iterate of the complete recordings, by one backward sweep.
 
@@ -131,20 +144,30 @@ def exact_curvature(
     z = collocation.pack(iterate.p, projected)
     multipliers = constraint_multipliers(collocation, z, stopwatch)
     directions = np.column_stack(
-        [_tangent_direction(collocation, iterate, k) for k in range(len(iterate.p))]
+        [
+            _tangent_direction(collocation, iterate, k)
+            for k in range(len(iterate.p))
+        ]
     )
     hessian = collocation.hessian(z, 1.0, multipliers)
-    reduced = directions.T @ (hessian @ directions) / (2 * collocation.loss_scale)
+    reduced = (
+        directions.T @ (hessian @ directions) / (2 * collocation.loss_scale)
+    )
     return (reduced + reduced.T) / 2 - iterate.fit.information
 
 
-def _tangent_direction(collocation: Collocation, iterate: Iterate, k: int) -> Array:
+def _tangent_direction(
+    collocation: Collocation, iterate: Iterate, k: int
+) -> Array:
     """Return the change (variables,) of all variables per unit of the parameter with index k, along
     the equations of motion; other parameters do not change.
     """
     unit = np.eye(len(iterate.p))[k]
     position_changes = [
-        each.tangent.by_p @ unit[segment.parameter_indices[segment.dynamic_parameters]]
-        for each, segment in zip(iterate.trajectories, collocation.transcriptions, strict=True)
+        each.tangent.by_p
+        @ unit[segment.parameter_indices[segment.dynamic_parameters]]
+        for each, segment in zip(
+            iterate.trajectories, collocation.transcriptions, strict=True
+        )
     ]
     return collocation.pack(unit, position_changes)

@@ -19,7 +19,9 @@ from ..validated_types import Options, Positive
 T = TypeVar("T", bound="Options")
 
 
-def method_from_options(kind: type[T], options: Mapping[str, Any], key: str) -> T:
+def method_from_options(
+    kind: type[T], options: Mapping[str, Any], key: str
+) -> T:
     """Return a method made from its options.
 
     Parameters
@@ -40,7 +42,9 @@ def method_from_options(kind: type[T], options: Mapping[str, Any], key: str) -> 
     for name in options:
         if name not in known:
             has = f"it has {', '.join(known)}{hint_at(name, known)}"
-            raise InputError(f"{kind.name!r} has no option {name!r}; {has}", None, key)
+            raise InputError(
+                f"{kind.name!r} has no option {name!r}; {has}", None, key
+            )
     try:
         return kind(**options)
     except InputError as error:
@@ -64,7 +68,9 @@ def _require_ascending(shares: tuple[float, ...]) -> tuple[float, ...]:
     """
     is_ascending = all(a < b for a, b in pairwise(shares))
     if not is_ascending or shares[-1:] != (1.0,):
-        raise ValueError(f"found {list(shares)}; expected numbers above 0 that ascend to 1")
+        raise ValueError(
+            f"found {list(shares)}; expected numbers above 0 that ascend to 1"
+        )
     return shares
 
 

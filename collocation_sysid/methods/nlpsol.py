@@ -88,13 +88,20 @@ def solve(
     previous_evaluations_s = watch.evaluations
     previous_linear_algebra_s = watch.linear_algebra
     unaccounted_s = (
-        recorder.elapsed_s - watch.build - previous_evaluations_s - previous_linear_algebra_s
+        recorder.elapsed_s
+        - watch.build
+        - previous_evaluations_s
+        - previous_linear_algebra_s
     )
     with watch.building():
         start = recorder.initial_variables(start)
         functions = NlpFunctions(program, hessian, errors)
         monitor = IterationMonitor(recorder, program, errors)
-        options = {**_COMMON, "iteration_callback": monitor, **settings(functions)}
+        options = {
+            **_COMMON,
+            "iteration_callback": monitor,
+            **settings(functions),
+        }
         solver = _create_solver(plugin, functions, options)
     initial_variables = convert_variables(start, collocation, program)
     z, multipliers, return_status, count = _run(
@@ -108,27 +115,45 @@ def solve(
         raise errors[0]
     watch.evaluations = previous_evaluations_s + functions.seconds
     # What is neither set-up nor callback.
-    accounted_s = watch.build + watch.evaluations + monitor.seconds + unaccounted_s
-    watch.linear_algebra = max(previous_linear_algebra_s, recorder.elapsed_s - accounted_s)
+    accounted_s = (
+        watch.build + watch.evaluations + monitor.seconds + unaccounted_s
+    )
+    watch.linear_algebra = max(
+        previous_linear_algebra_s, recorder.elapsed_s - accounted_s
+    )
     status = statuses.get(return_status, Status.NUMERICAL_FAILURE)
     if monitor.stop or (recorder.is_late and not status.converged):
         status = Status.INTERRUPTED if monitor.stop else Status.TIME_LIMIT
     if not (status.converged and np.isfinite(z).all()):
-        z, multipliers = monitor.best or (initial_variables, np.zeros(program.constraint_count))
+        z, multipliers = monitor.best or (
+            initial_variables,
+            np.zeros(program.constraint_count),
+        )
     # A solver that never began leaves its count as memory had it.
-    iterations = 0 if status is Status.REFUSED else count or max(0, monitor.lines - 1)
+    iterations = (
+        0 if status is Status.REFUSED else count or max(0, monitor.lines - 1)
+    )
     problem_multipliers = complete_multipliers(program, z, multipliers)[
         : collocation.constraint_count
     ]
     problem_variables = convert_variables(z, program, collocation)
     status = judge(status, problem_variables, problem_multipliers)
-    message = f"{status.sentence} ({NAMES.get(plugin, plugin)}: {return_status})"
+    message = (
+        f"{status.sentence} ({NAMES.get(plugin, plugin)}: {return_status})"
+    )
     return recorder.solution(
-        status, message, problem_variables, problem_multipliers, iterations, functions.calls
+        status,
+        message,
+        problem_variables,
+        problem_multipliers,
+        iterations,
+        functions.calls,
     )
 
 
-def _create_solver(plugin: str, functions: NlpFunctions, settings: dict[str, Any]) -> ca.Function:
+def _create_solver(
+    plugin: str, functions: NlpFunctions, settings: dict[str, Any]
+) -> ca.Function:
     """Return CasADi's solver of a program.
 
     Raises
@@ -140,15 +165,25 @@ def _create_solver(plugin: str, functions: NlpFunctions, settings: dict[str, Any
     value, rows = functions.nlp(z, ca.MX(0, 1))
     output = io.StringIO()
     try:
-        with redirect_stdout(output):  # where IPOPT says which setting it refuses
-            return ca.nlpsol("solver", plugin, {"x": z, "f": value, "g": rows}, settings)
+        with redirect_stdout(
+            output
+        ):  # where IPOPT says which setting it refuses
+            return ca.nlpsol(
+                "solver", plugin, {"x": z, "f": value, "g": rows}, settings
+            )
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).strip().splitlines()]
         unknown = [line for line in lines if "Unknown option" in line]
-        reason = (output.getvalue().strip() or [*unknown, lines[-1]][0]).splitlines()[0]
-        reason = re.sub(r"^\S+:\d+: | Check the option documentation\.$", "", reason)
+        reason = (
+            output.getvalue().strip() or [*unknown, lines[-1]][0]
+        ).splitlines()[0]
+        reason = re.sub(
+            r"^\S+:\d+: | Check the option documentation\.$", "", reason
+        )
         name = NAMES.get(plugin, plugin)
-        raise InputError(f"{name} cannot be set up: {reason}", None, "solver") from error
+        raise InputError(
+            f"{name} cannot be set up: {reason}", None, "solver"
+        ) from error
 
 
 class _SolverAbandoned(Exception):
@@ -187,7 +222,10 @@ def _run(
     lower, upper = bounds
     arguments = {"x0": start, "lbx": lower, "ubx": upper, "lbg": 0, "ubg": 0}
     if multipliers is not None:
-        arguments |= {"lam_g0": multipliers.constraints, "lam_x0": multipliers.bounds}
+        arguments |= {
+            "lam_g0": multipliers.constraints,
+            "lam_x0": multipliers.bounds,
+        }
     results: list[tuple[Array, Array, str, int]] = []
 
     def search() -> None:
@@ -195,9 +233,13 @@ def _run(
         try:
             answer = solver(**arguments)
             stats = solver.stats()
-        except RuntimeError as error:  # of its own, or what a callback's failure makes of it
+        except (
+            RuntimeError
+        ) as error:  # of its own, or what a callback's failure makes of it
             message = str(error).strip().splitlines()[-1].split(": ", 1)[-1]
-            results.append((np.full(len(start), np.nan), np.zeros(0), message, 0))
+            results.append(
+                (np.full(len(start), np.nan), np.zeros(0), message, 0)
+            )
             return
         z = answer["x"].full().ravel()
         multipliers = answer["lam_g"].full().ravel()
@@ -208,17 +250,25 @@ def _run(
         _run_on_thread(search, monitor)
     else:
         search()
-    return results[0] if results else (np.full(len(start), np.nan), np.zeros(0), "left behind", 0)
+    return (
+        results[0]
+        if results
+        else (np.full(len(start), np.nan), np.zeros(0), "left behind", 0)
+    )
 
 
-def _run_on_thread(search: Callable[[], None], monitor: IterationMonitor) -> None:
+def _run_on_thread(
+    search: Callable[[], None], monitor: IterationMonitor
+) -> None:
     """Run a search on a thread, so that the main thread can handle signals during long
     factorisations.
 
     After a request to stop, the search is abandoned if it does not end within `GRACE_S`: the thread
     goes on, and `monitor.errors` receives an entry.
     """
-    thread = threading.Thread(target=copy_context().run, args=(search,), daemon=True)
+    thread = threading.Thread(
+        target=copy_context().run, args=(search,), daemon=True
+    )
     with _interruptible(monitor):
         thread.start()
         try:
@@ -239,7 +289,10 @@ def _interruptible(monitor: IterationMonitor) -> Iterator[None]:
     SIGTERM is treated the same if its handler raises KeyboardInterrupt. The previous handlers are
     restored at the end.
     """
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {
+        number: signal.getsignal(number)
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
     if not raises_interrupt(handlers[signal.SIGTERM]):
         del handlers[signal.SIGTERM]
 

@@ -160,7 +160,9 @@ class ReducedSearch:
         self.collocation = collocation = recorder.collocation
         self.sweeps = 0
         # Points that depth cameras see belong to what is near: they tell of no long step.
-        self.has_depth_cameras = any(segment.depths for segment in collocation.transcriptions)
+        self.has_depth_cameras = any(
+            segment.depths for segment in collocation.transcriptions
+        )
         self.largest_trust = SEEING if self.has_depth_cameras else WIDEST
         self.trust = min(options.trust, self.largest_trust)
         self.indefinite_steps = 0
@@ -184,8 +186,12 @@ class ReducedSearch:
         # The last trial, where cameras have looked anew.
         self.camera_trial: Any = None, None, None
         nodes = [segment.body.nodes_m for segment in collocation.transcriptions]
-        self.edge_m = min(segment.length_m for segment in collocation.transcriptions)
-        self.size_m = max(float(np.ptp(points, axis=0).max()) for points in nodes)
+        self.edge_m = min(
+            segment.length_m for segment in collocation.transcriptions
+        )
+        self.size_m = max(
+            float(np.ptp(points, axis=0).max()) for points in nodes
+        )
 
     # The ladder -------------------------------------------------------------------------------
 
@@ -214,7 +220,10 @@ class ReducedSearch:
         if self.trajectories is None:
             return None
         try:
-            rows = [segment.grid_times for segment in self.collocation.transcriptions]
+            rows = [
+                segment.grid_times
+                for segment in self.collocation.transcriptions
+            ]
             return self._minimise(self._horizon(rows, last=True), is_last=True)
         except SimulationError:
             self.trajectories = self.point = None
@@ -274,7 +283,9 @@ class ReducedSearch:
                 # Rows that only nearly satisfy the equations may lead nowhere; simulated ones do.
                 restarted, restart_failure = horizon.simulate(self.p)
                 self.sweeps += 1
-                if sum(horizon.row_counts(restarted)) > sum(horizon.row_counts(reached)):
+                if sum(horizon.row_counts(restarted)) > sum(
+                    horizon.row_counts(reached)
+                ):
                     reached = restarted
                     failure = restart_failure
             if failure is None:
@@ -284,7 +295,11 @@ class ReducedSearch:
             rows = horizon.row_counts(reached)
             fewest = min(FEWEST, *horizon.rows)
             is_unstarted = previous is None and min(rows) < fewest
-            if is_unstarted or sum(rows) <= furthest or self.sweeps >= self.options.max_iterations:
+            if (
+                is_unstarted
+                or sum(rows) <= furthest
+                or self.sweeps >= self.options.max_iterations
+            ):
                 raise failure
             furthest = sum(rows)
             self.trajectories = reached
@@ -311,7 +326,9 @@ class ReducedSearch:
         assert self.trajectories is not None
         tolerance = self.options.tolerance
         self.trust = min(self.options.trust, self.largest_trust)
-        point = self._accept(horizon, horizon.evaluate(self.p, self.trajectories, self.point))
+        point = self._accept(
+            horizon, horizon.evaluate(self.p, self.trajectories, self.point)
+        )
         rejections = 0
         curvature = np.zeros((len(point.p), len(point.p)))
         previous = np.inf
@@ -326,13 +343,20 @@ class ReducedSearch:
             rate = min(1.0, length / previous)
             if is_last and is_full_step and length * rate <= SAFETY * tolerance:
                 final_positions = horizon.extrapolate(point, step)
-                summaries = horizon.fit_summaries(point.p + step, final_positions)
+                summaries = horizon.fit_summaries(
+                    point.p + step, final_positions
+                )
                 if self._are_feasible(summaries):
                     self._record(
-                        point.p + step, final_positions, point.predicted_loss(step), summaries
+                        point.p + step,
+                        final_positions,
+                        point.predicted_loss(step),
+                        summaries,
                     )
                     return Status.CONVERGED
-            predicted_share = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
+            predicted_share = 1.0 - point.predicted_loss(step) / max(
+                point.loss, 1e-300
+            )
             if not is_last and predicted_share < self.options.rung_decrease:
                 return Status.CONVERGED
             if self.sweeps >= self.options.max_iterations:
@@ -350,23 +374,35 @@ class ReducedSearch:
                 rejections = 0
                 previous = length
                 continue
-            if is_short and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
+            if (
+                is_short
+                and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m
+            ):
                 return Status.CONVERGED  # rounding keeps it from getting better
             if self.has_depth_cameras and length <= LEAST_DETERMINED_SHARE:
-                return Status.CONVERGED  # what is seen changes by more than such a step gains
+                return (
+                    Status.CONVERGED
+                )  # what is seen changes by more than such a step gains
             if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
                 return Status.STALLED
             self.trust = SHRINK * length
             rejections += 1
-            if rejections == 1 and point.feasibility_m > INFEASIBLE * self.size_m:
+            if (
+                rejections == 1
+                and point.feasibility_m > INFEASIBLE * self.size_m
+            ):
                 point = self._make_feasible(horizon, point)
 
-    def _update_curvature(self, curvature: Array, previous: Iterate, after: Iterate) -> Array:
+    def _update_curvature(
+        self, curvature: Array, previous: Iterate, after: Iterate
+    ) -> Array:
         """Return the part of the Hessian (np, np) at `after` that Gauss–Newton neglects: exact, or
         by a secant update of `curvature` from the point `previous`, as the options state.
         """
         if self.options.hessian == "exact":
-            return exact_curvature(self.collocation, after, self.recorder.stopwatch)
+            return exact_curvature(
+                self.collocation, after, self.recorder.stopwatch
+            )
         return secant_update(curvature, previous, after)
 
     def _step_length(self, step: Array) -> float:
@@ -384,7 +420,9 @@ class ReducedSearch:
         high = np.maximum(high, 0.0) + 1e-15
         return with_curvature(point.fit, curvature).minimiser(low, high)
 
-    def _try(self, horizon: Horizon, point: Iterate, step: Array) -> Iterate | None:
+    def _try(
+        self, horizon: Horizon, point: Iterate, step: Array
+    ) -> Iterate | None:
         """Return the point after a step (np,) of the parameters from `point`, clipped to the
         bounds, by one sweep; None if that fails or is not finite.
         """
@@ -435,7 +473,10 @@ class ReducedSearch:
         no longer compared with a loss that is too low.
         """
         refined = self._try(horizon, point, np.zeros(len(point.p)))
-        if refined is None or refined.feasibility_m > CONTRACTION * point.feasibility_m:
+        if (
+            refined is None
+            or refined.feasibility_m > CONTRACTION * point.feasibility_m
+        ):
             return self._resimulated(horizon, point)
         return self._accept(horizon, refined)
 
@@ -454,7 +495,11 @@ class ReducedSearch:
             resimulated = horizon.evaluate(point.p, x)
         except SimulationError:
             return point
-        return self._accept(horizon, resimulated) if resimulated.is_finite else point
+        return (
+            self._accept(horizon, resimulated)
+            if resimulated.is_finite
+            else point
+        )
 
     def _are_feasible(self, summaries: list[FitSummary]) -> bool:
         """Return whether the residuals of the equations of motion are much smaller than the
@@ -462,7 +507,9 @@ class ReducedSearch:
         """
         return all(
             each.violation_n <= FEASIBLE_FORCE * segment.force_n
-            for each, segment in zip(summaries, self.collocation.transcriptions, strict=True)
+            for each, segment in zip(
+                summaries, self.collocation.transcriptions, strict=True
+            )
         )
 
     # Where recordings are read ----------------------------------------------------------------
@@ -481,17 +528,27 @@ class ReducedSearch:
         is_first : bool
             Whether these are the first trajectories of the search.
         """
-        if (is_first or not self.is_associated) and self.trajectories is not None:
-            counts = [segment.rows_to_place for segment in self.collocation.transcriptions]
+        if (
+            is_first or not self.is_associated
+        ) and self.trajectories is not None:
+            counts = [
+                segment.rows_to_place
+                for segment in self.collocation.transcriptions
+            ]
             if any(counts):
                 rows = horizon.first_rows(self.trajectories, counts)
                 # What cameras see later is not there yet.
-                self.is_associated = not self.has_depth_cameras or [*map(len, rows)] == counts
+                self.is_associated = (
+                    not self.has_depth_cameras or [*map(len, rows)] == counts
+                )
                 self._set_collocation(
-                    horizon, *self.collocation.place_unknown_markers(self.p, rows)
+                    horizon,
+                    *self.collocation.place_unknown_markers(self.p, rows),
                 )
 
-    def _set_collocation(self, horizon: Horizon, collocation: Collocation, p: Array) -> None:
+    def _set_collocation(
+        self, horizon: Horizon, collocation: Collocation, p: Array
+    ) -> None:
         """Use another collocation of the same problem, and its parameters p (np,), in the search,
         the recorder and the horizon, in place.
         """
@@ -509,7 +566,10 @@ class ReducedSearch:
         if is_camera_trial:
             p = after.p
         else:
-            counts = [segment.rows_to_follow for segment in self.collocation.transcriptions]
+            counts = [
+                segment.rows_to_follow
+                for segment in self.collocation.transcriptions
+            ]
             rows = horizon.first_rows(point.trajectories, counts)
             collocation, p = self.collocation.follow_estimates(point.p, rows)
         if collocation is self.collocation or self.reassociations >= REREADINGS:
@@ -518,7 +578,9 @@ class ReducedSearch:
         self._set_collocation(horizon, collocation, p)
         return after if is_camera_trial else horizon.reassociate(p, point)
 
-    def _is_better_for_cameras(self, horizon: Horizon, point: Iterate, trial: Iterate) -> bool:
+    def _is_better_for_cameras(
+        self, horizon: Horizon, point: Iterate, trial: Iterate
+    ) -> bool:
         """Return whether a trial is still acceptable with depth points associated at its estimates.
 
         A depth point may then belong to another part of the surface, or to none. True without depth
@@ -530,7 +592,9 @@ class ReducedSearch:
             return True
         if self.reassociations >= REREADINGS:
             return False
-        self.most_measurements = max(self.most_measurements, before.measurement_count)
+        self.most_measurements = max(
+            self.most_measurements, before.measurement_count
+        )
         after = self._reassociate(horizon, trial)
         self.reassociations -= self.collocation is not before
         self.camera_trial = trial, self.collocation, after
@@ -548,12 +612,16 @@ class ReducedSearch:
         record it, and return it as associated.
         """
         self.point = point = self._reassociate(horizon, point)
-        self.indefinite_steps = sum(report.indefinite_steps for report in point.reports)
+        self.indefinite_steps = sum(
+            report.indefinite_steps for report in point.reports
+        )
         summaries = [report.fit_summary for report in point.reports]
         self._record(point.p, point.trajectories, point.loss, summaries)
         return point
 
-    def _record(self, p: Array, x: list[Any], loss: float, summaries: list[FitSummary]) -> None:
+    def _record(
+        self, p: Array, x: list[Any], loss: float, summaries: list[FitSummary]
+    ) -> None:
         """Store parameters and trajectories as the best so far, and add an entry to the history.
 
         Parameters
@@ -569,7 +637,11 @@ class ReducedSearch:
         self.p = p
         self.trajectories = x
         squares_m2 = sum(each.squares_m2 for each in summaries)
-        rms_m = float(np.sqrt(squares_m2 / max(1, sum(each.samples for each in summaries))))
+        rms_m = float(
+            np.sqrt(
+                squares_m2 / max(1, sum(each.samples for each in summaries))
+            )
+        )
         violation_n = max(each.violation_n for each in summaries)
         values = self.collocation.parameter_values(p)
         time_s = self.recorder.elapsed_s

@@ -96,7 +96,9 @@ class ReducedSpace(SearchOptions):
         collocation = recorder.collocation
         try:
             trajectories = search.trajectories and workers.fetch(
-                workers.map_experiments(trajectory_positions, search.trajectories)
+                workers.map_experiments(
+                    trajectory_positions, search.trajectories
+                )
             )
             recorder.notes += workers.notes()
         except SearchEnded as lost:
@@ -105,10 +107,18 @@ class ReducedSpace(SearchOptions):
             trajectories, _ = simulate_trajectories(collocation, search.p)
         z = complete_variables(collocation, search.p, trajectories)
         rows = [segment.grid_times for segment in collocation.transcriptions]
-        is_complete = trajectories is not None and [len(x) for x in trajectories] == rows
-        recorder.notes += _notes(collocation, search.indefinite_steps, z, status)
-        multipliers = None if is_complete else np.zeros(collocation.constraint_count)
-        return recorder.solution(status, message, z, multipliers, search.sweeps, search.sweeps)
+        is_complete = (
+            trajectories is not None and [len(x) for x in trajectories] == rows
+        )
+        recorder.notes += _notes(
+            collocation, search.indefinite_steps, z, status
+        )
+        multipliers = (
+            None if is_complete else np.zeros(collocation.constraint_count)
+        )
+        return recorder.solution(
+            status, message, z, multipliers, search.sweeps, search.sweeps
+        )
 
 
 def memory_mb(collocation: Collocation) -> float:
@@ -116,7 +126,9 @@ def memory_mb(collocation: Collocation) -> float:
     # Two points with positions, p and Z; positions of the answer and of its gradients.
     columns = 2 * (2 + collocation.nq) + 6
     values = columns * collocation.variable_count
-    chunks = sorted(Sweep(segment).chunk_bytes for segment in collocation.transcriptions)
+    chunks = sorted(
+        Sweep(segment).chunk_bytes for segment in collocation.transcriptions
+    )
     concurrent = concurrent_count(len(chunks), collocation.threads)
     return (8 * values + sum(chunks[-concurrent:])) / 1e6
 
@@ -135,7 +147,9 @@ def _main_measurement(collocation: Collocation) -> tuple[str, str]:
     return "readings", "sigma of the readings"
 
 
-def _notes(collocation: Collocation, indefinite_steps: int, z: Array, status: Status) -> list[str]:
+def _notes(
+    collocation: Collocation, indefinite_steps: int, z: Array, status: Status
+) -> list[str]:
     """Return notes for the user on the answer: on time steps whose matrix is indefinite, and on
     residuals that are much larger than the noise.
 
@@ -152,7 +166,9 @@ def _notes(collocation: Collocation, indefinite_steps: int, z: Array, status: St
     """
     notes = []
     if indefinite_steps:
-        steps = sum(segment.constraint_times for segment in collocation.transcriptions)
+        steps = sum(
+            segment.constraint_times for segment in collocation.transcriptions
+        )
         notes.append(
             f"the equations of {indefinite_steps} of {steps} time steps are not positive definite "
             "at the solution: the body is near buckling, or the estimated damping is too large"

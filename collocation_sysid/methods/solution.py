@@ -228,10 +228,16 @@ class Solution:
         why : str
             Reason for the second solve; it is inserted between the notes of both.
         """
-        previous_iterations = max([first.iterations, *(line.number for line in first.history[-1:])])
+        previous_iterations = max(
+            [first.iterations, *(line.number for line in first.history[-1:])]
+        )
         previous_s = first.timing.total
         shifted_history = [
-            replace(each, number=each.number + previous_iterations, time_s=each.time_s + previous_s)
+            replace(
+                each,
+                number=each.number + previous_iterations,
+                time_s=each.time_s + previous_s,
+            )
             for each in self.history
         ]
         return replace(
@@ -267,7 +273,9 @@ class Solution:
     @property
     def theta(self) -> Array:
         """Constants (k,) of the first experiment's body, see `Body.constants`."""
-        return self.collocation.transcriptions[0].body.theta_from_values(self.parameters)
+        return self.collocation.transcriptions[0].body.theta_from_values(
+            self.parameters
+        )
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -299,18 +307,31 @@ class Solution:
             nuisance = part.segment.nuisance
             readings = part.segment.experiment.readings
             values = (part.phi * nuisance.scales).tolist()
-            for entry, full, value in zip(nuisance.entries, nuisance.names, values, strict=True):
+            for entry, full, value in zip(
+                nuisance.entries, nuisance.names, values, strict=True
+            ):
                 known.append(full)
-                names = {full, entry.label, entry.label.rpartition(" [")[0], entry.row.name}
+                names = {
+                    full,
+                    entry.label,
+                    entry.label.rpartition(" [")[0],
+                    entry.row.name,
+                }
                 if entry.row == GAUGE:
                     names.add([*readings[entry.number].unknowns][entry.axis])
                 if name in names:
                     estimates[full] = value
         if len(estimates) == 1:
             return next(iter(estimates.values()))
-        which = f"{name!r} is ambiguous" if estimates else f"no nuisance parameter {name!r}"
+        which = (
+            f"{name!r} is ambiguous"
+            if estimates
+            else f"no nuisance parameter {name!r}"
+        )
         expected = ", ".join(map(repr, estimates or dict.fromkeys(known)))
-        raise InputError(f"{which}; expected one of {expected or '(none)'}{hint_at(name, known)}")
+        raise InputError(
+            f"{which}; expected one of {expected or '(none)'}{hint_at(name, known)}"
+        )
 
     def part_of(self, experiment: str) -> ExperimentIterate | None:
         """Return the iterate of one experiment at the solution, by the experiment's name; None if
@@ -330,7 +351,10 @@ class Solution:
         """Predicted marker positions (T, M, 3) of each fitted experiment [m], at its
         estimated nuisance parameters φ.
         """
-        return [part.segment.markers.predict_positions(part.x, part.phi) for part in self.parts]
+        return [
+            part.segment.markers.predict_positions(part.x, part.phi)
+            for part in self.parts
+        ]
 
     @cached_property
     def wrenches(self) -> dict[str, list[Array]]:
@@ -341,7 +365,9 @@ class Solution:
         """
         parts = [part for part in self.parts if part.segment.sensors]
         return {
-            part.segment.experiment.name: part.observation.predict_wrenches(part.x)
+            part.segment.experiment.name: part.observation.predict_wrenches(
+                part.x
+            )
             for part in parts
         }
 
@@ -385,9 +411,13 @@ class Solution:
         without samples.
         """
         rms_by_experiment = {}
-        for segment, readings in zip(self.collocation.transcriptions, self.readings_m, strict=True):
+        for segment, readings in zip(
+            self.collocation.transcriptions, self.readings_m, strict=True
+        ):
             markers = segment.experiment.markers
-            squares = np.sum((readings - markers.positions_m) ** 2, axis=2)[markers.is_present]
+            squares = np.sum((readings - markers.positions_m) ** 2, axis=2)[
+                markers.is_present
+            ]
             rms_by_experiment[segment.experiment.name] = root_mean(squares)
         return rms_by_experiment
 
@@ -395,12 +425,16 @@ class Solution:
     def max_violation_n(self) -> float:
         """Largest residual of the equations of motion [N], computed from `z`."""
         violations = self.collocation.residuals_n(self.z)
-        return float(max(np.abs(residual).max(initial=0.0) for residual in violations))
+        return float(
+            max(np.abs(residual).max(initial=0.0) for residual in violations)
+        )
 
     @cached_property
     def max_violation_relative(self) -> float:
         """Largest residual of the equations of motion over the largest force in the equations."""
-        return self.max_violation_n / max(self.collocation.largest_force_n(self.z), 1e-300)
+        return self.max_violation_n / max(
+            self.collocation.largest_force_n(self.z), 1e-300
+        )
 
     @cached_property
     def kkt_residual(self) -> float:
@@ -434,7 +468,9 @@ def wrench_rms(
         component was measured.
     """
     pairs = zip(predicted, experiment.wrenches, strict=True)
-    residuals = [sensor.symmetry * (read - sensor.values) for read, sensor in pairs]
+    residuals = [
+        sensor.symmetry * (read - sensor.values) for read, sensor in pairs
+    ]
     components = np.concatenate(residuals) if residuals else np.zeros((0, 6))
     force, torque = (
         float(np.sqrt(np.nanmean(each**2))) if np.isfinite(each).any() else None
@@ -443,7 +479,9 @@ def wrench_rms(
     return force, torque
 
 
-def custom_sensor_rms(experiment: Experiment, predicted: Mapping[str, Array]) -> dict[str, float]:
+def custom_sensor_rms(
+    experiment: Experiment, predicted: Mapping[str, Array]
+) -> dict[str, float]:
     """Return the RMS residuals of custom sensors by name, in the unit of each sensor.
 
     Parameters
@@ -454,8 +492,13 @@ def custom_sensor_rms(experiment: Experiment, predicted: Mapping[str, Array]) ->
         Predicted values by sensor name. Samples that are NaN, predicted or measured, are ignored; a
         sensor without any other has the value NaN.
     """
-    residuals = ((g.name, predicted[g.name] - g.measured_values) for g in experiment.readings)
-    return {name: float(np.sqrt(np.nanmean(each**2))) for name, each in residuals}
+    residuals = (
+        (g.name, predicted[g.name] - g.measured_values)
+        for g in experiment.readings
+    )
+    return {
+        name: float(np.sqrt(np.nanmean(each**2))) for name, each in residuals
+    }
 
 
 def pooled_wrench_rms(solution: Solution) -> tuple[float | None, float | None]:
@@ -466,7 +509,9 @@ def pooled_wrench_rms(solution: Solution) -> tuple[float | None, float | None]:
     squares = np.zeros(2)
     counts = np.zeros(2)
     for segment in solution.collocation.transcriptions:
-        components = solution.wrench_rms.get(segment.experiment.name, (None, None))
+        components = solution.wrench_rms.get(
+            segment.experiment.name, (None, None)
+        )
         for k, value in enumerate(components):
             if value is not None:
                 squares[k] = squares[k] + value**2
@@ -489,7 +534,10 @@ class Method(Protocol):
     """
 
     def __call__(
-        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
+        self,
+        collocation: Collocation,
+        watch: Watch | None = None,
+        start: Array | None = None,
     ) -> Solution:
         """Solve the NLP.
 
@@ -538,19 +586,26 @@ def constraint_multipliers(
         segment = iterate.segment
         gradient = collocation.loss_scale * iterate.gradient()[0]
         solver = Sweep(segment, stopwatch=stopwatch)
-        y = segment.force_n * solver.backward(iterate.x, iterate.equations, gradient)
+        y = segment.force_n * solver.backward(
+            iterate.x, iterate.equations, gradient
+        )
         return segment.select_rows(y)
 
     multipliers_by_experiment = map_experiments(
         of_experiment, collocation.iterates(z), collocation.threads
     )
     multipliers = np.concatenate(multipliers_by_experiment)
-    if any(segment.is_grasp_constraint.any() for segment in collocation.transcriptions):
+    if any(
+        segment.is_grasp_constraint.any()
+        for segment in collocation.transcriptions
+    ):
         _set_grasp_multipliers(collocation, z, multipliers)
     return multipliers
 
 
-def _set_grasp_multipliers(collocation: Collocation, z: Array, multipliers: Array) -> None:
+def _set_grasp_multipliers(
+    collocation: Collocation, z: Array, multipliers: Array
+) -> None:
     """Set the multipliers (constraints,) of prescribed displacements to minus the remaining
     gradient of the Lagrangian, in place.
 

@@ -101,7 +101,9 @@ class Recorder:
         self.notes += notes
         return z
 
-    def run_search(self, search: Callable[[], tuple[Status, str]]) -> tuple[Status, str]:
+    def run_search(
+        self, search: Callable[[], tuple[Status, str]]
+    ) -> tuple[Status, str]:
         """Run a search and return its status and message, also if it ends by an exception.
 
         Parameters
@@ -120,7 +122,10 @@ class Recorder:
         except SearchEnded as end:
             return end.status, end.message
         except SimulationError as error:
-            return Status.NOT_SIMULABLE, f"{Status.NOT_SIMULABLE.sentence} {error}."
+            return (
+                Status.NOT_SIMULABLE,
+                f"{Status.NOT_SIMULABLE.sentence} {error}.",
+            )
         except KeyboardInterrupt:
             return Status.INTERRUPTED, Status.INTERRUPTED.sentence
 
@@ -137,7 +142,10 @@ class Recorder:
             Loss L at z, which is not evaluated again.
         """
         collocation = self.collocation
-        violation_n = max(float(np.abs(r).max(initial=0.0)) for r in collocation.residuals_n(z))
+        violation_n = max(
+            float(np.abs(r).max(initial=0.0))
+            for r in collocation.residuals_n(z)
+        )
         line = Iteration(
             number,
             loss,
@@ -155,7 +163,9 @@ class Recorder:
         many.
         """
         shown_values = {
-            name: value for name, value in line.parameters.items() if not is_field_coefficient(name)
+            name: value
+            for name, value in line.parameters.items()
+            if not is_field_coefficient(name)
         }
         line = replace(line, parameters=shown_values)
         self.history.append(line)

@@ -143,9 +143,7 @@ def start_problem(
         return collocation, None
     reason = f"the body cannot be simulated at the guess ({failure})"
     if failure is None:
-        reason = (
-            "at the guess, the simulation is farther from the measurements than an undeformed body"
-        )
+        reason = "at the guess, the simulation is farther from the measurements than an undeformed body"
     result = rescue(collocation, reason, is_complete)
     if result is None:
         return collocation, None  # the method will tell what it needs
@@ -154,7 +152,9 @@ def start_problem(
     return replace(collocation, parameters=result.parameters), result
 
 
-def rescue(collocation: Collocation, reason: str, is_complete: bool = False) -> Scan | None:
+def rescue(
+    collocation: Collocation, reason: str, is_complete: bool = False
+) -> Scan | None:
     """Return a scan without the given guesses; None if it finds no start.
 
     Parameters
@@ -195,7 +195,9 @@ def scan_stiffness(
     """
     began = time.perf_counter()
     trial = _TrialSimulation(
-        replace(collocation, parameters=_with_units(collocation.parameters, 1.0))
+        replace(
+            collocation, parameters=_with_units(collocation.parameters, 1.0)
+        )
     )
     trials = _ScanState(trial)
     step = (SOFTEST_PA / STIFFEST_PA) ** (1 / (STEPS - 1))
@@ -224,7 +226,10 @@ def scan_stiffness(
     best = int(np.flatnonzero(young_pa == candidates[0])[0])
     start = typical_parameters(collocation.parameters, candidates[0])
     others = _other_starts(misfit, best) if not is_complete else ()
-    starts = {k: typical_parameters(collocation.parameters, young_pa[k]) for k in (best, *others)}
+    starts = {
+        k: typical_parameters(collocation.parameters, young_pa[k])
+        for k in (best, *others)
+    }
     return Scan(
         reason,
         young_pa,
@@ -255,11 +260,14 @@ def _other_starts(misfit: Array, best: int) -> tuple[int, ...]:
     known = np.where(np.isfinite(misfit), misfit, np.inf)
     padded = np.concatenate([[np.inf], known, [np.inf]])
     is_minimum = (known < padded[:-2]) & (known <= padded[2:])
-    candidates = {best - 1, best + 1, *np.flatnonzero(is_minimum).tolist()} - {best}
+    candidates = {best - 1, best + 1, *np.flatnonzero(is_minimum).tolist()} - {
+        best
+    }
     possible = [
         k
         for k in candidates
-        if 0 <= k < len(known) and known[k] <= EQUIVALENT_LOSS_RATIO * known[best]
+        if 0 <= k < len(known)
+        and known[k] <= EQUIVALENT_LOSS_RATIO * known[best]
     ]
     return tuple(sorted(possible, key=lambda k: known[k])[:MORE_STARTS])
 
@@ -270,14 +278,20 @@ def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
 
     Parameters with a prior get its mean instead. Fixed parameters and those with a guess are kept.
     """
-    guesses = {i.name: i.guess for i in parameters.items if i.tied is None and i.guess is not None}
+    guesses = {
+        i.name: i.guess
+        for i in parameters.items
+        if i.tied is None and i.guess is not None
+    }
 
     def initial_value(item: Parameter) -> float:
         """Return the guess of a parameter, its prior mean, or a typical value within its bounds."""
         if item.guess is not None:
             return item.guess
         region, dot, _ = item.name.rpartition(".")
-        poisson = guesses.get(f"{region}{dot}poisson", guesses.get("poisson", 0.3))
+        poisson = guesses.get(
+            f"{region}{dot}poisson", guesses.get("poisson", 0.3)
+        )
         usual = usual_value(item.name, young_pa, poisson)
         if item.prior is not None:
             usual = item.prior[0]
@@ -285,7 +299,9 @@ def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
         return float(np.clip(usual, item.lower, item.upper))
 
     sized = _with_units(parameters, young_pa)
-    return sized.with_guess({item.name: initial_value(item) for item in parameters.free})
+    return sized.with_guess(
+        {item.name: initial_value(item) for item in parameters.free}
+    )
 
 
 def typical_constants(parameters: Parameters) -> dict[str, float]:
@@ -300,7 +316,11 @@ def _ranked_moduli(young_pa: Array, misfit: Array) -> list[float]:
     if np.isnan(misfit).all():
         return []
     best = int(np.nanargmin(misfit))
-    return [float(young_pa[k]) for k in range(best, len(young_pa)) if np.isfinite(misfit[k])]
+    return [
+        float(young_pa[k])
+        for k in range(best, len(young_pa))
+        if np.isfinite(misfit[k])
+    ]
 
 
 def _with_units(parameters: Parameters, young_pa: float) -> Parameters:
@@ -309,7 +329,10 @@ def _with_units(parameters: Parameters, young_pa: float) -> Parameters:
     """
     unit = young_pa / 10
     return Parameters(
-        tuple(replace(i, unit=unit) if np.isnan(i.unit) else i for i in parameters.items)
+        tuple(
+            replace(i, unit=unit) if np.isnan(i.unit) else i
+            for i in parameters.items
+        )
     )
 
 
@@ -326,15 +349,23 @@ def without_guesses(collocation: Collocation) -> Collocation:
 
     def without_guess(item: Parameter) -> Parameter:
         """Return the parameter without its guess, if that can be replaced."""
-        is_replaceable = item.prior is not None or usual_value(item.name, 1.0) is not None
-        return replace(item, guess=None) if is_replaceable and item in free else item
+        is_replaceable = (
+            item.prior is not None or usual_value(item.name, 1.0) is not None
+        )
+        return (
+            replace(item, guess=None)
+            if is_replaceable and item in free
+            else item
+        )
 
     free = collocation.parameters.free
     items = tuple(map(without_guess, collocation.parameters.items))
     return replace(collocation, parameters=Parameters(items))
 
 
-def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> float:
+def _misfit(
+    collocation: Collocation, p: Array, positions: Sequence[Array]
+) -> float:
     """Return the root mean square of all residuals on the first rows, in standard deviations.
 
     Markers of unknown position are associated with the body at the first samples.
@@ -362,15 +393,17 @@ def _residuals(iterate: ExperimentIterate) -> Array:
     residuals = []
     slopes = []
     predictions = iterate.observation.linearise_fixed_motion(iterate.x)
-    for reading, (residual, slope) in zip(iterate.segment.residuals, predictions, strict=True):
+    for reading, (residual, slope) in zip(
+        iterate.segment.residuals, predictions, strict=True
+    ):
         rough = reading.rough_residuals(iterate.x, iterate.phi)
         if rough is not None:
             residuals.append(rough)
             slopes.append(np.zeros((len(rough), slope.shape[-1])))
             continue
-        is_compared = reading.compared_with(len(iterate.observables[len(residuals)]))[
-            : len(residual)
-        ]
+        is_compared = reading.compared_with(
+            len(iterate.observables[len(residuals)])
+        )[: len(residual)]
         residuals.append(residual[is_compared])
         slopes.append(slope[is_compared] * reading.has_offsets)
     residual = np.concatenate(residuals)
@@ -380,7 +413,9 @@ def _residuals(iterate: ExperimentIterate) -> Array:
     residual = np.append(residual, np.zeros(len(priors)))
     offset_slopes = np.concatenate([offset_slopes, priors])
     return (
-        residual - offset_slopes @ np.linalg.lstsq(offset_slopes, residual, rcond=None)[0]
+        residual
+        - offset_slopes
+        @ np.linalg.lstsq(offset_slopes, residual, rcond=None)[0]
         if offset_slopes.size
         else residual
     )
@@ -394,9 +429,13 @@ def _compared_samples(transcription: Transcription) -> int:
     first_samples = [transcription.experiment.markers.first_visible_sample]
     for reading in transcription.residuals[1:]:
         first_samples.append(
-            int(np.searchsorted(t_s, reading.first_needed_s)) + reading.observable.delay_steps
+            int(np.searchsorted(t_s, reading.first_needed_s))
+            + reading.observable.delay_steps
         )
-    return min(len(t_s), max(samples_in_share(len(t_s), SHARES[0]), max(first_samples) + 1))
+    return min(
+        len(t_s),
+        max(samples_in_share(len(t_s), SHARES[0]), max(first_samples) + 1),
+    )
 
 
 class _TrialSimulation:
@@ -429,18 +468,26 @@ class _TrialSimulation:
     def rigid_misfit(self) -> float:
         """Misfit of an undeformed body that moves with the grasp, in standard deviations."""
         positions = []
-        for segment, rows in zip(self.collocation.transcriptions, self.rows, strict=True):
-            rigid_positions = segment.experiment.rigid_positions(segment.dynamics.t_s[:rows])
+        for segment, rows in zip(
+            self.collocation.transcriptions, self.rows, strict=True
+        ):
+            rigid_positions = segment.experiment.rigid_positions(
+                segment.dynamics.t_s[:rows]
+            )
             positions.append(rigid_positions.reshape(rows, -1))
         return _misfit(self.collocation, self.collocation.guess_p, positions)
 
-    def evaluate_guess(self, is_complete: bool) -> tuple[float, SimulationError | None]:
+    def evaluate_guess(
+        self, is_complete: bool
+    ) -> tuple[float, SimulationError | None]:
         """Return the misfit of the guess and None, or NaN and the failure of its simulation. With
         `is_complete` the complete recordings are simulated; the misfit is always that of their
         first part.
         """
         p = self.collocation.guess_p
-        positions, failure = self._simulate(p, None, self.all_rows if is_complete else self.rows)
+        positions, failure = self._simulate(
+            p, None, self.all_rows if is_complete else self.rows
+        )
         if failure is not None:
             return np.nan, failure
         return self._evaluate(p, positions), None
@@ -501,7 +548,12 @@ class _TrialSimulation:
         Equilibria are searched near the trajectories `warm`; None for no guess.
         """
         return simulate_trajectories(
-            self.collocation, p, known_rows=None, rows=rows, options=LOOSE, guess=warm
+            self.collocation,
+            p,
+            known_rows=None,
+            rows=rows,
+            options=LOOSE,
+            guess=warm,
         )
 
 
@@ -531,11 +583,17 @@ class _ScanState:
         Of neighbours that give the same parameters only one is tried.
         """
         failures = 0
-        first, *others = ([*same] for _, same in groupby(young_pa, self.trial.parameter_key))
+        first, *others = (
+            [*same] for _, same in groupby(young_pa, self.trial.parameter_key)
+        )
         for young in (first[-1], *(same[0] for same in others)):
             misfit = self._try(young)
-            finite_misfits = [m for m in self.misfits.values() if np.isfinite(m)]
-            is_failure = bool(finite_misfits) and not misfit <= WORSE * min(finite_misfits)
+            finite_misfits = [
+                m for m in self.misfits.values() if np.isfinite(m)
+            ]
+            is_failure = bool(finite_misfits) and not misfit <= WORSE * min(
+                finite_misfits
+            )
             failures = failures + 1 if is_failure else 0
             if failures == CONSECUTIVE_FAILURES:
                 self.is_ended_early = True
@@ -555,7 +613,9 @@ class _ScanState:
         best = self.misfits[young_pa]
         beyond = young_pa * factor
         while LIMITS_PA[1] < beyond < LIMITS_PA[0]:
-            if self.trial.parameter_key(beyond) == self.trial.parameter_key(beyond / factor):
+            if self.trial.parameter_key(beyond) == self.trial.parameter_key(
+                beyond / factor
+            ):
                 return
             misfit = self._try(beyond)
             if not misfit < (1 - BETTER) * best:
@@ -568,7 +628,9 @@ class _ScanState:
 
         False for the softest end if the scan ended before it.
         """
-        finite_misfits = {young: m for young, m in self.misfits.items() if np.isfinite(m)}
+        finite_misfits = {
+            young: m for young, m in self.misfits.items() if np.isfinite(m)
+        }
         if not finite_misfits or (softest and self.is_ended_early):
             return False
         best = min(finite_misfits, key=lambda young: finite_misfits[young])

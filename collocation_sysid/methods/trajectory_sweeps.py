@@ -51,7 +51,9 @@ class FitSummary:
     samples: int
 
     @classmethod
-    def from_iterate(cls, iterate: ExperimentIterate, x: Array, violation_n: float) -> FitSummary:
+    def from_iterate(
+        cls, iterate: ExperimentIterate, x: Array, violation_n: float
+    ) -> FitSummary:
         """Return the fit of positions x (rows, 3n) [m] at the parameters of an experiment.
 
         Parameters
@@ -148,7 +150,9 @@ class SimulationResult:
     times_s: tuple[float, float, float]
 
 
-def trajectory_positions(trajectory: SweepResult | SimulationResult | Array) -> Array:
+def trajectory_positions(
+    trajectory: SweepResult | SimulationResult | Array,
+) -> Array:
     """Return the positions (rows, 3n) [m] of a sweep result, a simulation, or an array of
     positions.
     """
@@ -192,9 +196,15 @@ def sweep(
     dynamics = part.equations.dynamics
     if (massless := dynamics.body.mass_problem(dynamics.theta)) is not None:
         raise SimulationError(massless, float(dynamics.t_s[0]))
-    tangent = solver.forward(part.x, part.equations, known_sweep.tangent if known_sweep else None)
+    tangent = solver.forward(
+        part.x, part.equations, known_sweep.tangent if known_sweep else None
+    )
     return _sweep_result(
-        part, huber, tangent=tangent, previous=previous, times_s=solver.stopwatch.read_and_reset()
+        part,
+        huber,
+        tangent=tangent,
+        previous=previous,
+        times_s=solver.stopwatch.read_and_reset(),
     )
 
 
@@ -232,7 +242,9 @@ def sweep_after_step(
     SimulationError
         If a time step is singular or not finite.
     """
-    part = _iterate(transcription, p, extrapolate(transcription, previous, step))
+    part = _iterate(
+        transcription, p, extrapolate(transcription, previous, step)
+    )
     dynamics = part.equations.dynamics
     x = part.x
     if dynamics.is_static:
@@ -244,7 +256,9 @@ def sweep_after_step(
             approximate_solution=x,
         )
         x = equilibria if failure is None else x
-    return sweep(solver, transcription, huber=huber, p=p, trajectory=x, previous=previous)
+    return sweep(
+        solver, transcription, huber=huber, p=p, trajectory=x, previous=previous
+    )
 
 
 def reassociate(
@@ -280,7 +294,9 @@ def reassociate(
     )
 
 
-def extrapolate(transcription: Transcription, sweep_result: SweepResult, step: Array) -> Array:
+def extrapolate(
+    transcription: Transcription, sweep_result: SweepResult, step: Array
+) -> Array:
     """Return positions (rows, 3n) [m] after the feasibility step of a sweep and a step (k,) of the
     experiment's parameters, to first order.
     """
@@ -338,12 +354,18 @@ def fit_summary(transcription: Transcription, p: Array, x: Array) -> FitSummary:
     residuals of the equations of motion evaluated at x.
     """
     part = _iterate(transcription, p, x)
-    return FitSummary.from_iterate(part, x, float(np.abs(part.residual_n).max()))
+    return FitSummary.from_iterate(
+        part, x, float(np.abs(part.residual_n).max())
+    )
 
 
-def _iterate(transcription: Transcription, p: Array, x: Array) -> ExperimentIterate:
+def _iterate(
+    transcription: Transcription, p: Array, x: Array
+) -> ExperimentIterate:
     """Return the experiment at parameters p (k,) and positions x (rows, 3n)."""
-    return ExperimentIterate(transcription, p[: transcription.nq], p[transcription.nq :], x)
+    return ExperimentIterate(
+        transcription, p[: transcription.nq], p[transcription.nq :], x
+    )
 
 
 def _sweep_result(
@@ -370,25 +392,41 @@ def _sweep_result(
     times_s : tuple of three floats
         Times for `Stopwatch.add` [s].
     """
-    response = iterate.observation.response_of_array(tangent.by_p, tangent.grasp_forces)
-    predictions = iterate.observation.linearise(iterate.x, response, tangent.step)
+    response = iterate.observation.response_of_array(
+        tangent.by_p, tangent.grasp_forces
+    )
+    predictions = iterate.observation.linearise(
+        iterate.x, response, tangent.step
+    )
     matches = zip(predictions, iterate.segment.residuals, strict=True)
     residuals_and_slopes = [
-        huber_as_least_squares(*each, reading.huber) for each, reading in matches
+        huber_as_least_squares(*each, reading.huber)
+        for each, reading in matches
     ]
-    residual = np.concatenate([values.ravel() for values, _ in residuals_and_slopes])
+    residual = np.concatenate(
+        [values.ravel() for values, _ in residuals_and_slopes]
+    )
     slope = np.concatenate(
-        [by.reshape(values.size, by.shape[-1]) for values, by in residuals_and_slopes]
+        [
+            by.reshape(values.size, by.shape[-1])
+            for values, by in residuals_and_slopes
+        ]
     )
     report = SweepReport(
-        fit=SquareRootInformation.empty(slope.shape[1]).with_rows(residual, slope),
+        fit=SquareRootInformation.empty(slope.shape[1]).with_rows(
+            residual, slope
+        ),
         previous_slopes_residual=np.zeros(slope.shape[1])
         if previous is None
         else previous.slope.T @ residual,
         feasibility_m=float(np.abs(tangent.step).max()),
-        position_change_m=0.0 if previous is None else float(np.abs(iterate.x - previous.x).max()),
+        position_change_m=0.0
+        if previous is None
+        else float(np.abs(iterate.x - previous.x).max()),
         indefinite_steps=tangent.indefinite_count,
-        fit_summary=FitSummary.from_iterate(iterate, iterate.x + tangent.step, tangent.violation_n),
+        fit_summary=FitSummary.from_iterate(
+            iterate, iterate.x + tangent.step, tangent.violation_n
+        ),
         times_s=times_s,
     )
     return SweepResult(iterate.x, tangent, slope, report)

@@ -123,7 +123,9 @@ class ContactLaw:
             return np.full(len(self.edges_m), self.obstacle.width_m)
         if self.obstacle.relaxed is not None:
             return RELAXED_WIDTH * self.edges_m
-        return (FRICTION_WIDTH if self.obstacle.has_friction else WIDTH) * self.edges_m
+        return (
+            FRICTION_WIDTH if self.obstacle.has_friction else WIDTH
+        ) * self.edges_m
 
     @property
     def largest_width_m(self) -> float:
@@ -144,7 +146,10 @@ class ContactLaw:
         columns = []
         if self.obstacle.stiffness_pa_m is None:
             offset = self.body.starts[part]
-            columns = [offset + k for k in range(len(self.body.parts[part].material.constants))]
+            columns = [
+                offset + k
+                for k in range(len(self.body.parts[part].material.constants))
+            ]
         if (friction := self.obstacle.friction_constant) is not None:
             columns.append(list(self.body.constants).index(friction.name))
         return np.array(columns, dtype=np.int64)
@@ -165,7 +170,9 @@ class ContactLaw:
 
     def stiffness_at(self, theta: Array) -> Array:
         """Return κ (i,) at each point of a body with constants θ (k,) [Pa/m]."""
-        stiffness = float(ca.evalf(self.stiffness(ca.SX(ca.DM(theta[self.constant_columns])))))
+        stiffness = float(
+            ca.evalf(self.stiffness(ca.SX(ca.DM(theta[self.constant_columns]))))
+        )
         return stiffness * self.data[3]
 
     def friction_coefficient(self, constants: ca.SX) -> ca.SX:
@@ -173,7 +180,11 @@ class ContactLaw:
         (c,).
         """
         coefficient = self.obstacle.friction
-        return constants[-1] if isinstance(coefficient, str) else ca.SX(coefficient)
+        return (
+            constants[-1]
+            if isinstance(coefficient, str)
+            else ca.SX(coefficient)
+        )
 
     def to_obstacle_frame(self, y: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Express a contact point in the axes of its obstacle.
@@ -197,7 +208,9 @@ class ContactLaw:
     @property
     def _frame_size_m(self) -> float:
         """Length of the axes of the obstacle's frame [m]."""
-        return float(self.body.frame_nodes_m[1, 0] - self.body.frame_nodes_m[0, 0])
+        return float(
+            self.body.frame_nodes_m[1, 0] - self.body.frame_nodes_m[0, 0]
+        )
 
     def gap_at(self, point_m: ca.SX) -> ca.SX:
         """Return the signed gap g [m] at a point in obstacle axes; negative inside the obstacle.
@@ -207,7 +220,9 @@ class ContactLaw:
         point_m : (3,) SX
             Point relative to the origin of the frame, see `to_obstacle_frame` [m].
         """
-        return self.obstacle.shape.signed_distance(point_m + ca.DM(self.body.frame_nodes_m[0]))
+        return self.obstacle.shape.signed_distance(
+            point_m + ca.DM(self.body.frame_nodes_m[0])
+        )
 
     def scaled_pressure(self, gap: ca.SX, data: ca.SX) -> ca.SX:
         """Return b, the pressure divided by κ [m], at a gap.
@@ -227,9 +242,13 @@ class ContactLaw:
             reach = ca.fmax(width_m - gap, 0)
             overlap = ca.fmax(-gap, 0)
             return (reach**2 - overlap**2) / width_m
-        return data[1] / ca.fmax(gap, data[1] / (LARGEST_SCALED_PRESSURE * width_m))
+        return data[1] / ca.fmax(
+            gap, data[1] / (LARGEST_SCALED_PRESSURE * width_m)
+        )
 
-    def mean_scaled_pressure(self, gaps: tuple[ca.SX, ca.SX], data: ca.SX) -> ca.SX:
+    def mean_scaled_pressure(
+        self, gaps: tuple[ca.SX, ca.SX], data: ca.SX
+    ) -> ca.SX:
         """Return the mean of b [m] over a step in which the gap changes linearly between two values
         [m]; `data` (5,) are those of the point.
         """
@@ -246,9 +265,13 @@ class ContactLaw:
         """
         relaxed = (self.obstacle.relaxed or 0.0) * self.widths_m**2
         has_stiffness = self.obstacle.stiffness_pa_m is not None
-        per_unit = np.ones_like(self.edges_m) if has_stiffness else 1 / self.edges_m
+        per_unit = (
+            np.ones_like(self.edges_m) if has_stiffness else 1 / self.edges_m
+        )
         step_s = np.zeros_like(self.edges_m)
-        return np.array([self.surface.area_m2, relaxed, self.widths_m, per_unit, step_s])
+        return np.array(
+            [self.surface.area_m2, relaxed, self.widths_m, per_unit, step_s]
+        )
 
     @cached_property
     def gap_function(self) -> GeneratedFunction:
@@ -291,11 +314,22 @@ class ContactLaw:
             moving_parts = ca.vertsplit(u, 3)
             frame = ca.vertsplit(data, [0, 9 * moving, data.numel()])
             frame_ends = ca.vertsplit(frame[0], 9)
-            y = [part for pair in zip(moving_parts, frame_ends, strict=True) for part in pair]
+            y = [
+                part
+                for pair in zip(moving_parts, frame_ends, strict=True)
+                for part in pair
+            ]
             constants, point_data = ca.vertsplit(
-                frame[1], [0, len(self.constant_columns), len(self.constant_columns) + DATA_COUNT]
+                frame[1],
+                [
+                    0,
+                    len(self.constant_columns),
+                    len(self.constant_columns) + DATA_COUNT,
+                ],
             )
-            return self.force_expression(ca.vertcat(*y, constants), point_data)[:3]
+            return self.force_expression(ca.vertcat(*y, constants), point_data)[
+                :3
+            ]
 
         return GeneratedFunction(
             force,
@@ -330,7 +364,9 @@ class ContactLaw:
             Data of the point, see `data`; entry 1 is r δ².
         """
         inputs, b = ca.vertsplit(u, [0, u.numel() - 1, u.numel()])
-        gap = self.gap_at(self.to_obstacle_frame(inputs[: 3 * VECTORS_PER_POINT])[0])
+        gap = self.gap_at(
+            self.to_obstacle_frame(inputs[: 3 * VECTORS_PER_POINT])[0]
+        )
         residual = b + gap - ca.sqrt((b - gap) ** 2 + 4 * data[1])
         return ca.vertcat(self.force_expression(inputs, data, b), residual)
 
@@ -357,11 +393,15 @@ class ContactLaw:
         place, axes, slope, normal_n = self._normal(u, data, scaled_pressure)
         # The forces on the ends of the axes follow from the coordinates of the point in these axes.
         push = normal_n * slope
-        force = ca.vertcat(axes @ push, ca.vec(u[:3] @ push.T) / self._frame_size_m)
+        force = ca.vertcat(
+            axes @ push, ca.vec(u[:3] @ push.T) / self._frame_size_m
+        )
         if not self.obstacle.has_friction:
             return force
         _, friction, _ = self._friction(u, place, axes @ slope, normal_n)
-        return force + ca.vertcat(friction, -ca.vec(friction @ (place / self._frame_size_m).T))
+        return force + ca.vertcat(
+            friction, -ca.vec(friction @ (place / self._frame_size_m).T)
+        )
 
     def _normal(
         self, u: ca.SX, data: ca.SX, pressing: ca.SX | None
@@ -387,14 +427,19 @@ class ContactLaw:
         if pressing is not None:
             scaled_pressure = pressing
         elif self.is_averaged:
-            scaled_pressure = self.mean_scaled_pressure(self._end_gaps(u, half_s=data[4] / 2), data)
+            scaled_pressure = self.mean_scaled_pressure(
+                self._end_gaps(u, half_s=data[4] / 2), data
+            )
         else:
             scaled_pressure = self.scaled_pressure(gap, data)
         return (
             place,
             axes,
             slope,
-            data[0] * data[3] * self.stiffness(self._constants(u)) * scaled_pressure,
+            data[0]
+            * data[3]
+            * self.stiffness(self._constants(u))
+            * scaled_pressure,
         )
 
     def _end_gaps(self, u: ca.SX, half_s: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -404,7 +449,8 @@ class ContactLaw:
         y = u[: 3 * VECTORS_PER_POINT]
         v = u[3 * VECTORS_PER_POINT : 6 * VECTORS_PER_POINT]
         before, after = (
-            self.gap_at(self.to_obstacle_frame(y + way * v)[0]) for way in (-half_s, half_s)
+            self.gap_at(self.to_obstacle_frame(y + way * v)[0])
+            for way in (-half_s, half_s)
         )
         return before, after
 
@@ -428,14 +474,18 @@ class ContactLaw:
         normal_n : SX
             Normal force N.
         """
-        relative, *ends = ca.vertsplit(u[3 * VECTORS_PER_POINT : 6 * VECTORS_PER_POINT], 3)
+        relative, *ends = ca.vertsplit(
+            u[3 * VECTORS_PER_POINT : 6 * VECTORS_PER_POINT], 3
+        )
         relative -= ca.horzcat(*ends) @ (place / self._frame_size_m)
         normal = slope / ca.norm_2(slope)
         tangential = relative - normal * ca.dot(normal, relative)
         limit_n = self.friction_coefficient(self._constants(u)) * normal_n
         return (
             limit_n,
-            -limit_n / ca.sqrt(ca.sumsqr(tangential) + self.slip**2) * tangential,
+            -limit_n
+            / ca.sqrt(ca.sumsqr(tangential) + self.slip**2)
+            * tangential,
             tangential,
         )
 
@@ -449,11 +499,20 @@ class ContactLaw:
 
         def friction_values(u: ca.SX, data: ca.SX) -> ca.SX:
             place, axes, slope, normal_n = self._normal(u, data, pressing=None)
-            limit_n, friction, tangential = self._friction(u, place, axes @ slope, normal_n)
+            limit_n, friction, tangential = self._friction(
+                u, place, axes @ slope, normal_n
+            )
             slips = ca.sumsqr(tangential) > (SLIP_THRESHOLD * self.slip) ** 2
-            return ca.vertcat(limit_n, limit_n * slips, friction, -ca.dot(friction, tangential))
+            return ca.vertcat(
+                limit_n,
+                limit_n * slips,
+                friction,
+                -ca.dot(friction, tangential),
+            )
 
-        return GeneratedFunction(friction_values, self.force_function.input_size, DATA_COUNT)
+        return GeneratedFunction(
+            friction_values, self.force_function.input_size, DATA_COUNT
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -508,8 +567,12 @@ class Contact(Pointwise):
     def scaled_pressures(self, xi: Array) -> Array:
         """Return the pressures divided by κ, b (1, T, i) [m], at positions ξ (T, 3n)."""
         gaps = self.law_of_contact.gaps(self.points.vectors(xi))
-        data = np.broadcast_to(self.law_of_contact.data[:, None], (DATA_COUNT, *gaps.shape))
-        return self.law_of_contact.scaled_pressure_function.evaluate(gaps[None], data)
+        data = np.broadcast_to(
+            self.law_of_contact.data[:, None], (DATA_COUNT, *gaps.shape)
+        )
+        return self.law_of_contact.scaled_pressure_function.evaluate(
+            gaps[None], data
+        )
 
     def rigid_limit_n(self, states: States) -> Array:
         """Return the change (T, 3n) of the forces if contact were rigid, to first order [N].
@@ -525,17 +588,21 @@ class Contact(Pointwise):
         """
         evaluated = self._inputs_at(states)
         y = evaluated.u[evaluated.y]
-        gap, normal = self.law_of_contact.gap_function.evaluate_with_jacobian(y, _no_data(y))
+        gap, normal = self.law_of_contact.gap_function.evaluate_with_jacobian(
+            y, _no_data(y)
+        )
         _, slopes = self.law.evaluate_with_jacobian(evaluated.u, evaluated.data)
-        change = np.einsum("vkti,kti->vti", slopes[evaluated.y, :3], normal[0, :3] * gap[0])
+        change = np.einsum(
+            "vkti,kti->vti", slopes[evaluated.y, :3], normal[0, :3] * gap[0]
+        )
         return self.factor * self.points.assemble(change, evaluated.chosen)
 
     def friction_sums(self, states: States) -> Array:
         """Return the sums over the points (6, T) of `ContactLaw.friction_function`."""
         evaluated = self._inputs_at(states)
-        return self.law_of_contact.friction_function.evaluate(evaluated.u, evaluated.data).sum(
-            axis=2
-        )
+        return self.law_of_contact.friction_function.evaluate(
+            evaluated.u, evaluated.data
+        ).sum(axis=2)
 
     @property
     def is_nonlinear_in_velocity(self) -> bool:
@@ -576,8 +643,12 @@ class Contact(Pointwise):
         y = self.points.vectors(states.xi)
         if self.is_complementarity:
             return None, y
-        is_active = np.any(self._least_gaps(states, y) < self.law_of_contact.widths_m, axis=0)
-        is_active[np.flatnonzero(~is_active)[: -is_active.sum() % POINT_BATCH]] = True
+        is_active = np.any(
+            self._least_gaps(states, y) < self.law_of_contact.widths_m, axis=0
+        )
+        is_active[
+            np.flatnonzero(~is_active)[: -is_active.sum() % POINT_BATCH]
+        ] = True
         chosen = np.flatnonzero(is_active)
         return chosen, y[..., chosen]
 
@@ -590,7 +661,8 @@ class Contact(Pointwise):
             return self.law_of_contact.gaps(y)
         half_step = half_s * self.points.vectors(states.nu)
         return np.minimum(
-            self.law_of_contact.gaps(y - half_step), self.law_of_contact.gaps(y + half_step)
+            self.law_of_contact.gaps(y - half_step),
+            self.law_of_contact.gaps(y + half_step),
         )
 
     def deepest_point(self, x: Array) -> tuple[float, Array]:
@@ -600,11 +672,13 @@ class Contact(Pointwise):
         The depth is negative if no point has a pressure.
         """
         y = self.points.vectors(x[None])
-        gap, slopes = self.law_of_contact.gap_function.evaluate_with_jacobian(y, _no_data(y))
+        gap, slopes = self.law_of_contact.gap_function.evaluate_with_jacobian(
+            y, _no_data(y)
+        )
         deepest = int(gap[0, 0].argmin())
-        return self.law_of_contact.widths_m[deepest] - float(gap[0, 0, deepest]), slopes[
-            0, :3, 0, deepest
-        ]
+        return self.law_of_contact.widths_m[deepest] - float(
+            gap[0, 0, deepest]
+        ), slopes[0, :3, 0, deepest]
 
     def constants(self, states: States) -> Array:
         """Return the constants (c, 1) on which stiffness and friction depend."""
@@ -630,7 +704,9 @@ def _no_data(y: Array) -> Array:
     return np.zeros((0, *y.shape[1:]))
 
 
-def contact_terms(experiment: Experiment, step_s: float = 0.0) -> tuple[Contact, ...]:
+def contact_terms(
+    experiment: Experiment, step_s: float = 0.0
+) -> tuple[Contact, ...]:
     """Return the contact terms of an experiment's obstacles.
 
     Parameters
@@ -643,7 +719,12 @@ def contact_terms(experiment: Experiment, step_s: float = 0.0) -> tuple[Contact,
     terms = []
     for obstacle in experiment.obstacles:
         averaged = step_s > 0 and obstacle.relaxed is None
-        law = contact_law(experiment.body, obstacle, static=experiment.is_static, averaged=averaged)
+        law = contact_law(
+            experiment.body,
+            obstacle,
+            static=experiment.is_static,
+            averaged=averaged,
+        )
         terms.append(Contact(law, step_s=step_s if averaged else 0.0))
     return tuple(terms)
 

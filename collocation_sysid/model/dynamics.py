@@ -29,7 +29,11 @@ from ..fem.pattern import SymmetricPattern
 from ..recording.experiment import Experiment
 from .force_internal_variables import ForceHistory
 from .forces import Forces
-from .internal_variables import AnyHistory, histories_of_trajectory, insert_histories
+from .internal_variables import (
+    AnyHistory,
+    histories_of_trajectory,
+    insert_histories,
+)
 from .schemes import QUASI_STATIC, SLIDING, Scheme, as_scheme
 from .weight import DofMasses
 
@@ -53,13 +57,22 @@ class StencilTables:
     r: Array  # (N,)
 
     @classmethod
-    def from_scheme(cls, scheme: Scheme, rows: int, first_row: int) -> StencilTables:
+    def from_scheme(
+        cls, scheme: Scheme, rows: int, first_row: int
+    ) -> StencilTables:
         """Return the tables of rows 0 … `rows` − 1; rows before `first_row` are zero."""
-        p, q, w, s = (np.zeros((rows, scheme.largest_lag + 1)) for _ in range(4))
+        p, q, w, s = (
+            np.zeros((rows, scheme.largest_lag + 1)) for _ in range(4)
+        )
         r = np.zeros(rows)
         for row in range(first_row, rows):
             stencil = scheme.stencil(row)
-            for table, values in ((p, stencil.p), (q, stencil.q), (w, stencil.w), (s, stencil.s)):
+            for table, values in (
+                (p, stencil.p),
+                (q, stencil.q),
+                (w, stencil.w),
+                (s, stencil.s),
+            ):
                 table[row, : len(values)] = values
             r[row] = stencil.r
         return cls(p, q, w, s, r)
@@ -134,10 +147,17 @@ class Dynamics:
         """
         if experiment.is_static:
             t_s = experiment.t_s
-            table = SLIDING if any(o.has_friction for o in experiment.obstacles) else QUASI_STATIC
+            table = (
+                SLIDING
+                if any(o.has_friction for o in experiment.obstacles)
+                else QUASI_STATIC
+            )
         else:
             rows = (len(experiment.t_s) - 1) * substeps + 1
-            t_s = experiment.t_s[0] + np.arange(rows) * experiment.timestep_s / substeps
+            t_s = (
+                experiment.t_s[0]
+                + np.arange(rows) * experiment.timestep_s / substeps
+            )
             table = as_scheme(scheme, experiment.start_rule)
         rows = len(t_s)
         first_row = 0 if experiment.start == "equilibrium" else 1
@@ -149,7 +169,9 @@ class Dynamics:
         averaged_s = 0.0
         if not experiment.is_static and table.is_midpoint:
             averaged_s = experiment.timestep_s / substeps
-        forces = Forces.from_experiment(experiment, evaluated_s, step_s=averaged_s)
+        forces = Forces.from_experiment(
+            experiment, evaluated_s, step_s=averaged_s
+        )
         goals = experiment.prescribed_displacements(t_s)[1].reshape(rows, -1)
         is_prescribed = ~np.isnan(goals)
         is_prescribed[:, experiment.prescribed_dofs] = False
@@ -163,7 +185,9 @@ class Dynamics:
             prescribed_m=goals,
             is_temporarily_prescribed=is_prescribed,
             evaluated_s=evaluated_s,
-            start_velocity_m_s=np.zeros(dofs) if velocity is None else np.array(velocity).ravel(),
+            start_velocity_m_s=np.zeros(dofs)
+            if velocity is None
+            else np.array(velocity).ravel(),
             loaded_since_s=experiment.loaded_since_s,
             is_static=experiment.is_static,
         )
@@ -180,13 +204,17 @@ class Dynamics:
         """Return these equations with other forces, and with the masses of these forces."""
         if forces.mass is self.forces.mass:
             return replace(self, forces=forces)
-        return replace(self, forces=forces, mass=_row_masses(self.tables, forces.mass))
+        return replace(
+            self, forces=forces, mass=_row_masses(self.tables, forces.mass)
+        )
 
     def rows_to_evaluations(self, row_values: Array) -> Array:
         """Return quantities of the rows (N, …), distributed to the evaluations by the transpose of
         the weighted mean that gives a row's value.
         """
-        total = self.tables.w.sum(axis=1).reshape((-1,) + (1,) * (row_values.ndim - 1))
+        total = self.tables.w.sum(axis=1).reshape(
+            (-1,) + (1,) * (row_values.ndim - 1)
+        )
         shares = row_values / np.where(total == 0, 1.0, total)
         return np.where(total == 0, row_values, 0.0) + self.combine_transposed(
             self.tables.w, shares
@@ -209,7 +237,9 @@ class Dynamics:
         t = self.tables
         return replace(
             self,
-            tables=StencilTables(t.p[:rows], t.q[:rows], w=t.w[:rows], s=t.s[:rows], r=t.r[:rows]),
+            tables=StencilTables(
+                t.p[:rows], t.q[:rows], w=t.w[:rows], s=t.s[:rows], r=t.r[:rows]
+            ),
             t_s=self.t_s[:rows],
             mass=self.mass.at_times(slice(rows)),
             forces=self.forces.at_times(slice(rows)),
@@ -270,7 +300,9 @@ class Dynamics:
         if self.is_static:
             return np.append(np.diff(self.t_s), 1.0)
         lags = self.tables.p @ np.arange(self.largest_lag + 1.0)
-        return self.step_s * np.append(np.diff(np.arange(self.row_count) - lags), 1.0)
+        return self.step_s * np.append(
+            np.diff(np.arange(self.row_count) - lags), 1.0
+        )
 
     @property
     def theta(self) -> Array:
@@ -290,7 +322,9 @@ class Dynamics:
             Given internal variables of the previous evaluation, by the index of the history.
             Internal variables that are not given are computed from x.
         """
-        if not (self.body.has_memory or self.forces.terms_with_internal_variables):
+        if not (
+            self.body.has_memory or self.forces.terms_with_internal_variables
+        ):
             return ()
         first_rows = slice(len(x))
         states = self.all_evaluation_states(x)
@@ -418,7 +452,10 @@ class Dynamics:
         total = np.zeros_like(x)
         total[self.first_row :] = force
         inertia = self.mass.inertia_kg * self.acceleration(x)
-        return self.combine(self.tables.w, self.zero_prescribed_forces(total)) - inertia
+        return (
+            self.combine(self.tables.w, self.zero_prescribed_forces(total))
+            - inertia
+        )
 
     def zero_prescribed_forces(self, rows: Array) -> Array:
         """Set the forces at temporarily prescribed dofs to zero, in place, and return the array.
@@ -436,11 +473,16 @@ class Dynamics:
         rows before `first_row` and in static experiments.
         """
         acceleration = self.combine(self.tables.s, x) / self.step_s**2
-        acceleration += np.outer(self.tables.r / self.step_s, self.start_velocity_m_s)
+        acceleration += np.outer(
+            self.tables.r / self.step_s, self.start_velocity_m_s
+        )
         return acceleration
 
     def linearise(
-        self, x: Array, out: Array | None = None, histories: Sequence[AnyHistory] = ()
+        self,
+        x: Array,
+        out: Array | None = None,
+        histories: Sequence[AnyHistory] = (),
     ) -> Linearisation:
         """Return forces and derivatives at the evaluation states of x (N, 3n).
 
@@ -499,7 +541,9 @@ def _combine(table: Array, rows: Array) -> Array:
 
 def _row_masses(tables: StencilTables, at_evaluations: DofMasses) -> DofMasses:
     """Return the mass in each row, from the mass at the evaluations."""
-    return replace(at_evaluations, tied_kg=_evaluation_mean(tables, at_evaluations.tied_kg))
+    return replace(
+        at_evaluations, tied_kg=_evaluation_mean(tables, at_evaluations.tied_kg)
+    )
 
 
 def _evaluation_mean(tables: StencilTables, at_evaluations: Array) -> Array:
@@ -512,7 +556,9 @@ def _evaluation_mean(tables: StencilTables, at_evaluations: Array) -> Array:
     """
     if (at_evaluations == at_evaluations[:1]).all():
         return at_evaluations
-    total = tables.w.sum(axis=1).reshape((-1,) + (1,) * (at_evaluations.ndim - 1))
+    total = tables.w.sum(axis=1).reshape(
+        (-1,) + (1,) * (at_evaluations.ndim - 1)
+    )
     mean = _combine(tables.w, at_evaluations) / np.where(total == 0, 1.0, total)
     return np.where(total == 0, at_evaluations, mean)
 
@@ -557,7 +603,9 @@ class StencilRow:
         """Lags i ≥ 1 for which the force of this row depends on x_{t−i}."""
         return [i for i in range(1, len(self.p)) if self.p[i] or self.q[i]]
 
-    def block(self, by_position: Array, by_velocity: Array, pattern: SymmetricPattern) -> Array:
+    def block(
+        self, by_position: Array, by_velocity: Array, pattern: SymmetricPattern
+    ) -> Array:
         """Return the lower triangle (m,) of −∂c_t/∂x_t, symmetric part.
 
         Parameters
@@ -572,7 +620,9 @@ class StencilRow:
         values[pattern.diagonal] += self.s[0] * self.mass_kg
         return values
 
-    def skew_block(self, by_position_skew: Array, by_velocity_skew: Array) -> Array:
+    def skew_block(
+        self, by_position_skew: Array, by_velocity_skew: Array
+    ) -> Array:
         """Return the lower triangle, (m,) or (0,), of the skew part of −∂c_t/∂x_t.
 
         Parameters
@@ -582,12 +632,18 @@ class StencilRow:
         """
         return -self.w[0] * self.skew(0, by_position_skew, by_velocity_skew)
 
-    def skew(self, lag: int, by_position_skew: Array, by_velocity_skew: Array) -> Array:
+    def skew(
+        self, lag: int, by_position_skew: Array, by_velocity_skew: Array
+    ) -> Array:
         """Return the skew part (m,) of p G + q C at a lag, from those of G (m,) and C (m,); that of
         C may be empty, which stands for zero.
         """
         skew_part = self.p[lag] * by_position_skew
-        return skew_part + self.q[lag] * by_velocity_skew if by_velocity_skew.size else skew_part
+        return (
+            skew_part + self.q[lag] * by_velocity_skew
+            if by_velocity_skew.size
+            else skew_part
+        )
 
 
 def weighted_sum_of_past(
@@ -604,7 +660,9 @@ def weighted_sum_of_past(
     shape : tuple of int
         Shape of the result where no coefficient is nonzero.
     """
-    terms = [c * item for c, item in zip(coefficients[1:], past, strict=False) if c]
+    terms = [
+        c * item for c, item in zip(coefficients[1:], past, strict=False) if c
+    ]
     if not terms:
         return np.zeros(shape)
     for term in terms[1:]:

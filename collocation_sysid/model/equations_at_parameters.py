@@ -62,7 +62,9 @@ class EquationsAtParameters:
         """Derivatives ∂θ/∂q of the constants (k, nq); nuisance parameters do not change θ."""
         return self.theta_p[:, : self.nq]
 
-    def force_derivatives(self, rows: int | slice, input_slopes: Array) -> Array:
+    def force_derivatives(
+        self, rows: int | slice, input_slopes: Array
+    ) -> Array:
         """Return the derivatives ∂F/∂p (…, 3n, m) of the total forces at some evaluations.
 
         Parameters
@@ -73,7 +75,9 @@ class EquationsAtParameters:
             Derivatives of the forces by the inputs at these evaluations.
         """
         return input_slopes @ (
-            self.input_derivatives[0] if self._is_constant_in_time else self.input_derivatives[rows]
+            self.input_derivatives[0]
+            if self._is_constant_in_time
+            else self.input_derivatives[rows]
         )
 
     @property
@@ -112,9 +116,9 @@ class EquationsAtParameters:
         if not self.mass_depends_on_parameters:
             return 0.0
         masses = self.dynamics.forces.mass_derivatives
-        by_p = self._row_input_derivatives[0 if self._is_constant_in_time else rows][
-            ..., [*masses], :
-        ]
+        by_p = self._row_input_derivatives[
+            0 if self._is_constant_in_time else rows
+        ][..., [*masses], :]
         mass = np.array([*masses.values()])[:, dofs]
         return acceleration[..., None] * (mass.T @ by_p)
 
@@ -148,7 +152,10 @@ class EquationsAtParameters:
             mass_derivatives = row_weights[..., None] * (
                 mass.T @ self._row_input_derivatives[:, places]
             )
-            by_x -= dynamics.combine_transposed(dynamics.tables.s, mass_derivatives) / step_s**2
+            by_x -= (
+                dynamics.combine_transposed(dynamics.tables.s, mass_derivatives)
+                / step_s**2
+            )
             inertia[:, places] = (row_weights * acceleration) @ mass.T
             by_u = by_u - dynamics.rows_to_evaluations(inertia)
         second_order = (
@@ -156,4 +163,6 @@ class EquationsAtParameters:
             @ force_curvature.theta_theta
             @ self.input_derivatives
         )
-        return by_x, second_order.sum(axis=0) + self.inputs.weighted_hessian(self.p, by_u)
+        return by_x, second_order.sum(axis=0) + self.inputs.weighted_hessian(
+            self.p, by_u
+        )

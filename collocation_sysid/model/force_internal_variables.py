@@ -80,18 +80,24 @@ class ForceHistory:
         """
         term = forces.pointwise_term(number)[0]
         shape = term.internal_variable_count, len(xi), term.points.count
-        previous = PreviousState(np.zeros(shape) if before is None else before, since_s)
+        previous = PreviousState(
+            np.zeros(shape) if before is None else before, since_s
+        )
         history = cls(forces, number, xi, nu, previous)
         if before is None:
             for k in range(len(xi) - 1):
-                previous.before[:, k + 1] = history.internal_variables(slice(k, k + 1))[:, 0]
+                previous.before[:, k + 1] = history.internal_variables(
+                    slice(k, k + 1)
+                )[:, 0]
         return history
 
     def internal_variables(self, rows: slice) -> Array:
         """Return the internal variables h (n, T, I) after some evaluations."""
         return self.term_at(rows).internal_variables(self._states(rows))
 
-    def term_at(self, rows: slice, variable_weights: Array | None = None) -> Pointwise:
+    def term_at(
+        self, rows: slice, variable_weights: Array | None = None
+    ) -> Pointwise:
         """Return the force term at some evaluations, with its previous internal variables.
 
         Parameters
@@ -122,11 +128,15 @@ class ForceHistory:
     def final_state(self) -> ForcePreviousState:
         """State after the last evaluation."""
         last = slice(len(self.xi) - 1, None)
-        return ForcePreviousState(self.number, self.term_at(last), self.internal_variables(last))
+        return ForcePreviousState(
+            self.number, self.term_at(last), self.internal_variables(last)
+        )
 
     def derivatives(self, rows: slice) -> LawDerivatives:
         """Return the derivatives of F and h at some evaluations, each (d + n, …, T, I)."""
-        return self._without_static_velocity(self.term_at(rows).derivatives(self._states(rows)))
+        return self._without_static_velocity(
+            self.term_at(rows).derivatives(self._states(rows))
+        )
 
     def _without_static_velocity(self, parts: LawDerivatives) -> LawDerivatives:
         """Return the derivatives; those by ẏ are zero if the force gets no velocities, in a static
@@ -154,7 +164,9 @@ class ForceHistory:
         inputs.
         """
 
-    def mixed_second_derivatives(self, mu: Array, weights: Array) -> LawDerivatives:
+    def mixed_second_derivatives(
+        self, mu: Array, weights: Array
+    ) -> LawDerivatives:
         """Return the second derivatives of weights · F + μ · h by (u, b), each (…, n, N, I).
 
         Parameters
@@ -166,13 +178,18 @@ class ForceHistory:
         """
         all_rows = slice(None)
         return self._without_static_velocity(
-            self.term_at(all_rows, mu).mixed_second_derivatives(self._states(all_rows), weights)
+            self.term_at(all_rows, mu).mixed_second_derivatives(
+                self._states(all_rows), weights
+            )
         )
 
     # Along a motion -------------------------------------------------------------------------------
 
     def forward_columns(
-        self, by_p: Callable[[int], Array], done: int = 0, known: Array | None = None
+        self,
+        by_p: Callable[[int], Array],
+        done: int = 0,
+        known: Array | None = None,
     ) -> ForceForwardColumns:
         """Return an iterator of the columns db forward in time, see `ForceForwardColumns`.
 
@@ -210,7 +227,9 @@ class ForceHistory:
         by_parameters = np.zeros(by_p.shape[2])
         for k in reversed(range(len(self.xi))):
             by_xi[k], by_nu[k] = pulling.state_gradient()
-            by_parameters += pulling.input_gradient() @ by_p[k][self.input_columns]
+            by_parameters += (
+                pulling.input_gradient() @ by_p[k][self.input_columns]
+            )
             pulling.step_back(force_weights[k])
         return by_xi, by_nu, by_parameters
 
@@ -234,7 +253,9 @@ class ForcePreviousState:
     after: Array
 
     @classmethod
-    def from_state(cls, forces: Forces, number: int, x: Array, v: Array) -> ForcePreviousState:
+    def from_state(
+        cls, forces: Forces, number: int, x: Array, v: Array
+    ) -> ForcePreviousState:
         """Return the internal variables h after an evaluation at (x, v), (3n,) each.
 
         Parameters
@@ -247,7 +268,11 @@ class ForcePreviousState:
             Position [m] and velocity [m/s].
         """
         term = forces.pointwise_term(number)[0]
-        return cls(number, term, term.internal_variables(forces.states_of_terms(x, v)(term)))
+        return cls(
+            number,
+            term,
+            term.internal_variables(forces.states_of_terms(x, v)(term)),
+        )
 
     def insert_at_same_time(self, forces: Forces) -> Forces:
         """Return forces in the same state, with the internal variables before it inserted;
@@ -257,19 +282,25 @@ class ForcePreviousState:
         if previous is None:
             return forces
         return forces.with_term(
-            self.number, forces.pointwise_term(self.number)[0].with_previous_state(previous)
+            self.number,
+            forces.pointwise_term(self.number)[0].with_previous_state(previous),
         )
 
-    def insert_after_interval(self, forces: Forces, interval_s: float) -> Forces:
+    def insert_after_interval(
+        self, forces: Forces, interval_s: float
+    ) -> Forces:
         """Return forces in a state one interval [s] later, with the internal variables after this
         evaluation inserted as the previous ones.
         """
         previous = PreviousState(self.after, np.array([interval_s]))
         return forces.with_term(
-            self.number, forces.pointwise_term(self.number)[0].with_previous_state(previous)
+            self.number,
+            forces.pointwise_term(self.number)[0].with_previous_state(previous),
         )
 
-    def advance(self, forces: Forces, x: Array, v: Array, interval_s: float) -> ForcePreviousState:
+    def advance(
+        self, forces: Forces, x: Array, v: Array, interval_s: float
+    ) -> ForcePreviousState:
         """Return the internal variables in the state (x, v) one interval later.
 
         Parameters
@@ -312,7 +343,9 @@ class _DerivativeIterator:
         d = self.points.dofs
         if chunk != self._chunk:
             self._chunk = chunk
-            self._parts = self.history.derivatives(slice(chunk * CHUNK, (chunk + 1) * CHUNK))
+            self._parts = self.history.derivatives(
+                slice(chunk * CHUNK, (chunk + 1) * CHUNK)
+            )
         now = [part[:, :, k] for part in self._parts]
         return LawDerivatives(*(part[:d] for part in now)), LawDerivatives(
             *(part[d:] for part in now)
@@ -349,10 +382,14 @@ class ForceForwardColumns(_DerivativeIterator):
         """Return the contribution of the internal variables to dF at the next evaluation, (3n,
         columns).
         """
-        contribution = np.einsum("abi,bic->aci", self.derivatives()[0].b, self.columns)
+        contribution = np.einsum(
+            "abi,bic->aci", self.derivatives()[0].b, self.columns
+        )
         return self.points.assemble(contribution).T
 
-    def advance(self, of_state: Callable[[], Array], of_rate: Callable[[], Array]) -> None:
+    def advance(
+        self, of_state: Callable[[], Array], of_rate: Callable[[], Array]
+    ) -> None:
         """Pass the next evaluation and update the columns, in place.
 
         Parameters
@@ -366,7 +403,9 @@ class ForceForwardColumns(_DerivativeIterator):
         columns += np.einsum("abi,bc->aic", by.c, of_inputs)
         for part, state_change in ((by.y, of_state), (by.v, of_rate)):
             if part.any():
-                columns += np.einsum("abi,bci->aic", part, self.points.vectors(state_change().T))
+                columns += np.einsum(
+                    "abi,bci->aic", part, self.points.vectors(state_change().T)
+                )
         self.columns = columns
         self.next = self.next + 1
 
@@ -387,7 +426,8 @@ class ForceAdjoint(_DerivativeIterator):
         """Return the derivatives of μ · h by ξ and ν of the evaluation, (3n,) each."""
         by = self.derivatives()[1]
         by_x, by_v = (
-            self.points.assemble(self._weighted_by_mu(each)[:, None])[0] for each in (by.y, by.v)
+            self.points.assemble(self._weighted_by_mu(each)[:, None])[0]
+            for each in (by.y, by.v)
         )
         return by_x, by_v
 

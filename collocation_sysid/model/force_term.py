@@ -114,7 +114,10 @@ class ForceTerm(ABC):
 
     @abstractmethod
     def add_derivatives(
-        self, linearisation: Linearisation, places: AssemblyIndices, states: States
+        self,
+        linearisation: Linearisation,
+        places: AssemblyIndices,
+        states: States,
     ) -> None:
         """Add the forces and their first derivatives to a linearisation, in place.
 
@@ -129,7 +132,11 @@ class ForceTerm(ABC):
 
     @abstractmethod
     def add_second_derivatives(
-        self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
+        self,
+        curvature: SecondDerivatives,
+        places: AssemblyIndices,
+        states: States,
+        weights: Array,
     ) -> None:
         """Add the derivatives of weightsᵀ F to a curvature, in place.
 
@@ -208,27 +215,40 @@ class Potential(ForceTerm):
 
     def interpolate(self, other: Self, share: float) -> Self:
         """Return this force with its amplitude interpolated to that of another time."""
-        return self.with_inputs(self.amplitude + share * (other.amplitude - self.amplitude))
+        return self.with_inputs(
+            self.amplitude + share * (other.amplitude - self.amplitude)
+        )
 
     def force(self, states: States) -> Array:
         """Return the forces −c ∂S/∂x (T, 3n) [N]."""
         return -self.amplitude * self.scalar.gradient(states.xi)
 
     def add_derivatives(
-        self, linearisation: Linearisation, places: AssemblyIndices, states: States
+        self,
+        linearisation: Linearisation,
+        places: AssemblyIndices,
+        states: States,
     ) -> None:
         """Add the forces and their first derivatives to a linearisation, in place, at the entries
         and input columns `places`.
         """
         gradient = self.scalar.gradient(states.xi)
-        np.subtract(linearisation.force, self.amplitude * gradient, out=linearisation.force)
-        linearisation.by_position[:, places.entries] -= self.amplitude * self.scalar.hessian(
-            states.xi
+        np.subtract(
+            linearisation.force,
+            self.amplitude * gradient,
+            out=linearisation.force,
+        )
+        linearisation.by_position[:, places.entries] -= (
+            self.amplitude * self.scalar.hessian(states.xi)
         )
         linearisation.by_theta[:, :, places.inputs.start] -= gradient
 
     def add_second_derivatives(
-        self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
+        self,
+        curvature: SecondDerivatives,
+        places: AssemblyIndices,
+        states: States,
+        weights: Array,
     ) -> None:
         """Add the second derivatives of Σ weights · F, and its first ones by the inputs, to a
         curvature, in place, at `places`; the weights are (T, 3n).
@@ -236,7 +256,13 @@ class Potential(ForceTerm):
         xi = states.xi
         column = places.inputs.start
         third_derivatives = self.scalar.hessian_derivative(xi, weights)
-        curvature.position_position[:, places.entries] -= self.amplitude * third_derivatives
-        hessian_products = self.couplings.products(self.scalar.hessian(xi), weights)
+        curvature.position_position[:, places.entries] -= (
+            self.amplitude * third_derivatives
+        )
+        hessian_products = self.couplings.products(
+            self.scalar.hessian(xi), weights
+        )
         curvature.position_theta[:, :, column] -= hessian_products
-        curvature.theta[:, column] -= np.einsum("ti,ti->t", weights, self.scalar.gradient(xi))
+        curvature.theta[:, column] -= np.einsum(
+            "ti,ti->t", weights, self.scalar.gradient(xi)
+        )

@@ -24,7 +24,12 @@ from ..fem.pattern import JointPattern, SymmetricPattern
 from ..recording.experiment import Experiment
 from .contact import Contact, contact_terms
 from .force_term import AssemblyIndices, ForceTerm, Potential, States
-from .point_forces import CustomForce, Pointwise, air_drag_terms, custom_force_terms
+from .point_forces import (
+    CustomForce,
+    Pointwise,
+    air_drag_terms,
+    custom_force_terms,
+)
 from .weight import DofMasses, Weight
 
 
@@ -81,7 +86,9 @@ class Forces:
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         potentials = tuple(
-            Potential(actuator.measure, actuator.energy_amplitude_at(times)[:, None])
+            Potential(
+                actuator.measure, actuator.energy_amplitude_at(times)[:, None]
+            )
             for actuator in experiment.actuators
         )
         touching = contact_terms(experiment, step_s)
@@ -103,7 +110,9 @@ class Forces:
         return forces if theta is None else forces.with_theta(theta)
 
     @classmethod
-    def of_body_alone(cls, body: Body, theta: Sequence[float] | Array) -> Forces:
+    def of_body_alone(
+        cls, body: Body, theta: Sequence[float] | Array
+    ) -> Forces:
         """Return the forces on a body without loads, gravity or contact, at one time.
 
         Custom forces of the body's own are included.
@@ -159,7 +168,10 @@ class Forces:
         weight, *further = (
             term.with_inputs(u[:, start:stop])
             for term, start, stop in zip(
-                forces.terms, self._input_offsets, self._input_offsets[1:], strict=False
+                forces.terms,
+                self._input_offsets,
+                self._input_offsets[1:],
+                strict=False,
             )
         )
         return replace(forces, weight=weight, external_terms=tuple(further))
@@ -167,7 +179,9 @@ class Forces:
     def at_times(self, rows: slice) -> Forces:
         """Return these forces at some of the T times, given as a slice."""
         further = tuple(term.at_times(rows) for term in self.external_terms)
-        return replace(self, weight=self.weight.at_times(rows), external_terms=further)
+        return replace(
+            self, weight=self.weight.at_times(rows), external_terms=further
+        )
 
     def scaled(self, factor: float) -> Forces:
         """Return these forces with gravity, loads and other external forces multiplied by a factor.
@@ -175,7 +189,9 @@ class Forces:
         Masses and internal forces are unchanged.
         """
         further = tuple(term.scaled(factor) for term in self.external_terms)
-        return replace(self, weight=self.weight.scaled(factor), external_terms=further)
+        return replace(
+            self, weight=self.weight.scaled(factor), external_terms=further
+        )
 
     def interpolate(self, other: Forces, share: float) -> Forces:
         """Return forces with the loads interpolated linearly to those of another time.
@@ -191,10 +207,14 @@ class Forces:
         """
         further = tuple(
             term.interpolate(that, share)
-            for term, that in zip(self.external_terms, other.external_terms, strict=True)
+            for term, that in zip(
+                self.external_terms, other.external_terms, strict=True
+            )
         )
         return replace(
-            other, weight=self.weight.interpolate(other.weight, share), external_terms=further
+            other,
+            weight=self.weight.interpolate(other.weight, share),
+            external_terms=further,
         )
 
     def with_term(self, number: int, term: ForceTerm) -> Forces:
@@ -220,19 +240,29 @@ class Forces:
             for term in self.external_terms
             if isinstance(term, Contact) and not term.is_complementarity
         ]
-        further = tuple(term for term in self.external_terms if term not in touching)
+        further = tuple(
+            term for term in self.external_terms if term not in touching
+        )
         places = [
-            p.entries for t, p in self._terms_with_indices if t.couplings and t not in touching
+            p.entries
+            for t, p in self._terms_with_indices
+            if t.couplings and t not in touching
         ]
-        pattern = JointPattern(self.pattern, (self.joint_pattern.places[0], *places))
-        return replace(self, external_terms=further, joint_pattern=pattern), touching
+        pattern = JointPattern(
+            self.pattern, (self.joint_pattern.places[0], *places)
+        )
+        return replace(
+            self, external_terms=further, joint_pattern=pattern
+        ), touching
 
     def only_loads(self) -> Forces:
         """Return these forces without the external terms besides weight and loads; internal forces
         stay.
         """
         return replace(
-            self, external_terms=(), joint_pattern=JointPattern.from_patterns((self.body.pattern,))
+            self,
+            external_terms=(),
+            joint_pattern=JointPattern.from_patterns((self.body.pattern,)),
         )
 
     def total(self, xi: Array, nu: Array) -> Array:
@@ -241,13 +271,19 @@ class Forces:
         """
         states_for = self.states_of_terms(xi, nu)
         total = self.body.force(
-            xi, states_for(self.weight).nu, self.theta, self.mass.compact_tied_kg, self.memory_state
+            xi,
+            states_for(self.weight).nu,
+            self.theta,
+            self.mass.compact_tied_kg,
+            self.memory_state,
         )
         for term in self.terms:
             total = total + term.force(states_for(term))
         return total
 
-    def linearise(self, xi: Array, nu: Array, out: Array | None = None) -> Linearisation:
+    def linearise(
+        self, xi: Array, nu: Array, out: Array | None = None
+    ) -> Linearisation:
         """Return the forces and their first derivatives by state and inputs.
 
         Internal variables of `memory_state` and of the terms are held fixed.
@@ -262,7 +298,12 @@ class Forces:
         states_for = self.states_of_terms(xi, nu)
         still_nu = states_for(self.weight).nu
         at = self.body.linearise(
-            xi, still_nu, self.theta, out, self.mass.compact_tied_kg, self.memory_state
+            xi,
+            still_nu,
+            self.theta,
+            out,
+            self.mass.compact_tied_kg,
+            self.memory_state,
         )
         if self.is_static:
             at.by_velocity[:] = 0.0
@@ -275,7 +316,10 @@ class Forces:
                 by_theta=self._with_input_columns(at.by_theta),
                 by_position_skew=spread(at.by_position_skew),
                 by_velocity_skew=np.zeros(
-                    (len(at.force), self.pattern.entry_count * self.has_skew_damping)
+                    (
+                        len(at.force),
+                        self.pattern.entry_count * self.has_skew_damping,
+                    )
                 ),
             )
         for term, places in self._terms_with_indices:
@@ -340,17 +384,25 @@ class Forces:
                 spread(at.position_velocity),
                 position_theta=with_columns(at.position_theta),
                 velocity_theta=with_columns(at.velocity_theta),
-                theta_theta=with_columns(with_columns(at.theta_theta).swapaxes(1, 2)),
+                theta_theta=with_columns(
+                    with_columns(at.theta_theta).swapaxes(1, 2)
+                ),
                 theta=with_columns(at.theta),
                 position_velocity_skew=spread(at.position_velocity_skew),
                 # Room for the curvature by velocities, where forces may have some.
                 velocity_velocity=np.zeros(
-                    (len(at.theta), self.pattern.entry_count * self._is_nonlinear_in_velocity)
+                    (
+                        len(at.theta),
+                        self.pattern.entry_count
+                        * self._is_nonlinear_in_velocity,
+                    )
                 ),
             )
         for term, places in self._terms_with_indices:
             states = states_for(term)
-            term.add_second_derivatives(at, places, states, weights.reshape(states.xi.shape))
+            term.add_second_derivatives(
+                at, places, states, weights.reshape(states.xi.shape)
+            )
         return at
 
     @cached_property
@@ -361,14 +413,18 @@ class Forces:
     @cached_property
     def _is_nonlinear_in_velocity(self) -> bool:
         """Whether derivatives by the velocity of any term depend on the velocity."""
-        return any(term.is_nonlinear_in_velocity for term in self.external_terms)
+        return any(
+            term.is_nonlinear_in_velocity for term in self.external_terms
+        )
 
     @property
     def curvature_width(self) -> int:
         """Length of one time's row of `out` in `weighted_hessian`."""
         return self.body.curvature_width
 
-    def states_of_terms(self, xi: Array, nu: Array) -> Callable[[ForceTerm], States]:
+    def states_of_terms(
+        self, xi: Array, nu: Array
+    ) -> Callable[[ForceTerm], States]:
         """Return a function that gives each term its states, from positions ξ and velocities ν, (T,
         3n) or (3n,).
 
@@ -377,7 +433,11 @@ class Forces:
         """
         size = self.body.pattern.size
         moving = States(xi.reshape(-1, size), nu.reshape(-1, size), self.theta)
-        resting = replace(moving, nu=np.zeros_like(moving.nu)) if self.is_static else moving
+        resting = (
+            replace(moving, nu=np.zeros_like(moving.nu))
+            if self.is_static
+            else moving
+        )
         return lambda term: moving if term.uses_increments else resting
 
     @cached_property
@@ -389,11 +449,15 @@ class Forces:
             (
                 term,
                 AssemblyIndices(
-                    slice(start, stop), nowhere if term.couplings is None else next(entries)
+                    slice(start, stop),
+                    nowhere if term.couplings is None else next(entries),
                 ),
             )
             for term, start, stop in zip(
-                self.terms, self._input_offsets, self._input_offsets[1:], strict=False
+                self.terms,
+                self._input_offsets,
+                self._input_offsets[1:],
+                strict=False,
             )
         ]
 
@@ -422,13 +486,21 @@ class Forces:
     @property
     def terms_with_internal_variables(self) -> list[int]:
         """Indices in `external_terms` of the terms with internal variables."""
-        return [k for k, term in enumerate(self.external_terms) if term.internal_variable_count]
+        return [
+            k
+            for k, term in enumerate(self.external_terms)
+            if term.internal_variable_count
+        ]
 
     @property
     def complementarity_terms(self) -> list[int]:
         """Indices in `external_terms` of the contacts as complementarity."""
         further = enumerate(self.external_terms)
-        return [k for k, term in further if isinstance(term, Contact) and term.is_complementarity]
+        return [
+            k
+            for k, term in further
+            if isinstance(term, Contact) and term.is_complementarity
+        ]
 
     def _with_input_columns(self, by_theta: Array) -> Array:
         """Return derivatives by θ (…, k) with zero columns appended for the inputs of the terms (…,
@@ -437,4 +509,6 @@ class Forces:
         further = self._input_offsets[-1] - self._input_offsets[0]
         if not further:
             return by_theta
-        return np.concatenate([by_theta, np.zeros((*by_theta.shape[:-1], further))], axis=-1)
+        return np.concatenate(
+            [by_theta, np.zeros((*by_theta.shape[:-1], further))], axis=-1
+        )

@@ -46,7 +46,9 @@ class GeneratedFunction:
         """Return the values y (m, …) at inputs (k, …) or (k,) and data (d, …)."""
         return self._evaluate_at_instances(self._value, u, data)[0][:, 0]
 
-    def evaluate_with_jacobian(self, u: Array, data: Array) -> tuple[Array, Array]:
+    def evaluate_with_jacobian(
+        self, u: Array, data: Array
+    ) -> tuple[Array, Array]:
         """Return the values y (m, …) and the derivatives ∂y/∂u (m, k, …) at all instances.
 
         Parameters
@@ -59,7 +61,9 @@ class GeneratedFunction:
         value, slopes = self._evaluate_at_instances(self._slopes, u, data)
         return value[:, 0], slopes
 
-    def weighted_hessian(self, u: Array, data: Array, weights: Array | None = None) -> Array:
+    def weighted_hessian(
+        self, u: Array, data: Array, weights: Array | None = None
+    ) -> Array:
         """Return the second derivatives (k, k, …) of Σ weights · y by u.
 
         Parameters
@@ -70,7 +74,9 @@ class GeneratedFunction:
             Weights of the values; 1 by default.
         """
         weights = (
-            np.ones((self._symbols[2].numel(), *data.shape[1:])) if weights is None else weights
+            np.ones((self._symbols[2].numel(), *data.shape[1:]))
+            if weights is None
+            else weights
         )
         return self._evaluate_at_instances(self._curvature, u, data, weights)[0]
 
@@ -104,7 +110,9 @@ class GeneratedFunction:
     def jacobian_pattern(self) -> NDArray[np.bool_]:
         """Mask (m, k) of the structurally nonzero derivatives ∂y/∂u."""
         u, _, y = self._symbols
-        return np.array(ca.DM(ca.jacobian(y, u).sparsity(), 1.0).full(), dtype=bool)
+        return np.array(
+            ca.DM(ca.jacobian(y, u).sparsity(), 1.0).full(), dtype=bool
+        )
 
     @cached_property
     def hessian_pattern(self) -> NDArray[np.bool_]:
@@ -128,14 +136,24 @@ class GeneratedFunction:
     @cached_property
     def _slopes(self) -> ca.Function:
         u, data, y = self._symbols
-        return ca.Function("slopes", [u, data], [y, ca.densify(ca.jacobian(y, u))], CASADI_OPTIONS)
+        return ca.Function(
+            "slopes",
+            [u, data],
+            [y, ca.densify(ca.jacobian(y, u))],
+            CASADI_OPTIONS,
+        )
 
     @cached_property
     def _curvature(self) -> ca.Function:
         u, data, y = self._symbols
         weights = ca.SX.sym("weights", y.numel())
         second, _ = ca.hessian(ca.dot(weights, y), u)
-        return ca.Function("curvature", [u, data, weights], [ca.densify(second)], CASADI_OPTIONS)
+        return ca.Function(
+            "curvature",
+            [u, data, weights],
+            [ca.densify(second)],
+            CASADI_OPTIONS,
+        )
 
     def _evaluate_at_instances(
         self, function: ca.Function, u: Array, *others: Array
@@ -155,17 +173,26 @@ class GeneratedFunction:
         shape = others[0].shape[1:]
         count = int(np.prod(shape))
         if u.ndim == 1:
-            u = np.broadcast_to(u.reshape(-1, *(1 for _ in shape)), (len(u), *shape))
+            u = np.broadcast_to(
+                u.reshape(-1, *(1 for _ in shape)), (len(u), *shape)
+            )
         sizes = [function.size_out(k) for k in range(function.n_out())]
         if not count:
             return [np.zeros((*size, *shape)) for size in sizes]
         name = function.name()
         with COMPILING:
             if name not in self._evaluators:
-                self._evaluators[name] = make_instance_evaluator(function, self.is_compiled)
-        outputs = self._evaluators[name]([x.reshape(len(x), count) for x in (u, *others)])
+                self._evaluators[name] = make_instance_evaluator(
+                    function, self.is_compiled
+                )
+        outputs = self._evaluators[name](
+            [x.reshape(len(x), count) for x in (u, *others)]
+        )
         pairs = zip(outputs, sizes, strict=True)
-        return [each.reshape(*size[::-1], *shape).swapaxes(0, 1) for each, size in pairs]
+        return [
+            each.reshape(*size[::-1], *shape).swapaxes(0, 1)
+            for each, size in pairs
+        ]
 
     @cached_property
     def _evaluators(self) -> dict[str, Instances]:

@@ -76,9 +76,13 @@ class GraspConstraint:
             return self._constant_positions
         places, slopes = self.displaced_nodes(phi)
         rotations, shifts = self.pose_rows
-        by_phi = self._direct_derivatives + np.einsum("tgj,gjk->tgk", rotations, slopes)
+        by_phi = self._direct_derivatives + np.einsum(
+            "tgj,gjk->tgk", rotations, slopes
+        )
         positions = np.einsum("tgj,gj->tg", rotations, places) + shifts
-        positions += self._direct_derivatives @ phi[self.nuisance.motion_indices]
+        positions += (
+            self._direct_derivatives @ phi[self.nuisance.motion_indices]
+        )
         by_phi[np.isnan(positions)] = 0.0
         return PrescribedDisplacements(self.dofs, positions, by_phi)
 
@@ -92,20 +96,29 @@ class GraspConstraint:
         )
         places[:, ~self._is_body_node] = self._points[:, ~self._is_body_node]
         by_own[..., ~self._is_body_node] = 0
-        slopes = np.zeros((3, len(self.nuisance.motion_indices), places.shape[1]))
+        slopes = np.zeros(
+            (3, len(self.nuisance.motion_indices), places.shape[1])
+        )
         slopes[:, self._columns] = by_own
         places = places.T[self._node_of_dof]
         slopes = np.moveaxis(slopes, 2, 0)[self._node_of_dof]
         for columns, obstacle, row, axis, place in self._obstacle_parameters:
             if row != OBSTACLE_TIME:
-                column = np.flatnonzero(self.nuisance.motion_indices == place)[0]
+                column = np.flatnonzero(self.nuisance.motion_indices == place)[
+                    0
+                ]
                 frame_m = self.experiment.body.nodes_m[obstacle.nodes]
-                directions = np.broadcast_to(obstacle.offset_direction, frame_m.shape)
+                directions = np.broadcast_to(
+                    obstacle.offset_direction, frame_m.shape
+                )
                 if row == OBSTACLE_TILT:
                     directions = np.cross(
-                        obstacle.tilt_axes[axis], frame_m - obstacle.shape.tilt_centre_m
+                        obstacle.tilt_axes[axis],
+                        frame_m - obstacle.shape.tilt_centre_m,
                     )
-                displacement = self.nuisance.scales[place] * np.repeat(directions, 3, axis=0)
+                displacement = self.nuisance.scales[place] * np.repeat(
+                    directions, 3, axis=0
+                )
                 slopes[columns, :, column] = displacement
                 places[columns] += phi[place] * displacement
         return places, slopes
@@ -114,7 +127,9 @@ class GraspConstraint:
         """Return Σ weights[t, g] ∂²position/∂φ² (m, m) by the φ of the motion, for weights (N, g)
         that are zero while a dof is free.
         """
-        point_weights = np.einsum("tgj,tg->gj", np.nan_to_num(self.pose_rows[0]), weights)
+        point_weights = np.einsum(
+            "tgj,tg->gj", np.nan_to_num(self.pose_rows[0]), weights
+        )
         node_weights = np.zeros_like(self._points.T)
         np.add.at(node_weights, self._node_of_dof, point_weights)
         node_weights[~self._is_body_node] = 0.0
@@ -139,19 +154,29 @@ class GraspConstraint:
         """Derivatives of positions (N, g, m) by zeros of displacements and by delays of
         obstacles.
         """
-        derivatives = np.zeros((len(self.t_s), len(self.dofs), len(self.nuisance.motion_indices)))
+        derivatives = np.zeros(
+            (len(self.t_s), len(self.dofs), len(self.nuisance.motion_indices))
+        )
         for number, grasp in enumerate(self.experiment.body_grasps):
             rows = np.flatnonzero(grasp.is_active(self.t_s))
             for axis, place in zip(
-                grasp.zero, self.nuisance.displacement_zero_indices(number), strict=False
+                grasp.zero,
+                self.nuisance.displacement_zero_indices(number),
+                strict=False,
             ):
-                columns = np.searchsorted(self.dofs, 3 * grasp.nodes + "xyz".index(axis))
+                columns = np.searchsorted(
+                    self.dofs, 3 * grasp.nodes + "xyz".index(axis)
+                )
                 column = np.flatnonzero(self.nuisance.motion_indices == place)
-                derivatives[np.ix_(rows, columns, column)] = self.nuisance.scales[place]
+                derivatives[np.ix_(rows, columns, column)] = (
+                    self.nuisance.scales[place]
+                )
             for place in self.nuisance.strain_zero_indices:
                 columns = np.searchsorted(self.dofs, grasp.prescribed_dofs)
                 column = np.flatnonzero(self.nuisance.motion_indices == place)
-                shifts_m = np.tile(self.nuisance.strain_shifts_m[number], len(grasp.nodes))
+                shifts_m = np.tile(
+                    self.nuisance.strain_shifts_m[number], len(grasp.nodes)
+                )
                 own_m = shifts_m.reshape(-1, 3)[:, grasp.axis_indices].ravel()
                 derivatives[np.ix_(rows, columns, column)] = (
                     self.nuisance.scales[place] * own_m[None, :, None]
@@ -164,13 +189,19 @@ class GraspConstraint:
                     obstacle.poses.moved_positions(places_m, self.t_s + s)
                     for s in (half_interval_s, -half_interval_s)
                 )
-                rate = (before - after).reshape(len(self.t_s), -1) / (2 * half_interval_s)
+                rate = (before - after).reshape(len(self.t_s), -1) / (
+                    2 * half_interval_s
+                )
                 column = np.flatnonzero(self.nuisance.motion_indices == place)
-                derivatives[:, columns, column] = self.nuisance.scales[place] * rate
+                derivatives[:, columns, column] = (
+                    self.nuisance.scales[place] * rate
+                )
         return derivatives
 
     @property
-    def _obstacle_parameters(self) -> Iterator[tuple[Index, Obstacle, NuisanceRow, int, int]]:
+    def _obstacle_parameters(
+        self,
+    ) -> Iterator[tuple[Index, Obstacle, NuisanceRow, int, int]]:
         """For each nuisance parameter of an obstacle, yield the positions of the obstacle's dofs in
         `dofs`, the obstacle, the row, the axis and the index in φ.
         """
@@ -202,14 +233,20 @@ class GraspConstraint:
     @property
     def _columns(self) -> Index:
         """Positions of the parameters of H among the nuisance parameters that affect the motion."""
-        return np.flatnonzero(np.isin(self.nuisance.motion_indices, self.nuisance.grasp_indices))
+        return np.flatnonzero(
+            np.isin(self.nuisance.motion_indices, self.nuisance.grasp_indices)
+        )
 
     @cached_property
     def _constant_positions(self) -> PrescribedDisplacements:
         """Prescribed positions where they do not depend on φ."""
-        goals_m = self.experiment.prescribed_displacements(self.t_s)[1].reshape(len(self.t_s), -1)
+        goals_m = self.experiment.prescribed_displacements(self.t_s)[1].reshape(
+            len(self.t_s), -1
+        )
         return PrescribedDisplacements(
-            self.dofs, goals_m[:, self.dofs], np.zeros((len(goals_m), len(self.dofs), 0))
+            self.dofs,
+            goals_m[:, self.dofs],
+            np.zeros((len(goals_m), len(self.dofs), 0)),
         )
 
     @cached_property
@@ -218,7 +255,8 @@ class GraspConstraint:
         [m], so that the position is rotation · H X + shift; NaN while the dof is free.
         """
         rotations, shifts_m = (
-            np.full((len(self.t_s), len(self.dofs), *s), np.nan) for s in ((3,), ())
+            np.full((len(self.t_s), len(self.dofs), *s), np.nan)
+            for s in ((3,), ())
         )
         for grasp in self.experiment.grasps:
             times = np.flatnonzero(grasp.is_active(self.t_s))

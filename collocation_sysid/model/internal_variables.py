@@ -61,12 +61,16 @@ def histories_of_trajectory(
     for number in forces.terms_with_internal_variables:
         before = previous_states.get(len(collected))
         collected.append(
-            ForceHistory.from_states(forces, number, xi=xi, nu=nu, since_s=since_s, before=before)
+            ForceHistory.from_states(
+                forces, number, xi=xi, nu=nu, since_s=since_s, before=before
+            )
         )
     return tuple(collected)
 
 
-def insert_histories(forces: Forces, histories: Sequence[AnyHistory], rows: slice) -> Forces:
+def insert_histories(
+    forces: Forces, histories: Sequence[AnyHistory], rows: slice
+) -> Forces:
     """Return the forces of some evaluations with the internal variables of the histories.
 
     Parameters
@@ -82,7 +86,9 @@ def insert_histories(forces: Forces, histories: Sequence[AnyHistory], rows: slic
     return forces
 
 
-def start_states(forces: Forces, x: Array, v: Array, loaded_s: float) -> tuple[PreviousState, ...]:
+def start_states(
+    forces: Forces, x: Array, v: Array, loaded_s: float
+) -> tuple[PreviousState, ...]:
     """Return the internal variables in the start state: positions x [m] and velocities v [m/s],
     (3n,) each.
 
@@ -102,7 +108,9 @@ def start_states(forces: Forces, x: Array, v: Array, loaded_s: float) -> tuple[P
         for number in forces.terms_with_internal_variables
     ]
     if forces.body.has_memory:
-        states.insert(0, MemoryState.at_start(forces.body, x, forces.theta, loaded_s))
+        states.insert(
+            0, MemoryState.at_start(forces.body, x, forces.theta, loaded_s)
+        )
     return tuple(states)
 
 
@@ -125,9 +133,15 @@ def insert_previous_states(
 
 
 def advance_states(
-    forces: Forces, previous_states: Sequence[PreviousState], x: Array, v: Array, interval_s: float
+    forces: Forces,
+    previous_states: Sequence[PreviousState],
+    x: Array,
+    v: Array,
+    interval_s: float,
 ) -> tuple[PreviousState, ...]:
     """Return the internal variables in a state (x, v), (3n,) each, `interval_s` [s] after that of
     `previous_states`; `forces` are those at the later time.
     """
-    return tuple(each.advance(forces, x, v, interval_s) for each in previous_states)
+    return tuple(
+        each.advance(forces, x, v, interval_s) for each in previous_states
+    )

@@ -174,7 +174,9 @@ class NuisanceMap:
     strain_shifts_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod
-    def from_experiment(cls, experiment: Experiment, pivot_m: Array | None = None) -> NuisanceMap:
+    def from_experiment(
+        cls, experiment: Experiment, pivot_m: Array | None = None
+    ) -> NuisanceMap:
         """Return the nuisance parameters of an experiment.
 
         A parameter that recordings share has the same name in all of them.
@@ -194,24 +196,40 @@ class NuisanceMap:
         entries = tuple(_entries(experiment))
         body = experiment.body
         scope = experiment.nuisance.scope
-        middle_m = experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0)
+        middle_m = experiment.rigid_positions(experiment.t_s[:1])[0].mean(
+            axis=0
+        )
         scales = np.array([entry.sigma for entry in entries], dtype=float)
         # Of each kind once: a body may carry thousands of markers.
         rows = {entry.row.name: entry.row for entry in entries}
-        steps = {name: row.step(experiment) for name, row in rows.items() if row.step is not None}
-        reach = [min(e.row.reach, steps.get(e.row.name, np.inf) / e.sigma) for e in entries]
+        steps = {
+            name: row.step(experiment)
+            for name, row in rows.items()
+            if row.step is not None
+        }
+        reach = [
+            min(e.row.reach, steps.get(e.row.name, np.inf) / e.sigma)
+            for e in entries
+        ]
         grasped_nodes = prescribed_nodes(experiment.body_grasps)
         nuisance_map = cls(
             entries,
-            tuple(f"{scope.get(e.row.name, experiment.name)}: {e.label}" for e in entries),
+            tuple(
+                f"{scope.get(e.row.name, experiment.name)}: {e.label}"
+                for e in entries
+            ),
             scales,
             np.array(reach),
             experiment.timestep_s,
             experiment.duration_s,
             np.array(experiment.gravity_m_s2),
             middle_m if pivot_m is None else pivot_m,
-            body.nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(axis=0),
-            np.array([a.calibration for a in experiment.actuators]).reshape(-1, 3),
+            body.nodes_m[
+                grasped_nodes if len(grasped_nodes) else slice(None)
+            ].mean(axis=0),
+            np.array([a.calibration for a in experiment.actuators]).reshape(
+                -1, 3
+            ),
             tuple(timed for _, timed in _timed_loads(experiment)),
             (float(experiment.t_s[0]), float(experiment.t_s[-1])),
             _strain_shifts_m(experiment),
@@ -234,34 +252,50 @@ class NuisanceMap:
         what = "reading" if row.reading else "clock"
         try:
             expression: Any = row.reading and row.reading(y, values, t_s, self)
-            expression = ca.SX(row.clock(values, t_s, self) if row.clock else expression)
+            expression = ca.SX(
+                row.clock(values, t_s, self) if row.clock else expression
+            )
         except Exception as error:
-            raise InputError(f"the {what} of {row.name} failed: {reason(error)}") from error
+            raise InputError(
+                f"the {what} of {row.name} failed: {reason(error)}"
+            ) from error
         expected = (3, 1) if row.reading else (1, 1)
         if expression.shape != expected:
-            problem = f"the {what} of {row.name} has the shape {expression.shape}"
+            problem = (
+                f"the {what} of {row.name} has the shape {expression.shape}"
+            )
             raise InputError(f"{problem}; expected {expected}")
         slopes = ca.Function(
-            "slopes", [y, values, t_s], [expression, ca.jacobian(expression, values)]
+            "slopes",
+            [y, values, t_s],
+            [expression, ca.jacobian(expression, values)],
         )
         evaluated = slopes([0.1, 0.2, 0.3], 0.0, self.interval_s)
         if not all(np.isfinite(part.full()).all() for part in evaluated):
-            raise InputError(f"the {what} of {row.name} or its derivatives are not finite at zero")
+            raise InputError(
+                f"the {what} of {row.name} or its derivatives are not finite at zero"
+            )
 
     @property
     def size(self) -> int:
         """Number k of nuisance parameters."""
         return len(self.names)
 
-    def iterate_values(self, phi: Array) -> Iterator[tuple[NuisanceEntry, str, float]]:
+    def iterate_values(
+        self, phi: Array
+    ) -> Iterator[tuple[NuisanceEntry, str, float]]:
         """Yield entry, name and value (in the entry's unit) of each parameter at φ, except for the
         places of markers.
         """
-        for entry, name, value in zip(self.entries, self.names, phi * self.scales, strict=True):
+        for entry, name, value in zip(
+            self.entries, self.names, phi * self.scales, strict=True
+        ):
             if entry.row != PLACE:
                 yield entry, name, float(value)
 
-    def indices_of_rows(self, *rows: NuisanceRow, component: int | None = None) -> Index:
+    def indices_of_rows(
+        self, *rows: NuisanceRow, component: int | None = None
+    ) -> Index:
         """Return the indices in φ of some rows, of all components or of one.
 
         Parameters
@@ -270,18 +304,24 @@ class NuisanceMap:
         component : int, optional
             Index of the component.
         """
-        return self._indices_where(lambda e: e.row in rows and component in (None, e.number))
+        return self._indices_where(
+            lambda e: e.row in rows and component in (None, e.number)
+        )
 
     def _indices_where(self, chosen: Callable[[NuisanceEntry], bool]) -> Index:
         """Return the indices in φ of the entries for which a function is true."""
-        return np.array([k for k, e in enumerate(self.entries) if chosen(e)], dtype=np.int64)
+        return np.array(
+            [k for k, e in enumerate(self.entries) if chosen(e)], dtype=np.int64
+        )
 
     @cached_property
     def motion_indices(self) -> Index:
         """Indices in φ of the parameters that affect the motion: gravity, grasps, loads,
         actuators.
         """
-        return self._indices_where(lambda e: not CHANGES_OF_MOTION.isdisjoint(e.row.changes))
+        return self._indices_where(
+            lambda e: not CHANGES_OF_MOTION.isdisjoint(e.row.changes)
+        )
 
     @cached_property
     def actuator_indices(self) -> Index:
@@ -292,7 +332,11 @@ class NuisanceMap:
         """Return the indices in φ of factor, offset and logarithm of the lag of the actuator with
         index `number`; −1 for one that is not estimated.
         """
-        columns = {TENSION_OFFSET.name: 1, PRESSURE_OFFSET.name: 1, PRESSURE_LAG.name: 2}
+        columns = {
+            TENSION_OFFSET.name: 1,
+            PRESSURE_OFFSET.name: 1,
+            PRESSURE_LAG.name: 2,
+        }
         indices = [-1, -1, -1]
         for k in self.actuator_indices:
             if self.entries[k].number == number:
@@ -306,8 +350,12 @@ class NuisanceMap:
         calibration = self.declared_calibration.copy()
         values = phi * self.scales
         for number in range(len(calibration)):
-            for column, place in enumerate(self.actuator_calibration_indices(number)):
-                calibration[number, column] += 0.0 if place < 0 else values[place]
+            for column, place in enumerate(
+                self.actuator_calibration_indices(number)
+            ):
+                calibration[number, column] += (
+                    0.0 if place < 0 else values[place]
+                )
         return calibration
 
     # What markers read --------------------------------------------------------------------------
@@ -316,12 +364,22 @@ class NuisanceMap:
         """Return the indices in φ (count, f) of the parameters on which the measurement of each of
         `count` markers depends: those of the marker, then those of all markers.
         """
-        read = self._indices_where(lambda e: e.row.reading is not None or e.row.clock is not None)
+        read = self._indices_where(
+            lambda e: e.row.reading is not None or e.row.clock is not None
+        )
         single = [k for k in read if self.entries[k].row.of == "marker"]
-        of_marker = [[k for k in single if self.entries[k].number == m] for m in range(count)]
+        of_marker = [
+            [k for k in single if self.entries[k].number == m]
+            for m in range(count)
+        ]
         common = np.tile(np.setdiff1d(read, single), (count, 1))
         return np.hstack(
-            [np.array(of_marker, dtype=np.int64).reshape(count, -1 if count else 0), common]
+            [
+                np.array(of_marker, dtype=np.int64).reshape(
+                    count, -1 if count else 0
+                ),
+                common,
+            ]
         )
 
     @cached_property
@@ -342,9 +400,14 @@ class NuisanceMap:
             Time of the sample.
         """
         values = self.values_by_row(phi, places)
-        return sum((row.clock(values[row], t_s, self) for row in values if row.clock), ca.SX(0))
+        return sum(
+            (row.clock(values[row], t_s, self) for row in values if row.clock),
+            ca.SX(0),
+        )
 
-    def marker_measurement(self, y: ca.SX, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
+    def marker_measurement(
+        self, y: ca.SX, phi: ca.SX, places: Index, t_s: ca.SX
+    ) -> ca.SX:
         """Return the measured position (3,) of a marker whose true position is y (3,).
 
         Effects common to all markers are applied before those of the single marker.
@@ -361,7 +424,11 @@ class NuisanceMap:
         """
         values = self.values_by_row(phi, places)
         for row in sorted(values, key=lambda row: row.of == "marker"):
-            y = y if row.reading is None else row.reading(y, values[row], t_s, self)
+            y = (
+                y
+                if row.reading is None
+                else row.reading(y, values[row], t_s, self)
+            )
         return y
 
     # What moves the body ------------------------------------------------------------------------
@@ -382,7 +449,9 @@ class NuisanceMap:
         """Indices in φ of the zero of the strain of a specimen; empty if it is not estimated."""
         return self.indices_of_rows(STRAIN_ZERO)
 
-    def obstacle_parameters(self, number: int) -> list[tuple[NuisanceRow, int, int]]:
+    def obstacle_parameters(
+        self, number: int
+    ) -> list[tuple[NuisanceRow, int, int]]:
         """Return row, axis and index in φ of every nuisance parameter of an obstacle.
 
         Parameters
@@ -390,18 +459,33 @@ class NuisanceMap:
         number : int
             Index among the grasps, in which obstacles follow the grippers.
         """
-        own = (k for k in self.motion_indices.tolist() if self.entries[k].row.of == "obstacle")
-        here = ((self.entries[k], k) for k in own if self.entries[k].number == number)
+        own = (
+            k
+            for k in self.motion_indices.tolist()
+            if self.entries[k].row.of == "obstacle"
+        )
+        here = (
+            (self.entries[k], k)
+            for k in own
+            if self.entries[k].number == number
+        )
         return [(entry.row, entry.axis, k) for entry, k in here]
 
-    def with_grasps(self, grasps: Sequence[Grasp], phi: Array) -> tuple[Grasp, ...]:
+    def with_grasps(
+        self, grasps: Sequence[Grasp], phi: Array
+    ) -> tuple[Grasp, ...]:
         """Return grasps and obstacles, in the order of the experiment's `grasps`, at their poses at
         φ: with the hand–eye transform, delays and offsets.
         """
         motion = self.grasp_motion_matrix(phi)
-        return tuple(self._with_grasp(k, grasp, motion, phi) for k, grasp in enumerate(grasps))
+        return tuple(
+            self._with_grasp(k, grasp, motion, phi)
+            for k, grasp in enumerate(grasps)
+        )
 
-    def _with_grasp(self, number: int, grasp: Grasp, motion: Array, phi: Array) -> Grasp:
+    def _with_grasp(
+        self, number: int, grasp: Grasp, motion: Array, phi: Array
+    ) -> Grasp:
         """Return one grasp or obstacle at its pose at φ.
 
         Parameters
@@ -416,18 +500,27 @@ class NuisanceMap:
         if isinstance(grasp, Obstacle):
             deviations: dict[NuisanceRow, Array] = {}
             for row, axis, place in self.obstacle_parameters(number):
-                deviations.setdefault(row, np.zeros(2))[axis] = phi[place] * self.scales[place]
+                deviations.setdefault(row, np.zeros(2))[axis] = (
+                    phi[place] * self.scales[place]
+                )
             zeros = np.zeros(2)
             offset, delay_s = (
-                deviations.get(r, zeros)[0] for r in (OBSTACLE_OFFSET, OBSTACLE_TIME)
+                deviations.get(r, zeros)[0]
+                for r in (OBSTACLE_OFFSET, OBSTACLE_TIME)
             )
-            return grasp.displaced(offset, deviations.get(OBSTACLE_TILT, zeros), delay_s)
+            return grasp.displaced(
+                offset, deviations.get(OBSTACLE_TILT, zeros), delay_s
+            )
         zero_m = np.zeros(3)
         for place in self.displacement_zero_indices(number):
             zero_m[self.entries[place].axis] = phi[place] * self.scales[place]
         for place in self.strain_zero_indices:
-            zero_m += phi[place] * self.scales[place] * self.strain_shifts_m[number]
-        return replace(grasp, poses=grasp.poses.after(motion).with_shift(zero_m))
+            zero_m += (
+                phi[place] * self.scales[place] * self.strain_shifts_m[number]
+            )
+        return replace(
+            grasp, poses=grasp.poses.after(motion).with_shift(zero_m)
+        )
 
     def bounds(self, samples: int) -> tuple[Array, Array]:
         """Return the lowest and the highest φ (k,) with valid measurements and loads.
@@ -447,8 +540,12 @@ class NuisanceMap:
             largest_s = max(range_s, LARGEST_DELAY_FRACTION * self.duration_s)
             low[k] = max(middle_s - range_s, -largest_s) / unit
             high[k] = min(middle_s + range_s, largest_s) / unit
-        for k, timed in zip(self.indices_of_rows(JOINING), self.timed_loads, strict=True):
-            margins = (np.array(self.recorded_s) - timed.declared_s) / self.scales[k]
+        for k, timed in zip(
+            self.indices_of_rows(JOINING), self.timed_loads, strict=True
+        ):
+            margins = (
+                np.array(self.recorded_s) - timed.declared_s
+            ) / self.scales[k]
             low[k], high[k] = np.clip(
                 INSIDE_RECORDING_FACTOR * margins,
                 -LARGEST_JOINING_DELAY_SIGMAS,
@@ -484,7 +581,9 @@ class NuisanceMap:
     @cached_property
     def grasp_motion(self) -> GeneratedFunction:
         """Expression of H X for a point X, of the φ of `grasp_indices`."""
-        return GeneratedFunction(self._displaced_point, len(self.grasp_indices), data_size=3)
+        return GeneratedFunction(
+            self._displaced_point, len(self.grasp_indices), data_size=3
+        )
 
     def _displaced_point(self, phi: ca.SX, point: ca.SX) -> ca.SX:
         """Return H X (3,) of a point X (3,) of the undeformed body [m], with the hand–eye transform
@@ -493,7 +592,9 @@ class NuisanceMap:
         values = self.values_by_row(phi, self.grasp_indices)
         if GRASP_TURN in values:
             pivot = ca.DM(self.grasp_pivot_m)
-            point = cayley_rotation(values[GRASP_TURN]) @ (point - pivot) + pivot
+            point = (
+                cayley_rotation(values[GRASP_TURN]) @ (point - pivot) + pivot
+            )
         if GRASP_SHIFT in values:
             point = point + values[GRASP_SHIFT]
         return point
@@ -503,14 +604,20 @@ class NuisanceMap:
         points = np.hstack([np.zeros((3, 1)), np.eye(3)])
         images = self.grasp_motion.evaluate(phi[self.grasp_indices], points)
         matrix = np.eye(4)
-        matrix[:3] = np.column_stack([images[:, 1:] - images[:, :1], images[:, 0]])
+        matrix[:3] = np.column_stack(
+            [images[:, 1:] - images[:, :1], images[:, 0]]
+        )
         return matrix
 
     def gravity(self, phi: Array) -> Array:
         """Return gravity (3,) in the frame of the body at φ [m/s²]."""
         if not len(self.gravity_indices):
             return self.gravity_m_s2
-        return ca.evalf(self.gravity_expression(ca.SX(phi[self.gravity_indices]))).full().ravel()
+        return (
+            ca.evalf(self.gravity_expression(ca.SX(phi[self.gravity_indices])))
+            .full()
+            .ravel()
+        )
 
     @cached_property
     def gravity_indices(self) -> Index:
@@ -529,7 +636,9 @@ class NuisanceMap:
             gravity = cayley_rotation(values[POSE_TURN]).T @ gravity
         return ca.SX(gravity)
 
-    def values_by_row(self, phi: ca.SX, places: Index) -> dict[NuisanceRow, ca.SX]:
+    def values_by_row(
+        self, phi: ca.SX, places: Index
+    ) -> dict[NuisanceRow, ca.SX]:
         """Return parameters with units by row, each a column vector.
 
         Parameters
@@ -567,7 +676,12 @@ def _strain_shifts_m(experiment: Experiment) -> Array:
         return np.zeros((0, 3))
     moving = experiment.specimen.displaced_nodes()
     still = np.zeros(3), np.zeros(3)
-    return np.array([sum(moving.get(int(g.nodes[0]), still)) for g in experiment.body_grasps])
+    return np.array(
+        [
+            sum(moving.get(int(g.nodes[0]), still))
+            for g in experiment.body_grasps
+        ]
+    )
 
 
 def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
@@ -578,18 +692,30 @@ def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
             _components(experiment, applicable[0].of) if applicable else ()
         ):
             for row in applicable:
-                for axis, name, unit, sigma in _component_axes(experiment, row, number):
+                for axis, name, unit, sigma in _component_axes(
+                    experiment, row, number
+                ):
                     label = row.label.format(which=component_name, axis=name)
                     yield NuisanceEntry(
-                        row, number, axis=axis, label=f"{label} [{unit}]", sigma=sigma
+                        row,
+                        number,
+                        axis=axis,
+                        label=f"{label} [{unit}]",
+                        sigma=sigma,
                     )
     for number, gauge in enumerate(experiment.readings):
         for axis, (name, sigma) in enumerate(gauge.unknowns.items()):
-            label = f"{without_unit(name)} of {gauge.name} [{unit_of(name) or '1'}]"
-            yield NuisanceEntry(GAUGE, number, axis=axis, label=label, sigma=sigma)
+            label = (
+                f"{without_unit(name)} of {gauge.name} [{unit_of(name) or '1'}]"
+            )
+            yield NuisanceEntry(
+                GAUGE, number, axis=axis, label=label, sigma=sigma
+            )
 
 
-def _components(experiment: Experiment, of: Component) -> Iterable[tuple[int, str]]:
+def _components(
+    experiment: Experiment, of: Component
+) -> Iterable[tuple[int, str]]:
     """Return index and name of all components of one kind, such as all markers."""
     names = experiment.markers.names
     if of == "recording":
@@ -597,11 +723,17 @@ def _components(experiment: Experiment, of: Component) -> Iterable[tuple[int, st
     if of == "marker":
         return enumerate(names)
     if of == "place":
-        return [(m, names[m]) for m in np.flatnonzero(experiment.place_sigma_m > 0).tolist()]
+        return [
+            (m, names[m])
+            for m in np.flatnonzero(experiment.place_sigma_m > 0).tolist()
+        ]
     if of == "grasp":
         return [(k, str(k + 1)) for k in range(len(experiment.body_grasps))]
     if of == "obstacle":
-        return enumerate((each.name for each in experiment.obstacles), len(experiment.body_grasps))
+        return enumerate(
+            (each.name for each in experiment.obstacles),
+            len(experiment.body_grasps),
+        )
     if of == "depth":
         return enumerate(depth.name for depth in experiment.depths)
     if of == "load":
@@ -640,23 +772,39 @@ def _component_axes(
     if row == TARE:
         wrench = _wrenches(experiment)[number]
         measured = np.flatnonzero(wrench.measured_components).tolist()
-        return [(k, COMPONENTS[k], UNITS[k], sigma * float(wrench.sigmas[k])) for k in measured]
+        return [
+            (k, COMPONENTS[k], UNITS[k], sigma * float(wrench.sigmas[k]))
+            for k in measured
+        ]
     if row in (OBSTACLE_TILT, OBSTACLE_TIME):
         obstacle = experiment.grasps[number]
         assert isinstance(obstacle, Obstacle)
-        if not (obstacle.shape.has_tilt if row == OBSTACLE_TILT else len(obstacle.poses.t_s) > 1):
+        if not (
+            obstacle.shape.has_tilt
+            if row == OBSTACLE_TILT
+            else len(obstacle.poses.t_s) > 1
+        ):
             return []
-    if row in (DEPTH_BIAS, DEPTH_SCALE) and experiment.depths[number].camera.matrix is None:
+    if (
+        row in (DEPTH_BIAS, DEPTH_SCALE)
+        and experiment.depths[number].camera.matrix is None
+    ):
         return []
     if row == DEPTH_EDGE and not len(experiment.depths[number].images_m):
         return []
     axes = [(axis, name, row.unit, sigma) for axis, name in enumerate(names)]
-    return [each for each in axes if row != ZERO or each[1] in experiment.grasps[number].zero]
+    return [
+        each
+        for each in axes
+        if row != ZERO or each[1] in experiment.grasps[number].zero
+    ]
 
 
 def _wrenches(experiment: Experiment) -> list[Wrench]:
     """Return the wrench sensors of all grasps."""
-    return [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
+    return [
+        grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None
+    ]
 
 
 def _timed_loads(experiment: Experiment) -> list[tuple[str, TimedLoad]]:
@@ -666,7 +814,10 @@ def _timed_loads(experiment: Experiment) -> list[tuple[str, TimedLoad]]:
     verbs: dict[LoadTime, str] = {"from_s": "joining", "until_s": "leaving"}
     return [
         (f"{verbs[change]} of {kind} {number}", TimedLoad(load, change))
-        for kind, loads in (("mass", experiment.masses), ("force", experiment.forces))
+        for kind, loads in (
+            ("mass", experiment.masses),
+            ("force", experiment.forces),
+        )
         for number, load in enumerate(loads, start=1)
         for change in get_args(LoadTime)
         if experiment.changes_within(load, change)

@@ -64,7 +64,12 @@ class Unknown:
 
 
 # Keys of the table of a parameter in a problem file.
-PARAMETER_KEYS = (*(field.name for field in fields(Unknown)), "fixed", "tied_to", "ratio")
+PARAMETER_KEYS = (
+    *(field.name for field in fields(Unknown)),
+    "fixed",
+    "tied_to",
+    "ratio",
+)
 
 
 @dataclass(frozen=True)
@@ -130,15 +135,22 @@ class Parameter:
         if self.is_fixed:
             self._check_fixed()
             return
-        least = 0.0 if self.scale == "log" else constant_named(self.name).at_least
-        if not least <= self.lower < self.upper or (self.scale == "log" and self.lower == 0):
+        least = (
+            0.0 if self.scale == "log" else constant_named(self.name).at_least
+        )
+        if not least <= self.lower < self.upper or (
+            self.scale == "log" and self.lower == 0
+        ):
             raise InputError(
                 f"lower = {self.lower:g}, upper = {self.upper:g}, expected "
                 f"{'0 < ' if self.scale == 'log' else _lower_limit_text(least)}lower < upper",
                 None,
                 self.name,
             )
-        if self.guess is not None and not self.lower <= self.guess <= self.upper:
+        if (
+            self.guess is not None
+            and not self.lower <= self.guess <= self.upper
+        ):
             raise InputError(
                 f"guess = {self.guess:g}, expected a value within [{self.lower:g}, {self.upper:g}]",
                 None,
@@ -149,17 +161,27 @@ class Parameter:
             self.prior[1] > 0 and (self.prior[0] > 0 or self.scale == "linear")
         ):
             raise InputError(
-                f"prior = {self.prior}, expected positive mean and deviation", None, self.name
+                f"prior = {self.prior}, expected positive mean and deviation",
+                None,
+                self.name,
             )
 
     def _check_fixed(self) -> None:
         """Raise an `InputError` if the fixed value is inadmissible for the constant."""
         constant = constant_named(self.name)
-        least = constant.at_least if self.scale == "linear" else constant.lower_limit
+        least = (
+            constant.at_least
+            if self.scale == "linear"
+            else constant.lower_limit
+        )
         value = np.nan if self.guess is None else self.guess
         if not (np.isfinite(value) and value >= least):
-            expected = "a number" if least == -np.inf else f"a number >= {least:g}"
-            raise InputError(f"fixed = {value:g}, expected {expected}", None, self.name)
+            expected = (
+                "a number" if least == -np.inf else f"a number >= {least:g}"
+            )
+            raise InputError(
+                f"fixed = {value:g}, expected {expected}", None, self.name
+            )
         self._require_below_limit(value, "fixed")
 
     def _require_below_limit(self, value: float, what: str) -> None:
@@ -179,12 +201,16 @@ class Parameter:
                 else ""
             )
             raise InputError(
-                f"{what} = {value:g}, expected less than {limit:g}{why}", None, self.name
+                f"{what} = {value:g}, expected less than {limit:g}{why}",
+                None,
+                self.name,
             )
 
     def to_coordinate(self, value: float) -> float:
         """Return the solver's coordinate q of a value."""
-        return float(np.log(value)) if self.scale == "log" else value / self.unit
+        return (
+            float(np.log(value)) if self.scale == "log" else value / self.unit
+        )
 
     def from_coordinate(self, q: float) -> float:
         """Return the value at a solver's coordinate q."""
@@ -205,7 +231,9 @@ def _lower_limit_text(least: float) -> str:
 FIRST_CONTRAST = 2.0
 
 
-def complete_parameter(name: str, user_statement: Unknown | Tied | float) -> Parameter:
+def complete_parameter(
+    name: str, user_statement: Unknown | Tied | float
+) -> Parameter:
     """Return the complete definition of a parameter, with defaults from its constant.
 
     Parameters
@@ -256,9 +284,15 @@ def complete_parameter(name: str, user_statement: Unknown | Tied | float) -> Par
     try:
         return Parameter(
             name,
-            None if user_statement.guess is None else float(user_statement.guess),
-            low if user_statement.lower is None else float(user_statement.lower),
-            high if user_statement.upper is None else float(user_statement.upper),
+            None
+            if user_statement.guess is None
+            else float(user_statement.guess),
+            low
+            if user_statement.lower is None
+            else float(user_statement.lower),
+            high
+            if user_statement.upper is None
+            else float(user_statement.upper),
             prior=(0.0, 1.0)
             if user_statement.prior is None and is_field_coefficient(name)
             else user_statement.prior,
@@ -266,7 +300,10 @@ def complete_parameter(name: str, user_statement: Unknown | Tied | float) -> Par
             unit=float(typical) if scale == "linear" else 1.0,
         )
     except InputError as error:
-        if user_statement.lower is not None and user_statement.upper is not None:
+        if (
+            user_statement.lower is not None
+            and user_statement.upper is not None
+        ):
             raise
         message = f"{error.message}; where lower or upper is not given, these bounds are assumed"
         raise InputError(message, None, name) from error
@@ -304,13 +341,22 @@ class Parameters:
                 )
 
     def __repr__(self) -> str:
-        described = (item for item in self.items if not is_field_coefficient(item.name))
+        described = (
+            item for item in self.items if not is_field_coefficient(item.name)
+        )
         return f"Parameters({', '.join(map(_describe, described))})"
 
     @classmethod
-    def from_mapping(cls, statements: Mapping[str, Unknown | Tied | float]) -> Parameters:
+    def from_mapping(
+        cls, statements: Mapping[str, Unknown | Tied | float]
+    ) -> Parameters:
         """Return parameters from the user's statements by name; a number is a fixed value."""
-        return cls(tuple(complete_parameter(name, value) for name, value in statements.items()))
+        return cls(
+            tuple(
+                complete_parameter(name, value)
+                for name, value in statements.items()
+            )
+        )
 
     def with_fields(self, bodies: Iterable[Body]) -> Parameters:
         """Return these parameters with those of the bodies' fields that are not stated yet.
@@ -319,7 +365,9 @@ class Parameters:
         nor has a prior gets the prior of its field.
         """
         bodies = tuple(bodies)
-        names = dict.fromkeys(name for body in bodies for name in body.field_coefficient_names)
+        names = dict.fromkeys(
+            name for body in bodies for name in body.field_coefficient_names
+        )
         priors = {
             name: (1.0, deviation)
             for body in bodies
@@ -336,7 +384,11 @@ class Parameters:
             for name, prior in priors.items()
             if name not in self.names
         )
-        modes = (complete_parameter(name, Unknown(0.0)) for name in names if name not in self.names)
+        modes = (
+            complete_parameter(name, Unknown(0.0))
+            for name in names
+            if name not in self.names
+        )
         return Parameters((*own_items, *contrasts, *modes))
 
     def only_fixed(self, values: Mapping[str, float]) -> Parameters:
@@ -362,12 +414,18 @@ class Parameters:
     @cached_property
     def free(self) -> tuple[Parameter, ...]:
         """Parameters that are estimated, in the order of q."""
-        return tuple(item for item in self.items if not item.is_fixed and item.tied is None)
+        return tuple(
+            item
+            for item in self.items
+            if not item.is_fixed and item.tied is None
+        )
 
     @property
     def linear_names(self) -> frozenset[str]:
         """Names of the parameters with linear scale."""
-        return frozenset(item.name for item in self.items if item.scale == "linear")
+        return frozenset(
+            item.name for item in self.items if item.scale == "linear"
+        )
 
     def scale_and_bounds(self, name: str) -> tuple[bool, tuple[float, float]]:
         """Return whether a parameter has a linear scale (else a logarithmic one), and its (lower,
@@ -394,7 +452,9 @@ class Parameters:
         InputError
             If a parameter has no guess.
         """
-        return np.array([item.to_coordinate(_guess(item)) for item in self.free])
+        return np.array(
+            [item.to_coordinate(_guess(item)) for item in self.free]
+        )
 
     @property
     def bounds_q(self) -> tuple[Array, Array]:
@@ -410,7 +470,9 @@ class Parameters:
         """
         by_name = {item.name: ca.SX(item.guess or 0.0) for item in self.items}
         for k, item in enumerate(self.free):
-            by_name[item.name] = ca.exp(q[k]) if item.scale == "log" else q[k] * item.unit
+            by_name[item.name] = (
+                ca.exp(q[k]) if item.scale == "log" else q[k] * item.unit
+            )
         for item in self.items:
             if item.tied is not None:
                 by_name[item.name] = item.tied.ratio * by_name[item.tied.to]
@@ -451,7 +513,9 @@ class Parameters:
         for k, item in enumerate(self.free):
             if item.prior is not None:
                 mean, deviation = item.prior
-                slopes[k] = (1.0 if item.scale == "log" else item.unit) / deviation
+                slopes[k] = (
+                    1.0 if item.scale == "log" else item.unit
+                ) / deviation
                 residuals[k] = (q[k] - item.to_coordinate(mean)) * slopes[k]
         return residuals, slopes
 
@@ -470,7 +534,10 @@ class Parameters:
                 f"{hint_at(unknown[0], self.names)}"
             )
         return Parameters(
-            tuple(replace(i, guess=values[i.name]) if i.name in values else i for i in self.items)
+            tuple(
+                replace(i, guess=values[i.name]) if i.name in values else i
+                for i in self.items
+            )
         )
 
     def with_fixed(self, values: Mapping[str, float]) -> Parameters:
@@ -481,7 +548,9 @@ class Parameters:
         """
         return Parameters(
             tuple(
-                Parameter(i.name, values[i.name], is_fixed=True) if i.name in values else i
+                Parameter(i.name, values[i.name], is_fixed=True)
+                if i.name in values
+                else i
                 for i in self.items
             )
         )
@@ -500,14 +569,18 @@ class Parameters:
         for name in self.names:
             if name not in known:
                 parameter, _, key = name.rpartition(".")
-                if parameter in known:  # a misspelt key of a parameter's table reads like a region
+                if (
+                    parameter in known
+                ):  # a misspelt key of a parameter's table reads like a region
                     raise InputError(
                         "unknown key; expected one of "
                         f"{', '.join(PARAMETER_KEYS)}{hint_at(key, PARAMETER_KEYS)}",
                         None,
                         name,
                     )
-                expected = ", ".join(dict.fromkeys(n for body in bodies for n in body.constants))
+                expected = ", ".join(
+                    dict.fromkeys(n for body in bodies for n in body.constants)
+                )
                 raise InputError(
                     f"no such parameter; the model's are {expected}{hint_at(name, known)}",
                     None,
@@ -525,9 +598,15 @@ class Parameters:
                 )
         for item in self.items:
             stiff = without_region(item.name) in ("mu_pa", "young_pa")
-            if item.is_fixed and item.guess == 0 and (stiff or is_density(item.name)):
+            if (
+                item.is_fixed
+                and item.guess == 0
+                and (stiff or is_density(item.name))
+            ):
                 what = "a stiffness" if stiff else "a density"
-                raise InputError(f"fixed = 0, expected {what} above 0", None, item.name)
+                raise InputError(
+                    f"fixed = 0, expected {what} above 0", None, item.name
+                )
 
 
 def _guess(item: Parameter) -> float:
@@ -566,7 +645,9 @@ class ThetaMap:
 
     def expression(self, q: ca.SX, _: ca.SX | None = None) -> ca.SX:
         """Return θ (k,) as an expression in q; the second argument is not used."""
-        return ca.vertcat(*self.body.assemble_theta(self.parameters.expressions(q)))
+        return ca.vertcat(
+            *self.body.assemble_theta(self.parameters.expressions(q))
+        )
 
     def theta(self, q: Sequence[float] | Array) -> Array:
         """Return the constants θ (k,) at q (nq,)."""
@@ -574,7 +655,9 @@ class ThetaMap:
 
     def jacobian(self, q: Array) -> Array:
         """Return the derivatives ∂θ/∂q (k, nq)."""
-        return self._theta.evaluate_with_jacobian(_as_float_array(q), NOTHING)[1]
+        return self._theta.evaluate_with_jacobian(_as_float_array(q), NOTHING)[
+            1
+        ]
 
     @property
     def derived_names(self) -> tuple[str, ...]:
@@ -585,12 +668,16 @@ class ThetaMap:
         """Return the derived moduli (d,) at q, in the order of their names, and derivatives by q
         (d, nq).
         """
-        return self._derived[1].evaluate_with_jacobian(_as_float_array(q), NOTHING)
+        return self._derived[1].evaluate_with_jacobian(
+            _as_float_array(q), NOTHING
+        )
 
     @cached_property
     def _theta(self) -> GeneratedFunction:
         """Expression of θ with derivatives."""
-        return GeneratedFunction(self.expression, len(self.parameters.free), data_size=0)
+        return GeneratedFunction(
+            self.expression, len(self.parameters.free), data_size=0
+        )
 
     @cached_property
     def _derived(self) -> tuple[tuple[str, ...], GeneratedFunction]:
@@ -606,7 +693,9 @@ class ThetaMap:
         def values(q: ca.SX, _: ca.SX) -> ca.SX:
             return _derived_moduli(names, body, self.expression(q))[1]
 
-        return derived_names, GeneratedFunction(values, self._theta.input_size, data_size=0)
+        return derived_names, GeneratedFunction(
+            values, self._theta.input_size, data_size=0
+        )
 
 
 # Data of an expression that depends on q alone.
@@ -636,13 +725,22 @@ def _derived_moduli(
     """
     derived: dict[str, ca.SX] = {}
     shares = body.split_theta(theta)
-    for part, share, source in zip(body.parts, shares, body.constant_sources(names), strict=True):
+    for part, share, source in zip(
+        body.parts, shares, body.constant_sources(names), strict=True
+    ):
         lame = part.material.lame(share[: len(part.material.constants)])
         young, poisson = engineering_constants(lame[0], lame[1])
-        moduli = {"young_pa": young, "poisson": poisson, "lambda_pa": lame[0], "mu_pa": lame[1]}
+        moduli = {
+            "young_pa": young,
+            "poisson": poisson,
+            "lambda_pa": lame[0],
+            "mu_pa": lame[1],
+        }
         by_young = "young_pa" in source.names
         prefix = f"{part.name}."
-        shares_all = not any(name.startswith(prefix) for name in source.names.values())
+        shares_all = not any(
+            name.startswith(prefix) for name in source.names.values()
+        )
         if derived and shares_all:
             continue  # it has the moduli of the rest
         for own, value in moduli.items():
@@ -650,16 +748,20 @@ def _derived_moduli(
                 derived[part.full_name(own)] = value
         if part.prony:
             memory_constants = share[
-                part.law_constant_count : part.law_constant_count + 2 * len(part.prony)
+                part.law_constant_count : part.law_constant_count
+                + 2 * len(part.prony)
             ]
             derived[part.full_name(INSTANTANEOUS.name)] = young * (
                 1 + ca.sum1(memory_constants[::2])
             )
-    return tuple(derived), ca.vertcat(*derived.values()) if derived else ca.SX(0, 1)
+    return tuple(derived), ca.vertcat(*derived.values()) if derived else ca.SX(
+        0, 1
+    )
 
 
 def resolve_theta(
-    body: Body, values: Parameters | Mapping[str, float] | Sequence[float] | Array
+    body: Body,
+    values: Parameters | Mapping[str, float] | Sequence[float] | Array,
 ) -> Array:
     """Return the constants θ (k,) of a body from parameters, values by name, or θ itself.
 

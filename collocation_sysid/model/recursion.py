@@ -52,7 +52,12 @@ class Recursion:
     @property
     def input_offsets(self) -> list[int]:
         """End indices of h_{k−1}, s_k, s_{k−1} and c in the input vector of `step_function`."""
-        sizes = [self.state_size, self.signal_size, self.signal_size, self.constant_count]
+        sizes = [
+            self.state_size,
+            self.signal_size,
+            self.signal_size,
+            self.constant_count,
+        ]
         return np.cumsum(sizes).tolist()
 
     @cached_property
@@ -60,10 +65,14 @@ class Recursion:
         """Expression R of the stacked inputs u = (h_{k−1}, s_k, s_{k−1}, c), with derivatives."""
 
         def expression(u: ca.SX, data: ca.SX) -> ca.SX:
-            before, now, last, constants = ca.vertsplit(u, [0, *self.input_offsets])
+            before, now, last, constants = ca.vertsplit(
+                u, [0, *self.input_offsets]
+            )
             return self.expression(before, now, last, constants, data)
 
-        return GeneratedFunction(expression, self.input_offsets[-1], self.data_size)
+        return GeneratedFunction(
+            expression, self.input_offsets[-1], self.data_size
+        )
 
     def linear_coefficients(self, constants: ca.SX, data: ca.SX) -> ca.SX:
         """Return ∂R/∂(h_{k−1}, s_k, s_{k−1}) of a recursion that is linear in these, column by
@@ -81,7 +90,9 @@ class Recursion:
         """
         u = ca.SX.sym("u", self.input_offsets[2])
         before, now, last = ca.vertsplit(u, [0, *self.input_offsets[:3]])
-        return ca.vec(ca.jacobian(self.expression(before, now, last, constants, data), u))
+        return ca.vec(
+            ca.jacobian(self.expression(before, now, last, constants, data), u)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +151,10 @@ class RecursionTrajectory:
         before = np.arange(times.start, times.stop) - 1
         states = np.where((before < 0)[:, None], 0.0, self.states[:, before])
         last = self.signal[:, np.maximum(before, 0)]
-        c = np.broadcast_to(self.constants[:, None, None], (len(self.constants), *last.shape[1:]))
+        c = np.broadcast_to(
+            self.constants[:, None, None],
+            (len(self.constants), *last.shape[1:]),
+        )
         return np.concatenate([states, self.signal[:, times], last, c])
 
     @cached_property
@@ -148,10 +162,14 @@ class RecursionTrajectory:
         """Derivatives of R by h_{k−1}, s_k, s_{k−1} and c, a list of arrays (n, …, N, I)."""
         step = self.recursion.step_function
         all_times = slice(0, self.signal.shape[1])
-        by_u = step.evaluate_with_jacobian(self._stacked_inputs(all_times), self.data)[1]
+        by_u = step.evaluate_with_jacobian(
+            self._stacked_inputs(all_times), self.data
+        )[1]
         return np.split(by_u, self.recursion.input_offsets[:-1], axis=1)
 
-    def jacobian_vector_product(self, signal_changes: Array, constant_changes: Array) -> Array:
+    def jacobian_vector_product(
+        self, signal_changes: Array, constant_changes: Array
+    ) -> Array:
         """Return the changes of the states (n, N, I, c) for c directions at once.
 
         Parameters
@@ -164,9 +182,13 @@ class RecursionTrajectory:
         by_state, by_now, by_last, by_constants = self._jacobians
         changes = np.einsum("abkp,bkpc->akpc", by_now, signal_changes)
         changes += np.einsum("abkp,bc->akpc", by_constants, constant_changes)
-        changes[:, 1:] += np.einsum("abkp,bkpc->akpc", by_last[:, :, 1:], signal_changes[:, :-1])
+        changes[:, 1:] += np.einsum(
+            "abkp,bkpc->akpc", by_last[:, :, 1:], signal_changes[:, :-1]
+        )
         for k in range(1, changes.shape[1]):
-            changes[:, k] += np.einsum("abp,bpc->apc", by_state[:, :, k], changes[:, k - 1])
+            changes[:, k] += np.einsum(
+                "abp,bpc->apc", by_state[:, :, k], changes[:, k - 1]
+            )
         return changes
 
     def vector_jacobian_product(self, weights: Array) -> tuple[Array, Array]:
@@ -180,7 +202,11 @@ class RecursionTrajectory:
         by_state, by_now, by_last, by_constants = self._jacobians
         total = weights.copy()
         for k in range(total.shape[1] - 1, 0, -1):
-            total[:, k - 1] += np.einsum("abp,ap->bp", by_state[:, :, k], total[:, k])
+            total[:, k - 1] += np.einsum(
+                "abp,ap->bp", by_state[:, :, k], total[:, k]
+            )
         by_signal = np.einsum("abkp,akp->bkp", by_now, total)
-        by_signal[:, :-1] += np.einsum("abkp,akp->bkp", by_last[:, :, 1:], total[:, 1:])
+        by_signal[:, :-1] += np.einsum(
+            "abkp,akp->bkp", by_last[:, :, 1:], total[:, 1:]
+        )
         return by_signal, np.einsum("abkp,akp->b", by_constants, total)

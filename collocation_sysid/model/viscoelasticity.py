@@ -65,17 +65,24 @@ def _stiffening(u: ca.SX, data: ca.SX) -> ca.SX:
     since_s = data[0]
     began = data[1]
     at_once = u[0] * ca.exp(-since_s / u[1])
-    return began * at_once + (1 - began) * _stiffening_of_interval(u, since_s + began)
+    return began * at_once + (1 - began) * _stiffening_of_interval(
+        u, since_s + began
+    )
 
 
-def _overstress(before: ca.SX, now: ca.SX, _: ca.SX, u: ca.SX, data: ca.SX) -> ca.SX:
+def _overstress(
+    before: ca.SX, now: ca.SX, _: ca.SX, u: ca.SX, data: ca.SX
+) -> ca.SX:
     """Return m_k from m_{k−1} (`before`) and S_k (`now`), with u = (g, τ).
 
     Data are the time since the previous evaluation, or at the start since the load was applied; 1
     at the start, else 0; and the time to the next evaluation.
     """
     e = ca.exp(-data[2] / u[1])
-    return e * before + (e * _stiffening(u, data) - _stiffening_of_interval(u, data[2])) * now
+    return (
+        e * before
+        + (e * _stiffening(u, data) - _stiffening_of_interval(u, data[2])) * now
+    )
 
 
 OVERSTRESS = Recursion(_overstress, 1, 1, 2, 3)
@@ -85,7 +92,9 @@ def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
     """Return the coefficients c, d and a of an evaluation, with u = (g, τ); see `_overstress` for
     the data.
     """
-    return ca.vertcat(_stiffening(u, data), OVERSTRESS.linear_coefficients(u, data)[:2])
+    return ca.vertcat(
+        _stiffening(u, data), OVERSTRESS.linear_coefficients(u, data)[:2]
+    )
 
 
 COEFFICIENTS = GeneratedFunction(_coefficients, 2, 3)
@@ -133,7 +142,9 @@ class FadingCoefficients:
         loaded_s : float
             Time for which the body has been in its start shape; infinite if its memory has relaxed.
         """
-        places = np.array([(each.share, each.tau) for each in body.memory.branches]).T
+        places = np.array(
+            [(each.share, each.tau) for each in body.memory.branches]
+        ).T
         branches = len(body.memory.branches)
         shape = (branches, len(until_next_s))
         since_s = np.empty(shape)
@@ -141,7 +152,9 @@ class FadingCoefficients:
         since_s[:, 1:] = until_next_s[:-1]
         began = np.broadcast_to(np.arange(shape[1]) == 0, shape)
         data = np.stack([since_s, began, np.broadcast_to(until_next_s, shape)])
-        u = np.broadcast_to(theta[places][..., None], (2, branches, len(until_next_s)))
+        u = np.broadcast_to(
+            theta[places][..., None], (2, branches, len(until_next_s))
+        )
         (c, d, a), by = COEFFICIENTS.evaluate_with_jacobian(u, data)
         return cls(places, u, data, c, d, a, by)
 
@@ -149,7 +162,9 @@ class FadingCoefficients:
         """Return the derivatives (q, B, N) of the coefficients d and a along the q directions
         `theta_q` (k, q) of θ.
         """
-        d_q, a_q = np.einsum("cjbn,jbq->cqbn", self.by[1:], theta_q[self.places])
+        d_q, a_q = np.einsum(
+            "cjbn,jbq->cqbn", self.by[1:], theta_q[self.places]
+        )
         return d_q, a_q
 
 
@@ -206,13 +221,17 @@ class MemoryHistory:
             Given internal variables m_{k−1}; computed from the states by default.
         """
         stress = body.stresses.stress(xi, theta)
-        fades = FadingCoefficients.from_body(body, theta, until_next_s, loaded_s)
+        fades = FadingCoefficients.from_body(
+            body, theta, until_next_s, loaded_s
+        )
         if previous_variables is None:
             borne = body.memory.to_branches(stress)
             d, a = map(body.memory.repeat_over_points, (fades.d, fades.a))
             previous_variables = np.zeros(borne.shape)
             for k in range(len(previous_variables) - 1):
-                previous_variables[k + 1] = d[k] * previous_variables[k] + a[k] * borne[k]
+                previous_variables[k + 1] = (
+                    d[k] * previous_variables[k] + a[k] * borne[k]
+                )
         return cls(body, theta, xi, stress, fades, previous_variables)
 
     @property
@@ -226,14 +245,18 @@ class MemoryHistory:
         """
         past = self.memory.relaxed(len(self.xi[rows]))
         fades = self.fading
-        past.overstress[:] = self.memory.sum_over_branches(self.previous_variables[rows])
+        past.overstress[:] = self.memory.sum_over_branches(
+            self.previous_variables[rows]
+        )
         for branch, c in zip(self.memory.branches, fades.c, strict=True):
             past.stiffening[:, branch.part] += c[rows]
         second = STIFFENING.weighted_hessian(fades.u, fades.data)
-        past.stiffening_derivatives[:, fades.places] = np.moveaxis(fades.by[0, ..., rows], 2, 0)
-        past.stiffening_second_derivatives[:, fades.places[:, None], fades.places] = np.moveaxis(
-            second[..., rows], 3, 0
+        past.stiffening_derivatives[:, fades.places] = np.moveaxis(
+            fades.by[0, ..., rows], 2, 0
         )
+        past.stiffening_second_derivatives[
+            :, fades.places[:, None], fades.places
+        ] = np.moveaxis(second[..., rows], 3, 0)
         return past
 
     def insert_into(self, forces: Forces, rows: slice) -> Forces:
@@ -248,11 +271,16 @@ class MemoryHistory:
         forces : Forces
         mu : (N, all branches)
         """
-        past = replace(self.past_at(slice(None)), stress_weights=self.stress_weights(mu))
+        past = replace(
+            self.past_at(slice(None)), stress_weights=self.stress_weights(mu)
+        )
         return replace(forces, memory_state=past)
 
     def forward_columns(
-        self, by_p: Callable[[int], Array], done: int = 0, known: Array | None = None
+        self,
+        by_p: Callable[[int], Array],
+        done: int = 0,
+        known: Array | None = None,
     ) -> MemoryForwardColumns:
         """Return an iterator of the columns dm forward in time, see `MemoryForwardColumns`.
 
@@ -265,7 +293,9 @@ class MemoryHistory:
         known : (columns, all branches), optional
             Columns after those evaluations; 0 by default.
         """
-        return MemoryForwardColumns(self, by_p(0)[: len(self.theta)], done, known)
+        return MemoryForwardColumns(
+            self, by_p(0)[: len(self.theta)], done, known
+        )
 
     def adjoint(self) -> MemoryAdjoint:
         """Return an iterator of the weights μ backward in time, see `MemoryAdjoint`."""
@@ -275,7 +305,9 @@ class MemoryHistory:
     def final_state(self) -> MemoryState:
         """State of the memory after the last evaluation."""
         c = self.memory.repeat_over_points(self.fading.c)[-1]
-        overstress = self.previous_variables[-1] + c * self.memory.to_branches(self.stress[-1])
+        overstress = self.previous_variables[-1] + c * self.memory.to_branches(
+            self.stress[-1]
+        )
         return MemoryState(self.body, self.theta, self.stress[-1], overstress)
 
     @property
@@ -284,7 +316,8 @@ class MemoryHistory:
         if m satisfies the recursion.
         """
         d, a = (
-            self.memory.repeat_over_points(each[:, :-1]) for each in (self.fading.d, self.fading.a)
+            self.memory.repeat_over_points(each[:, :-1])
+            for each in (self.fading.d, self.fading.a)
         )
         m = self.previous_variables
         borne = self.memory.to_branches(self.stress[:-1])
@@ -296,7 +329,9 @@ class MemoryHistory:
         """Return σ_k (N, width) such that Σ μ_k a_k S_k = Σ σ_k S_k, for weights μ (N, all
         branches).
         """
-        return self.memory.sum_over_branches(self.memory.repeat_over_points(self.fading.a) * mu)
+        return self.memory.sum_over_branches(
+            self.memory.repeat_over_points(self.fading.a) * mu
+        )
 
     def _overstress_inputs(self, mu: Array) -> Array:
         """Return the inputs (5, B, N) of `OVERSTRESS` whose value is Σ μ_k m_k of each branch.
@@ -305,11 +340,14 @@ class MemoryHistory:
         """
         borne = self.memory.to_branches(self.stress)
         before, now = (
-            self.memory.sum_over_points(mu * each) for each in (self.previous_variables, borne)
+            self.memory.sum_over_points(mu * each)
+            for each in (self.previous_variables, borne)
         )
         return np.stack([before, now, 0 * now, *self.fading.u])
 
-    def stress_derivatives(self, theta_q: Array) -> Iterator[tuple[slice, Array]]:
+    def stress_derivatives(
+        self, theta_q: Array
+    ) -> Iterator[tuple[slice, Array]]:
         """Yield consecutive slices of at most `EVALUATIONS_PER_CHUNK` evaluations, each with the
         derivatives ∂S/∂θ θ_q (T, q, width) there, for q directions θ_q (k, q) in θ.
         """
@@ -317,7 +355,9 @@ class MemoryHistory:
             rows = slice(start, start + EVALUATIONS_PER_CHUNK)
             yield (
                 rows,
-                self.body.stresses.stress_theta_derivatives(self.xi[rows], self.theta, theta_q),
+                self.body.stresses.stress_theta_derivatives(
+                    self.xi[rows], self.theta, theta_q
+                ),
             )
 
     def vector_jacobian_product(
@@ -382,9 +422,13 @@ class MemoryHistory:
         data = self.fading.data
         elastic = self.body.elastic_indices
         fading_inputs = slice(OVERSTRESS.input_offsets[2], None)
-        slopes = OVERSTRESS.step_function.evaluate_with_jacobian(inputs, data)[1]
+        slopes = OVERSTRESS.step_function.evaluate_with_jacobian(inputs, data)[
+            1
+        ]
         second = OVERSTRESS.step_function.weighted_hessian(inputs, data)
-        curvature.theta[:, places] += np.moveaxis(slopes[0, fading_inputs], 2, 0)
+        curvature.theta[:, places] += np.moveaxis(
+            slopes[0, fading_inputs], 2, 0
+        )
         curvature.theta_theta[:, places[:, None], places] += np.moveaxis(
             second[fading_inputs, fading_inputs], 3, 0
         )
@@ -394,10 +438,16 @@ class MemoryHistory:
         ):
             weights = memory.sum_over_branches(branch_mask * mu)
             by_xi = self.body.stresses.stress_vjp(self.xi, weights, self.theta)
-            for place, factor in zip(places[:, number], mixed[:, number], strict=True):
+            for place, factor in zip(
+                places[:, number], mixed[:, number], strict=True
+            ):
                 curvature.position_theta[:, :, place] += factor[:, None] * by_xi
-        for rows, by in self.stress_derivatives(np.eye(len(self.theta))[:, elastic]):
-            by_moduli = memory.sum_over_points(memory.to_branches(by) * mu[rows, None])
+        for rows, by in self.stress_derivatives(
+            np.eye(len(self.theta))[:, elastic]
+        ):
+            by_moduli = memory.sum_over_points(
+                memory.to_branches(by) * mu[rows, None]
+            )
             both = np.einsum("jbt,bte->tjbe", mixed[..., rows], by_moduli)
             curvature.theta_theta[rows, places[..., None], elastic] += both
             curvature.theta_theta[rows, elastic, places[..., None]] += both
@@ -424,12 +474,18 @@ class MemoryState:
     overstress: Array
 
     @classmethod
-    def at_start(cls, body: Body, x: Array, theta: Array, loaded_s: float) -> MemoryState:
+    def at_start(
+        cls, body: Body, x: Array, theta: Array, loaded_s: float
+    ) -> MemoryState:
         """Return the memory in the start shape x (3n,) [m], loaded for a time `loaded_s` [s];
         infinite if the memory has relaxed.
         """
         return MemoryHistory.from_states(
-            body, x[None], theta=theta, until_next_s=np.ones(1), loaded_s=loaded_s
+            body,
+            x[None],
+            theta=theta,
+            until_next_s=np.ones(1),
+            loaded_s=loaded_s,
         ).final_state
 
     def insert_at_same_time(self, forces: Forces) -> Forces:
@@ -438,7 +494,9 @@ class MemoryState:
         past.overstress[0] = self.body.memory.sum_over_branches(self.overstress)
         return replace(forces, memory_state=past)
 
-    def insert_after_interval(self, forces: Forces, interval_s: float) -> Forces:
+    def insert_after_interval(
+        self, forces: Forces, interval_s: float
+    ) -> Forces:
         """Return forces in a state one interval [s] later, with the memory inserted; self is
         unchanged.
         """
@@ -449,7 +507,9 @@ class MemoryState:
             past.stiffening[0, branch.part] += own
         return replace(forces, memory_state=past)
 
-    def advance(self, forces: Forces, x: Array, v: Array, interval_s: float) -> MemoryState:
+    def advance(
+        self, forces: Forces, x: Array, v: Array, interval_s: float
+    ) -> MemoryState:
         """Return the memory in the state x (3n,) one interval later.
 
         Forces and velocity are not used.
@@ -457,7 +517,9 @@ class MemoryState:
         memory = self.body.memory
         previous, c = self._after_interval(interval_s)
         stress = self.body.stresses.stress(x[None], self.theta)[0]
-        overstress = previous + memory.repeat_over_points(c) * memory.to_branches(stress)
+        overstress = previous + memory.repeat_over_points(
+            c
+        ) * memory.to_branches(stress)
         return MemoryState(self.body, self.theta, stress, overstress)
 
     def _after_interval(self, interval_s: float) -> tuple[Array, Array]:
@@ -468,9 +530,9 @@ class MemoryState:
         share, tau_s = self.theta[[(b.share, b.tau) for b in memory.branches]].T
         e, c = fading_coefficients(share, tau_s, interval_s)
         borne = memory.to_branches(self.stress)
-        return memory.repeat_over_points(e) * self.overstress - memory.repeat_over_points(
-            c
-        ) * borne, c
+        return memory.repeat_over_points(
+            e
+        ) * self.overstress - memory.repeat_over_points(c) * borne, c
 
 
 def with_start_memory(forces: Forces, loaded_s: float) -> Forces:
@@ -503,7 +565,11 @@ class MemoryForwardColumns:
     """
 
     def __init__(
-        self, history: MemoryHistory, theta_q: Array, done: int = 0, known: Array | None = None
+        self,
+        history: MemoryHistory,
+        theta_q: Array,
+        done: int = 0,
+        known: Array | None = None,
     ) -> None:
         self.history = history
         self.next = done
@@ -516,13 +582,19 @@ class MemoryForwardColumns:
         self._stress = np.zeros((len(self.columns), self.stresses.width))
         self._state = np.zeros((len(self.columns), history.xi.shape[1]))
         self._direction = np.zeros_like(self._state)
-        self._moduli = np.flatnonzero(theta_q[history.body.elastic_indices].any(axis=0))
+        self._moduli = np.flatnonzero(
+            theta_q[history.body.elastic_indices].any(axis=0)
+        )
         self._theta_q = theta_q[:, self._moduli]
         self._by_moduli = np.zeros((0, 0, 0))
         fades = history.fading
         self._own = np.flatnonzero(theta_q[fades.places].any(axis=(0, 1)))
-        self._d, self._a = map(self.memory.repeat_over_points, (fades.d, fades.a))
-        self._d_own, self._a_own = fades.jacobian_vector_product(theta_q[:, self._own])
+        self._d, self._a = map(
+            self.memory.repeat_over_points, (fades.d, fades.a)
+        )
+        self._d_own, self._a_own = fades.jacobian_vector_product(
+            theta_q[:, self._own]
+        )
 
     def force_columns(self) -> Array:
         """Return the contribution of the memory to dF at the next evaluation, (3n, columns); the
@@ -533,7 +605,9 @@ class MemoryForwardColumns:
             self._state, self.memory.sum_over_branches(self.columns), self.theta
         ).T
 
-    def advance(self, of_state: Callable[[], Array], _: Callable[[], Array]) -> None:
+    def advance(
+        self, of_state: Callable[[], Array], _: Callable[[], Array]
+    ) -> None:
         """Pass the next evaluation and update the columns, in place.
 
         Parameters
@@ -556,8 +630,12 @@ class MemoryForwardColumns:
             self._direction *= a
         else:
             stress.fill(0.0)
-        self.stresses.stress_jvp(self._state, self._direction, self.theta, stress)
-        for column, slope in zip(self._moduli, self._elastic_stress_derivatives(k), strict=True):
+        self.stresses.stress_jvp(
+            self._state, self._direction, self.theta, stress
+        )
+        for column, slope in zip(
+            self._moduli, self._elastic_stress_derivatives(k), strict=True
+        ):
             stress[column] += a * slope if alone else slope
         if not alone:
             self.columns += a * self.memory.to_branches(stress)
@@ -579,7 +657,9 @@ class MemoryForwardColumns:
         if k % EVALUATIONS_PER_CHUNK == 0 or not len(self._by_moduli):
             first = k - k % EVALUATIONS_PER_CHUNK
             xi = self.history.xi[first : first + EVALUATIONS_PER_CHUNK]
-            self._by_moduli = self.stresses.stress_theta_derivatives(xi, self.theta, self._theta_q)
+            self._by_moduli = self.stresses.stress_theta_derivatives(
+                xi, self.theta, self._theta_q
+            )
         return self._by_moduli[k % EVALUATIONS_PER_CHUNK]
 
 
@@ -601,10 +681,13 @@ class MemoryAdjoint:
         history = self.history
         k = self.next
         weights = history.memory.sum_over_branches(
-            history.memory.repeat_over_points(history.fading.a[:, k]) * self.columns
+            history.memory.repeat_over_points(history.fading.a[:, k])
+            * self.columns
         )
         state = history.xi[k]
-        by_x = history.body.stresses.stress_vjp(state[None], weights[None], history.theta)[0]
+        by_x = history.body.stresses.stress_vjp(
+            state[None], weights[None], history.theta
+        )[0]
         return by_x, np.zeros_like(by_x)
 
     def step_back(self, force_weight: Array) -> None:
@@ -619,7 +702,9 @@ class MemoryAdjoint:
         k = self.next
         state = history.xi[k][None]
         weight = force_weight[None]
-        push = history.body.stresses.memory_force_vjp(state, weight, history.theta)[0]
+        push = history.body.stresses.memory_force_vjp(
+            state, weight, history.theta
+        )[0]
         d = history.memory.repeat_over_points(history.fading.d[:, k])
         self.columns = d * self.columns + history.memory.to_branches(push)
         self.next -= 1

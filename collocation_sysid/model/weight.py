@@ -84,7 +84,9 @@ class DofMasses:
         result.
         """
         if len(self.tied_kg) and self.tied_kg.strides[0] == 0:
-            return np.broadcast_to(constant_kg + self.tied_kg[0], self.tied_kg.shape)
+            return np.broadcast_to(
+                constant_kg + self.tied_kg[0], self.tied_kg.shape
+            )
         return constant_kg + self.tied_kg
 
     @cached_property
@@ -138,9 +140,21 @@ class Weight(ForceTerm):
         body = experiment.body
         tied = np.repeat(experiment.point_mass_at_nodes_kg(t_s), 3, axis=1)
         air_kg = experiment.air_density_kg_m3 * body.dof_volume_m3
-        mass = DofMasses(_own_kg(body), _as_constant_view(tied), air_kg, ADDED_MASS_SHARE * air_kg)
+        mass = DofMasses(
+            _own_kg(body),
+            _as_constant_view(tied),
+            air_kg,
+            ADDED_MASS_SHARE * air_kg,
+        )
         applied = _as_constant_view(applied.reshape(len(applied), -1))
-        return cls(body, mass, experiment.gravity_m_s2, applied, False, *_no_loads(applied))
+        return cls(
+            body,
+            mass,
+            experiment.gravity_m_s2,
+            applied,
+            False,
+            *_no_loads(applied),
+        )
 
     @classmethod
     def of_body_alone(cls, body: Body) -> Weight:
@@ -154,10 +168,15 @@ class Weight(ForceTerm):
         """Return this weight for a body with constants θ, which contain free densities."""
         if not self.body.mass_derivatives:
             return self
-        return replace(self, mass=replace(self.mass, own_kg=self.body.mass_of_dofs(theta)))
+        return replace(
+            self, mass=replace(self.mass, own_kg=self.body.mass_of_dofs(theta))
+        )
 
     def with_load_inputs(
-        self, has_gravity_input: bool, loads: Sequence[PointMass | Force], t_s: Array
+        self,
+        has_gravity_input: bool,
+        loads: Sequence[PointMass | Force],
+        t_s: Array,
     ) -> Weight:
         """Return this weight with gravity and the shares of some loads as inputs; other loads stay
         as they are.
@@ -177,9 +196,15 @@ class Weight(ForceTerm):
             if isinstance(load, PointMass):
                 kg[k] = np.repeat(load.node_mass_kg(nodes), 3)
             else:
-                newtons[k] = load.node_forces_n(t_s, nodes).reshape(len(t_s), -1)
+                newtons[k] = load.node_forces_n(t_s, nodes).reshape(
+                    len(t_s), -1
+                )
         return replace(
-            self, has_gravity_input=has_gravity_input, joining_kg=kg, joining_n=newtons, share=share
+            self,
+            has_gravity_input=has_gravity_input,
+            joining_kg=kg,
+            joining_n=newtons,
+            share=share,
         )
 
     @property
@@ -193,13 +218,19 @@ class Weight(ForceTerm):
         """
         if not self.size:
             return self
-        weight = replace(self, gravity_m_s2=u[0, :3]) if self.has_gravity_input else self
+        weight = (
+            replace(self, gravity_m_s2=u[0, :3])
+            if self.has_gravity_input
+            else self
+        )
         if not len(self.joining_kg):
             return weight
         share = u[:, 3 * self.has_gravity_input :]
         change = share - self.share
         tied_kg = self.mass.tied_kg + change @ self.joining_kg
-        applied_n = self.applied_n + np.einsum("tl,ltd->td", change, self.joining_n)
+        applied_n = self.applied_n + np.einsum(
+            "tl,ltd->td", change, self.joining_n
+        )
         mass = replace(self.mass, tied_kg=tied_kg)
         return replace(weight, mass=mass, applied_n=applied_n, share=share)
 
@@ -232,7 +263,9 @@ class Weight(ForceTerm):
             """Return the linear interpolation between two arrays."""
             return a + share * (b - a)
 
-        mass = replace(self.mass, tied_kg=between(self.mass.tied_kg, other.mass.tied_kg))
+        mass = replace(
+            self.mass, tied_kg=between(self.mass.tied_kg, other.mass.tied_kg)
+        )
         return replace(
             self,
             mass=mass,
@@ -270,7 +303,10 @@ class Weight(ForceTerm):
         return self.mass.weight_kg * self.gravity + self.applied_n
 
     def add_derivatives(
-        self, linearisation: Linearisation, places: AssemblyIndices, states: States
+        self,
+        linearisation: Linearisation,
+        places: AssemblyIndices,
+        states: States,
     ) -> None:
         """Add the forces and their first derivatives to a linearisation, in place, at the input
         columns `places`; the states are not used.
@@ -281,14 +317,22 @@ class Weight(ForceTerm):
         first_column = places.inputs.start
         if self.has_gravity_input:
             for axis in range(3):
-                linearisation.by_theta[:, axis::3, first_column + axis] += self.mass.weight_kg[
-                    :, axis::3
-                ]
-        for k, (kg, newtons) in enumerate(self._joining, first_column + 3 * self.has_gravity_input):
-            linearisation.by_theta[:, :, k] += kg * self._load_acceleration(states) + newtons
+                linearisation.by_theta[:, axis::3, first_column + axis] += (
+                    self.mass.weight_kg[:, axis::3]
+                )
+        for k, (kg, newtons) in enumerate(
+            self._joining, first_column + 3 * self.has_gravity_input
+        ):
+            linearisation.by_theta[:, :, k] += (
+                kg * self._load_acceleration(states) + newtons
+            )
 
     def add_second_derivatives(
-        self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
+        self,
+        curvature: SecondDerivatives,
+        places: AssemblyIndices,
+        states: States,
+        weights: Array,
     ) -> None:
         """Add the derivatives of Σ weights · F, for weights (T, 3n), to a curvature, in place, at
         the input columns `places`; the states are not used.
@@ -298,14 +342,20 @@ class Weight(ForceTerm):
         first_column = places.inputs.start
         if self.has_gravity_input:
             gravity_columns = slice(first_column, first_column + 3)
-            curvature.theta[:, gravity_columns] += _sum_over_nodes(weights * self.mass.weight_kg)
+            curvature.theta[:, gravity_columns] += _sum_over_nodes(
+                weights * self.mass.weight_kg
+            )
             for place, kg in self.mass_derivatives(first_column).items():
                 mixed = _sum_over_nodes(weights * kg)
                 curvature.theta_theta[:, place, gravity_columns] += mixed
                 curvature.theta_theta[:, gravity_columns, place] += mixed
-        for k, (kg, newtons) in enumerate(self._joining, first_column + 3 * self.has_gravity_input):
+        for k, (kg, newtons) in enumerate(
+            self._joining, first_column + 3 * self.has_gravity_input
+        ):
             share_derivative = kg * self._load_acceleration(states) + newtons
-            curvature.theta[:, k] += np.einsum("ti,ti->t", weights, share_derivative)
+            curvature.theta[:, k] += np.einsum(
+                "ti,ti->t", weights, share_derivative
+            )
             curvature.velocity_theta[:, :, k] -= (
                 self.body.tied_damping_rate(states.theta) * kg * weights
             )
@@ -321,7 +371,9 @@ class Weight(ForceTerm):
 
     def _load_acceleration(self, states: States) -> Array:
         """Return the acceleration g − γ_m ν (T, 3n) by which a tied mass loads the body [m/s²]."""
-        return self.gravity - self.body.tied_damping_rate(states.theta) * states.nu
+        return (
+            self.gravity - self.body.tied_damping_rate(states.theta) * states.nu
+        )
 
 
 def _own_kg(body: Body) -> Array:
@@ -343,7 +395,11 @@ def _no_loads(rows: Array, count: int = 0) -> tuple[Array, Array, Array]:
     count : int
     """
     times, dofs = rows.shape
-    return np.zeros((count, dofs)), np.zeros((count, times, dofs)), np.zeros((times, count))
+    return (
+        np.zeros((count, dofs)),
+        np.zeros((count, times, dofs)),
+        np.zeros((times, count)),
+    )
 
 
 def _sum_over_nodes(dofs: Array) -> Array:
@@ -353,4 +409,8 @@ def _sum_over_nodes(dofs: Array) -> Array:
 
 def _as_constant_view(rows: Array) -> Array:
     """Return equal rows as a read-only view of one row with stride 0; other arrays unchanged."""
-    return np.broadcast_to(rows[0].copy(), rows.shape) if (rows == rows[:1]).all() else rows
+    return (
+        np.broadcast_to(rows[0].copy(), rows.shape)
+        if (rows == rows[:1]).all()
+        else rows
+    )

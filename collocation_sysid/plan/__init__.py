@@ -13,7 +13,13 @@ uncertainty.
 """
 
 from .run_execution import RunOptions, RunStore, run_all
-from .study_planning import PlannedRun, Starts, plan_comparison, plan_models, plan_sweep
+from .study_planning import (
+    PlannedRun,
+    Starts,
+    plan_comparison,
+    plan_models,
+    plan_sweep,
+)
 
 __all__ = [
     "PlannedRun",

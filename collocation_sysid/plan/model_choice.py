@@ -67,7 +67,9 @@ SURE = 2.0
 LIKELY = 1.0
 
 
-def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> list[Row]:
+def model_rows(
+    planned: Sequence[PlannedRun], records: Mapping[str, Record]
+) -> list[Row]:
     """Return one row for each model, in their order.
 
     Parameters
@@ -85,7 +87,9 @@ def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> 
     of_model: dict[str, dict[str, Any]] = {}
     for run in planned:
         fit = (records.get(run.key) or {}).get("model") or {}
-        of_model.setdefault(run.varied_values["model"], {})[run.test_name or ""] = fit
+        of_model.setdefault(run.varied_values["model"], {})[
+            run.test_name or ""
+        ] = fit
     rows = [_model_row(label, fits) for label, fits in of_model.items()]
     _add_criterion(rows)
     _add_ratios(rows)
@@ -100,7 +104,9 @@ def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
     all. Unknown values are None.
     """
     complete_fit = fits.get("", {})
-    predictions = {name: fit.get("prediction") or {} for name, fit in fits.items() if name}
+    predictions = {
+        name: fit.get("prediction") or {} for name, fit in fits.items() if name
+    }
     evidence = complete_fit.get("evidence")
     free = complete_fit.get("free")
     unit = next((each["unit"] for each in predictions.values() if each), "m")
@@ -112,9 +118,15 @@ def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
         "unit": unit,
         "rms": (complete_fit.get("rms") or {}).get(unit),
         "held_out_rms": _pooled_rms([*predictions.values()]),
-        "predictions": {name: each.get("rms") for name, each in predictions.items()},
-        "blocks": {name: each.get("blocks") for name, each in predictions.items()},
-        "failures": {n: fits[n]["failure"] for n in predictions if fits[n].get("failure")},
+        "predictions": {
+            name: each.get("rms") for name, each in predictions.items()
+        },
+        "blocks": {
+            name: each.get("blocks") for name, each in predictions.items()
+        },
+        "failures": {
+            n: fits[n]["failure"] for n in predictions if fits[n].get("failure")
+        },
         "evidence": evidence,
         "parameters": complete_fit.get("parameters") or {},
         "budget": complete_fit.get("budget") or {},
@@ -129,7 +141,10 @@ def _pooled_rms(predictions: Sequence[Mapping[str, Any]]) -> float | None:
     if len({each["unit"] for each in predictions}) > 1:
         return None  # metres and newtons have no common measure
     samples = sum(each["samples"] for each in predictions)
-    return sqrt(sum(each["samples"] * each["rms"] ** 2 for each in predictions) / samples)
+    return sqrt(
+        sum(each["samples"] * each["rms"] ** 2 for each in predictions)
+        / samples
+    )
 
 
 def _add_criterion(rows: Sequence[Row]) -> None:
@@ -157,7 +172,10 @@ def _add_ratios(rows: Sequence[Row]) -> None:
         if best is None or row["held_out_rms"] is None:
             continue
         names = [name for name, rms in best["predictions"].items() if rms]
-        logs = [log(row["predictions"][name] / best["predictions"][name]) for name in names]
+        logs = [
+            log(row["predictions"][name] / best["predictions"][name])
+            for name in names
+        ]
         row["log_ratio"] = log(row["held_out_rms"] / best["held_out_rms"])
         row["log_ratio_error"] = _log_ratio_error(row, best, logs)
 
@@ -171,12 +189,18 @@ def _log_ratio_error(row: Row, best: Row, logs: Sequence[float]) -> float:
     """
     if row is best:
         return 0.0
-    pairs = [(row["blocks"][name], best["blocks"][name]) for name in best["blocks"]]
-    squares, best_squares = (np.concatenate(each) for each in zip(*pairs, strict=True))
+    pairs = [
+        (row["blocks"][name], best["blocks"][name]) for name in best["blocks"]
+    ]
+    squares, best_squares = (
+        np.concatenate(each) for each in zip(*pairs, strict=True)
+    )
     change = squares - best_squares
     # d ln √(a/b) = (a − b) / (a + b) to first order
     of_sum = float(np.std(change, ddof=1)) * sqrt(len(change))
-    between = float(np.std(logs, ddof=1)) / sqrt(len(logs)) if len(logs) > 1 else 0.0
+    between = (
+        float(np.std(logs, ddof=1)) / sqrt(len(logs)) if len(logs) > 1 else 0.0
+    )
     return max(between, of_sum / float(np.sum(squares + best_squares)))
 
 
@@ -211,7 +235,8 @@ def _equally_good(rows: Sequence[Row], errors: float) -> list[Row]:
         for row in rows
         if row["converged"]
         and row["log_ratio"] is not None
-        and row["log_ratio"] <= max(EQUIVALENT_ERROR, errors * row["log_ratio_error"])
+        and row["log_ratio"]
+        <= max(EQUIVALENT_ERROR, errors * row["log_ratio_error"])
     ]
 
 
@@ -237,12 +262,24 @@ def advice(rows: Sequence[Row]) -> str:
             f"{rival['delta_aic']:.3g} lower than that of {rival['model']}."
         )
     predicted = [row for row in others if row["log_ratio"] is not None]
-    failures = [_failed_prediction(row, chosen) for row in others if row["log_ratio"] is None]
+    failures = [
+        _failed_prediction(row, chosen)
+        for row in others
+        if row["log_ratio"] is None
+    ]
     if not predicted:
-        return " ".join([f"{use}: no other model predicts the held-out samples.", *failures])
+        return " ".join(
+            [f"{use}: no other model predicts the held-out samples.", *failures]
+        )
     rival = min(predicted, key=lambda row: row["log_ratio"])
-    sentences = [f"{use}: {_comparison(chosen, rival)}.", _certainty(chosen, rival), *failures]
-    return " ".join([*sentences, *(each.sentence for each in law_disagreements(rows))])
+    sentences = [
+        f"{use}: {_comparison(chosen, rival)}.",
+        _certainty(chosen, rival),
+        *failures,
+    ]
+    return " ".join(
+        [*sentences, *(each.sentence for each in law_disagreements(rows))]
+    )
 
 
 def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
@@ -257,7 +294,9 @@ def _failed_prediction(row: Row, chosen: Row) -> str:
     """Return a sentence on a model with which some held-out samples cannot be predicted, and on its
     AIC if that speaks for it.
     """
-    without = " and ".join(f"'{name}'" for name, rms in row["predictions"].items() if not rms)
+    without = " and ".join(
+        f"'{name}'" for name, rms in row["predictions"].items() if not rms
+    )
     sentence = f"{row['model']} does not predict {without}"
     if (more := chosen["delta_aic"] - row["delta_aic"]) <= NO_SUPPORT:
         return f"{sentence}."
@@ -328,7 +367,11 @@ def _certainty(chosen: Row, rival: Row) -> str:
 def model_notes(rows: Sequence[Row]) -> list[str]:
     """Return notes that explain the table and list failures."""
     names = rows[0]["predictions"]
-    test_data = "each recording in turn" if len(names) > 1 else "the last third of the recording"
+    test_data = (
+        "each recording in turn"
+        if len(names) > 1
+        else "the last third of the recording"
+    )
     counted = rows[0]["independent"]
     evidence = next((row["evidence"] for row in rows if row["evidence"]), None)
     equivalent = ""
@@ -340,7 +383,11 @@ def model_notes(rows: Sequence[Row]) -> list[str]:
         equivalent += "independent ones."
     return [
         f"Held out: {test_data}; ±: standard error of the ratio to the best.{equivalent}",
-        *(f"{row['model']}: {row['status']}" for row in rows if not row["converged"]),
+        *(
+            f"{row['model']}: {row['status']}"
+            for row in rows
+            if not row["converged"]
+        ),
         *(
             f"{row['model']} without '{name}': {why}"
             for row in rows
@@ -377,7 +424,11 @@ class Evidence:
         """Return Akaike's criterion for an equivalent number of measurements, equal for all
         compared models.
         """
-        return independent * float(np.log(self.misfit)) + self.prior + 2 * self.fitted
+        return (
+            independent * float(np.log(self.misfit))
+            + self.prior
+            + 2 * self.fitted
+        )
 
 
 def evidence_from_fit(fit: LinearisedFit) -> Evidence:
@@ -388,7 +439,11 @@ def evidence_from_fit(fit: LinearisedFit) -> Evidence:
     if fit.chi_squared > rounding:
         processes = error_processes(fit, factored)
         pairs = zip(fit.blocks, processes, strict=True)
-        independent = sum(_independent_measurements(b, p) for b, p in pairs if b.measurement_count)
+        independent = sum(
+            _independent_measurements(b, p)
+            for b, p in pairs
+            if b.measurement_count
+        )
     return Evidence(
         max(fit.chi_squared, rounding),
         float(np.sum(fit.prior_residual**2)),
@@ -398,16 +453,22 @@ def evidence_from_fit(fit: LinearisedFit) -> Evidence:
     )
 
 
-def _independent_measurements(block: ResidualBlock, process: ErrorProcess) -> float:
+def _independent_measurements(
+    block: ResidualBlock, process: ErrorProcess
+) -> float:
     """Return the equivalent number of independent measurements in one block of residuals."""
     lags = np.arange(1, len(process.autocorrelation))
-    in_time = 1 + 2 * float((1 - lags / len(block.t_s)) @ process.autocorrelation[1:])
+    in_time = 1 + 2 * float(
+        (1 - lags / len(block.t_s)) @ process.autocorrelation[1:]
+    )
     is_observed = block.channels[2].any(axis=0)
     among = process.channel_covariance[np.ix_(is_observed, is_observed)]
     total = float(np.trace(among)) ** 2
     # Few samples make channels look alike that are not: that much is taken off tr Σ².
     sum_of_squares = float(np.sum(among**2)) - total / max(process.samples, 1.0)
-    channels = float(np.clip(total / max(sum_of_squares, 1e-300), 1.0, len(among)))
+    channels = float(
+        np.clip(total / max(sum_of_squares, 1e-300), 1.0, len(among))
+    )
     return block.measurement_count * channels / len(among) / max(1.0, in_time)
 
 
@@ -436,7 +497,11 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
         Status, parameters and RMS; with converged fits also "evidence" and "budget" if all are
         fitted, else "prediction", which is None with a "failure" if the simulation failed.
     """
-    known, start_s = reserve_test_data(problem, test_name) if test_name else (problem, np.inf)
+    known, start_s = (
+        reserve_test_data(problem, test_name)
+        if test_name
+        else (problem, np.inf)
+    )
     solution = solve(known, method)
     record: dict[str, Any] = {
         "status": solution.status.value,
@@ -468,11 +533,17 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
     )
     if not isinstance(rollout, ForwardSimulation):
         return record | {"prediction": None, "failure": rollout}
-    complete_experiment = next(e for e in problem.experiments if e.name == test_name)
-    return record | {"prediction": _prediction_error(complete_experiment, rollout, start_s)}
+    complete_experiment = next(
+        e for e in problem.experiments if e.name == test_name
+    )
+    return record | {
+        "prediction": _prediction_error(complete_experiment, rollout, start_s)
+    }
 
 
-def _budget_record(problem: Problem, solution: Solution, fit: LinearisedFit) -> dict[str, Any]:
+def _budget_record(
+    problem: Problem, solution: Solution, fit: LinearisedFit
+) -> dict[str, Any]:
     """Return the uncertainty budget of each estimate, without noise of the poses, step and mesh.
 
     Empty if the error bars cannot be computed.
@@ -481,14 +552,24 @@ def _budget_record(problem: Problem, solution: Solution, fit: LinearisedFit) -> 
     parameters = solution.collocation.parameters
     try:
         known = uncertainty_from_fit(fit, parameters, solution.q, options)
-        changes = changes_of_assumptions(solution.collocation, solution.z, options.considered)
+        changes = changes_of_assumptions(
+            solution.collocation, solution.z, options.considered
+        )
     except (InputError, SimulationError):
         return {}  # without error bars there is none
     means = options.assumptions.means
     sources = VarianceSources.from_fit(
-        fit, changes, parameters=parameters, q=solution.q, uncertainty=known, means=means
+        fit,
+        changes,
+        parameters=parameters,
+        q=solution.q,
+        uncertainty=known,
+        means=means,
     )
-    return {name: asdict(line) for name, line in budget(sources, known, {}, parameters).items()}
+    return {
+        name: asdict(line)
+        for name, line in budget(sources, known, {}, parameters).items()
+    }
 
 
 def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
@@ -503,12 +584,27 @@ def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
         start_s = -np.inf
     else:
         start_s = float(chosen.t_s[0] + FITTED * chosen.duration_s)
-        tracks = np.where((chosen.t_s > start_s)[:, None, None], np.nan, chosen.markers.positions_m)
-        grasps = tuple(_without_later_wrench(grasp, start_s) for grasp in chosen.grasps)
-        depths = [each for d in chosen.depths if (each := d.until_time(start_s)) is not None]
-        readings = [_without_later_values(gauge, start_s) for gauge in chosen.readings]
+        tracks = np.where(
+            (chosen.t_s > start_s)[:, None, None],
+            np.nan,
+            chosen.markers.positions_m,
+        )
+        grasps = tuple(
+            _without_later_wrench(grasp, start_s) for grasp in chosen.grasps
+        )
+        depths = [
+            each
+            for d in chosen.depths
+            if (each := d.until_time(start_s)) is not None
+        ]
+        readings = [
+            _without_later_values(gauge, start_s) for gauge in chosen.readings
+        ]
         remaining = replace(
-            with_markers(chosen, tracks), grasps=grasps, depths=depths, readings=readings
+            with_markers(chosen, tracks),
+            grasps=grasps,
+            depths=depths,
+            readings=readings,
         )
     experiments = [remaining if e is chosen else e for e in problem.experiments]
     return replace(problem, experiments=experiments), start_s
@@ -529,7 +625,9 @@ def _without_later_values(gauge: Gauge, end_s: float) -> Gauge:
     """Return the custom sensor without measurements after a time [s]; itself if none would
     remain.
     """
-    values = np.where((gauge.sample_times_s > end_s)[:, None], np.nan, gauge.measured_values)
+    values = np.where(
+        (gauge.sample_times_s > end_s)[:, None], np.nan, gauge.measured_values
+    )
     return replace(gauge, values=values) if np.isfinite(values).any() else gauge
 
 
@@ -539,9 +637,13 @@ def _stress_residuals_pa(
     """Return times (S,) and differences (S,) of predicted and measured stresses [Pa] of a specimen,
     in the order of time; NaN where not measured.
     """
-    stresses = [gauge for gauge in experiment.readings if gauge.unit == STRESS_UNIT]
+    stresses = [
+        gauge for gauge in experiment.readings if gauge.unit == STRESS_UNIT
+    ]
     t_s = np.concatenate([gauge.sample_times_s for gauge in stresses])
-    differences = [predicted[gauge.name] - gauge.measured_values for gauge in stresses]
+    differences = [
+        predicted[gauge.name] - gauge.measured_values for gauge in stresses
+    ]
     order = np.argsort(t_s, kind="stable")
     return t_s[order], np.concatenate(differences)[order, 0]
 
@@ -549,7 +651,9 @@ def _stress_residuals_pa(
 def _pooled_stress_rms_pa(solution: Solution) -> float | None:
     """Return the RMS residual of the stresses of all fitted specimens [Pa]; None without any."""
     residuals = [
-        _stress_residuals_pa(segment.experiment, solution.readings[segment.experiment.name])[1]
+        _stress_residuals_pa(
+            segment.experiment, solution.readings[segment.experiment.name]
+        )[1]
         for segment in solution.collocation.transcriptions
         if segment.experiment.specimen is not None
     ]
@@ -582,7 +686,10 @@ def _prediction_error(
         t_s = np.concatenate([sensor.t_s for sensor in experiment.wrenches])
         pairs = zip(rollout.wrenches, experiment.wrenches, strict=True)
         residuals = np.concatenate(
-            [sensor.symmetry * (read - sensor.values)[:, :3] for read, sensor in pairs]
+            [
+                sensor.symmetry * (read - sensor.values)[:, :3]
+                for read, sensor in pairs
+            ]
         )
         order = np.argsort(t_s, kind="stable")
         unit = "N"
@@ -590,7 +697,9 @@ def _prediction_error(
         residuals = residuals[order, None]
         is_counted = np.asarray(np.isfinite(residuals).any(axis=2))
     is_test_sample = t_s > start_s
-    squares = np.where(is_counted, np.nansum(residuals**2, axis=2), 0.0)[is_test_sample]
+    squares = np.where(is_counted, np.nansum(residuals**2, axis=2), 0.0)[
+        is_test_sample
+    ]
     samples = int(is_counted[is_test_sample].sum())
     blocks = [float(np.sum(each)) for each in np.array_split(squares, BLOCKS)]
     rms = float(np.sqrt(squares.sum() / samples)) if samples else None

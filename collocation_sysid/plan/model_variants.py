@@ -80,7 +80,9 @@ def parse_dampings(text: str) -> tuple[str, ...]:
     return _parse_names(text, DAMPINGS, "--damping")
 
 
-def _parse_names(text: str, known_names: Iterable[str], option: str) -> tuple[str, ...]:
+def _parse_names(
+    text: str, known_names: Iterable[str], option: str
+) -> tuple[str, ...]:
     """Return names from text separated by commas, each once.
 
     Raises
@@ -103,10 +105,16 @@ def parse_branches(text: str) -> tuple[int, ...]:
         For anything but whole numbers from 0 to `MOST_BRANCHES`.
     """
     items = [item.strip() for item in text.split(",") if item.strip()]
-    counts = [int(item) for item in items if item.isascii() and item.isdecimal() and len(item) < 3]
+    counts = [
+        int(item)
+        for item in items
+        if item.isascii() and item.isdecimal() and len(item) < 3
+    ]
     if not items or len(counts) < len(items) or max(counts) > MOST_BRANCHES:
         expected = f"whole numbers up to {MOST_BRANCHES}, such as 0,1,2"
-        raise InputError(f"found {text!r}; expected {expected}", None, "--prony")
+        raise InputError(
+            f"found {text!r}; expected {expected}", None, "--prony"
+        )
     return tuple(dict.fromkeys(counts))
 
 
@@ -136,7 +144,10 @@ def models(
     compared = file_variants(problems, overrides)
     if materials or branches or dampings:
         fitted = [e for e in problems[0].experiments if not e.validation]
-        times_s = min(e.timestep_s for e in fitted), max(e.duration_s for e in fitted)
+        times_s = (
+            min(e.timestep_s for e in fitted),
+            max(e.duration_s for e in fitted),
+        )
         files, compared = compared, []
         for file in files:
             of_file = variants(
@@ -149,14 +160,19 @@ def models(
                 dampings=dampings,
             )
             front = f"{file.label}: " * (len(files) > 1)
-            compared += [replace(v, label=front + v.label, path=file.path) for v in of_file]
+            compared += [
+                replace(v, label=front + v.label, path=file.path)
+                for v in of_file
+            ]
     if len(compared) < 2:
         options = {
             "--materials": (materials, "neo-hookean,yeoh"),
             "--damping": (dampings, "kelvin-voigt,material"),
             "--prony": (branches or (0,), "0,1"),
         }
-        option, example = next((o, e) for o, (is_declared, e) in options.items() if is_declared)
+        option, example = next(
+            (o, e) for o, (is_declared, e) in options.items() if is_declared
+        )
         raise InputError(
             f"found the model {compared[0].label} alone; expected two or more to compare, such as "
             f"{example}",
@@ -212,27 +228,43 @@ def variants(
             parameters = _with_material(parameters, material, region)
         if damping is not None:
             label.append(damping)
-            laws = {"damping": damping} | ({} if material is None else {"material": material})
+            laws = {"damping": damping} | (
+                {} if material is None else {"material": material}
+            )
             changes |= _law_changes(body, laws, region)
             for name in DAMPING_ASSUMPTIONS:
                 changes[f"uncertainty.assumptions.{name}"] = "none"
         if count is not None:
-            label.append("no memory" if count == 0 else f"{count} branch{'es' * (count > 1)}")
-            own = [t for t in body.get("prony", []) if t.get("region") == region]
-            others = [t for t in body.get("prony", []) if t.get("region") != region]
-            tables = _branch_tables(own, count, {t["name"] for t in others}, region)
+            label.append(
+                "no memory"
+                if count == 0
+                else f"{count} branch{'es' * (count > 1)}"
+            )
+            own = [
+                t for t in body.get("prony", []) if t.get("region") == region
+            ]
+            others = [
+                t for t in body.get("prony", []) if t.get("region") != region
+            ]
+            tables = _branch_tables(
+                own, count, {t["name"] for t in others}, region
+            )
             if tables or body.get("prony"):
                 changes["object.prony"] = [*others, *tables]
             old = [each["name"] for each in own]
             parameters = _with_memory(parameters, old, tables, times_s)
         changes["parameters"] = parameters
-        settings = tuple(f"{key}={as_inline_toml(value)}" for key, value in changes.items())
+        settings = tuple(
+            f"{key}={as_inline_toml(value)}" for key, value in changes.items()
+        )
         label_text = f"{region}: " * (region is not None) + ", ".join(label)
         varied.append(ModelVariant(label_text, (*overrides, *settings), path))
     return varied
 
 
-def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list[ModelVariant]:
+def file_variants(
+    problems: Sequence[Problem], overrides: Sequence[str]
+) -> list[ModelVariant]:
     """Return problem files of the same recordings as models, named after the files.
 
     Raises
@@ -251,11 +283,16 @@ def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list
             )
     paths = [Path(str(problem.path)) for problem in problems]
     if len({path.resolve() for path in paths}) < len(paths):
-        raise InputError("this file is given twice; expected another", paths[-1], "--with")
+        raise InputError(
+            "this file is given twice; expected another", paths[-1], "--with"
+        )
     stems = [path.stem for path in paths]
     distinct = len(set(stems)) == len(stems)
     return [
-        ModelVariant(path.stem if distinct else str(path), tuple(overrides), path) for path in paths
+        ModelVariant(
+            path.stem if distinct else str(path), tuple(overrides), path
+        )
+        for path in paths
     ]
 
 
@@ -271,7 +308,9 @@ def _measured_counts(problem: Problem) -> dict[str, int]:
 
 def _measured_text(measured: Mapping[str, int]) -> str:
     """Return the recordings with their numbers in words."""
-    return " and ".join(f"'{name}' ({count} numbers)" for name, count in measured.items())
+    return " and ".join(
+        f"'{name}' ({count} numbers)" for name, count in measured.items()
+    )
 
 
 def _require_region(
@@ -288,10 +327,20 @@ def _require_region(
     if branches and owners - {region}:
         other_region = next(iter(owners - {region}))
         whose = (
-            "all parts without their own" if other_region is None else f"region '{other_region}'"
+            "all parts without their own"
+            if other_region is None
+            else f"region '{other_region}'"
         )
-        expected = "none with --region" if other_region is None else f"--region {other_region}"
-        raise InputError(f"found branches of {whose}; expected {expected}", path, "object.prony")
+        expected = (
+            "none with --region"
+            if other_region is None
+            else f"--region {other_region}"
+        )
+        raise InputError(
+            f"found branches of {whose}; expected {expected}",
+            path,
+            "object.prony",
+        )
 
 
 def _law_changes(
@@ -318,9 +367,13 @@ def _with_material(
 
     A part with its own constants keeps constants of its own; the others share theirs.
     """
-    of_any = {c.name for each in MATERIALS.values() for c in each.constants} | {*ELASTIC}
+    of_any = {c.name for each in MATERIALS.values() for c in each.constants} | {
+        *ELASTIC
+    }
     fronts = {
-        name[: -len(without_region(name))] for name in parameters if without_region(name) in of_any
+        name[: -len(without_region(name))]
+        for name in parameters
+        if without_region(name) in of_any
     }
     if region is not None:
         fronts = {f"{region}."}
@@ -337,19 +390,33 @@ def _with_part_material(
     possible = {*own, *elastic_names(MATERIALS[material])}
     mine = {prefix + name for name in of_any}
     unchanged = {
-        n: v for n, v in parameters.items() if n not in mine or without_region(n) in possible
+        n: v
+        for n, v in parameters.items()
+        if n not in mine or without_region(n) in possible
     }
     alone = any(name in mine for name in parameters)
-    elastic = {without_region(name) for name in unchanged if name in (mine if alone else of_any)}
+    elastic = {
+        without_region(name)
+        for name in unchanged
+        if name in (mine if alone else of_any)
+    }
     shear_pa = _shear_pa(parameters, prefix)
     if "mu_pa" in own and not elastic & {"mu_pa", "young_pa"}:
         unchanged[f"{prefix}mu_pa"] = _starting_guess("mu_pa", shear_pa)
-    own_or_shared = {without_region(name) for name in unchanged if name in mine | of_any}
+    own_or_shared = {
+        without_region(name) for name in unchanged if name in mine | of_any
+    }
     if elastic_names(MATERIALS[material]) and not own_or_shared & VOLUMETRIC:
         # A foam has no modulus that another material could take over.
         unchanged[f"{prefix}poisson"] = _starting_guess("poisson", shear_pa)
-    needed = [name for name in own if name not in ELASTIC and prefix + name not in unchanged]
-    return unchanged | {prefix + name: _starting_guess(name, shear_pa) for name in needed}
+    needed = [
+        name
+        for name in own
+        if name not in ELASTIC and prefix + name not in unchanged
+    ]
+    return unchanged | {
+        prefix + name: _starting_guess(name, shear_pa) for name in needed
+    }
 
 
 def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
@@ -365,7 +432,9 @@ def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
         return float("nan") if value is None else float(value)
 
     linear = 0.0 if math.isnan(guess("c01_pa")) else guess("c01_pa")
-    poisson = USUAL_POISSON if math.isnan(guess("poisson")) else guess("poisson")
+    poisson = (
+        USUAL_POISSON if math.isnan(guess("poisson")) else guess("poisson")
+    )
     terms = range(1, MOST_TERMS + 1)
     if any(not math.isnan(guess(f"beta_{p}")) for p in terms):
         factors = {p: 1.0 for p in terms}  # of a foam
@@ -391,18 +460,27 @@ def _starting_guess(name: str, shear_pa: float | None) -> dict[str, Any]:
     usual = usual_value(name, 2 * (1 + USUAL_POISSON) * shear_pa, USUAL_POISSON)
     if usual is None:
         return {}
-    return {"guess": usual} if usual else {"guess": usual, "typical": LESS * shear_pa}
+    return (
+        {"guess": usual}
+        if usual
+        else {"guess": usual, "typical": LESS * shear_pa}
+    )
 
 
 def _branch_tables(
-    own: Sequence[Mapping[str, Any]], count: int, others: set[str], region: str | None
+    own: Sequence[Mapping[str, Any]],
+    count: int,
+    others: set[str],
+    region: str | None,
 ) -> list[dict[str, Any]]:
     """Return the first `count` branches of the file, followed by new ones if there are fewer."""
     tables = [dict(each) for each in own[:count]]
     used_names = {each["name"] for each in tables} | others
     names = (f"prony_{k}" for k in range(1, count + len(used_names) + 1))
     region_key = {} if region is None else {"region": region}
-    new = [{"name": name, **region_key} for name in names if name not in used_names]
+    new = [
+        {"name": name, **region_key} for name in names if name not in used_names
+    ]
     return [*tables, *new[: count - len(tables)]]
 
 
@@ -445,7 +523,10 @@ def as_inline_toml(value: Any) -> str:
     if isinstance(value, Mapping):
         return (
             "{"
-            + ", ".join(f"{json.dumps(k)} = {as_inline_toml(v)}" for k, v in value.items())
+            + ", ".join(
+                f"{json.dumps(k)} = {as_inline_toml(v)}"
+                for k, v in value.items()
+            )
             + "}"
         )
     if isinstance(value, (list, tuple)):

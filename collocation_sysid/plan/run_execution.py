@@ -81,11 +81,18 @@ def execute(
         record["wall_s"] = time.monotonic() - began
         if record["outcome"] != CRASHED:
             break
-    return {**planned, **record, "attempts": attempts, "time_limit_s": time_limit_s}
+    return {
+        **planned,
+        **record,
+        "attempts": attempts,
+        "time_limit_s": time_limit_s,
+    }
 
 
 def _attempt(
-    planned: dict[str, Any], time_limit_s: float | None, stopped: Callable[[], bool]
+    planned: dict[str, Any],
+    time_limit_s: float | None,
+    stopped: Callable[[], bool],
 ) -> Record:
     """Execute a run once, in a process with one thread, and return its record; after a time limit
     with the best iterate, if the process wrote one.
@@ -142,7 +149,11 @@ def _watch(
         process.stdin.flush()
     try:
         while True:
-            remaining_s = LOOK_EVERY_S if deadline is None else deadline - time.monotonic()
+            remaining_s = (
+                LOOK_EVERY_S
+                if deadline is None
+                else deadline - time.monotonic()
+            )
             if remaining_s <= 0:
                 process.terminate()  # as Ctrl-C: it may write what it has
                 with contextlib.suppress(subprocess.TimeoutExpired):
@@ -153,7 +164,10 @@ def _watch(
                 process.wait(min(remaining_s, LOOK_EVERY_S))
                 return None
             if is_stopped():
-                return {"outcome": STOPPED, "message": "stopped when the study was stopped"}
+                return {
+                    "outcome": STOPPED,
+                    "message": "stopped when the study was stopped",
+                }
     finally:
         with contextlib.suppress(OSError):
             process.stdin.close()
@@ -200,9 +214,15 @@ class RunStore:
             record = json.loads(self._file(key).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return None
-        return record if isinstance(record, dict) and record.get("key") == key else None
+        return (
+            record
+            if isinstance(record, dict) and record.get("key") == key
+            else None
+        )
 
-    def load_finished(self, key: str, time_limit_s: float | None) -> Record | None:
+    def load_finished(
+        self, key: str, time_limit_s: float | None
+    ) -> Record | None:
         """Return the record of a run; None if the run should be executed again.
 
         A run is repeated if it crashed, or if it exceeded a time limit below the present one.
@@ -212,7 +232,11 @@ class RunStore:
             return None
         if record["outcome"] == TIMEOUT:
             previous_limit_s = record.get("time_limit_s") or 0.0
-            return record if time_limit_s is not None and time_limit_s <= previous_limit_s else None
+            return (
+                record
+                if time_limit_s is not None and time_limit_s <= previous_limit_s
+                else None
+            )
         return record
 
     def _file(self, key: str) -> Path:
@@ -272,7 +296,9 @@ def run_all(
     planned: Sequence[PlannedRun],
     store: RunStore,
     options: RunOptions,
-    on_record: Callable[[Record, int], None] = lambda record, worker_count: None,
+    on_record: Callable[[Record, int], None] = lambda record, worker_count: (
+        None
+    ),
 ) -> None:
     """Execute the runs of a study and store their records, each as soon as it has ended.
 
@@ -296,7 +322,9 @@ def run_all(
     """
     if not planned:
         return
-    with (_cluster_executor if options.scheduler else _thread_executor)(options) as pool:
+    with (_cluster_executor if options.scheduler else _thread_executor)(
+        options
+    ) as pool:
         futures = {pool.submit(run): run for run in planned}
         try:
             for future in as_completed(futures):
@@ -311,7 +339,9 @@ def run_all(
             raise
 
 
-def _result_record(future: Future, planned: PlannedRun, limits: RunOptions) -> Record:
+def _result_record(
+    future: Future, planned: PlannedRun, limits: RunOptions
+) -> Record:
     """Return the record of a run from its future; if that raises, a record of a crash, because its
     worker was lost.
     """
@@ -337,7 +367,9 @@ def _thread_executor(limits: RunOptions) -> Iterator[RunExecutor]:
 
         def submit(run: PlannedRun) -> Future:
             """Start a run and return the future of its record."""
-            return executor.submit(execute, run.as_dict(), limits.time_limit_s, stop.is_set)
+            return executor.submit(
+                execute, run.as_dict(), limits.time_limit_s, stop.is_set
+            )
 
         yield RunExecutor(submit, worker_count, stop.set)
 
@@ -354,11 +386,17 @@ def _cluster_executor(limits: RunOptions) -> Iterator[RunExecutor]:
 
             def submit(run: PlannedRun) -> Future:
                 """Start a run and return the future of its record."""
-                return executor.submit(_execute_on_worker, run.as_dict(), limits.time_limit_s, flag)
+                return executor.submit(
+                    _execute_on_worker, run.as_dict(), limits.time_limit_s, flag
+                )
 
-            yield RunExecutor(submit, max(1, sum(client.nthreads().values())), stop.set)
+            yield RunExecutor(
+                submit, max(1, sum(client.nthreads().values())), stop.set
+            )
 
 
-def _execute_on_worker(planned: dict[str, Any], time_limit_s: float | None, flag: str) -> Record:
+def _execute_on_worker(
+    planned: dict[str, Any], time_limit_s: float | None, flag: str
+) -> Record:
     """Execute a run on a worker until the event named `flag` is set, and return its record."""
     return execute(planned, time_limit_s, distributed().Event(flag).is_set)

@@ -46,7 +46,9 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
         A `PlannedRun` as a dictionary.
     """
     try:
-        problem = Problem.read(planned["problem"], planned["overrides"], planned["allow_code"])
+        problem = Problem.read(
+            planned["problem"], planned["overrides"], planned["allow_code"]
+        )
         test_name = planned.get("test_name")
         if test_name is not None:
             fit = fit_record(problem, planned["method"], test_name)
@@ -62,7 +64,11 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
         return {"outcome": ERROR, "message": str(error)}
     except Exception as error:
         message = f"{type(error).__name__}: {error}"
-        return {"outcome": ERROR, "message": message, "traceback": traceback.format_exc()}
+        return {
+            "outcome": ERROR,
+            "message": message,
+            "traceback": traceback.format_exc(),
+        }
 
 
 def _tip_record(finished: Run) -> dict[str, Any] | None:
@@ -76,12 +82,20 @@ def _tip_record(finished: Run) -> dict[str, Any] | None:
     grasped_nodes = prescribed_nodes(experiment.grasps)
     if not markers.names:
         return None
-    centre = nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(axis=0)
-    tip = int(np.linalg.norm(markers.predict_positions(nodes_m) - centre, axis=1).argmax())
+    centre = nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(
+        axis=0
+    )
+    tip = int(
+        np.linalg.norm(
+            markers.predict_positions(nodes_m) - centre, axis=1
+        ).argmax()
+    )
     measured = markers.positions_m[:, tip]
     rollout = finished.rollouts[experiment.name]
     rolled = (
-        rollout.trajectory.markers_m[:, tip] if isinstance(rollout, ForwardSimulation) else None
+        rollout.trajectory.markers_m[:, tip]
+        if isinstance(rollout, ForwardSimulation)
+        else None
     )
     error = None
     if rolled is not None and markers.is_present[:, tip].any():

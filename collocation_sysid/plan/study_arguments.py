@@ -22,7 +22,9 @@ RANGE = "such as 50:5000:log:9 or 0:1:5"
 
 def unique_items(text: str) -> tuple[str, ...]:
     """Return the items of text separated by commas, each once, in their order."""
-    return tuple(dict.fromkeys(item.strip() for item in text.split(",") if item.strip()))
+    return tuple(
+        dict.fromkeys(item.strip() for item in text.split(",") if item.strip())
+    )
 
 
 def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
@@ -35,7 +37,11 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
     """
     names = unique_items(text)
     if not names:
-        raise InputError(f"found no name; expected some of {', '.join(METHODS)}", None, option)
+        raise InputError(
+            f"found no name; expected some of {', '.join(METHODS)}",
+            None,
+            option,
+        )
     for name in names:
         require_method(name, option)
     return names
@@ -91,7 +97,9 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
         If the file cannot be read, or has no such table.
     """
     if "=" in item:
-        pairs = [pair.partition("=") for pair in item.split(",") if pair.strip()]
+        pairs = [
+            pair.partition("=") for pair in item.split(",") if pair.strip()
+        ]
         return None, {name.strip(): value.strip() for name, _, value in pairs}
     path = Path(item)
     require_regular(path, "--truth")
@@ -108,7 +116,11 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
         raise InputError(f"cannot be read: {error}", path, "--truth") from error
     table = content.get("parameters", content)
     if not isinstance(table, Mapping):
-        raise InputError("parameters is not a table; expected true values by name", path, "--truth")
+        raise InputError(
+            "parameters is not a table; expected true values by name",
+            path,
+            "--truth",
+        )
     return path, table
 
 
@@ -122,7 +134,11 @@ def _positive_value(name: str, value: Any, source: Path | None) -> float:
         number = np.nan
     if not 0 < number < np.inf:
         quoted = value[:60] if isinstance(value, str) else shortened(value)
-        raise InputError(f"found {name} = {quoted}; expected a positive number", source, "--truth")
+        raise InputError(
+            f"found {name} = {quoted}; expected a positive number",
+            source,
+            "--truth",
+        )
     return number
 
 
@@ -153,11 +169,19 @@ def parse_varied_keys(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
                 "--over",
             )
         if key in over:
-            raise InputError(f"{key} is given twice; put its values in one list", None, "--over")
+            raise InputError(
+                f"{key} is given twice; put its values in one list",
+                None,
+                "--over",
+            )
         ranged = ":" in values and not values.startswith(('"', "'", "[", "{"))
-        over[key] = tuple(_range_values(key, values) if ranged else _split_values(values))
+        over[key] = tuple(
+            _range_values(key, values) if ranged else _split_values(values)
+        )
     if not over:
-        raise InputError("missing; expected at least one key to sweep over", None, "--over")
+        raise InputError(
+            "missing; expected at least one key to sweep over", None, "--over"
+        )
     require_few(math.prod(map(len, over.values())), "--over", "runs")
     return over
 
@@ -176,7 +200,11 @@ def require_few(count: int, option: str, noun: str) -> None:
     """
     if count > MOST_RUNS:
         number = f"{count:,}" if count < 10**15 else "more than 10¹⁵"
-        raise InputError(f"asks for {number} {noun}; expected at most {MOST_RUNS:,}", None, option)
+        raise InputError(
+            f"asks for {number} {noun}; expected at most {MOST_RUNS:,}",
+            None,
+            option,
+        )
 
 
 def _range_values(key: str, text: str) -> Iterable[str]:
@@ -187,7 +215,11 @@ def _range_values(key: str, text: str) -> Iterable[str]:
         high = float(middle[0])
         number = int(count)
         spacing = middle[1] if len(middle) == 2 else "linear"
-        if len(middle) > 2 or number < 1 or not np.isfinite([low, high, high - low]).all():
+        if (
+            len(middle) > 2
+            or number < 1
+            or not np.isfinite([low, high, high - low]).all()
+        ):
             raise ValueError
     except (ValueError, IndexError):
         raise InputError(
@@ -204,7 +236,9 @@ def _range_values(key: str, text: str) -> Iterable[str]:
         )
     if spacing == "log" and not (low > 0 and high > 0):
         raise InputError(
-            f"found {text} for {key}; a logarithmic range needs ends above 0", None, "--over"
+            f"found {text} for {key}; a logarithmic range needs ends above 0",
+            None,
+            "--over",
         )
     spaced = np.geomspace if spacing == "log" else np.linspace
     # Without the rounding errors of their computation.

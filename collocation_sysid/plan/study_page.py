@@ -15,7 +15,13 @@ from ..fem.constants import symbol_of, symbol_with_unit, unit_of
 from ..files import SCHEMA, replaced_file, write_text_file
 from ..serialisation import as_json
 from .law_disagreements import law_table
-from .model_choice import advice, display_unit, law_disagreements, model_notes, model_rows
+from .model_choice import (
+    advice,
+    display_unit,
+    law_disagreements,
+    model_notes,
+    model_rows,
+)
 from .run_execution import Record, RunStore
 from .study_kinds import METHOD_STUDY, MODEL_STUDY
 from .study_planning import PlannedRun, shortened_keys
@@ -48,7 +54,9 @@ WORDS = {
     "relative to best": "held out, relative to the best",
 }
 UNITS = ("Pa", "s", "1/s", "kg/m³")
-MEDIANS_NOTE = "Errors, misfits and costs are medians over the runs with a result."
+MEDIANS_NOTE = (
+    "Errors, misfits and costs are medians over the runs with a result."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +88,10 @@ class StudyReport:
         """One row for each planned run, or for each model."""
         if self.kind == MODEL_STUDY:
             return model_rows(self.planned, self.records)
-        return [run_row(run, self.records.get(run.key), self.yardstick) for run in self.planned]
+        return [
+            run_row(run, self.records.get(run.key), self.yardstick)
+            for run in self.planned
+        ]
 
     @property
     def views(self) -> list[Table]:
@@ -89,7 +100,10 @@ class StudyReport:
             return comparison_views(method_rows(self.rows))
         if self.kind == MODEL_STUDY:
             disagreements = law_disagreements(self.rows)
-            return [*model_views(self.rows), *([law_table(disagreements)] if disagreements else [])]
+            return [
+                *model_views(self.rows),
+                *([law_table(disagreements)] if disagreements else []),
+            ]
         return sweep_views(self.rows, list(self.planned[0].varied_values))
 
     @property
@@ -104,8 +118,15 @@ class StudyReport:
     @property
     def tables(self) -> list[Table]:
         """Tables for pages: headings in words, and the runs of a comparison."""
-        views = [replace(view, heads=tuple(map(_in_words, view.heads))) for view in self.views]
-        return [*views, run_view(self.rows)] if self.kind == METHOD_STUDY else views
+        views = [
+            replace(view, heads=tuple(map(_in_words, view.heads)))
+            for view in self.views
+        ]
+        return (
+            [*views, run_view(self.rows)]
+            if self.kind == METHOD_STUDY
+            else views
+        )
 
     @property
     def failures(self) -> list[str]:
@@ -121,11 +142,19 @@ class StudyReport:
     def notes(self) -> list[str]:
         """Notes that explain the tables."""
         missing = len(self.planned) - len(self.records)
-        notes = [f"{missing} of {len(self.planned)} runs remain to be done."] if missing else []
+        notes = (
+            [f"{missing} of {len(self.planned)} runs remain to be done."]
+            if missing
+            else []
+        )
         if self.kind == MODEL_STUDY:
             return [*model_notes(self.rows), *notes]
         return [
-            *((self.yardstick.sentence, MEDIANS_NOTE) if self.kind == METHOD_STUDY else ()),
+            *(
+                (self.yardstick.sentence, MEDIANS_NOTE)
+                if self.kind == METHOD_STUDY
+                else ()
+            ),
             *notes,
         ]
 
@@ -139,7 +168,9 @@ def load_report(
 ) -> StudyReport:
     """Return the report of planned runs from their stored records."""
     loaded = {run.key: store.load(run.key) for run in planned}
-    records = {key: record for key, record in loaded.items() if record is not None}
+    records = {
+        key: record for key, record in loaded.items() if record is not None
+    }
     return StudyReport(
         title,
         kind,
@@ -155,11 +186,16 @@ def load_report(
 def study_tables(report: StudyReport, folder: Path) -> list[Shown]:
     """Return the tables of a study within 80 columns, and its failures."""
     # What no line of the tables says.
-    parts: list[Shown] = [*report.headline, ""] if report.kind == MODEL_STUDY else []
+    parts: list[Shown] = (
+        [*report.headline, ""] if report.kind == MODEL_STUDY else []
+    )
     for table in report.views:
         parts += [table, ""]
     failures = report.failures
-    parts += [*report.notes, *(Line(each, "doubtful") for each in failures[:SHOWN_FAILURES])]
+    parts += [
+        *report.notes,
+        *(Line(each, "doubtful") for each in failures[:SHOWN_FAILURES]),
+    ]
     if len(failures) > SHOWN_FAILURES:
         more = f"and {len(failures) - SHOWN_FAILURES} more in summary.md"
         parts.append(Line(more, "doubtful"))
@@ -172,7 +208,9 @@ def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
         (
             str(number),
             run.label,
-            " ".join("–" if g is None else f"{g:.4g}" for g in run.guess.values()),
+            " ".join(
+                "–" if g is None else f"{g:.4g}" for g in run.guess.values()
+            ),
             "finished" if run.key in finished else "to do",
         )
         for number, run in enumerate(planned, start=1)
@@ -193,8 +231,12 @@ def write_report(report: StudyReport, folder: Path) -> None:
     write_text_file(folder / "runs.csv", as_csv(rows))
     if report.kind == METHOD_STUDY:
         write_text_file(folder / "summary.csv", as_csv(method_rows(rows)))
-    write_text_file(folder / "summary.json", as_json(report_json(report)) + "\n")
-    write_text_file(folder / "summary.md", as_markdown([report_section(report)]))
+    write_text_file(
+        folder / "summary.json", as_json(report_json(report)) + "\n"
+    )
+    write_text_file(
+        folder / "summary.md", as_markdown([report_section(report)])
+    )
     if report.kind == MODEL_STUDY:
         figures = {}
     elif report.kind == METHOD_STUDY:
@@ -249,7 +291,9 @@ def as_csv(rows: Sequence[Row]) -> str:
 def report_section(report: StudyReport) -> TitledParts:
     """Return tables and failures as a section for a paper's appendix or an issue."""
     failures = (Items(tuple(report.failures)),) if report.failures else ()
-    without = tuple(TitledParts("Runs without a result", (each,)) for each in failures)
+    without = tuple(
+        TitledParts("Runs without a result", (each,)) for each in failures
+    )
     parts = (*report.headline, *report.notes, *report.views, *without)
     return TitledParts(report.title, parts, level=1)
 
@@ -259,7 +303,9 @@ def _in_words(head: str) -> str:
     if head.startswith("Δ") and head.endswith(" %"):
         return f"error of {head[1:-2]} [%]"
     symbol, space, unit = head.partition(" ")
-    return WORDS.get(head, f"{symbol} [{unit}]" if space and unit in UNITS else head)
+    return WORDS.get(
+        head, f"{symbol} [{unit}]" if space and unit in UNITS else head
+    )
 
 
 # Views --------------------------------------------------------------------------------------------
@@ -272,19 +318,44 @@ def comparison_views(summaries: Sequence[Row]) -> list[Table]:
     success: dict[str, Cell] = {
         "runs": lambda row: str(row["runs"]),
         "success": lambda row: f"{row['successes']}/{row['runs']}",
-        "95 %": lambda row: f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f} %",
+        "95 %": lambda row: (
+            f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f} %"
+        ),
     }
     success |= _error_cells(summaries)
-    quality = ["violation_n", "violation_relative", "rms_m", "rollout_rms_m", "tip_max_m"]
-    cost = ["iterations", "evaluations", "build_s", "evaluations_s", "linear_algebra_s", "total_s"]
+    quality = [
+        "violation_n",
+        "violation_relative",
+        "rms_m",
+        "rollout_rms_m",
+        "tip_max_m",
+    ]
+    cost = [
+        "iterations",
+        "evaluations",
+        "build_s",
+        "evaluations_s",
+        "linear_algebra_s",
+        "total_s",
+    ]
     if all(row["evaluations"] is None for row in summaries):
         cost.remove("evaluations")
     return [
-        _table_view("Success", {"method": _text_cell("method")}, success, summaries),
         _table_view(
-            "Quality", {"method": _text_cell("method")}, _number_cells(*quality), summaries
+            "Success", {"method": _text_cell("method")}, success, summaries
         ),
-        _table_view("Cost", {"method": _text_cell("method")}, _number_cells(*cost), summaries),
+        _table_view(
+            "Quality",
+            {"method": _text_cell("method")},
+            _number_cells(*quality),
+            summaries,
+        ),
+        _table_view(
+            "Cost",
+            {"method": _text_cell("method")},
+            _number_cells(*cost),
+            summaries,
+        ),
     ]
 
 
@@ -295,7 +366,9 @@ def run_view(rows: Sequence[Row]) -> Table:
         "ended": _text_cell("status"),
         "succeeded": lambda row: "yes" if row["success"] else "no",
     }
-    cells |= _error_cells(rows) | _number_cells("rms_m", "rollout_rms_m", "iterations", "total_s")
+    cells |= _error_cells(rows) | _number_cells(
+        "rms_m", "rollout_rms_m", "iterations", "total_s"
+    )
     ordered = sorted(rows, key=lambda row: row["start"])
     view = _table_view("Runs", names, cells, ordered)
     return replace(view, heads=tuple(map(_in_words, view.heads)))
@@ -305,12 +378,16 @@ def _method_sentence(row: Row) -> str:
     """Return how often, how accurately and how fast a method found the solution, in words."""
     low = 100 * row["success_low"]
     high = 100 * row["success_high"]
-    sentence = f"{row['method']} succeeded in {row['successes']} of {row['runs']} runs"
+    sentence = (
+        f"{row['method']} succeeded in {row['successes']} of {row['runs']} runs"
+    )
     sentence += f" (95 % interval of the rate: {low:.0f} to {high:.0f} %)"
     if row["total_s"] is None:
         return f"{sentence}, and gave no result."
     misfit = f"with a marker error of {1e3 * row['rms_m']:.2g} mm"
-    return f"{sentence}, {misfit} and a time of {row['total_s']:.2g} s (medians)."
+    return (
+        f"{sentence}, {misfit} and a time of {row['total_s']:.2g} s (medians)."
+    )
 
 
 def sweep_sentences(rows: Sequence[Row]) -> list[str]:
@@ -319,22 +396,36 @@ def sweep_sentences(rows: Sequence[Row]) -> list[str]:
     sentences = [f"{len(converged)} of {len(rows)} runs converged."]
     for name in parameters_in(rows):
         values = [row[f"value_{name}"] for row in converged]
-        errors = [e for row in converged if (e := row[f"std_error_{name}"]) is not None]
+        errors = [
+            e
+            for row in converged
+            if (e := row[f"std_error_{name}"]) is not None
+        ]
         if len(values) > 1:
-            spread = f"; the largest standard error is {max(errors):.2g}" if errors else ""
+            spread = (
+                f"; the largest standard error is {max(errors):.2g}"
+                if errors
+                else ""
+            )
             low = f"{min(values):.4g}"
             high = f"{max(values):.4g} {unit_of(name)}".strip()
-            sentences.append(f"Their {symbol_of(name)} is from {low} to {high}{spread}.")
+            sentences.append(
+                f"Their {symbol_of(name)} is from {low} to {high}{spread}."
+            )
     return sentences
 
 
 def sweep_views(rows: Sequence[Row], varied_keys: Sequence[str]) -> list[Table]:
     """Return tables of estimates and quality by swept values."""
-    places = {short: _varied_cell(key) for key, short in shortened_keys(varied_keys)}
+    places = {
+        short: _varied_cell(key) for key, short in shortened_keys(varied_keys)
+    }
     estimates: dict[str, Cell] = {}
     for name in parameters_in(rows):
         estimates[symbol_with_unit(name)] = _estimate_cell(name)
-    number_columns = _number_cells("rms_m", "rollout_rms_m", "iterations", "total_s")
+    number_columns = _number_cells(
+        "rms_m", "rollout_rms_m", "iterations", "total_s"
+    )
     quality = {"status": _text_cell("status"), **number_columns}
     return [
         _table_view("Estimates ± standard error", places, estimates, rows),
@@ -356,8 +447,13 @@ def model_views(rows: Sequence[Row]) -> list[Table]:
     moduli: dict[str, Cell] = {}
     names = dict.fromkeys(name for row in rows for name in row["parameters"])
     for name in names:
-        moduli[symbol_with_unit(name)] = _number_cell(name, 1, ".4g", "parameters")
-    model = {"": lambda row: "→" if row["chosen"] else "", "model": _text_cell("model")}
+        moduli[symbol_with_unit(name)] = _number_cell(
+            name, 1, ".4g", "parameters"
+        )
+    model = {
+        "": lambda row: "→" if row["chosen"] else "",
+        "model": _text_cell("model"),
+    }
     views = [_table_view("Models", model, number_columns, rows)]
     test_columns = {
         f"'{n}' {unit}": _number_cell(n, factor, ".3g", "predictions")
@@ -365,13 +461,26 @@ def model_views(rows: Sequence[Row]) -> list[Table]:
     }
     if len(test_columns) > 1:
         views.append(
-            _table_view("Recordings held out", {"model": _text_cell("model")}, test_columns, rows)
+            _table_view(
+                "Recordings held out",
+                {"model": _text_cell("model")},
+                test_columns,
+                rows,
+            )
         )
-    return [*views, _transposed_view("Parameters", {"model": _text_cell("model")}, moduli, rows)]
+    return [
+        *views,
+        _transposed_view(
+            "Parameters", {"model": _text_cell("model")}, moduli, rows
+        ),
+    ]
 
 
 def _transposed_view(
-    title: str, names: Mapping[str, Cell], cells: Mapping[str, Cell], rows: Sequence[Row]
+    title: str,
+    names: Mapping[str, Cell],
+    cells: Mapping[str, Cell],
+    rows: Sequence[Row],
 ) -> Table:
     """Return a table with a line for each cell and a column for each row, for many cells and few
     rows.
@@ -386,7 +495,9 @@ def _transposed_view(
     rows : sequence of Row
     """
     (name,) = names.values()
-    lines = tuple((head, *(cell(row) for row in rows)) for head, cell in cells.items())
+    lines = tuple(
+        (head, *(cell(row) for row in rows)) for head, cell in cells.items()
+    )
     return Table(title, ("", *(name(row) for row in rows)), lines)
 
 
@@ -402,7 +513,10 @@ def _ratio_text(row: Row) -> str:
 
 
 def _table_view(
-    title: str, names: Mapping[str, Cell], number_columns: Mapping[str, Cell], rows: Sequence[Row]
+    title: str,
+    names: Mapping[str, Cell],
+    number_columns: Mapping[str, Cell],
+    rows: Sequence[Row],
 ) -> Table:
     """Return a table with a line for each row and a column for each cell; the first columns are
     `names`.
@@ -430,7 +544,9 @@ def _varied_cell(key: str) -> Cell:
     return cell
 
 
-def _number_cell(name: str, factor: float = 1.0, form: str = ".2g", among: str = "") -> Cell:
+def _number_cell(
+    name: str, factor: float = 1.0, form: str = ".2g", among: str = ""
+) -> Cell:
     """Return the cell of a number, "–" if unknown.
 
     Parameters
@@ -445,7 +561,9 @@ def _number_cell(name: str, factor: float = 1.0, form: str = ".2g", among: str =
         Key of the mapping in the row that contains the number; "" if it is in the row itself.
     """
     shown = NumberColumn(factor=factor, form=form)
-    return lambda row: shown.format(row[among].get(name) if among else row[name])
+    return lambda row: shown.format(
+        row[among].get(name) if among else row[name]
+    )
 
 
 def _error_cells(rows: Sequence[Row]) -> dict[str, Cell]:
@@ -453,13 +571,19 @@ def _error_cells(rows: Sequence[Row]) -> dict[str, Cell]:
     heading.
     """
     names = parameters_in(rows, "error_")
-    return {f"Δ{symbol_of(name)} %": _number_cell(f"error_{name}", 100) for name in names}
+    return {
+        f"Δ{symbol_of(name)} %": _number_cell(f"error_{name}", 100)
+        for name in names
+    }
 
 
 def _number_cells(*names: str) -> dict[str, Cell]:
     """Return the cells of the columns with these names in `COLUMNS`, by heading."""
     return {
-        COLUMNS[name].head: lambda row, name=name: COLUMNS[name].format(row[name]) for name in names
+        COLUMNS[name].head: lambda row, name=name: COLUMNS[name].format(
+            row[name]
+        )
+        for name in names
     }
 
 
@@ -472,6 +596,10 @@ def _estimate_cell(name: str) -> Cell:
         spread = row.get(f"std_error_{name}")
         if value is None:
             return "–"
-        return f"{value:.4g}" if spread is None else f"{value:.4g} ± {float(f'{spread:.1g}'):g}"
+        return (
+            f"{value:.4g}"
+            if spread is None
+            else f"{value:.4g} ± {float(f'{spread:.1g}'):g}"
+        )
 
     return cell

@@ -88,15 +88,24 @@ class PlannedRun:
         return asdict(self)
 
 
-def shortened_keys(keys: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def shortened_keys(
+    keys: Sequence[str] | Mapping[str, Any],
+) -> Iterator[tuple[str, str]]:
     """Yield each dotted key with the shortest ending that distinguishes it from the others; of
     parameters at least two parts, name and key.
     """
     for key in keys:
         parts = key.split(".")
         fewest_parts = 2 if parts[0] == "parameters" else 1
-        ends = [".".join(parts[-count:]) for count in range(fewest_parts, len(parts) + 1)]
-        unique_ends = (e for e in ends if sum(f".{other}".endswith(f".{e}") for other in keys) == 1)
+        ends = [
+            ".".join(parts[-count:])
+            for count in range(fewest_parts, len(parts) + 1)
+        ]
+        unique_ends = (
+            e
+            for e in ends
+            if sum(f".{other}".endswith(f".{e}") for other in keys) == 1
+        )
         yield key, next(unique_ends, key)
 
 
@@ -125,7 +134,9 @@ class Starts(Options):
         super().__post_init__()
         require_few(self.starts, "starts", "starts")
 
-    def overrides(self, problem: Problem, truth: Mapping[str, float], start: int) -> Iterator[str]:
+    def overrides(
+        self, problem: Problem, truth: Mapping[str, float], start: int
+    ) -> Iterator[str]:
         """Yield the overrides of one start: guesses, log-uniform around truth or guess, within the
         bounds.
 
@@ -144,7 +155,9 @@ class Starts(Options):
             For a parameter with neither a guess nor a true value.
         """
         free = problem.parameters.free if start else ()
-        exponents = np.random.default_rng([self.seed, start]).uniform(-1, 1, len(free))
+        exponents = np.random.default_rng([self.seed, start]).uniform(
+            -1, 1, len(free)
+        )
         for item, exponent in zip(free, exponents, strict=True):
             centre = truth.get(item.name, item.guess)
             if centre is None:
@@ -154,7 +167,9 @@ class Starts(Options):
                     problem.path,
                     f"parameters.{item.name}",
                 )
-            inside = float(np.clip(centre * self.spread**exponent, item.lower, item.upper))
+            inside = float(
+                np.clip(centre * self.spread**exponent, item.lower, item.upper)
+            )
             yield f"parameters.{item.name}.guess={inside!r}"
 
 
@@ -197,10 +212,16 @@ def plan_comparison(
             "file; write one, and use Problem.read"
         )
     if problem.substeps == "auto":  # or each method would choose for itself
-        overrides = [*overrides, f"transcription.substeps={problem.first_substeps}"]
+        overrides = [
+            *overrides,
+            f"transcription.substeps={problem.first_substeps}",
+        ]
     planned = []
     for start in range(starts.starts):
-        start_overrides = [*overrides, *starts.overrides(problem, truth or {}, start)]
+        start_overrides = [
+            *overrides,
+            *starts.overrides(problem, truth or {}, start),
+        ]
         file, _ = read_problem_file(problem.path, start_overrides)
         details = {"start": start, "allow_code": allow_code}
         planned += [
@@ -241,14 +262,19 @@ def plan_sweep(
     planned = []
     for values in itertools.product(*over.values()):
         varied_values = dict(zip(over, values, strict=True))
-        run_overrides = [*overrides, *(f"{key}={value}" for key, value in varied_values.items())]
+        run_overrides = [
+            *overrides,
+            *(f"{key}={value}" for key, value in varied_values.items()),
+        ]
         try:
             file, _ = read_problem_file(path, run_overrides)
         except InputError as error:
             where = "--over" if error.source == "--set" else error.source
             raise InputError(error.message, where, error.where) from error
         details = {"varied_values": varied_values, "allow_code": allow_code}
-        planned.append(_planned_run(path, file, method, run_overrides, **details))
+        planned.append(
+            _planned_run(path, file, method, run_overrides, **details)
+        )
     return planned
 
 
@@ -280,7 +306,11 @@ def plan_models(
         wrenches.
     """
     for each in problem.experiments:
-        is_compared = each.markers.sample_count or each.wrenches or each.specimen is not None
+        is_compared = (
+            each.markers.sample_count
+            or each.wrenches
+            or each.specimen is not None
+        )
         if not (each.validation or is_compared):
             raise InputError(
                 f"'{each.name}' has neither markers nor a measured wrench; expected one of these, "
@@ -291,9 +321,16 @@ def plan_models(
     for test_name in ("", *fitted_recordings(problem)):
         for variant in variants:
             file, _ = read_problem_file(variant.path, variant.overrides)
-            details = {"varied_values": {"model": variant.label}, "test_name": test_name}
+            details = {
+                "varied_values": {"model": variant.label},
+                "test_name": test_name,
+            }
             details |= {"allow_code": allow_code}
-            planned.append(_planned_run(variant.path, file, method, variant.overrides, **details))
+            planned.append(
+                _planned_run(
+                    variant.path, file, method, variant.overrides, **details
+                )
+            )
     return planned
 
 
@@ -303,7 +340,11 @@ def fitted_recordings(problem: Problem) -> list[str]:
 
 
 def _planned_run(
-    path: Path, file: ProblemFile, method: str | None, overrides: Sequence[str], **more: Any
+    path: Path,
+    file: ProblemFile,
+    method: str | None,
+    overrides: Sequence[str],
+    **more: Any,
 ) -> PlannedRun:
     """Return the run of a file with its overrides, with a key that depends on all that decides its
     result.
@@ -332,15 +373,26 @@ def _planned_run(
     }
     content = file.model_dump(mode="json", exclude_unset=True)
     solver = content.get("solver", {})
-    content["solver"] = {key: solver[key] for key in ("huber", method) if key in solver}
+    content["solver"] = {
+        key: solver[key] for key in ("huber", method) if key in solver
+    }
     content["solver"]["method"] = method
-    of_study = start if more.get("test_name") is None else f"without {more['test_name']}"
+    of_study = (
+        start
+        if more.get("test_name") is None
+        else f"without {more['test_name']}"
+    )
     hashes = _file_hashes(content, path.parent)
     decisive = [content, of_study, hashes, version("collocation-sysid")]
     text = json.dumps(decisive, sort_keys=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
     return PlannedRun(
-        key, str(path.resolve()), method, overrides=tuple(overrides), guess=guess, **more
+        key,
+        str(path.resolve()),
+        method,
+        overrides=tuple(overrides),
+        guess=guess,
+        **more,
     )
 
 
@@ -352,7 +404,10 @@ def _file_hashes(content: Any, folder: Path) -> dict[str, str]:
     for text in _texts(content):
         with suppress(OSError, ValueError):  # a text that is no file's name
             if files := stored_files(folder / text):
-                each = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+                each = [
+                    hashlib.sha256(file.read_bytes()).hexdigest()
+                    for file in files
+                ]
                 hashes[text] = " ".join(each)
     return hashes
 

@@ -57,7 +57,9 @@ PANEL_MM = 32.0
 
 
 def comparison_plots(
-    rows: Sequence[Row], records: Mapping[str, Record], yardstick: SuccessCriterion
+    rows: Sequence[Row],
+    records: Mapping[str, Record],
+    yardstick: SuccessCriterion,
 ) -> dict[str, Figure]:
     """Return the figures of a comparison of methods by file name without suffix; those without data
     are left out.
@@ -79,9 +81,15 @@ def comparison_plots(
     done = [row for row in rows if row["status"] != "missing"]
     centre = reference_parameters(done, yardstick) if done else {}
     # A run without a guess that failed has no place among the starts.
-    done = [row for row in done if all(row[f"guess_{name}"] is not None for name in centre)]
+    done = [
+        row
+        for row in done
+        if all(row[f"guess_{name}"] is not None for name in centre)
+    ]
     if centre and len({row["start"] for row in done}) > 1:
-        figures["success"] = success_by_distance(done, centre, bool(yardstick.truth))
+        figures["success"] = success_by_distance(
+            done, centre, bool(yardstick.truth)
+        )
         figures["basins"] = basins(done, centre, bool(yardstick.truth))
     return figures
 
@@ -98,30 +106,50 @@ def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
     }
 
 
-def convergence_in_time(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
+def convergence_in_time(
+    rows: Sequence[Row], records: Mapping[str, Record]
+) -> Figure:
     """Return a figure of loss and violation of the equations of motion against time, a line
     per run.
     """
     figure = new_figure(PAGE_MM, 70)
     panels = figure.subplots(1, 2)
     for method, (colour, runs) in _by_method(rows).items():
-        style: dict[str, Any] = {"color": colour, "lw": LINE_PT, "marker": ".", "ms": 3}
+        style: dict[str, Any] = {
+            "color": colour,
+            "lw": LINE_PT,
+            "marker": ".",
+            "ms": 3,
+        }
         for k, row in enumerate(runs):
             history = read(Result, records[row["key"]]["result"]).history
             times = [line.time_s for line in history]
             for axes, name in zip(panels, ("loss", "violation_n"), strict=True):
-                values = np.array([getattr(line, name) for line in history], dtype=float)
+                values = np.array(
+                    [getattr(line, name) for line in history], dtype=float
+                )
                 values[~(values > 0)] = np.nan
                 label = None if k else method
-                axes.plot(times, values, label=label, alpha=max(0.2, len(runs) ** -0.5), **style)
+                axes.plot(
+                    times,
+                    values,
+                    label=label,
+                    alpha=max(0.2, len(runs) ** -0.5),
+                    **style,
+                )
     style_axes(panels[0], "Loss", "time [s]", "Σ (residual / σ)²")
     style_axes(
-        panels[1], "Violation of the equations of motion", "time [s]", "largest residual [N]"
+        panels[1],
+        "Violation of the equations of motion",
+        "time [s]",
+        "largest residual [N]",
     )
     for axes in panels:
         make_log_axis(axes)
         axes.set_xscale("log", nonpositive="mask")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
+        axes.xaxis.set_major_locator(
+            LogLocator(subs=(1.0, 2.0, 5.0), numticks=7)
+        )
         format_plain_numbers(axes.xaxis)
     add_legend_above(panels[0], 3, height=1.1)
     return figure
@@ -139,7 +167,9 @@ def success_by_distance(
     figure = new_figure(PAGE_MM / 2, 65)
     axes = figure.subplots()
     factors = np.array([guess_distance(row, centre) for row in rows])
-    edges = np.geomspace(max(1.0, factors.min()), factors.max() * (1 + 1e-9), DISTANCE_BINS + 1)
+    edges = np.geomspace(
+        max(1.0, factors.min()), factors.max() * (1 + 1e-9), DISTANCE_BINS + 1
+    )
     methods = _by_method(rows)
     for k, (method, (colour, runs)) in enumerate(methods.items()):
         off = np.array([guess_distance(row, centre) for row in runs])
@@ -147,7 +177,11 @@ def success_by_distance(
         rates = []
         bars = []
         for low, high in itertools.pairwise(edges):
-            hits = [row["success"] for row, f in zip(runs, off, strict=True) if low <= f < high]
+            hits = [
+                row["success"]
+                for row, f in zip(runs, off, strict=True)
+                if low <= f < high
+            ]
             if hits:
                 rate = np.mean(hits)
                 least, most = wilson_interval(sum(hits), len(hits))
@@ -155,12 +189,20 @@ def success_by_distance(
                 places.append(low ** (1 - shift) * high**shift)
                 rates.append(100 * rate)
                 bars.append((100 * (rate - least), 100 * (most - rate)))
-        style = {"fmt": "o-", "ms": 3, "lw": LINE_PT, "elinewidth": 0.7, "capsize": 2}
+        style = {
+            "fmt": "o-",
+            "ms": 3,
+            "lw": LINE_PT,
+            "elinewidth": 0.7,
+            "capsize": 2,
+        }
         axes.errorbar(
             places, rates, np.abs(np.array(bars)).T, color=colour, label=method, **style
         )  # fmt: skip
     title = f"Success over distance from the {'true values' if is_truth_known else 'best estimate'}"
-    style_axes(axes, title, "factor by which the worst guess is wrong", "success [%]")
+    style_axes(
+        axes, title, "factor by which the worst guess is wrong", "success [%]"
+    )
     axes.set_xscale("log")
     axes.set_xticks(edges, [f"{edge:.2g}" for edge in edges])
     axes.xaxis.set_minor_locator(NullLocator())
@@ -169,7 +211,9 @@ def success_by_distance(
     return figure
 
 
-def basins(rows: Sequence[Row], centre: Mapping[str, float], is_truth_known: bool) -> Figure:
+def basins(
+    rows: Sequence[Row], centre: Mapping[str, float], is_truth_known: bool
+) -> Figure:
     """Return a figure of the start points over each pair of parameters, a row of panels for each
     method.
 
@@ -178,11 +222,18 @@ def basins(rows: Sequence[Row], centre: Mapping[str, float], is_truth_known: boo
     names = list(centre)
     pairs = list(itertools.combinations(names, 2)) or [(names[0], names[0])]
     methods = _by_method(rows)
-    figure = new_figure(max(PAGE_MM / 2, PANEL_MM * len(pairs)), 14 + PANEL_MM * len(methods))
-    panels = figure.subplots(len(methods), len(pairs), sharex=True, sharey=True, squeeze=False)
+    figure = new_figure(
+        max(PAGE_MM / 2, PANEL_MM * len(pairs)), 14 + PANEL_MM * len(methods)
+    )
+    panels = figure.subplots(
+        len(methods), len(pairs), sharex=True, sharey=True, squeeze=False
+    )
     for (method, (_, runs)), line in zip(methods.items(), panels, strict=True):
         for axes, (first, second) in zip(line, pairs, strict=True):
-            for success, colour, marker in ((False, VERMILION, "x"), (True, BLUE, "o")):
+            for success, colour, marker in (
+                (False, VERMILION, "x"),
+                (True, BLUE, "o"),
+            ):
                 chosen = [row for row in runs if row["success"] is success]
                 axes.scatter(
                     [row[f"guess_{first}"] / centre[first] for row in chosen],
@@ -191,9 +242,19 @@ def basins(rows: Sequence[Row], centre: Mapping[str, float], is_truth_known: boo
                     label="success" if success else "failure",
                 )  # fmt: skip
             axes.plot(
-                1, 1, "+", color=BLACK, ms=6, label="truth" if is_truth_known else "best estimate"
+                1,
+                1,
+                "+",
+                color=BLACK,
+                ms=6,
+                label="truth" if is_truth_known else "best estimate",
             )
-            style_axes(axes, method if axes is line[0] else "", "", symbol_as_mathtext(second))
+            style_axes(
+                axes,
+                method if axes is line[0] else "",
+                "",
+                symbol_as_mathtext(second),
+            )
     for axes, (first, _) in zip(panels[-1], pairs, strict=True):
         axes.set_xlabel(symbol_as_mathtext(first), fontsize=TEXT_PT)
     _ratio_axes(panels[0, 0], max(guess_distance(row, centre) for row in rows))
@@ -208,9 +269,18 @@ def basins(rows: Sequence[Row], centre: Mapping[str, float], is_truth_known: boo
 def _ratio_axes(axes: Axes, factor: float) -> None:
     """Set both axes to a logarithmic scale from about 1/factor to factor, with three ticks each."""
     digit = 10 ** np.floor(np.log10(factor))
-    tick = max((t for t in (1.5, 2.0, 5.0, 10.0) if t * digit <= factor), default=1.0) * digit
+    tick = (
+        max(
+            (t for t in (1.5, 2.0, 5.0, 10.0) if t * digit <= factor),
+            default=1.0,
+        )
+        * digit
+    )
     axes.set(xscale="log", yscale="log")
-    for axis, limit in ((axes.xaxis, axes.set_xlim), (axes.yaxis, axes.set_ylim)):
+    for axis, limit in (
+        (axes.xaxis, axes.set_xlim),
+        (axes.yaxis, axes.set_ylim),
+    ):
         limit(0.8 / factor, 1.25 * factor)
         axis.set_major_locator(FixedLocator([1 / tick, 1, tick]))
         format_plain_numbers(axis, ".2g")
@@ -226,11 +296,20 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
     figure = new_figure(PAGE_MM, 65)
     panels = figure.subplots(1, 3, sharex=True)
     tip = records[rows[0]["key"]]["tip"]
-    dots: dict[str, Any] = {"ms": 3.5, "color": BLACK, "mec": "none", "zorder": 3}
+    dots: dict[str, Any] = {
+        "ms": 3.5,
+        "color": BLACK,
+        "mec": "none",
+        "zorder": 3,
+    }
     measured = 1e3 * np.array(tip["measured_m"], dtype=float)
     for axis, (axes, letter) in enumerate(zip(panels, "xyz", strict=True)):
         axes.plot(tip["t_s"], measured[:, axis], ".", label="measured", **dots)
-        title = f"Tip: marker {tip['marker']} of {tip['experiment']}" if axis == 0 else ""
+        title = (
+            f"Tip: marker {tip['marker']} of {tip['experiment']}"
+            if axis == 0
+            else ""
+        )
         style_axes(axes, title, "time [s]", f"{letter} [mm]")
         axes.yaxis.set_major_locator(MaxNLocator(5))
     for method, (colour, runs) in _by_method(rows).items():
@@ -239,21 +318,35 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
         if not track.get("rolled_out_m"):
             continue
         rolled = 1e3 * np.array(track["rolled_out_m"], dtype=float)
-        off = f", error at most {1e3 * track['max_m']:.2g} mm" if track["max_m"] else ""
+        off = (
+            f", error at most {1e3 * track['max_m']:.2g} mm"
+            if track["max_m"]
+            else ""
+        )
         for axis, axes in enumerate(panels):
-            axes.plot(track["t_s"], rolled[:, axis], color=colour, lw=LINE_PT, label=method + off)
+            axes.plot(
+                track["t_s"],
+                rolled[:, axis],
+                color=colour,
+                lw=LINE_PT,
+                label=method + off,
+            )
     add_figure_legend(figure, 2)
     return figure
 
 
-def sweep_plots(rows: Sequence[Row], varied_keys: Sequence[str]) -> dict[str, Figure]:
+def sweep_plots(
+    rows: Sequence[Row], varied_keys: Sequence[str]
+) -> dict[str, Figure]:
     """Return the figures of a sweep by file name; empty if no run has a result."""
     if all(row["rms_m"] is None for row in rows):
         return {}
     return {"sweep": estimates_against(rows, varied_keys)}
 
 
-def estimates_against(rows: Sequence[Row], varied_keys: Sequence[str]) -> Figure:
+def estimates_against(
+    rows: Sequence[Row], varied_keys: Sequence[str]
+) -> Figure:
     """Return a figure of estimates with their 95 % intervals: a row for each parameter, a column
     for each swept key.
 
@@ -269,7 +362,9 @@ def estimates_against(rows: Sequence[Row], varied_keys: Sequence[str]) -> Figure
     for column, key in enumerate(varied_keys):
         places, texts = _axis_positions([row[key] for row in rows])
         for line, name in zip(panels, names, strict=True):
-            for label, colour, shift, chosen in _groups(rows, varied_keys, key, shorts):
+            for label, colour, shift, chosen in _groups(
+                rows, varied_keys, key, shorts
+            ):
                 _draw_estimates(
                     line[column],
                     rows,
@@ -280,7 +375,12 @@ def estimates_against(rows: Sequence[Row], varied_keys: Sequence[str]) -> Figure
                     label=label,
                 )
             unit = f" [{unit_of(name)}]" if unit_of(name) else ""
-            style_axes(line[column], "", "", "" if column else symbol_as_mathtext(name) + unit)
+            style_axes(
+                line[column],
+                "",
+                "",
+                "" if column else symbol_as_mathtext(name) + unit,
+            )
         bottom = panels[-1, column]
         bottom.set_xlabel(shorts[key], fontsize=TEXT_PT)
         shown = list(texts)[:: -(-len(texts) // MOST_TICKS)]
@@ -288,7 +388,9 @@ def estimates_against(rows: Sequence[Row], varied_keys: Sequence[str]) -> Figure
         if len(varied_keys) > 1:
             add_legend_above(panels[0, column], 2)
     for line in panels:
-        drawn = np.concatenate([c.get_segments() for c in line[0].collections])[..., 1].ravel()
+        drawn = np.concatenate([c.get_segments() for c in line[0].collections])[
+            ..., 1
+        ].ravel()
         if drawn.size and drawn.min() > 0 and drawn.max() > WIDE * drawn.min():
             make_log_axis(line[0])
     return figure
@@ -297,8 +399,12 @@ def estimates_against(rows: Sequence[Row], varied_keys: Sequence[str]) -> Figure
 def _axis_positions(values: Sequence[str]) -> tuple[Array, dict[float, str]]:
     """Return the positions of swept values on the axis, evenly spaced, and their labels."""
     order = list(dict.fromkeys(values))
-    names = {float(place): _shortened(value) for place, value in enumerate(order)}
-    return np.array([order.index(value) for value in values], dtype=float), names
+    names = {
+        float(place): _shortened(value) for place, value in enumerate(order)
+    }
+    return np.array(
+        [order.index(value) for value in values], dtype=float
+    ), names
 
 
 def _shortened(value: str) -> str:
@@ -310,7 +416,10 @@ def _shortened(value: str) -> str:
 
 
 def _groups(
-    rows: Sequence[Row], varied_keys: Sequence[str], key: str, shorts: Mapping[str, str]
+    rows: Sequence[Row],
+    varied_keys: Sequence[str],
+    key: str,
+    shorts: Mapping[str, str],
 ) -> Iterator[tuple[str | None, str, float, Array]]:
     """Return label, colour, offset and mask of the rows that share a value of another key."""
     other = next((name for name in varied_keys if name != key), None)
@@ -340,9 +449,21 @@ def _draw_estimates(
         for what in ("value", "low", "high")
     )
     converged = np.array([row["converged"] for row in rows])
-    style: dict[str, Any] = {"ms": 3.5, "lw": 0.8, "capsize": 2, "color": colour}
+    style: dict[str, Any] = {
+        "ms": 3.5,
+        "lw": 0.8,
+        "capsize": 2,
+        "color": colour,
+    }
     for form, shown in (("o", chosen & converged), ("x", chosen & ~converged)):
         if (shown & np.isfinite(value)).any():
             bars = np.clip([value - low, high - value], 0, None)[:, shown]
-            axes.errorbar(places[shown], value[shown], bars, fmt=form, label=label, **style)
+            axes.errorbar(
+                places[shown],
+                value[shown],
+                bars,
+                fmt=form,
+                label=label,
+                **style,
+            )
             label = None

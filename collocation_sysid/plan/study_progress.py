@@ -34,7 +34,11 @@ class StudyProgress(Watched):
     """
 
     def __init__(
-        self, console: Console, remaining: Sequence[PlannedRun], total: int, quiet: bool = False
+        self,
+        console: Console,
+        remaining: Sequence[PlannedRun],
+        total: int,
+        quiet: bool = False,
     ) -> None:
         super().__init__(console, quiet)
         self.total = total
@@ -64,7 +68,9 @@ class StudyProgress(Watched):
         run = self._waiting.pop(record["key"])
         if record.get("wall_s") is not None:
             self._walls.setdefault(run.method, []).append(record["wall_s"])
-        status = (record.get("result") or record).get("status", record["outcome"])
+        status = (record.get("result") or record).get(
+            "status", record["outcome"]
+        )
         count = f"{self.total - len(self._waiting)}/{self.total} runs"
         wall = record.get("wall_s") or 0.0
         line = f"{count}: {run.label} {status} in {wall:.1f} s{self._remaining_text(worker_count)}"
@@ -75,9 +81,15 @@ class StudyProgress(Watched):
         empty if the remaining time is unknown.
         """
         remaining_s = remaining_time_s(
-            [run.method for run in self._waiting.values()], self._walls, worker_count
+            [run.method for run in self._waiting.values()],
+            self._walls,
+            worker_count,
         )
-        return "" if remaining_s is None else f"; about {duration(remaining_s)} left"
+        return (
+            ""
+            if remaining_s is None
+            else f"; about {duration(remaining_s)} left"
+        )
 
 
 class DesignProgress(Watched):
@@ -85,7 +97,9 @@ class DesignProgress(Watched):
     and then.
     """
 
-    def __init__(self, console: Console, evaluations: int, quiet: bool = False) -> None:
+    def __init__(
+        self, console: Console, evaluations: int, quiet: bool = False
+    ) -> None:
         super().__init__(console, quiet)
         self.evaluations = evaluations
 
@@ -99,20 +113,29 @@ class DesignProgress(Watched):
         log_size : float
             Logarithm of the smallest relative error bar.
         """
-        best = "none feasible yet" if log_size >= FORBIDDEN else f"{100 * np.exp(log_size):.3g} %"
+        best = (
+            "none feasible yet"
+            if log_size >= FORBIDDEN
+            else f"{100 * np.exp(log_size):.3g} %"
+        )
         line = f"{number} of {self.evaluations} motions evaluated, smallest error bar: {best}"
         seldom = number % EVERY == 0 or number == self.evaluations
         self.update(
-            Text(f"{line} (Ctrl-C stops and keeps the best)", style="dim"), line if seldom else ""
+            Text(f"{line} (Ctrl-C stops and keeps the best)", style="dim"),
+            line if seldom else "",
         )
 
     def show_activity(self, what: str) -> None:
         """Show `what` is being computed, such as a stage of the design."""
-        self.update(Text(f"{what} (Ctrl-C stops and keeps the best)", style="dim"), what)
+        self.update(
+            Text(f"{what} (Ctrl-C stops and keeps the best)", style="dim"), what
+        )
 
 
 def remaining_time_s(
-    waiting: Sequence[str], walls: Mapping[str, Sequence[float]], worker_count: int
+    waiting: Sequence[str],
+    walls: Mapping[str, Sequence[float]],
+    worker_count: int,
 ) -> float | None:
     """Return the estimated time for the waiting runs [s]; None if it is unknown.
 
@@ -129,6 +152,9 @@ def remaining_time_s(
     if not waiting or not every:
         return None
     overall = sum(every) / len(every)
-    means = {method: sum(of_method) / len(of_method) for method, of_method in walls.items()}
+    means = {
+        method: sum(of_method) / len(of_method)
+        for method, of_method in walls.items()
+    }
     expected = [means.get(method, overall) for method in waiting]
     return max(sum(expected) / worker_count, max(expected))

@@ -50,16 +50,23 @@ class NumberColumn:
         if value is None:
             return "–"
         value *= self.factor
-        return format(value, ".0f" if self.form == ".2g" and abs(value) >= 100 else self.form)
+        return format(
+            value,
+            ".0f" if self.form == ".2g" and abs(value) >= 100 else self.form,
+        )
 
 
 # Quality and cost of a run.
 COLUMNS = {
     "loss": NumberColumn(
-        from_result=lambda r: r.history[-1].loss if r.history else None, has_median=False
+        from_result=lambda r: r.history[-1].loss if r.history else None,
+        has_median=False,
     ),
     "rms_m": NumberColumn(
-        "markers mm", "markers, RMS [mm]", 1e3, from_result=lambda r: r.fit.rms_m
+        "markers mm",
+        "markers, RMS [mm]",
+        1e3,
+        from_result=lambda r: r.fit.rms_m,
     ),
     "violation_n": NumberColumn(
         "violation N",
@@ -69,23 +76,44 @@ COLUMNS = {
         lambda r: r.dynamics.max_violation_n,
     ),
     "violation_relative": NumberColumn(
-        "relative", "of the largest force", 1, ".1e", lambda r: r.dynamics.max_violation_relative
+        "relative",
+        "of the largest force",
+        1,
+        ".1e",
+        lambda r: r.dynamics.max_violation_relative,
     ),
     "rollout_rms_m": NumberColumn(
-        "forward mm", "forward simulation, RMS [mm]", 1e3, from_result=lambda r: r.rollout.rms_m
+        "forward mm",
+        "forward simulation, RMS [mm]",
+        1e3,
+        from_result=lambda r: r.rollout.rms_m,
     ),
-    "rollout_max_m": NumberColumn(from_result=lambda r: r.rollout.max_m, has_median=False),
+    "rollout_max_m": NumberColumn(
+        from_result=lambda r: r.rollout.max_m, has_median=False
+    ),
     "tip_max_m": NumberColumn("tip mm", "tip, at most [mm]", 1e3),
-    "iterations": NumberColumn("iter.", "iterations", 1, ".4g", lambda r: r.iterations),
-    "evaluations": NumberColumn("evals", "evaluations", 1, ".4g", lambda r: r.evaluations),
-    "build_s": NumberColumn("build s", "set-up [s]", from_result=lambda r: r.timing_s.build),
+    "iterations": NumberColumn(
+        "iter.", "iterations", 1, ".4g", lambda r: r.iterations
+    ),
+    "evaluations": NumberColumn(
+        "evals", "evaluations", 1, ".4g", lambda r: r.evaluations
+    ),
+    "build_s": NumberColumn(
+        "build s", "set-up [s]", from_result=lambda r: r.timing_s.build
+    ),
     "evaluations_s": NumberColumn(
-        "evaluate s", "evaluations [s]", from_result=lambda r: r.timing_s.evaluations
+        "evaluate s",
+        "evaluations [s]",
+        from_result=lambda r: r.timing_s.evaluations,
     ),
     "linear_algebra_s": NumberColumn(
-        "solve s", "linear algebra [s]", from_result=lambda r: r.timing_s.linear_algebra
+        "solve s",
+        "linear algebra [s]",
+        from_result=lambda r: r.timing_s.linear_algebra,
     ),
-    "total_s": NumberColumn("total s", "in all [s]", from_result=lambda r: r.timing_s.total),
+    "total_s": NumberColumn(
+        "total s", "in all [s]", from_result=lambda r: r.timing_s.total
+    ),
 }
 # 97.5 % quantile of the standard normal distribution.
 NORMAL_975 = 1.959963984540054
@@ -127,7 +155,9 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     rate = successes / trials
     z2 = NORMAL_975**2
     centre = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
-    spread = sqrt(z2 * (rate * (1 - rate) / trials + z2 / (4 * trials**2))) / (1 + z2 / trials)
+    spread = sqrt(z2 * (rate * (1 - rate) / trials + z2 / (4 * trials**2))) / (
+        1 + z2 / trials
+    )
     low = 0.0 if successes == 0 else centre - spread
     return low, 1.0 if successes == trials else centre + spread
 
@@ -135,7 +165,9 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 # Runs ---------------------------------------------------------------------------------------------
 
 
-def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion) -> Row:
+def run_row(
+    run: PlannedRun, record: Record | None, yardstick: SuccessCriterion
+) -> Row:
     """Return one run as a flat row; values are None if they are not known.
 
     Columns ``guess_*``, ``value_*``, ``std_error_*``, ``low_*``, ``high_*`` and ``error_*``
@@ -155,8 +187,14 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion)
     is_timeout = record["outcome"] == TIMEOUT
     converged = result is not None and result.converged and not is_timeout
     parameters = _parameter_columns(run, result, yardstick.truth)
-    errors = [parameters[f"error_{name}"] for name in run.guess if name in yardstick.truth]
-    is_accurate = all(error is not None and error <= yardstick.within for error in errors)
+    errors = [
+        parameters[f"error_{name}"]
+        for name in run.guess
+        if name in yardstick.truth
+    ]
+    is_accurate = all(
+        error is not None and error <= yardstick.within for error in errors
+    )
     values = {
         name: None if result is None else column.from_result(result)
         for name, column in COLUMNS.items()
@@ -167,7 +205,9 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion)
         "method": run.method,
         "start": run.start,
         **run.varied_values,
-        "status": record["outcome"] if is_timeout or result is None else result.status,
+        "status": record["outcome"]
+        if is_timeout or result is None
+        else result.status,
         "converged": converged,
         "success": converged and is_accurate,
         **parameters,
@@ -177,10 +217,14 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion)
         "attempts": record.get("attempts"),
         "message": record.get("message", ""),
     }
-    return {key: None if each != each else each for key, each in row.items()}  # NaN is no number
+    return {
+        key: None if each != each else each for key, each in row.items()
+    }  # NaN is no number
 
 
-def _parameter_columns(run: PlannedRun, result: Result | None, truth: Mapping[str, float]) -> Row:
+def _parameter_columns(
+    run: PlannedRun, result: Result | None, truth: Mapping[str, float]
+) -> Row:
     """Return the columns of the parameters."""
     row: Row = {}
     estimates = {} if result is None else result.parameters
@@ -191,19 +235,29 @@ def _parameter_columns(run: PlannedRun, result: Result | None, truth: Mapping[st
         estimate = estimates.get(name)
         value = None if estimate is None else estimate.value
         row[f"value_{name}"] = value
-        row[f"std_error_{name}"] = None if estimate is None else estimate.combined_std_error
+        row[f"std_error_{name}"] = (
+            None if estimate is None else estimate.combined_std_error
+        )
         interval = None if estimate is None else estimate.combined95
         row[f"low_{name}"], row[f"high_{name}"] = interval or (None, None)
         if name in truth:
             # Methods are compared by the optimum that they find, not by its correction.
-            optimum = value if estimate is None or estimate.optimum is None else estimate.optimum
-            row[f"error_{name}"] = None if optimum is None else abs(optimum / truth[name] - 1)
+            optimum = (
+                value
+                if estimate is None or estimate.optimum is None
+                else estimate.optimum
+            )
+            row[f"error_{name}"] = (
+                None if optimum is None else abs(optimum / truth[name] - 1)
+            )
     return row
 
 
 def parameters_in(rows: Sequence[Row], kind: str = "guess_") -> list[str]:
     """Return the names of the parameters for which rows have a column of this kind."""
-    return [name.removeprefix(kind) for name in rows[0] if name.startswith(kind)]
+    return [
+        name.removeprefix(kind) for name in rows[0] if name.startswith(kind)
+    ]
 
 
 # Methods ------------------------------------------------------------------------------------------
@@ -213,7 +267,9 @@ def method_rows(rows: Sequence[Row]) -> list[Row]:
     """Return a summary of each method, in the order of their first runs."""
     methods = dict.fromkeys(row["method"] for row in rows)
     return [
-        _method_summary(method, [row for row in rows if row["method"] == method])
+        _method_summary(
+            method, [row for row in rows if row["method"] == method]
+        )
         for method in methods
     ]
 
@@ -225,7 +281,10 @@ def _method_summary(method: str, rows: Sequence[Row]) -> Row:
     low, high = wilson_interval(successes, len(done))
     errors = [f"error_{name}" for name in parameters_in(rows, "error_")]
     medians = [name for name, column in COLUMNS.items() if column.has_median]
-    known = {n: [row[n] for row in done if row[n] is not None] for n in (*errors, *medians)}
+    known = {
+        n: [row[n] for row in done if row[n] is not None]
+        for n in (*errors, *medians)
+    }
     return {
         "method": method,
         "runs": len(done),
@@ -234,7 +293,10 @@ def _method_summary(method: str, rows: Sequence[Row]) -> Row:
         "success_rate": successes / len(done) if done else None,
         "success_low": low,
         "success_high": high,
-        **{name: float(np.median(each)) if each else None for name, each in known.items()},
+        **{
+            name: float(np.median(each)) if each else None
+            for name, each in known.items()
+        },
     }
 
 
@@ -253,7 +315,9 @@ def best_run(rows: Sequence[Row]) -> Row | None:
     return min(completed, key=rank, default=None)
 
 
-def reference_parameters(rows: Sequence[Row], yardstick: SuccessCriterion) -> dict[str, float]:
+def reference_parameters(
+    rows: Sequence[Row], yardstick: SuccessCriterion
+) -> dict[str, float]:
     """Return the parameters from which guesses are measured: the truth, or those of the best run.
 
     Empty if the best run did not converge.
@@ -269,5 +333,8 @@ def reference_parameters(rows: Sequence[Row], yardstick: SuccessCriterion) -> di
 
 def guess_distance(row: Row, centre: Mapping[str, float]) -> float:
     """Return the largest ratio between a guess and the reference; NaN without a reference."""
-    logs = [abs(np.log(row[f"guess_{name}"] / value)) for name, value in centre.items()]
+    logs = [
+        abs(np.log(row[f"guess_{name}"] / value))
+        for name, value in centre.items()
+    ]
     return float(np.exp(max(logs))) if logs else nan

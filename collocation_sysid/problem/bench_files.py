@@ -29,7 +29,12 @@ from ..recording.formats.columns import (
     name_and_unit,
 )
 from ..recording.formats.units import si_factor
-from .recording_schema import DisplacementSection, ExperimentSection, TableSection, WrenchSection
+from .recording_schema import (
+    DisplacementSection,
+    ExperimentSection,
+    TableSection,
+    WrenchSection,
+)
 
 # What the time is called in a table some of whose columns have names of the user's own: beside
 # `t_s` a reader would refuse these.
@@ -49,7 +54,9 @@ def has_displacement_table(section: ExperimentSection) -> bool:
     """Return whether a grasp or an obstacle of an experiment is moved by a table of
     displacements.
     """
-    return any(moved.displacement is not None for moved in section.moved_sections)
+    return any(
+        moved.displacement is not None for moved in section.moved_sections
+    )
 
 
 def table_name(section: ExperimentSection, table: TableSection) -> str:
@@ -101,7 +108,9 @@ class BenchTable:
         InputError
             If the table already has a column of that name with other values.
         """
-        quantities = {quantity.key: quantity for quantity in (TIME, *known_quantities)}
+        quantities = {
+            quantity.key: quantity for quantity in (TIME, *known_quantities)
+        }
         time = {TIME.key: self.t_s}
         for key, column in (time | dict(values)).items():
             quantity = quantities[key]
@@ -119,7 +128,10 @@ class BenchTable:
 
 
 def add_displacement(
-    table: BenchTable, layout: DisplacementSection, grasp: Grasp, rest_length_m: float | None
+    table: BenchTable,
+    layout: DisplacementSection,
+    grasp: Grasp,
+    rest_length_m: float | None,
 ) -> None:
     """Add the translations [m] of a grasp at the times of the table, in place, as
     `read_displacement` reads them.
@@ -128,8 +140,13 @@ def add_displacement(
     """
     shifts_m = layout.sign * grasp.poses.at(table.t_s)[1]
     displacement_m = shifts_m[:, "xyz".index(layout.axis)]
-    values = {"displacement": displacement_m, **dict(zip("xyz", shifts_m.T, strict=True))}
-    usual = ["displacement"] if grasp.zero in ("", layout.axis) else [*grasp.zero]
+    values = {
+        "displacement": displacement_m,
+        **dict(zip("xyz", shifts_m.T, strict=True)),
+    }
+    usual = (
+        ["displacement"] if grasp.zero in ("", layout.axis) else [*grasp.zero]
+    )
     if rest_length_m is not None:
         values["strain"] = displacement_m / rest_length_m
         usual = ["strain"]
@@ -138,7 +155,9 @@ def add_displacement(
     table.add(layout, {key: values[key] for key in chosen}, known)
 
 
-def add_wrench(table: BenchTable, layout: WrenchSection, at_s: Array, wrench: Array) -> None:
+def add_wrench(
+    table: BenchTable, layout: WrenchSection, at_s: Array, wrench: Array
+) -> None:
     """Add a wrench to a table, in place, such that `read_wrench` reads it back.
 
     Parameters
@@ -175,7 +194,9 @@ def _named_quantities(layout: TableSection) -> list[str]:
 
 
 def bench_tables(
-    section: ExperimentSection, experiment: Experiment, wrenches: Iterable[Array]
+    section: ExperimentSection,
+    experiment: Experiment,
+    wrenches: Iterable[Array],
 ) -> dict[str, BenchTable]:
     """Return the tables of a test bench that a simulation writes, by file name, see `table_name`.
 
@@ -194,19 +215,30 @@ def bench_tables(
     """
     moved = list(zip(section.moved_sections, experiment.grasps, strict=True))
     declared_tables = [
-        t for each in section.moved_sections for t in (each.displacement, each.wrench) if t
+        t
+        for each in section.moved_sections
+        for t in (each.displacement, each.wrench)
+        if t
     ]
-    time = OTHER_TIME if any(table.columns for table in declared_tables) else TIME.column
+    time = (
+        OTHER_TIME
+        if any(table.columns for table in declared_tables)
+        else TIME.column
+    )
     tables: dict[str, BenchTable] = {}
     for declared, grasp in moved:
         if (layout := declared.displacement) is not None:
             name = table_name(section, layout)
             table = tables.setdefault(name, BenchTable(grasp.poses.t_s, time))
-            add_displacement(table, layout, grasp, strain_length_m(layout, experiment.body))
+            add_displacement(
+                table, layout, grasp, strain_length_m(layout, experiment.body)
+            )
     measured = iter(wrenches)
     for declared, grasp in moved:
         if (sensed := declared.wrench) is not None and grasp.wrench is not None:
             at_s = grasp.wrench.t_s
-            table = tables.setdefault(table_name(section, sensed), BenchTable(at_s, time))
+            table = tables.setdefault(
+                table_name(section, sensed), BenchTable(at_s, time)
+            )
             add_wrench(table, sensed, at_s, next(measured))
     return tables

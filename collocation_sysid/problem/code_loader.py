@@ -65,7 +65,9 @@ class CodeLoader:
         InputError
             See `function`; also if the function is no energy density, see `Material.from_energy`.
         """
-        file, loaded = self.function(section.file, section.function, f"{key}.file")
+        file, loaded = self.function(
+            section.file, section.function, f"{key}.file"
+        )
         if isinstance(loaded, Material):
             return loaded
         with located(file):
@@ -80,8 +82,14 @@ class CodeLoader:
             See `function`; also if the function is no force, see `NodeForce.from_law`, or `carries`
             is wrong.
         """
-        file, loaded = self.function(section.file, section.function, f"{key}.file")
-        nodes = None if section.nodes is None else selection_from_section(section.nodes)
+        file, loaded = self.function(
+            section.file, section.function, f"{key}.file"
+        )
+        nodes = (
+            None
+            if section.nodes is None
+            else selection_from_section(section.nodes)
+        )
         name = section.function
         carries = section.carries
         if isinstance(loaded, NodeForce):
@@ -108,9 +116,13 @@ class CodeLoader:
             return isinstance(value, NuisanceRow)
 
         key = "nuisance.own.file"
-        return self._load(section.file, section.row, key, "NuisanceRow", is_row)[1]
+        return self._load(
+            section.file, section.row, key, "NuisanceRow", is_row
+        )[1]
 
-    def function(self, file: str, name: str, key: str) -> tuple[Path, Callable[..., Any]]:
+    def function(
+        self, file: str, name: str, key: str
+    ) -> tuple[Path, Callable[..., Any]]:
         """Run a Python file, and return its path and the function in it that has a name.
 
         A force with an energy, `NodeForce`, counts as a function.
@@ -138,7 +150,12 @@ class CodeLoader:
         return self._load(file, name, key, "function", is_function)
 
     def _load(
-        self, name: str, value_name: str, key: str, kind: str, is_kind: Callable[[Any], bool]
+        self,
+        name: str,
+        value_name: str,
+        key: str,
+        kind: str,
+        is_kind: Callable[[Any], bool],
     ) -> tuple[Path, Any]:
         """Run a file, and return its path and the value with a name.
 
@@ -170,11 +187,18 @@ class CodeLoader:
         try:
             names = runpy.run_path(str(file))
         except (Exception, SystemExit) as error:
-            raise InputError(f"running it failed: {reason(error)}", file) from error
+            raise InputError(
+                f"running it failed: {reason(error)}", file
+            ) from error
         if not is_kind(names.get(value_name)):
             known_names = [
-                n for n, value in names.items() if is_kind(value) and not n.startswith("_")
+                n
+                for n, value in names.items()
+                if is_kind(value) and not n.startswith("_")
             ]
             known = f"{', '.join(known_names) or 'none'}{hint_at(value_name, known_names)}"
-            raise InputError(f"there is no {kind} {value_name!r}; expected one of {known}", file)
+            raise InputError(
+                f"there is no {kind} {value_name!r}; expected one of {known}",
+                file,
+            )
         return file, names[value_name]

@@ -37,7 +37,13 @@ from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 from .problem_reading import read_problem_file
 from .problem_size import Say, Size, announce_reading, require_feasible
 from .recording_reader import RecordingReader
-from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
+from .schema import (
+    CodeSection,
+    ObjectSection,
+    ParameterSection,
+    PriorSection,
+    ProblemFile,
+)
 from .specimen_reader import SpecimenReader
 from .specimen_schema import SpecimenSection
 
@@ -58,9 +64,12 @@ def problem_arguments(
     See `Problem.read` for the parameters and errors.
     """
     file, text = read_problem_file(path, overrides)
-    if not simulation and all(section.validation for section in file.experiment):
+    if not simulation and all(
+        section.validation for section in file.experiment
+    ):
         raise InputError(
-            "every experiment has validation = true; expected at least one to fit", path
+            "every experiment has validation = true; expected at least one to fit",
+            path,
         )
     folder = path.parent if folder is None else Path(folder)
     unknowns = file.parameters
@@ -73,7 +82,9 @@ def problem_arguments(
         cells = SpecimenCells(file.object, code)
         if file.recordings:
             body, size = _load_object(file, folder, code, simulation, say)
-            mesh_warnings = [oddity.message for oddity in size_and_density_hypotheses(body)]
+            mesh_warnings = [
+                oddity.message for oddity in size_and_density_hypotheses(body)
+            ]
         else:
             body = cells.body_for(file.specimens[0].test)
             unknowns = cells.with_undamped(unknowns)
@@ -90,7 +101,10 @@ def problem_arguments(
     for section in file.experiment:
         if isinstance(section, SpecimenSection):
             specimen_reader = SpecimenReader(
-                section, folder, cells.body_for(section.test), simulation=simulation
+                section,
+                folder,
+                cells.body_for(section.test),
+                simulation=simulation,
             )
             with _locate_in_table(path, f"experiment '{section.name}'"):
                 specimens[section.name], experiment = specimen_reader.read()
@@ -108,7 +122,9 @@ def problem_arguments(
             size=size,
             say=say,
         )
-        with _locate_in_table(path, f"experiment '{section.name}'", mesh_warnings):
+        with _locate_in_table(
+            path, f"experiment '{section.name}'", mesh_warnings
+        ):
             experiments.append(reader.read())
         notes += reader.notes
     with located(path):
@@ -129,14 +145,20 @@ def problem_arguments(
 
 
 def _load_object(
-    file: ProblemFile, folder: Path, code: CodeLoader, simulation: bool, say: Say | None
+    file: ProblemFile,
+    folder: Path,
+    code: CodeLoader,
+    simulation: bool,
+    say: Say | None,
 ) -> tuple[Body, Size]:
     """Return the body of the recordings, and the size of the problem with one sample."""
     with _lengths_checked(file.object):
         generated = _generated_counts(file.object)
         if generated:
             corners, elements = generated
-            size = _smallest_size(file, corners=corners, elements=elements, simulation=simulation)
+            size = _smallest_size(
+                file, corners=corners, elements=elements, simulation=simulation
+            )
             require_feasible(replace(size, substeps=1), say)
         mesh = _load_mesh(file.object, folder)
     size = _smallest_size(
@@ -146,8 +168,12 @@ def _load_object(
         simulation=simulation,
     )
     require_feasible(replace(size, substeps=1), None if generated else say)
-    body = _load_body(with_guessed_densities(file.object, file.parameters), mesh, code)
-    return body.with_free_densities(body.parts_with_free_density(file.parameters)), size
+    body = _load_body(
+        with_guessed_densities(file.object, file.parameters), mesh, code
+    )
+    return body.with_free_densities(
+        body.parts_with_free_density(file.parameters)
+    ), size
 
 
 class SpecimenCells:
@@ -176,7 +202,9 @@ class SpecimenCells:
             self._bodies[has_inner_node] = cell_body(
                 test,
                 material,
-                prony=tuple(b.name for b in self._section.prony if b.region is None),
+                prony=tuple(
+                    b.name for b in self._section.prony if b.region is None
+                ),
                 damping=self._section.damping,
             )
         return self._bodies[has_inner_node]
@@ -189,7 +217,10 @@ class SpecimenCells:
         """
         constants = next(iter(self._bodies.values())).constants.values()
         damping = {c.name: 0.0 for c in constants if c in (GAMMA_R, GAMMA_M)}
-        return {**parameters, **{n: v for n, v in damping.items() if n not in parameters}}
+        return {
+            **parameters,
+            **{n: v for n, v in damping.items() if n not in parameters},
+        }
 
 
 def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
@@ -208,7 +239,9 @@ def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
     return None
 
 
-def _smallest_size(file: ProblemFile, corners: int, elements: int, *, simulation: bool) -> Size:
+def _smallest_size(
+    file: ProblemFile, corners: int, elements: int, *, simulation: bool
+) -> Size:
     """Return the size of the problem with one sample, before a mesh exists.
 
     Parameters
@@ -241,19 +274,30 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     names = [file.object.mesh, file.object.surface]
     names += [section.file for section in file.specimens]
     for section in file.recordings:
-        names += [section.markers.file, *(each.file for each in (*section.reading, *section.depth))]
+        names += [
+            section.markers.file,
+            *(each.file for each in (*section.reading, *section.depth)),
+        ]
         for grasp in section.moved_sections:
             displacement_file = section.file_of(grasp.displacement)
             wrench_file = section.file_of(grasp.wrench)
             names += [grasp.poses or displacement_file, wrench_file]
         for _, word, kind in LOADS:
-            keys = [key.name for _, key in keys_of(kind) if key.constant is not None]
-            names += [getattr(table, key) for table in getattr(section, word) for key in keys]
+            keys = [
+                key.name for _, key in keys_of(kind) if key.constant is not None
+            ]
+            names += [
+                getattr(table, key)
+                for table in getattr(section, word)
+                for key in keys
+            ]
     return tuple(folder / name for name in names if name is not None)
 
 
 @contextmanager
-def _locate_in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterator[None]:
+def _locate_in_table(
+    path: Path, table: str, odd: Sequence[str] = ()
+) -> Iterator[None]:
     """Context that adds file and table to errors that have no file.
 
     Messages begin with `odd`, warnings on the body that may explain the error.
@@ -271,7 +315,9 @@ def _locate_in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterato
             separator = ": " if " " in table else "."
             source = path
             where = separator.join(part for part in (table, inner) if part)
-        raise InputError("; ".join([*odd, error.message]), source, where) from error
+        raise InputError(
+            "; ".join([*odd, error.message]), source, where
+        ) from error
 
 
 def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
@@ -293,7 +339,9 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
         return _generate_mesh(section, section.edge_length_m)
     surface = existing_file(folder, section.surface, "surface")
     cache = folder / ".meshes"
-    return TetMesh.from_surface(surface, section.edge_length_m, section.length_unit, cache)
+    return TetMesh.from_surface(
+        surface, section.edge_length_m, section.length_unit, cache
+    )
 
 
 def _generate_mesh(section: ObjectSection, edge_length_m: float) -> TetMesh:
@@ -302,7 +350,10 @@ def _generate_mesh(section: ObjectSection, edge_length_m: float) -> TetMesh:
     """
     if (shape := section.cylinder) is not None:
         return cylinder_of_edge(
-            shape.diameter_m, shape.height_m, edge_length_m, quarter=shape.quarter
+            shape.diameter_m,
+            shape.height_m,
+            edge_length_m,
+            quarter=shape.quarter,
         )
     return box_of_edge(section.box_m or (0.0, 0.0, 0.0), edge_length_m)
 
@@ -313,7 +364,10 @@ def _lengths_checked(section: ObjectSection) -> Iterator[None]:
     that follows from it.
     """
     if (shape := section.cylinder) is not None:
-        lengths_m = {"cylinder.diameter_m": shape.diameter_m, "cylinder.height_m": shape.height_m}
+        lengths_m = {
+            "cylinder.diameter_m": shape.diameter_m,
+            "cylinder.height_m": shape.height_m,
+        }
     else:
         lengths_m = {"box_m": max(section.box_m or (0.0,))}
     try:
@@ -324,7 +378,9 @@ def _lengths_checked(section: ObjectSection) -> Iterator[None]:
         if length_m <= largest_m:
             raise
         likely = f"likely {length_m / 1e3:g}, if it was in mm"
-        message = f"found {length_m:g} m; expected at most {largest_m:g} m, {likely}"
+        message = (
+            f"found {length_m:g} m; expected at most {largest_m:g} m, {likely}"
+        )
         raise InputError(message, None, key) from error
 
 
@@ -335,10 +391,16 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
         return code.material(law, key) if isinstance(law, CodeSection) else law
 
     def branches(region: str | None) -> list[str]:
-        return [branch.name for branch in section.prony if branch.region == region]
+        return [
+            branch.name for branch in section.prony if branch.region == region
+        ]
 
     def field(section: Section | None, where: str) -> Field | None:
-        return None if section is None else Field(**declared_in(section, Field, where))
+        return (
+            None
+            if section is None
+            else Field(**declared_in(section, Field, where))
+        )
 
     regions = [
         Region(
@@ -361,17 +423,25 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
         damping=section.damping,
         regions=regions,
         prony=branches(None),
-        forces=[code.force(force, f"force.{k}") for k, force in enumerate(section.force)],
+        forces=[
+            code.force(force, f"force.{k}")
+            for k, force in enumerate(section.force)
+        ],
         field=field(section.field, "field"),
         rest_shape=_rest_shape(section),
         evaluator=section.evaluator,
     )
 
 
-def _rest_shape(section: ObjectSection) -> UnderGravity | Literal["stress_free"] | None:
+def _rest_shape(
+    section: ObjectSection,
+) -> UnderGravity | Literal["stress_free"] | None:
     """Return the stated stress-free shape; None if the file states none."""
     if section.scan is not None:
-        return UnderGravity(selection_from_section(section.scan.nodes), section.scan.gravity_m_s2)
+        return UnderGravity(
+            selection_from_section(section.scan.nodes),
+            section.scan.gravity_m_s2,
+        )
     return "stress_free" if section.rest_shape is not None else None
 
 
@@ -379,12 +449,22 @@ def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
     """Return the friction parameters that obstacles name, each once; frictions given as numbers are
     left out.
     """
-    declared = (each.friction for section in file.recordings for each in section.obstacle)
-    named = (one for one in declared if isinstance(one, str) and one.endswith(FRICTION.name))
+    declared = (
+        each.friction
+        for section in file.recordings
+        for each in section.obstacle
+    )
+    named = (
+        one
+        for one in declared
+        if isinstance(one, str) and one.endswith(FRICTION.name)
+    )
     return tuple(dict.fromkeys(map(constant_named, named)))
 
 
-def _as_parameter(name: str, section: ParameterSection | float) -> Unknown | Tied | float:
+def _as_parameter(
+    name: str, section: ParameterSection | float
+) -> Unknown | Tied | float:
     """Return one parameter from its table, or its fixed value; a table with `tied_to` gives a tied
     parameter.
     """
@@ -393,7 +473,9 @@ def _as_parameter(name: str, section: ParameterSection | float) -> Unknown | Tie
     if section.fixed is not None:
         return section.fixed
     if section.tied_to is not None:
-        return Tied(section.tied_to, 1.0 if section.ratio is None else section.ratio)
+        return Tied(
+            section.tied_to, 1.0 if section.ratio is None else section.ratio
+        )
     linear = (section.scale or constant_named(name).scale) == "linear"
     return Unknown(
         guess=section.guess,
@@ -412,5 +494,9 @@ def _prior(section: PriorSection, linear: bool) -> tuple[float, float]:
     """
     size = abs(section.mean)
     if linear:
-        return section.mean, section.deviation or (section.relative or 0.0) * size
-    return section.mean, section.relative or (section.deviation or 0.0) / max(size, 1e-300)
+        return section.mean, section.deviation or (
+            section.relative or 0.0
+        ) * size
+    return section.mean, section.relative or (section.deviation or 0.0) / max(
+        size, 1e-300
+    )

@@ -9,7 +9,13 @@ import numpy as np
 
 from ..array_types import Array
 from ..errors import InputError
-from ..recording import MarkerTable, PoseSequence, align_to_template, fit_poses, read_markers
+from ..recording import (
+    MarkerTable,
+    PoseSequence,
+    align_to_template,
+    fit_poses,
+    read_markers,
+)
 from ..recording.rigid_fit import least_rigid_marker
 from .recording_schema import ExperimentSection, MarkersSection, MovedSection
 
@@ -21,7 +27,9 @@ ROUNDING = 1e-6
 
 def gripper_markers(section: ExperimentSection) -> set[str]:
     """Return the names of the markers from which poses of grasps and obstacles are computed."""
-    return {name for moved in section.moved_sections for name in moved.markers or ()}
+    return {
+        name for moved in section.moved_sections for name in moved.markers or ()
+    }
 
 
 def read_marker_tracks(section: ExperimentSection, file: Path) -> MarkerTable:
@@ -31,8 +39,14 @@ def read_marker_tracks(section: ExperimentSection, file: Path) -> MarkerTable:
     markers = section.markers
     names = None
     if markers.names is not None:
-        other_names = [*(markers.template_m or ()), *sorted(gripper_markers(section))]
-        names = [*markers.names, *(n for n in dict.fromkeys(other_names) if n not in markers.names)]
+        other_names = [
+            *(markers.template_m or ()),
+            *sorted(gripper_markers(section)),
+        ]
+        names = [
+            *markers.names,
+            *(n for n in dict.fromkeys(other_names) if n not in markers.names),
+        ]
     return read_markers(
         file,
         names=names,
@@ -56,7 +70,9 @@ def transform_to_body_frame(
     """
     if markers.template_m is None or markers.template_window_s is None:
         return table, []
-    fit = align_to_template(table, markers.template_m, markers.template_window_s)
+    fit = align_to_template(
+        table, markers.template_m, markers.template_window_s
+    )
     names = list(markers.template_m)
     residuals_m = fit.residual_m
     worst = int(np.nanargmax(residuals_m))
@@ -78,7 +94,9 @@ def transform_to_body_frame(
 
 
 def poses_from_markers(
-    grasp: MovedSection, table: MarkerTable, window_s: tuple[float, float] | None
+    grasp: MovedSection,
+    table: MarkerTable,
+    window_s: tuple[float, float] | None,
 ) -> tuple[PoseSequence, list[str]]:
     """Return poses fitted to the tracks of a grasp's markers, and notes on residuals and missing
     frames.
@@ -96,7 +114,9 @@ def poses_from_markers(
     names = list(grasp.markers)
     reference_m = np.array([grasp.markers[name] for name in names])
     tracks = table.positions_m[:, [table.names.index(name) for name in names]]
-    fit = fit_poses(reference_m, tracks, [grasp.weights.get(name, 1.0) for name in names])
+    fit = fit_poses(
+        reference_m, tracks, [grasp.weights.get(name, 1.0) for name in names]
+    )
     poses = replace(fit.poses(table.t_s), interpolation=grasp.interpolation)
     first_s, last_s = window_s or (-np.inf, np.inf)
     is_in_window = (table.t_s >= first_s) & (table.t_s <= last_s)
@@ -109,7 +129,14 @@ def poses_from_markers(
     residual_m = np.where(is_in_window, fit.residual_m, np.nan)
     if np.isfinite(residual_m).any():
         notes.append(
-            _rigidity_note(names, reference_m, tracks, table.t_s, residual_m, grasp.max_residual_m)
+            _rigidity_note(
+                names,
+                reference_m,
+                tracks,
+                table.t_s,
+                residual_m,
+                grasp.max_residual_m,
+            )
         )
     return poses, notes
 
@@ -143,9 +170,7 @@ def _rigidity_note(
     worst = int(np.nanargmax(residual_m))
     size_m = float(np.linalg.norm(np.ptp(reference_m, axis=0)))
     limit_m = max_residual_m or max(UNUSUAL * median_m, ROUNDING * size_m)
-    fit_sentence = (
-        f"{', '.join(names)} fit a rigid motion to {_mm(median_m)} (median over the frames)"
-    )
+    fit_sentence = f"{', '.join(names)} fit a rigid motion to {_mm(median_m)} (median over the frames)"
     count = int((residual_m > limit_m).sum())
     if not count:
         return f"{fit_sentence}, at worst {_mm(residual_m[worst])}"

@@ -8,7 +8,12 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..files import replaced_file, require_possible, write_text_file
-from .editor_schema import SCHEMA_FILE, schema_text, schema_url, with_schema_reference
+from .editor_schema import (
+    SCHEMA_FILE,
+    schema_text,
+    schema_url,
+    with_schema_reference,
+)
 
 # A folder for each kind, see scripts/make_templates.py.
 TEMPLATES = Path(__file__).parent / "templates"
@@ -41,13 +46,17 @@ def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
     file = folder / "problem.toml"
     template = TEMPLATES / (kind or "swing")
     require_possible(folder)
-    data = sorted(each for each in template.iterdir() if kind and each.name != file.name)
+    data = sorted(
+        each for each in template.iterdir() if kind and each.name != file.name
+    )
     url = schema_url()
     schema = [] if url else [folder / SCHEMA_FILE]
     for each in (file, *(folder / each.name for each in data), *schema):
         if each.exists():
             raise InputError("it is there already; choose another name", each)
-    title = json.dumps(folder.resolve().name, ensure_ascii=False)  # quoted as TOML quotes
+    title = json.dumps(
+        folder.resolve().name, ensure_ascii=False
+    )  # quoted as TOML quotes
     text = (template / file.name).read_text(encoding="utf-8")
     text = with_schema_reference(text, url or SCHEMA_FILE)
     write_text_file(file, text.replace('title = ""', f"title = {title}", 1))

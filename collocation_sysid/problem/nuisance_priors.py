@@ -50,9 +50,13 @@ class NuisancePriorSection(Scoped):
     def _require_one_prior(self) -> NuisancePriorSection:
         """Raise `ValueError` if no prior is given and the scope alone is not sufficient."""
         priors = [key for key in type(self).model_fields if key != "scope"]
-        if not used_keys(self, *priors) and (self.scope == "recording" or not self.has_default):
+        if not used_keys(self, *priors) and (
+            self.scope == "recording" or not self.has_default
+        ):
             expected = "one or both" if len(priors) > 1 else "it"
-            raise ValueError(f"found no {' and no '.join(priors)}; expected {expected}")
+            raise ValueError(
+                f"found no {' and no '.join(priors)}; expected {expected}"
+            )
         return self
 
 

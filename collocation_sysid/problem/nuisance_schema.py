@@ -44,7 +44,9 @@ from .nuisance_priors import (
     ToolPrior,
 )
 
-KEYS = {key: list(rows) for key, rows in groupby(KINDS, key=lambda row: row.key)}
+KEYS = {
+    key: list(rows) for key, rows in groupby(KINDS, key=lambda row: row.key)
+}
 
 
 class CustomNuisanceSection(Scoped):
@@ -150,7 +152,9 @@ class NuisanceSection(Section):
     marker_offsets: PriorOrNone[MarkerOffsetsPrior] | None = None
     camera_offsets: PriorOrNone[CameraOffsetsPrior] | None = None
     calibration_scale: PriorOrNone[CalibrationScalePrior] | None = None
-    calibration_distortion: PriorOrNone[CalibrationDistortionPrior] | None = None
+    calibration_distortion: PriorOrNone[CalibrationDistortionPrior] | None = (
+        None
+    )
     time_shift: PriorOrNone[TimeShiftPrior] | None = None
     clock_rate: PriorOrNone[ClockRatePrior] | None = None
     pose: PriorOrNone[PosePrior] | None = None
@@ -209,7 +213,12 @@ def nuisance_from_section(
                 scope |= {row.name: prior.scope for row in rows}
     custom_rows = [row_of(each) for each in section.own]
     scopes_by_name = {
-        row.name: each.scope for row, each in zip(custom_rows, section.own, strict=True)
+        row.name: each.scope
+        for row, each in zip(custom_rows, section.own, strict=True)
     }
-    scope |= {name: word for name, word in scopes_by_name.items() if word != "recording"}
+    scope |= {
+        name: word
+        for name, word in scopes_by_name.items()
+        if word != "recording"
+    }
     return Nuisance(**deviations, scope=scope, own=custom_rows)

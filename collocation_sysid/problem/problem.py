@@ -29,9 +29,15 @@ from ..statistics.scale_identifiability import scale_concerns, static_concerns
 from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 
 
-def _as_parameters(parameters: Parameters | Mapping[str, Unknown | Tied | float]) -> Parameters:
+def _as_parameters(
+    parameters: Parameters | Mapping[str, Unknown | Tied | float],
+) -> Parameters:
     """Return the parameters; a mapping by name is converted."""
-    return parameters if isinstance(parameters, Parameters) else Parameters.from_mapping(parameters)
+    return (
+        parameters
+        if isinstance(parameters, Parameters)
+        else Parameters.from_mapping(parameters)
+    )
 
 
 @declaration
@@ -86,7 +92,9 @@ class Problem:
     explicit_grasps: bool = False
     huber: float | None = None
     method: str | Method = "reduced-space"
-    methods: Mapping[str, Method] = key(converter=dict[str, Method], default_factory=dict)
+    methods: Mapping[str, Method] = key(
+        converter=dict[str, Method], default_factory=dict
+    )
     rollout: RolloutOptions = field(default_factory=RolloutOptions)
     uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
     title: str = ""
@@ -94,20 +102,37 @@ class Problem:
     origin: Origin | None = None
 
     def __post_init__(self) -> None:
-        vars(self)["experiments"] = _with_free_densities(self.experiments, self.parameters)
-        vars(self)["parameters"] = self.parameters.with_fields(self.bodies)
-        cleaned = (note for body in self.bodies for note in (*body.mesh.notes, *body.notes))
-        odd = (
-            oddity.message for body in self.bodies for oddity in size_and_density_hypotheses(body)
+        vars(self)["experiments"] = _with_free_densities(
+            self.experiments, self.parameters
         )
-        still = (c.message for c in static_concerns(self.experiments, self.parameters))
-        vars(self)["notes"] = tuple(dict.fromkeys((*odd, *still, *cleaned, *self.notes)))
+        vars(self)["parameters"] = self.parameters.with_fields(self.bodies)
+        cleaned = (
+            note
+            for body in self.bodies
+            for note in (*body.mesh.notes, *body.notes)
+        )
+        odd = (
+            oddity.message
+            for body in self.bodies
+            for oddity in size_and_density_hypotheses(body)
+        )
+        still = (
+            c.message
+            for c in static_concerns(self.experiments, self.parameters)
+        )
+        vars(self)["notes"] = tuple(
+            dict.fromkeys((*odd, *still, *cleaned, *self.notes))
+        )
         self._validate()
-        unscaled = (c.message for c in scale_concerns(self.experiments, self.parameters))
+        unscaled = (
+            c.message for c in scale_concerns(self.experiments, self.parameters)
+        )
         vars(self)["notes"] = tuple(dict.fromkeys((*unscaled, *self.notes)))
 
     def __repr__(self) -> str:
-        names = ", ".join(repr(experiment.name) for experiment in self.experiments)
+        names = ", ".join(
+            repr(experiment.name) for experiment in self.experiments
+        )
         title = f"{self.title!r}, " if self.title else ""
         return f"Problem({title}experiments {names}; {self.parameters!r})"
 
@@ -145,10 +170,14 @@ class Problem:
         InputError
             For the first mistake in the file, or if this machine's memory is too small.
         """
-        from .loading import problem_arguments  # the schema is only built to read a file
+        from .loading import (
+            problem_arguments,
+        )  # the schema is only built to read a file
 
         path = Path(path)
-        contents = problem_arguments(path, overrides, allow_code, simulation, folder, say)
+        contents = problem_arguments(
+            path, overrides, allow_code, simulation, folder, say
+        )
         with located(path):
             return cls(**contents)
 
@@ -165,7 +194,11 @@ class Problem:
     @property
     def lengths_m(self) -> dict[str, float]:
         """Correlation lengths of spatially varying constants [m], by name of the constant."""
-        return {name: each for body in self.bodies for name, each in body.field_lengths_m.items()}
+        return {
+            name: each
+            for body in self.bodies
+            for name, each in body.field_lengths_m.items()
+        }
 
     def with_lengths(self, lengths_m: Mapping[str, float]) -> Problem:
         """Return the problem with other correlation lengths [m] of spatially varying constants, by
@@ -173,9 +206,14 @@ class Problem:
         """
         if dict(lengths_m) == self.lengths_m:
             return self
-        bodies = {id(body): body.with_field_lengths(lengths_m) for body in self.bodies}
+        bodies = {
+            id(body): body.with_field_lengths(lengths_m) for body in self.bodies
+        }
         return replace(
-            self, experiments=[replace(e, body=bodies[id(e.body)]) for e in self.experiments]
+            self,
+            experiments=[
+                replace(e, body=bodies[id(e.body)]) for e in self.experiments
+            ],
         )
 
     @property
@@ -197,16 +235,26 @@ class Problem:
         """
         bodies = {id(body): body.with_fields(fields) for body in self.bodies}
         removed_names = {
-            n for b in self.bodies for n in (*b.field_coefficient_names, *b.contrast_deviations)
+            n
+            for b in self.bodies
+            for n in (*b.field_coefficient_names, *b.contrast_deviations)
         }
         removed_names -= {
-            n for b in bodies.values() for n in (*b.field_coefficient_names, *b.contrast_deviations)
+            n
+            for b in bodies.values()
+            for n in (*b.field_coefficient_names, *b.contrast_deviations)
         }
         return replace(
             self,
-            experiments=[replace(e, body=bodies[id(e.body)]) for e in self.experiments],
+            experiments=[
+                replace(e, body=bodies[id(e.body)]) for e in self.experiments
+            ],
             parameters=Parameters(
-                tuple(item for item in self.parameters.items if item.name not in removed_names)
+                tuple(
+                    item
+                    for item in self.parameters.items
+                    if item.name not in removed_names
+                )
             ),
         )
 
@@ -242,7 +290,9 @@ class Problem:
             chosen = METHODS[chosen]()
         if isinstance(chosen, InteriorPoint):
             # Validation recordings are only simulated forward, by the contact's energy.
-            chosen.require(each for each in self.experiments if not each.validation)
+            chosen.require(
+                each for each in self.experiments if not each.validation
+            )
         return chosen
 
     def _validate(self) -> None:
@@ -254,14 +304,20 @@ class Problem:
         names = [experiment.name for experiment in self.experiments]
         if not names:
             raise InputError("there is no experiment; expected at least one")
-        if repeated := sorted({name for name in names if names.count(name) > 1}):
-            raise InputError(f"two experiments are named {repeated[0]!r}; names must differ")
+        if repeated := sorted(
+            {name for name in names if names.count(name) > 1}
+        ):
+            raise InputError(
+                f"two experiments are named {repeated[0]!r}; names must differ"
+            )
         if isinstance(self.substeps, str) and self.substeps != "auto":
             raise InputError(
                 f"found {self.substeps!r}; expected a whole number or 'auto'",
                 where="transcription.substeps",
             )
-        if self.first_substeps != 1 and all(each.is_static for each in self.experiments):
+        if self.first_substeps != 1 and all(
+            each.is_static for each in self.experiments
+        ):
             raise InputError(
                 f"found {self.substeps}, but every experiment is static, and between equilibria "
                 "there are no steps; expected none",
@@ -270,7 +326,9 @@ class Problem:
         self.parameters.require_constants_of(self.bodies)
         _require_rest_shapes(self.bodies, self.parameters)
         _require_equal_fields(self.bodies)
-        nuisance_indices([each for each in self.experiments if not each.validation], 0)
+        nuisance_indices(
+            [each for each in self.experiments if not each.validation], 0
+        )
         for experiment in self.experiments:
             with located(where=f"experiment '{experiment.name}'"):
                 as_scheme(self.scheme, experiment.start_rule)
@@ -286,12 +344,16 @@ class Problem:
                 )
 
 
-def _require_rest_shapes(bodies: Iterable[Body], parameters: Parameters) -> None:
+def _require_rest_shapes(
+    bodies: Iterable[Body], parameters: Parameters
+) -> None:
     """Raise `InputError` if no stress-free shape exists for the mesh under gravity at the guess.
 
     Nothing is checked if a parameter has no guess: the search then starts where the shape exists.
     """
-    if any(item.guess is None for item in parameters.items if item.tied is None):
+    if any(
+        item.guess is None for item in parameters.items if item.tied is None
+    ):
         return
     for body in bodies:
         theta = body.theta_from_values(parameters.values(parameters.guess_q))
@@ -305,7 +367,9 @@ def _require_equal_fields(bodies: Iterable[Body]) -> None:
     for part in (part for body in bodies for part in body.parts if part.field):
         assert part.field is not None
         shapes = part.field.shapes
-        if not np.array_equal(shapes_by_name.setdefault(part.field_name, shapes), shapes):
+        if not np.array_equal(
+            shapes_by_name.setdefault(part.field_name, shapes), shapes
+        ):
             raise InputError(
                 f"two bodies have a field of {part.field_name}, whose shapes differ as their "
                 "meshes do; expected one body, or fields of regions with names of their own"
@@ -321,8 +385,12 @@ def _with_free_densities(
     bodies = {}
     experiments = tuple(experiments)
     for body in {id(e.body): e.body for e in experiments}.values():
-        bodies[id(body)] = body.with_free_densities(body.parts_with_free_density(parameters.names))
+        bodies[id(body)] = body.with_free_densities(
+            body.parts_with_free_density(parameters.names)
+        )
     return tuple(
-        e if bodies[id(e.body)] is e.body else replace(e, body=bodies[id(e.body)])
+        e
+        if bodies[id(e.body)] is e.body
+        else replace(e, body=bodies[id(e.body)])
         for e in experiments
     )

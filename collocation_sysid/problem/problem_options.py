@@ -56,7 +56,9 @@ class UncertaintyOptions(ErrorModel):
         """Standard deviations of systematic effects and the surface's correlation length,
         by name.
         """
-        return self.assumptions.deviations | {CORRELATION_KEY: self.surface_correlation}
+        return self.assumptions.deviations | {
+            CORRELATION_KEY: self.surface_correlation
+        }
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,9 @@ _PLAINER = {
 }
 
 
-def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[ProblemFile, str]:
+def read_problem_file(
+    path: str | Path, overrides: Sequence[str] = ()
+) -> tuple[ProblemFile, str]:
     """Read and validate a problem file.
 
     Parameters
@@ -74,7 +76,9 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
         For invalid syntax, with the line if it is known, and for excessive nesting.
     """
     try:
-        if _ENDLESS_KEY.search(text) is not None:  # on which the parser would spend minutes
+        if (
+            _ENDLESS_KEY.search(text) is not None
+        ):  # on which the parser would spend minutes
             raise RecursionError
         content = tomllib.loads(text)
         if _depth(content) > DEEPEST:
@@ -82,7 +86,10 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
         return content
     except tomllib.TOMLDecodeError as error:
         raise _bad_syntax(str(error), text, path) from error
-    except (RecursionError, ValueError) as error:  # Python's limits of depth and of digits
+    except (
+        RecursionError,
+        ValueError,
+    ) as error:  # Python's limits of depth and of digits
         raise InputError(_beyond_limits(error), path) from error
 
 
@@ -91,8 +98,15 @@ def _depth(content: Any) -> int:
     level = [content]
     depth = 0
     while level and depth <= DEEPEST:
-        tables = [each.values() if isinstance(each, dict) else each for each in level]
-        level = [each for table in tables for each in table if isinstance(each, (dict, list))]
+        tables = [
+            each.values() if isinstance(each, dict) else each for each in level
+        ]
+        level = [
+            each
+            for table in tables
+            for each in table
+            if isinstance(each, (dict, list))
+        ]
         depth += 1
     return depth
 
@@ -125,11 +139,15 @@ def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise InputError(f"there is no such file; expected {what}", path) from None
+        raise InputError(
+            f"there is no such file; expected {what}", path
+        ) from None
     except IsADirectoryError:
         raise InputError(f"this is a folder; expected {what}", path) from None
     except UnicodeDecodeError:
-        raise InputError(f"this is not a text file; expected {what}", path) from None
+        raise InputError(
+            f"this is not a text file; expected {what}", path
+        ) from None
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path) from error
 
@@ -140,10 +158,14 @@ def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
     reason = _PLAINER.get(reason, reason)
     matched = re.match(r"line (\d+)", place)
     if matched is None:
-        return InputError(f"not valid TOML: {reason or complaint}, at its end", path)
+        return InputError(
+            f"not valid TOML: {reason or complaint}, at its end", path
+        )
     number = int(matched[1])
     line = excerpt(text.splitlines()[number - 1].strip())
-    return InputError(f"not valid TOML: {reason} in: {line}", path, f"line {number}")
+    return InputError(
+        f"not valid TOML: {reason} in: {line}", path, f"line {number}"
+    )
 
 
 # Overrides ----------------------------------------------------------------------------------------
@@ -179,8 +201,17 @@ def _apply_override(content: dict[str, Any], override: str) -> None:
         item: Any = _item_key(table, part, key)
         if isinstance(table, dict):
             # An experiment gets a default of its own, a part of which is to be overridden.
-            has_default = depth == 2 and leading[0] == "experiment" and isinstance(shared, dict)
-            table.setdefault(item, deepcopy(shared[item]) if has_default and item in shared else {})
+            has_default = (
+                depth == 2
+                and leading[0] == "experiment"
+                and isinstance(shared, dict)
+            )
+            table.setdefault(
+                item,
+                deepcopy(shared[item])
+                if has_default and item in shared
+                else {},
+            )
         table = table[item]
     item = _item_key(table, last, key)
     table[item] = _parse_value(value, key)
@@ -194,7 +225,9 @@ def _join_dotted_names(content: Any, parts: list[str]) -> list[str]:
         count = 1
         if isinstance(table, dict):
             several = range(len(parts), 1, -1)
-            count = next((n for n in several if ".".join(parts[:n]) in table), 1)
+            count = next(
+                (n for n in several if ".".join(parts[:n]) in table), 1
+            )
         names.append(".".join(parts[:count]))
         parts = parts[count:]
         table = table.get(names[-1]) if isinstance(table, dict) else None
@@ -225,7 +258,9 @@ def _item_key(place: Any, part: str, key: str) -> str | int:
             f"{key} goes beyond the value {place!r}, which is not a table; expected "
             "a key of a table"
         )
-    names = [item.get("name") if isinstance(item, dict) else None for item in place]
+    names = [
+        item.get("name") if isinstance(item, dict) else None for item in place
+    ]
     if part in names:
         return names.index(part)
     if part.isascii() and part.isdecimal() and int(part) < len(place):

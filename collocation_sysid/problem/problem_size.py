@@ -93,7 +93,9 @@ class Size:
         if self.unknowns:
             # Derivatives of all residuals of markers by all parameters are one array.
             parameters = self.unknowns + 3 * self.unplaced_markers
-            values += DERIVATIVE_COPIES * 3 * self.markers * self.samples * parameters
+            values += (
+                DERIVATIVE_COPIES * 3 * self.markers * self.samples * parameters
+            )
         values += FACTOR_ENTRIES * (self.nodes / NODES) ** FACTOR_POWER
         return (8 * values + BYTES_PER_ELEMENT * self.elements) / 1e6
 

@@ -124,8 +124,12 @@ class RecordingReader:
             Names the file and line, or the key within the experiment's table.
         """
         section = self.section
-        t_s, poses, table = self._align([*map(self._poses, range(len(section.moved_sections)))])
-        grasps = [self._grasp(k, sequence, t_s) for k, sequence in enumerate(poses)]
+        t_s, poses, table = self._align(
+            [*map(self._poses, range(len(section.moved_sections)))]
+        )
+        grasps = [
+            self._grasp(k, sequence, t_s) for k, sequence in enumerate(poses)
+        ]
         if len(prescribed_dofs(grasps)) == 3 * (n := len(self.body.nodes_m)):
             message = (
                 f"all {n} nodes of the body are selected, so that nothing can move; select fewer, "
@@ -133,7 +137,10 @@ class RecordingReader:
             )
             raise InputError(message, where="grasp")
         loads: dict[str, Any] = {
-            name: [self._from_table(kind, word, k) for k in range(len(getattr(section, word)))]
+            name: [
+                self._from_table(kind, word, k)
+                for k in range(len(getattr(section, word)))
+            ]
             for name, word, kind in LOADS
         }
         experiment = Experiment(
@@ -141,16 +148,23 @@ class RecordingReader:
             body=self.body,
             t_s=t_s,
             grasps=grasps,
-            readings=[self._custom_sensor(k, each, t_s) for k, each in enumerate(section.reading)],
+            readings=[
+                self._custom_sensor(k, each, t_s)
+                for k, each in enumerate(section.reading)
+            ],
             depths=[self._depth(k, t_s) for k in range(len(section.depth))],
             markers=self._markers(t_s, table),
-            nuisance=nuisance_from_section(section.nuisance, self.code.nuisance_row),
+            nuisance=nuisance_from_section(
+                section.nuisance, self.code.nuisance_row
+            ),
             air_density_kg_m3=self.air_density_kg_m3,
             **declared_in(section, Experiment, ""),
             **loads,
         )
         if section.has_markers and not self.simulation:
-            require_plausible_markers(experiment, typical_constants(self.parameters))
+            require_plausible_markers(
+                experiment, typical_constants(self.parameters)
+            )
         return experiment
 
     @property
@@ -160,15 +174,21 @@ class RecordingReader:
 
     def _add_notes(self, *notes: str) -> None:
         """Add notes, which begin with the experiment's name."""
-        self.notes += [f"experiment '{self.section.name}': {note}" for note in notes]
+        self.notes += [
+            f"experiment '{self.section.name}': {note}" for note in notes
+        ]
 
     # Files ----------------------------------------------------------------------------------------
 
     def _must_read(self, name: str | None) -> bool:
         """Return whether a file must be read: in a solve always, in a simulation if it exists."""
-        return not self.simulation or bool(name and stored_files(self.folder / name))
+        return not self.simulation or bool(
+            name and stored_files(self.folder / name)
+        )
 
-    def _require_existing(self, name: str | None, key: str, what: str = "a file") -> Path:
+    def _require_existing(
+        self, name: str | None, key: str, what: str = "a file"
+    ) -> Path:
         """Return the path of a file; raise `InputError` if none is named or it does not exist."""
         if name is None:
             raise InputError(f"missing; expected {what}", where=key)
@@ -180,7 +200,9 @@ class RecordingReader:
         """
         key = "file" if table.file is None and self.section.file else key
         return self._require_existing(
-            self.section.file_of(table), key, "a file here, or a file of the experiment"
+            self.section.file_of(table),
+            key,
+            "a file here, or a file of the experiment",
         )
 
     @property
@@ -207,16 +229,26 @@ class RecordingReader:
         """
         grasp = self.section.moved_sections[k]
         if grasp.markers is not None:
-            return self._poses_from_markers(grasp, self._grasp_key(k, "markers"))
+            return self._poses_from_markers(
+                grasp, self._grasp_key(k, "markers")
+            )
         if grasp.displacement is not None:
-            file = self._table_file(grasp.displacement, self._grasp_key(k, "displacement"))
+            file = self._table_file(
+                grasp.displacement, self._grasp_key(k, "displacement")
+            )
             layout = grasp.displacement.layout
-            layout |= {"length_m": strain_length_m(grasp.displacement, self.body)}
-            poses = read_displacement(file, **layout, timed=self._requires_times)
+            layout |= {
+                "length_m": strain_length_m(grasp.displacement, self.body)
+            }
+            poses = read_displacement(
+                file, **layout, timed=self._requires_times
+            )
         elif grasp.poses is None:
             return PoseSequence.fixed()
         else:
-            file = existing_file(self.folder, grasp.poses, self._grasp_key(k, "poses"))
+            file = existing_file(
+                self.folder, grasp.poses, self._grasp_key(k, "poses")
+            )
             poses = read_poses(file, grasp.quaternion, grasp.length_unit)
         if (transform := grasp.gripper_to_body) is not None:
             with located(where=self._grasp_key(k, "gripper_to_body")):
@@ -237,9 +269,13 @@ class RecordingReader:
         if self._marker_tracks is None:
             message = "there are no tracks to fit the poses to; expected markers.file, or poses"
             raise InputError(message, where=key)
-        _require_known_markers(grasp.markers or (), self._marker_tracks.names, key)
+        _require_known_markers(
+            grasp.markers or (), self._marker_tracks.names, key
+        )
         with located(where=key):
-            poses, notes = poses_from_markers(grasp, self._marker_tracks, self.section.window_s)
+            poses, notes = poses_from_markers(
+                grasp, self._marker_tracks, self.section.window_s
+            )
         self._add_notes(*(f"{key}: {note}" for note in notes))
         return poses
 
@@ -257,8 +293,12 @@ class RecordingReader:
         kind, word = (Obstacle, "force") if is_obstacle else (Grasp, "wrench")
         number = k + 1 - len(self.section.grasp_list)
         defaults = {"name": f"obstacle {number}"} if is_obstacle else {}
-        arguments: dict[str, Any] = defaults | declared_in(section, kind, self._grasp_key(k))
-        wrench = section.wrench and self._wrench(section.wrench, self._grasp_key(k, word), t_s)
+        arguments: dict[str, Any] = defaults | declared_in(
+            section, kind, self._grasp_key(k)
+        )
+        wrench = section.wrench and self._wrench(
+            section.wrench, self._grasp_key(k, word), t_s
+        )
         with located(where=self._grasp_key(k)):
             grasp = kind(**arguments, poses=poses, zero=zero, wrench=wrench)
         if is_obstacle:
@@ -268,11 +308,18 @@ class RecordingReader:
 
     # What is measured, and what acts --------------------------------------------------------------
 
-    def _read_wrench(self, section: WrenchSection, key: str) -> tuple[Array, Array]:
+    def _read_wrench(
+        self, section: WrenchSection, key: str
+    ) -> tuple[Array, Array]:
         """Return times (S,) [s] and values (S, 6) of a wrench's file."""
         file = self._table_file(section, f"{key}.file")
         layout = section.layout
-        return read_wrench(file, **layout, symmetry=section.symmetry, timed=self._requires_times)
+        return read_wrench(
+            file,
+            **layout,
+            symmetry=section.symmetry,
+            timed=self._requires_times,
+        )
 
     def _wrench(self, section: WrenchSection, key: str, t_s: Array) -> Wrench:
         """Return the measured wrench within the times t_s of the experiment [s], and note how many
@@ -287,37 +334,60 @@ class RecordingReader:
             arguments[sigma] /= section.symmetry
         with located(where=key):
             if not self._must_read(name):
-                return Wrench(t_s, np.zeros((len(t_s), 6)), **{"sigma_nm": 1.0, **arguments})
+                return Wrench(
+                    t_s,
+                    np.zeros((len(t_s), 6)),
+                    **{"sigma_nm": 1.0, **arguments},
+                )
             at_s, values = self._read_wrench(section, key)
-            is_used = is_within_experiment(at_s, t_s, str(name), self._is_static)
+            is_used = is_within_experiment(
+                at_s, t_s, str(name), self._is_static
+            )
             if self._is_static and not self.section.has_markers:
                 # Between equilibria it would be read off their chord, unless all of it is.
-                is_at_sample = np.abs(at_s[:, None] - t_s).min(axis=1) <= TIME_TOLERANCE_S
+                is_at_sample = (
+                    np.abs(at_s[:, None] - t_s).min(axis=1) <= TIME_TOLERANCE_S
+                )
                 is_used &= is_at_sample if is_at_sample.any() else True
-            self._add_notes(f"{name}: {is_used.sum()} of {len(at_s)} samples are used")
+            self._add_notes(
+                f"{name}: {is_used.sum()} of {len(at_s)} samples are used"
+            )
             return Wrench(at_s[is_used], values[is_used], **arguments)
 
-    def _custom_sensor(self, k: int, section: ReadingSection, t_s: Array) -> Gauge:
+    def _custom_sensor(
+        self, k: int, section: ReadingSection, t_s: Array
+    ) -> Gauge:
         """Return the custom sensor with index k and its values within the times t_s [s], and note
         how many samples are used.
 
         If a simulation has no file, the values are None and the times are t_s.
         """
         key = f"reading.{k}"
-        arguments: dict[str, Any] = {"name": section.name, **declared_in(section, Gauge, key)}
+        arguments: dict[str, Any] = {
+            "name": section.name,
+            **declared_in(section, Gauge, key),
+        }
         _, arguments["expression"] = self.code.function(
             section.code, section.function, f"{key}.code"
         )
-        if section.grasp and section.grasp > (count := len(self.section.grasp_list)):
+        if section.grasp and section.grasp > (
+            count := len(self.section.grasp_list)
+        ):
             message = f"found {section.grasp}; expected the number of a grasp, 1 to {count}"
             raise InputError(message, where=f"{key}.grasp")
         with located(where=key):
             if not self._must_read(section.file):
                 return Gauge(t_s=t_s, values=None, **arguments)
             file = self._require_existing(section.file, f"{key}.file")
-            at_s, values, arguments["columns"] = read_custom_sensor(file, section.columns)
-            is_used = is_within_experiment(at_s, t_s, str(section.file), self._is_static)
-            self._add_notes(f"{section.file}: {is_used.sum()} of {len(at_s)} samples are used")
+            at_s, values, arguments["columns"] = read_custom_sensor(
+                file, section.columns
+            )
+            is_used = is_within_experiment(
+                at_s, t_s, str(section.file), self._is_static
+            )
+            self._add_notes(
+                f"{section.file}: {is_used.sum()} of {len(at_s)} samples are used"
+            )
             return Gauge(t_s=at_s[is_used], values=values[is_used], **arguments)
 
     def _depth_images(self, k: int) -> tuple[DepthFileContent, Array]:
@@ -341,11 +411,13 @@ class RecordingReader:
         count = len(depth_file.images_m) or len(depth_file.clouds_m)
         t_s = section.t_s if section.t_s is not None else depth_file.t_s
         if t_s is None and count > 1 and not self._is_static:
-            message = (
-                f"{section.file} does not contain times of its {count} images; expected them in t_s"
-            )
+            message = f"{section.file} does not contain times of its {count} images; expected them in t_s"
             raise InputError(message, where=f"depth.{k}.t_s")
-        times = np.arange(float(count)) if t_s is None else np.array(t_s, dtype=float).ravel()
+        times = (
+            np.arange(float(count))
+            if t_s is None
+            else np.array(t_s, dtype=float).ravel()
+        )
         if len(times) != count:
             message = f"found {len(times)} times for {count} images or clouds; expected as many"
             raise InputError(message, where=f"depth.{k}.t_s")
@@ -359,30 +431,57 @@ class RecordingReader:
         where = f"depth.{k}"
         depth_file, at_s = self._depth_images(k)
         names = ("matrix", "pose", "distortion")
-        camera_arguments: dict[str, Any] = {name: getattr(depth_file, name) for name in names}
-        camera_arguments |= declared_in(section.camera, DepthCamera, f"{where}.camera")
+        camera_arguments: dict[str, Any] = {
+            name: getattr(depth_file, name) for name in names
+        }
+        camera_arguments |= declared_in(
+            section.camera, DepthCamera, f"{where}.camera"
+        )
         if section.camera.poses is not None:
-            file = existing_file(self.folder, section.camera.poses, f"{where}.camera.poses")
+            file = existing_file(
+                self.folder, section.camera.poses, f"{where}.camera.poses"
+            )
             camera_arguments["poses"] = read_poses(file)
         with located(where=f"{where}.camera"):
             camera = DepthCamera(
-                **{name: value for name, value in camera_arguments.items() if value is not None}
+                **{
+                    name: value
+                    for name, value in camera_arguments.items()
+                    if value is not None
+                }
             )
         with located(where=where):
-            is_used = is_within_experiment(at_s, t_s, section.file, self._is_static)
+            is_used = is_within_experiment(
+                at_s, t_s, section.file, self._is_static
+            )
             used = np.flatnonzero(is_used).tolist()
-            clouds = [depth_file.clouds_m[k] for k in used] if depth_file.clouds_m else []
+            clouds = (
+                [depth_file.clouds_m[k] for k in used]
+                if depth_file.clouds_m
+                else []
+            )
             images = []
             outlined = samples_with_outlines(len(used))
-            for number, sample in enumerate(used if len(depth_file.images_m) else ()):
+            for number, sample in enumerate(
+                used if len(depth_file.images_m) else ()
+            ):
                 image = depth_file.images_m[sample]
                 clouds.append(points_from_image(image, camera))
                 images.append(image if number in outlined else None)
-            arguments = {"name": section.name, **declared_in(section, Depth, where)}
+            arguments = {
+                "name": section.name,
+                **declared_in(section, Depth, where),
+            }
             depth = Depth(
-                t_s=at_s[is_used], clouds=clouds, camera=camera, images_m=images, **arguments
+                t_s=at_s[is_used],
+                clouds=clouds,
+                camera=camera,
+                images_m=images,
+                **arguments,
             )
-        self._add_notes(f"{section.file}: {len(clouds)} of {len(at_s)} images are used")
+        self._add_notes(
+            f"{section.file}: {len(clouds)} of {len(at_s)} images are used"
+        )
         return depth
 
     def _from_table(self, kind: type, list_key: str, k: int) -> Any:
@@ -407,11 +506,21 @@ class RecordingReader:
         """
         table = getattr(self.section, list_key)[k]
         where = f"{list_key}.{k}"
-        defaults = {"name": f"{list_key}_{k + 1}"} if "name" in type(table).model_fields else {}
+        defaults = (
+            {"name": f"{list_key}_{k + 1}"}
+            if "name" in type(table).model_fields
+            else {}
+        )
         arguments = defaults | declared_in(table, kind, where)
         for name, key in keys_of(kind):
-            if key.constant and key.read and (file_name := getattr(table, key.name)):
-                file = existing_file(self.folder, file_name, f"{where}.{key.name}")
+            if (
+                key.constant
+                and key.read
+                and (file_name := getattr(table, key.name))
+            ):
+                file = existing_file(
+                    self.folder, file_name, f"{where}.{key.name}"
+                )
                 arguments[name], arguments[key.constant] = key.read(file)
         with located(where=f"{where}.nodes" if "nodes" in arguments else where):
             return kind(**arguments).on_body(self.body)
@@ -428,10 +537,14 @@ class RecordingReader:
         markers = self.section.markers
         if not self.section.has_markers or not self._must_read(markers.file):
             return None
-        file = self._require_existing(markers.file, "markers.file", "a file of marker tracks")
+        file = self._require_existing(
+            markers.file, "markers.file", "a file of marker tracks"
+        )
         table = read_marker_tracks(self.section, file)
         self._add_notes(*(f"{markers.file}: {note}" for note in table.notes))
-        _require_known_markers(markers.template_m or (), table.names, "markers.template_m")
+        _require_known_markers(
+            markers.template_m or (), table.names, "markers.template_m"
+        )
         with located(where="markers.template_m"):
             table, notes = transform_to_body_frame(markers, table)
         self._add_notes(*notes)
@@ -455,7 +568,9 @@ class RecordingReader:
             return self._select_tracks(self._marker_tracks)
         markers = self.section.markers
         names = tuple(markers.names or markers.reference_m)
-        names_without_position = [name for name in names if name not in markers.reference_m]
+        names_without_position = [
+            name for name in names if name not in markers.reference_m
+        ]
         if names_without_position or not names:
             message = (
                 f"there is no {markers.file or 'file'} yet and no position of "
@@ -464,7 +579,9 @@ class RecordingReader:
             )
             raise InputError(message, where="markers.reference_m")
         times = self._sample_times(poses)
-        return self._select_tracks(MarkerTable(times, names, np.zeros((len(times), len(names), 3))))
+        return self._select_tracks(
+            MarkerTable(times, names, np.zeros((len(times), len(names), 3)))
+        )
 
     def _sample_times(self, poses: Sequence[PoseSequence]) -> Array:
         """Return the sample times [s] where no marker file gives them.
@@ -479,22 +596,42 @@ class RecordingReader:
         """
         section = self.section
         wrench_sections = [
-            (k, grasp.wrench) for k, grasp in enumerate(section.moved_sections) if grasp.wrench
+            (k, grasp.wrench)
+            for k, grasp in enumerate(section.moved_sections)
+            if grasp.wrench
         ]
-        if not (wrench_sections or section.has_markers or section.reading or section.depth):
+        if not (
+            wrench_sections
+            or section.has_markers
+            or section.reading
+            or section.depth
+        ):
             message = "nothing is measured: expected markers, a wrench, a reading, or depth"
             raise InputError(message, where="markers")
         existing_wrenches = [
-            s for s in wrench_sections if stored_files(self.folder / str(section.file_of(s[1])))
+            s
+            for s in wrench_sections
+            if stored_files(self.folder / str(section.file_of(s[1])))
         ]
         if existing_wrenches and not section.has_markers:
             k, sensor = existing_wrenches[0]
             return self._read_wrench(sensor, self._grasp_key(k, "wrench"))[0]
-        if self._is_static and section.depth and max(len(each.t_s) for each in poses) < 2:
+        if (
+            self._is_static
+            and section.depth
+            and max(len(each.t_s) for each in poses) < 2
+        ):
             return np.unique(
-                np.concatenate([self._depth_images(k)[1] for k in range(len(section.depth))])
+                np.concatenate(
+                    [
+                        self._depth_images(k)[1]
+                        for k in range(len(section.depth))
+                    ]
+                )
             )
-        times = max((sequence.t_s for sequence in poses), key=len, default=np.zeros(0))
+        times = max(
+            (sequence.t_s for sequence in poses), key=len, default=np.zeros(0)
+        )
         fewest = 1 if self._is_static else 3
         if len(times) < fewest:
             message = (
@@ -516,13 +653,21 @@ class RecordingReader:
         for key in ("reference_m", "reference_sigma_m", "sigma_m", "weights"):
             if isinstance(by_name := getattr(markers, key), dict):
                 _require_known_markers(by_name, table.names, f"markers.{key}")
-        unweighted = [name for name in table.names if markers.weights.get(name) == 0]
+        unweighted = [
+            name for name in table.names if markers.weights.get(name) == 0
+        ]
         if unweighted:
-            self._add_notes(f"markers excluded by a weight of 0: {', '.join(unweighted)}")
+            self._add_notes(
+                f"markers excluded by a weight of 0: {', '.join(unweighted)}"
+            )
         # Markers that only the gripper or the template needs are read, and not fitted.
-        fitted_names = set(markers.names or set(table.names) - gripper_markers(self.section))
+        fitted_names = set(
+            markers.names or set(table.names) - gripper_markers(self.section)
+        )
         indices = [
-            k for k, n in enumerate(table.names) if n in fitted_names and n not in unweighted
+            k
+            for k, n in enumerate(table.names)
+            if n in fitted_names and n not in unweighted
         ]
         if not indices:
             message = (
@@ -550,43 +695,66 @@ class RecordingReader:
         table = self._fitted_tracks(poses)
         static = self._is_static
         intervals = [
-            each.model_dump(include={"from_s", "until_s"}) for each in section.moved_sections
+            each.model_dump(include={"from_s", "until_s"})
+            for each in section.moved_sections
         ]
         grasp_intervals_s = [
-            (-np.inf if first is None else first, np.inf if last is None else last)
+            (
+                -np.inf if first is None else first,
+                np.inf if last is None else last,
+            )
             for first, last in (each.values() for each in intervals)
         ]
         pose_files = [
-            grasp.poses or section.file_of(grasp.displacement) for grasp in section.moved_sections
+            grasp.poses or section.file_of(grasp.displacement)
+            for grasp in section.moved_sections
         ]
         first_s, last_s = section.window_s or (-np.inf, np.inf)
         t_s = table.t_s[table.t_s >= first_s - TIME_TOLERANCE_S]
         t_s = t_s[t_s <= last_s + TIME_TOLERANCE_S]
-        for name, sequence, interval_s in zip(pose_files, poses, grasp_intervals_s, strict=True):
+        for name, sequence, interval_s in zip(
+            pose_files, poses, grasp_intervals_s, strict=True
+        ):
             if name is not None and len(t_s) and not static:
-                require_determined_motion(sequence, t_s, interval_s, self.folder / name)
+                require_determined_motion(
+                    sequence, t_s, interval_s, self.folder / name
+                )
         rate_hz = section.resample_hz
         # The files that a simulation writes are thinned when they are read.
         every = 1 if self.simulation else section.every
         if self.size is not None and len(t_s):
             samples = len(t_s) // every
             if rate_hz and not static:
-                samples = int(min((t_s[-1] - t_s[0]) * rate_hz, MOST_SAMPLES)) + 1
+                samples = (
+                    int(min((t_s[-1] - t_s[0]) * rate_hz, MOST_SAMPLES)) + 1
+                )
             places = section.markers.reference_m
             size = replace(
                 self.size,
                 samples=samples,
                 markers=len(table.names),
-                unplaced_markers=sum(name not in places for name in table.names),
+                unplaced_markers=sum(
+                    name not in places for name in table.names
+                ),
             )
             require_feasible(size, self.say)
         try:
             aligned = align(
-                poses, table, section.window_s, rate_hz, every, grasp_intervals_s, static
+                poses,
+                table,
+                section.window_s,
+                rate_hz,
+                every,
+                grasp_intervals_s,
+                static,
             )
         except InputError as error:
-            files = dict.fromkeys(name for name in (*pose_files, section.markers.file) if name)
-            raise InputError(error.message, where=" and ".join(files)) from error
+            files = dict.fromkeys(
+                name for name in (*pose_files, section.markers.file) if name
+            )
+            raise InputError(
+                error.message, where=" and ".join(files)
+            ) from error
         self._add_notes(*aligned.notes)
         if rate_hz and rate_hz > 1.01 / np.median(np.diff(table.t_s)):
             self._add_notes(
@@ -612,7 +780,9 @@ class RecordingReader:
         known_m = section.reference_sigma_m
         if np.isnan(sigma_m).any():
             missing_name = names[int(np.isnan(sigma_m).argmax())]
-            message = f"no value for {missing_name!r}; expected one for every marker"
+            message = (
+                f"no value for {missing_name!r}; expected one for every marker"
+            )
             raise InputError(message, where="markers.sigma_m")
         arguments: dict[str, Any] = declared_in(section, Markers, "markers")
         return Markers(
@@ -620,30 +790,45 @@ class RecordingReader:
             table.positions_m,
             sigma_m / np.sqrt(_by_marker(section.weights, names, 1.0)),
             names,
-            places_m=np.array([section.reference_m.get(name, [np.nan] * 3) for name in names]),
-            places_sigma_m=None if known_m is None else _by_marker(known_m, names, np.nan),
+            places_m=np.array(
+                [section.reference_m.get(name, [np.nan] * 3) for name in names]
+            ),
+            places_sigma_m=None
+            if known_m is None
+            else _by_marker(known_m, names, np.nan),
             **arguments,
         )
 
 
-def _by_marker(values: Mapping[str, float] | float, names: Sequence[str], default: float) -> Array:
+def _by_marker(
+    values: Mapping[str, float] | float, names: Sequence[str], default: float
+) -> Array:
     """Return the values (M,) of the markers with these names: one number for all, or the number of
     each name, `default` where the mapping has none.
     """
-    by_name = values if isinstance(values, Mapping) else dict.fromkeys(names, values)
+    by_name = (
+        values if isinstance(values, Mapping) else dict.fromkeys(names, values)
+    )
     return np.array([by_name.get(name, default) for name in names])
 
 
-def _require_known_markers(requested: Iterable[str], names: Sequence[str], key: str) -> None:
+def _require_known_markers(
+    requested: Iterable[str], names: Sequence[str], key: str
+) -> None:
     """Raise `InputError` at `key` if a requested name is not among `names`."""
     present = set(names)
     for name in requested:
         if name not in present:
             known = f"{', '.join(names)}{hint_at(name, names)}"
-            raise InputError(f"found {name!r}; expected names of the markers {known}", where=key)
+            raise InputError(
+                f"found {name!r}; expected names of the markers {known}",
+                where=key,
+            )
 
 
-def require_plausible_markers(experiment: Experiment, constants: Mapping[str, float]) -> None:
+def require_plausible_markers(
+    experiment: Experiment, constants: Mapping[str, float]
+) -> None:
     """Raise `InputError` if the tracks cannot belong to this body, because of a wrong unit or
     frame; see `_implausible_markers`.
 
@@ -676,16 +861,19 @@ def _implausible_markers(experiment: Experiment) -> str | None:
     is_measured = markers.is_present[k]
     measured = markers.positions_m[k, is_measured]
     span_m = _diagonal(measured)
-    if len(measured) > 1 and not LEAST_SPAN * body_m <= span_m <= LARGEST_SPAN * body_m:
+    if (
+        len(measured) > 1
+        and not LEAST_SPAN * body_m <= span_m <= LARGEST_SPAN * body_m
+    ):
         return (
             f"at t = {experiment.t_s[k]:.6g} s the markers span {span_m:.3g} m, but the body "
             f"{body_m:.3g} m; check length_unit of the markers and of the object"
         )
     if not experiment.body_grasps:
         return None
-    rigid_positions = markers.predict_positions(experiment.rigid_positions(experiment.t_s[[k]]))[
-        0, is_measured
-    ]
+    rigid_positions = markers.predict_positions(
+        experiment.rigid_positions(experiment.t_s[[k]])
+    )[0, is_measured]
     miss_m = np.linalg.norm(measured - rigid_positions, axis=1)
     worst = int(miss_m.argmax())
     if miss_m[worst] > LARGEST_MISS * body_m:

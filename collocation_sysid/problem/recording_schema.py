@@ -15,8 +15,21 @@ from ..recording.node_selection import Nodes
 from ..recording.placement import AttachmentRule
 from ..recording.solid_sections import SolidSection
 from ..schema_tables import ByForm, Section, Unit, Vector, used_keys
-from ..validated_types import AtLeastOne, Boundless, Finite, Flag, NotNegative, Positive, Text
-from .load_schema import ForceSection, PointMassSection, PressureSection, TendonSection
+from ..validated_types import (
+    AtLeastOne,
+    Boundless,
+    Finite,
+    Flag,
+    NotNegative,
+    Positive,
+    Text,
+)
+from .load_schema import (
+    ForceSection,
+    PointMassSection,
+    PressureSection,
+    TendonSection,
+)
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
 
 
@@ -32,7 +45,12 @@ class TransformSection(Section):
     """
 
     position_m: Vector = (0.0, 0.0, 0.0)
-    quaternion_xyzw: tuple[Finite, Finite, Finite, Finite] = (0.0, 0.0, 0.0, 1.0)
+    quaternion_xyzw: tuple[Finite, Finite, Finite, Finite] = (
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+    )
 
 
 class TableSection(Section):
@@ -59,7 +77,9 @@ class TableSection(Section):
     @property
     def layout(self) -> dict[str, Any]:
         """Arguments with which the columns are read, by name."""
-        return self.model_dump(include={"columns", "axis", "sign", "length_m", "area_m2"})
+        return self.model_dump(
+            include={"columns", "axis", "sign", "length_m", "area_m2"}
+        )
 
 
 class DisplacementSection(TableSection):
@@ -114,14 +134,19 @@ class WrenchSection(TableSection):
 
 def _as_table(value: str | DisplacementSection) -> DisplacementSection:
     """Return a displacement as a table; text is the name of its file."""
-    return DisplacementSection.model_validate({"file": value}) if isinstance(value, str) else value
+    return (
+        DisplacementSection.model_validate({"file": value})
+        if isinstance(value, str)
+        else value
+    )
 
 
 if TYPE_CHECKING:
     Displacement = DisplacementSection
 else:
     Displacement = Annotated[
-        Annotated[Text, AfterValidator(_as_table)] | DisplacementSection, ByForm(str)
+        Annotated[Text, AfterValidator(_as_table)] | DisplacementSection,
+        ByForm(str),
     ]
 
 
@@ -170,7 +195,9 @@ class MovedSection(Section):
         """
         sources = used_keys(self, "poses", "displacement", "markers")
         if len(sources) > 1:
-            raise ValueError(f"found {' and '.join(sources)}; expected one of them")
+            raise ValueError(
+                f"found {' and '.join(sources)}; expected one of them"
+            )
         if self.gripper_to_body is not None and self.markers is not None:
             raise ValueError(
                 "found gripper_to_body and markers; expected no gripper_to_body, because the "
@@ -358,14 +385,18 @@ class MarkersSection(Section):
         """Raise `ValueError` unless `template_m` and `template_window_s` are given together, with
         at least three positions and a window that starts before it ends.
         """
-        present = used_keys(self, "template_m", "template_window_s", "max_template_residual_m")
+        present = used_keys(
+            self, "template_m", "template_window_s", "max_template_residual_m"
+        )
         if present and not {"template_m", "template_window_s"} <= set(present):
             raise ValueError(
                 f"found {', '.join(present)}; expected template_m and template_window_s, both "
                 "or neither"
             )
         _require_three(self.template_m, "template_m")
-        if (window := self.template_window_s) is not None and not window[0] <= window[1]:
+        if (window := self.template_window_s) is not None and not window[
+            0
+        ] <= window[1]:
             raise ValueError(
                 f"found template_window_s = {list(window)}; expected [start, end] with start <= end"
             )
@@ -514,7 +545,9 @@ class DepthSection(NamedSection):
     background: Background = "auto"
     outline_sigma_px: Positive = 0.5
     file: Text
-    camera: DepthCameraSection = Field(default_factory=lambda: DepthCameraSection.model_construct())
+    camera: DepthCameraSection = Field(
+        default_factory=lambda: DepthCameraSection.model_construct()
+    )
     t_s: list[Finite] | None = None
     count_m: Positive | None = None
     length_unit: Unit = "m"
@@ -581,13 +614,17 @@ class ExperimentSection(NamedSection):
     file: Text | None = None
     grasp: Grasps = Field(default_factory=list)
     obstacle: list[ObstacleSection] = Field(default_factory=list)
-    markers: MarkersSection = Field(default_factory=lambda: MarkersSection.model_construct())
+    markers: MarkersSection = Field(
+        default_factory=lambda: MarkersSection.model_construct()
+    )
     window_s: tuple[Boundless, Boundless] | None = None
     resample_hz: Positive | None = None
     every: AtLeastOne = 1
     reading: list[ReadingSection] = Field(default_factory=list)
     depth: list[DepthSection] = Field(default_factory=list)
-    nuisance: NuisanceOrNone = Field(default_factory=lambda: NuisanceSection.model_construct())
+    nuisance: NuisanceOrNone = Field(
+        default_factory=lambda: NuisanceSection.model_construct()
+    )
 
     @property
     def has_markers(self) -> bool:
@@ -611,7 +648,10 @@ class ExperimentSection(NamedSection):
     @model_validator(mode="after")
     def _require_window(self) -> ExperimentSection:
         """Raise `ValueError` unless the window is missing or begins before it ends."""
-        if self.window_s is not None and not self.window_s[0] < self.window_s[1]:
+        if (
+            self.window_s is not None
+            and not self.window_s[0] < self.window_s[1]
+        ):
             raise ValueError(
                 f"found window_s = {list(self.window_s)}; expected [start, end] with start < end"
             )
@@ -625,8 +665,14 @@ class ExperimentSection(NamedSection):
         """
         if self.kind == "dynamic":
             return self
-        usual = {"start": "equilibrium", "start_rule": "standard", "resample_hz": None}
-        moving = [key for key, value in usual.items() if getattr(self, key) != value]
+        usual = {
+            "start": "equilibrium",
+            "start_rule": "standard",
+            "resample_hz": None,
+        }
+        moving = [
+            key for key, value in usual.items() if getattr(self, key) != value
+        ]
         if isinstance(getattr(self.nuisance, "time_shift", None), Section):
             moving.append("nuisance.time_shift")
         if moving:

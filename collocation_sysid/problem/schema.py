@@ -24,7 +24,15 @@ from ..schema_tables import (
     used_keys,
 )
 from ..statistics.systematic_effects import Assumptions
-from ..validated_types import AtLeastOne, Count, Finite, Flag, NotNegative, Positive, Text
+from ..validated_types import (
+    AtLeastOne,
+    Count,
+    Finite,
+    Flag,
+    NotNegative,
+    Positive,
+    Text,
+)
 from .problem_options import RolloutOptions, UncertaintyOptions
 from .recording_schema import ExperimentSection
 from .solver_schema import SolverSection
@@ -250,7 +258,9 @@ class ObjectSection(Section):
         """Raise `ValueError` for keys that exclude or require each other."""
         if self.has_shape:
             require_one(self, *SHAPES)
-        if self.has_shape and (self.mesh is None) != (self.edge_length_m is not None):
+        if self.has_shape and (self.mesh is None) != (
+            self.edge_length_m is not None
+        ):
             raise ValueError(
                 "edge_length_m is used only with surface, cylinder or box_m; expected one of "
                 "these, or no edge_length_m"
@@ -333,15 +343,23 @@ class ParameterSection(Section):
     def _require_one_kind(self) -> ParameterSection:
         """Raise `ValueError` for keys that do not belong together."""
         if len(used_kinds := used_keys(self, "guess", "fixed", "tied_to")) > 1:
-            raise ValueError(f"found {' and '.join(used_kinds)}; expected one of them, or none")
+            raise ValueError(
+                f"found {' and '.join(used_kinds)}; expected one of them, or none"
+            )
         of_kind = {
             "guess": ("lower", "upper", "prior", "scale", "typical"),
             "fixed": (),
             "tied_to": ("ratio",),
         }
-        kind = next((key for key in of_kind if getattr(self, key) is not None), "guess")
-        others = {key for keys in of_kind.values() for key in keys} - set(of_kind[kind])
-        if useless := used_keys(self, *(n for n in type(self).model_fields if n in others)):
+        kind = next(
+            (key for key in of_kind if getattr(self, key) is not None), "guess"
+        )
+        others = {key for keys in of_kind.values() for key in keys} - set(
+            of_kind[kind]
+        )
+        if useless := used_keys(
+            self, *(n for n in type(self).model_fields if n in others)
+        ):
             alternative = "guess instead, or nothing, to estimate the parameter"
             raise ValueError(
                 f"found {kind} together with {', '.join(useless)}; expected {kind} alone, or "
@@ -366,7 +384,9 @@ def _flatten_parameters(tables: Any, *, prefix: str = "") -> Any:
         return tables
     flattened: dict[str, Any] = {}
     for name, value in tables.items():
-        nested = isinstance(value, dict) and not set(value) & set(ParameterSection.model_fields)
+        nested = isinstance(value, dict) and not set(value) & set(
+            ParameterSection.model_fields
+        )
         full_name = f"{prefix}{name}"
         inner = (
             _flatten_parameters(value, prefix=f"{full_name}.")
@@ -379,8 +399,12 @@ def _flatten_parameters(tables: Any, *, prefix: str = "") -> Any:
     return flattened
 
 
-OneParameter = Annotated[ParameterSection | Finite, ByForm((dict, ParameterSection))]
-Parameters = Annotated[dict[str, OneParameter], BeforeValidator(_flatten_parameters)]
+OneParameter = Annotated[
+    ParameterSection | Finite, ByForm((dict, ParameterSection))
+]
+Parameters = Annotated[
+    dict[str, OneParameter], BeforeValidator(_flatten_parameters)
+]
 Substeps = Annotated[int, Field(strict=True, ge=1, le=MOST_STEPS)]
 
 
@@ -434,7 +458,11 @@ class UncertaintySection(Section, UncertaintyOptions):  # pyright: ignore[report
 
 def _kind_tag(value: Any) -> str:
     """Return the tag of an experiment's table, which messages omit."""
-    kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
+    kind = (
+        value.get("kind")
+        if isinstance(value, dict)
+        else getattr(value, "kind", None)
+    )
     return SPECIMEN_TAG if kind == "specimen" else "<recording>"
 
 
@@ -503,12 +531,20 @@ class ProblemFile(Section):
     @property
     def recordings(self) -> list[ExperimentSection]:
         """Experiments with the object's mesh."""
-        return [each for each in self.experiment if isinstance(each, ExperimentSection)]
+        return [
+            each
+            for each in self.experiment
+            if isinstance(each, ExperimentSection)
+        ]
 
     @property
     def specimens(self) -> list[SpecimenSection]:
         """Material tests without a mesh."""
-        return [each for each in self.experiment if isinstance(each, SpecimenSection)]
+        return [
+            each
+            for each in self.experiment
+            if isinstance(each, SpecimenSection)
+        ]
 
 
 def with_experiment_defaults(content: Any) -> Any:
@@ -518,21 +554,35 @@ def with_experiment_defaults(content: Any) -> Any:
     Only complete keys are taken over: a table in the experiment replaces that of the defaults. The
     content itself is not modified, and is returned if there is nothing to insert.
     """
-    shared = content.get("experiment_defaults") if isinstance(content, dict) else None
-    experiments = content.get("experiment") if isinstance(content, dict) else None
+    shared = (
+        content.get("experiment_defaults")
+        if isinstance(content, dict)
+        else None
+    )
+    experiments = (
+        content.get("experiment") if isinstance(content, dict) else None
+    )
     if not (isinstance(shared, dict) and isinstance(experiments, list)):
         return content
     completed_tables = [
-        _known_defaults(shared, table) | table if isinstance(table, dict) else table
+        _known_defaults(shared, table) | table
+        if isinstance(table, dict)
+        else table
         for table in experiments
     ]
     return content | {"experiment": completed_tables}
 
 
-def _known_defaults(shared: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
+def _known_defaults(
+    shared: dict[str, Any], table: dict[str, Any]
+) -> dict[str, Any]:
     """Return the defaults of an experiment: all, or of a specimen beside recordings those that
     specimens know.
     """
     if table.get("kind") != "specimen" or shared.get("kind") == "specimen":
         return shared
-    return {key: value for key, value in shared.items() if key in SpecimenSection.model_fields}
+    return {
+        key: value
+        for key, value in shared.items()
+        if key in SpecimenSection.model_fields
+    }

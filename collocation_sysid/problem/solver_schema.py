@@ -25,7 +25,10 @@ from ..methods.solution import Method
 from ..schema_tables import Among, Section
 from ..validated_types import Options, Positive
 
-OPTIONS = {method: [field.name for field in fields(kind)] for method, kind in METHODS.items()}
+OPTIONS = {
+    method: [field.name for field in fields(kind)]
+    for method, kind in METHODS.items()
+}
 DEFAULT = "reduced-space"
 
 
@@ -39,7 +42,9 @@ def _require_offered(name: Any) -> Any:
     return name
 
 
-MethodName = Annotated[str, Among(tuple(METHODS)), BeforeValidator(_require_offered)]
+MethodName = Annotated[
+    str, Among(tuple(METHODS)), BeforeValidator(_require_offered)
+]
 
 
 @dataclass(frozen=True)
@@ -55,9 +60,13 @@ class OptionTable:
     kind: type[Options]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        return no_info_plain_validator_function(partial(_method_from_table, self.kind.name))
+        return no_info_plain_validator_function(
+            partial(_method_from_table, self.kind.name)
+        )
 
-    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(
+        self, schema: Any, handler: Any
+    ) -> dict[str, Any]:
         return method_options_schema(self.kind.name)
 
 
@@ -94,29 +103,39 @@ class SolverSection(Section):
 
     method: MethodName = DEFAULT
     huber: Positive | None = None
-    interior_point: Annotated[InteriorPoint, OptionTable(InteriorPoint)] = _method_key(
-        InteriorPoint
+    interior_point: Annotated[InteriorPoint, OptionTable(InteriorPoint)] = (
+        _method_key(InteriorPoint)
     )
-    reduced_space: Annotated[ReducedSpace, OptionTable(ReducedSpace)] = _method_key(ReducedSpace)
+    reduced_space: Annotated[ReducedSpace, OptionTable(ReducedSpace)] = (
+        _method_key(ReducedSpace)
+    )
     penalty: Annotated[Penalty, OptionTable(Penalty)] = _method_key(Penalty)
-    augmented_lagrangian: Annotated[AugmentedLagrangian, OptionTable(AugmentedLagrangian)] = (
-        _method_key(AugmentedLagrangian)
-    )
+    augmented_lagrangian: Annotated[
+        AugmentedLagrangian, OptionTable(AugmentedLagrangian)
+    ] = _method_key(AugmentedLagrangian)
     shooting: Annotated[Shooting, OptionTable(Shooting)] = _method_key(Shooting)
-    casadi_sqpmethod: Annotated[SqpMethod, OptionTable(SqpMethod)] = _method_key(SqpMethod)
+    casadi_sqpmethod: Annotated[SqpMethod, OptionTable(SqpMethod)] = (
+        _method_key(SqpMethod)
+    )
     casadi_sleqp: Annotated[Sleqp, OptionTable(Sleqp)] = _method_key(Sleqp)
-    continuation: Annotated[Continuation, OptionTable(Continuation)] = _method_key(Continuation)
+    continuation: Annotated[Continuation, OptionTable(Continuation)] = (
+        _method_key(Continuation)
+    )
 
     @model_validator(mode="before")
     @classmethod
     def _require_option_tables(cls, table: Any) -> Any:
         """Raise `ValueError` if options of a method are outside the method's table."""
         outside = (
-            [name for name in table if _methods_with(name)] if isinstance(table, Mapping) else []
+            [name for name in table if _methods_with(name)]
+            if isinstance(table, Mapping)
+            else []
         )
         if outside:
             remedy = f"move {_advice_on_tables(outside, table.get('method', DEFAULT))}"
-            raise ValueError(f"the options of a method have a table of their own: {remedy}")
+            raise ValueError(
+                f"the options of a method have a table of their own: {remedy}"
+            )
         return table
 
     @property
@@ -139,7 +158,9 @@ def _method_from_table(method: str, table: Any) -> Any:
     """
     where = f"solver.{method}"
     if not isinstance(table, Mapping):
-        raise InputError(f"found {table!r}; expected a table of options", None, where)
+        raise InputError(
+            f"found {table!r}; expected a table of options", None, where
+        )
     for name in table:
         owners = _methods_with(name)
         if owners and method not in owners:
@@ -161,9 +182,12 @@ def _advice_on_tables(options: Sequence[str], chosen: Any) -> str:
     options_by_method: dict[str, list[str]] = {}
     for option in options:
         owners = _methods_with(option)
-        options_by_method.setdefault(chosen if chosen in owners else owners[0], []).append(option)
+        options_by_method.setdefault(
+            chosen if chosen in owners else owners[0], []
+        ).append(option)
     return " and ".join(
-        f"{', '.join(names)} to {table_heading(to)}" for to, names in options_by_method.items()
+        f"{', '.join(names)} to {table_heading(to)}"
+        for to, names in options_by_method.items()
     )
 
 

@@ -18,7 +18,11 @@ from ..recording.specimen_checks import (
     require_plausible_specimen,
     rows_after_cycles,
 )
-from ..recording.specimen_files import SpecimenLayout, SpecimenTable, read_specimen
+from ..recording.specimen_files import (
+    SpecimenLayout,
+    SpecimenTable,
+    read_specimen,
+)
 from .code_loader import existing_file
 from .specimen_schema import SpecimenSection, deviation
 
@@ -63,7 +67,9 @@ class SpecimenReader:
         table = read_specimen(
             file,
             layout_from_section(
-                section, requires_times=self.body.has_memory or section.window_s is not None
+                section,
+                requires_times=self.body.has_memory
+                or section.window_s is not None,
             ),
         )
         if table.is_incompressible and section.stress == "true":
@@ -96,10 +102,15 @@ class SpecimenReader:
         section = self.section
         rows = self._rows(table)
         if len(rows) < len(table.t_s):
-            self._add_note(f"{section.file}: {len(rows)} of {len(table.t_s)} rows are used")
+            self._add_note(
+                f"{section.file}: {len(rows)} of {len(table.t_s)} rows are used"
+            )
         arguments: dict[str, Any] = table.rows(rows)
         if table.is_displacement and section.area_m2 is not None:
-            arguments |= {"length_m": section.length_m, "area_m2": section.area_m2}
+            arguments |= {
+                "length_m": section.length_m,
+                "area_m2": section.area_m2,
+            }
         return Specimen(
             section.test,
             **arguments,
@@ -124,7 +135,9 @@ class SpecimenReader:
         if not rows.size:
             raise InputError("no sample is within window_s", where="window_s")
         if section.skip_cycles:
-            rows = rows[rows_after_cycles(table.strain[rows], section.skip_cycles)]
+            rows = rows[
+                rows_after_cycles(table.strain[rows], section.skip_cycles)
+            ]
         return rows[:: section.every]
 
     def _sigma_pa(self) -> float:

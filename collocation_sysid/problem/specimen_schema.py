@@ -90,8 +90,13 @@ class SpecimenSection(NamedSection):
         """Raise `ValueError` for keys that exclude or require each other."""
         require_one(self, "sigma_pa", "sigma_n")
         if self.sigma_n is not None and self.area_m2 is None:
-            raise ValueError("found sigma_n without area_m2, which divides it; expected both")
-        if self.window_s is not None and not self.window_s[0] < self.window_s[1]:
+            raise ValueError(
+                "found sigma_n without area_m2, which divides it; expected both"
+            )
+        if (
+            self.window_s is not None
+            and not self.window_s[0] < self.window_s[1]
+        ):
             raise ValueError(
                 f"found window_s = {list(self.window_s)}; expected [start, end] with start < end"
             )

@@ -107,20 +107,32 @@ class BlockBand:
         blocks = sorted(blocks, key=lambda block: block.offset)
         exists = np.array(
             [
-                [0 <= t + b.offset < count and row_starts[t + b.offset] >= 0 for b in blocks]
+                [
+                    0 <= t + b.offset < count and row_starts[t + b.offset] >= 0
+                    for b in blocks
+                ]
                 for t in range(count)
             ]
         )
         self._slabs: dict[tuple[bool, ...], _ColumnBlock] = {}
         for present in map(tuple, np.unique(exists, axis=0)):
-            chosen = [b for b, here in zip(blocks, present, strict=True) if here]
-            self._slabs[present] = _ColumnBlock.from_blocks(columns, chosen, top_rows)
+            chosen = [
+                b for b, here in zip(blocks, present, strict=True) if here
+            ]
+            self._slabs[present] = _ColumnBlock.from_blocks(
+                columns, chosen, top_rows
+            )
         kinds = [self._slabs[tuple(present)] for present in exists]
-        starts = np.concatenate([[0], np.cumsum([slab.entry_count for slab in kinds])])
+        starts = np.concatenate(
+            [[0], np.cumsum([slab.entry_count for slab in kinds])]
+        )
         self.starts = starts
         self.nnz = int(starts[-1])
         self.indptr = np.concatenate(
-            [[0], *(slab.column_ends + starts[t] for t, slab in enumerate(kinds))]
+            [
+                [0],
+                *(slab.column_ends + starts[t] for t, slab in enumerate(kinds)),
+            ]
         )
         self.indices = np.concatenate(
             [slab.row_indices(row_starts, t) for t, slab in enumerate(kinds)]
@@ -131,7 +143,9 @@ class BlockBand:
         self._kinds = kinds
         self._fill = make_combiner(_make_plan(kinds, starts[:-1], count, adds))
 
-    def positions(self, times: Index, offset: int, rows: Index, columns: Index) -> Index:
+    def positions(
+        self, times: Index, offset: int, rows: Index, columns: Index
+    ) -> Index:
         """Return the positions (len(times), len(rows)) in the values of entries of the blocks (t +
         offset, t).
 
@@ -208,12 +222,16 @@ class _ColumnBlock:
     entry_count: int
     column_ends: Index
     top_positions: Index
-    sorted_positions: Index  # sorted place of each entry, blocks stacked after the top rows
+    sorted_positions: (
+        Index  # sorted place of each entry, blocks stacked after the top rows
+    )
     block_indices: Index  # row offset of each stacked entry
     rows: Index
 
     @classmethod
-    def from_blocks(cls, columns: int, blocks: Sequence[BandBlock], top: int) -> _ColumnBlock:
+    def from_blocks(
+        cls, columns: int, blocks: Sequence[BandBlock], top: int
+    ) -> _ColumnBlock:
         """Return the structure of a column block of `columns` columns: `top` dense rows, then the
         blocks.
         """
@@ -222,7 +240,10 @@ class _ColumnBlock:
         rows = np.concatenate([top_rows, *(b.rows for b in blocks)])
         cols = np.concatenate([top_columns, *(b.columns for b in blocks)])
         level = np.concatenate(
-            [np.full(len(top_rows), -1), *(np.full(len(b.rows), k) for k, b in enumerate(blocks))]
+            [
+                np.full(len(top_rows), -1),
+                *(np.full(len(b.rows), k) for k, b in enumerate(blocks)),
+            ]
         )
         order = np.lexsort((rows, level, cols))
         place = np.empty(len(order), dtype=np.int64)
@@ -251,8 +272,12 @@ class _ColumnBlock:
         """Return the position in the column block of each entry of block number `block` (an
         index).
         """
-        first = self.top * self.columns + sum(len(b.rows) for b in self.blocks[:block])
-        return self.sorted_positions[first : first + len(self.blocks[block].rows)]
+        first = self.top * self.columns + sum(
+            len(b.rows) for b in self.blocks[:block]
+        )
+        return self.sorted_positions[
+            first : first + len(self.blocks[block].rows)
+        ]
 
     def locate(self, offset: int, rows: Index, columns: Index) -> Index:
         """Return the positions in the column block of entries (rows, columns) of the block at a row
@@ -270,7 +295,9 @@ class _ColumnBlock:
         sorter = np.argsort(codes)
         requested = np.asarray(columns) * width + rows
         entries = sorter[
-            np.minimum(np.searchsorted(codes, requested, sorter=sorter), len(codes) - 1)
+            np.minimum(
+                np.searchsorted(codes, requested, sorter=sorter), len(codes) - 1
+            )
         ]
         if (codes[entries] != requested).any():
             raise IndexError("an entry lies outside the block")
@@ -303,7 +330,9 @@ class CombinePlan:
     sources: NDArray[np.int32]
 
 
-def _make_plan(kinds: Sequence[_ColumnBlock], starts: Index, count: int, adds: bool) -> CombinePlan:
+def _make_plan(
+    kinds: Sequence[_ColumnBlock], starts: Index, count: int, adds: bool
+) -> CombinePlan:
     """Return the tasks that fill the column blocks.
 
     Parameters
@@ -336,9 +365,13 @@ def _make_plan(kinds: Sequence[_ColumnBlock], starts: Index, count: int, adds: b
                 used += len(places)
             start, length = maps[id(slab), k]
             active = [m for m in block.terms if m.a[t] != 0 or m.b[t] != 0]
-            terms = [(m.a[t], m.b[t], t + m.shift) for m in active] or [(0.0, 0.0, 0)]
+            terms = [(m.a[t], m.b[t], t + m.shift) for m in active] or [
+                (0.0, 0.0, 0)
+            ]
             for number, (a, b, row) in enumerate(terms):
-                tasks.append((starts[t], start, length, row, int(adds or number > 0)))
+                tasks.append(
+                    (starts[t], start, length, row, int(adds or number > 0))
+                )
                 coefficients.append((a, b))
         first_task.append(len(tasks))
     return CombinePlan(
@@ -382,7 +415,10 @@ class Submatrix:
     """
 
     def __init__(
-        self, pattern: SymmetricPattern, rows: Index, columns: Index | None = None
+        self,
+        pattern: SymmetricPattern,
+        rows: Index,
+        columns: Index | None = None,
     ) -> None:
         # Entries are sorted by column, so that those of the transpose are sorted by row.
         across, row_of_entry, source = pattern.full
@@ -395,7 +431,9 @@ class Submatrix:
         self._in_both = source[is_selected] + np.where(
             (row_of_entry > across)[is_selected], 0, pattern.entry_count
         )
-        ends = np.cumsum(np.bincount(place[row_of_entry[is_selected]], minlength=len(rows)))
+        ends = np.cumsum(
+            np.bincount(place[row_of_entry[is_selected]], minlength=len(rows))
+        )
         parts = (
             np.zeros(is_selected.sum()),
             number[across[is_selected]],
@@ -421,7 +459,9 @@ class Submatrix:
         return self._matrix
 
 
-def full_matrix(pattern: SymmetricPattern, lower: Array, skew: Array) -> sp.csc_array:
+def full_matrix(
+    pattern: SymmetricPattern, lower: Array, skew: Array
+) -> sp.csc_array:
     """Return the sparse matrix (3n, 3n) of the symmetric part `lower` (m,) and the skew
     part `skew`, (m,) or (0,).
     """
@@ -451,7 +491,10 @@ def skew_block_band(
         replace(
             block,
             lower_positions=block.full_positions,
-            terms=[BlockTerm(t.shift, t.a, t.b if by_velocity else 0.0 * t.b) for t in block.terms],
+            terms=[
+                BlockTerm(t.shift, t.a, t.b if by_velocity else 0.0 * t.b)
+                for t in block.terms
+            ],
         )
         for block in blocks
     ]

@@ -62,32 +62,52 @@ def align_camera(
         Index of the image.
     """
     rotations, translations = camera.poses
-    corners = ((x - translations[image]) @ rotations[image])[surface.plane_triangles]
-    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    corners = ((x - translations[image]) @ rotations[image])[
+        surface.plane_triangles
+    ]
+    sides = np.cross(
+        corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    )
     area = np.linalg.norm(sides, axis=1)
-    selected_area = area * np.repeat(surface.is_selected, len(area) // len(surface.faces))
+    selected_area = area * np.repeat(
+        surface.is_selected, len(area) // len(surface.faces)
+    )
     rng = np.random.default_rng(0)
-    chosen = rng.choice(len(area), SAMPLES, p=selected_area / selected_area.sum())
-    places = np.einsum("pc,pci->pi", rng.dirichlet(np.ones(3), SAMPLES), corners[chosen])
+    chosen = rng.choice(
+        len(area), SAMPLES, p=selected_area / selected_area.sum()
+    )
+    places = np.einsum(
+        "pc,pci->pi", rng.dirichlet(np.ones(3), SAMPLES), corners[chosen]
+    )
     normals = sides[chosen] / area[chosen, None]
     size_m = float(np.linalg.norm(np.ptp(x, axis=0)))
     tree = KDTree(thinned(camera.depth.points_m[image]))
     gates = np.geomspace(REACH * size_m, camera.depth.gate_m, ITERATIONS)
-    rotation_vectors = np.vstack([np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)])
-    cropped_cloud = np.asarray(tree.data)[KDTree(places).query(tree.data)[0] < gates[0]]
+    rotation_vectors = np.vstack(
+        [np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)]
+    )
+    cropped_cloud = np.asarray(tree.data)[
+        KDTree(places).query(tree.data)[0] < gates[0]
+    ]
     shifts = [
         np.zeros(3),
-        places.mean(axis=0) - cropped_cloud.mean(axis=0) if len(cropped_cloud) else np.zeros(3),
+        places.mean(axis=0) - cropped_cloud.mean(axis=0)
+        if len(cropped_cloud)
+        else np.zeros(3),
     ]
     candidates = [
-        (1.0, Rotation.from_rotvec(turn), shift) for turn in rotation_vectors for shift in shifts
+        (1.0, Rotation.from_rotvec(turn), shift)
+        for turn in rotation_vectors
+        for shift in shifts
     ]
     for half in np.array_split(gates, 2):
         candidates = [
             _iterate_alignment(camera, tree, places, normals, half, *start)
             for _, *start in candidates
         ]
-        candidates = sorted(candidates, key=lambda each: each[0])[:LEAST_POINTS_SHARE]
+        candidates = sorted(candidates, key=lambda each: each[0])[
+            :LEAST_POINTS_SHARE
+        ]
     _, turn, shift = candidates[0]
     return turn.as_rotvec(), shift
 
@@ -124,22 +144,36 @@ def _iterate_alignment(
         Mean squared distance over the gate, limited to one per point; rotation; and translation.
     """
     pivot = camera.pivot_m
-    prior = np.concatenate([camera.prior_weights(row) for row in (DEPTH_TURN, DEPTH_SHIFT)])
+    prior = np.concatenate(
+        [camera.prior_weights(row) for row in (DEPTH_TURN, DEPTH_SHIFT)]
+    )
     mismatch = 1.0
     for gate in gates:
         # Cloud points p are at R (p − c) + c + d: the surface looks for them in their own frame.
-        _, nearest = tree.query(rotation.inv().apply(places - pivot - translation_m) + pivot)
-        aligned = rotation.apply(np.asarray(tree.data)[nearest] - pivot) + pivot + translation_m
+        _, nearest = tree.query(
+            rotation.inv().apply(places - pivot - translation_m) + pivot
+        )
+        aligned = (
+            rotation.apply(np.asarray(tree.data)[nearest] - pivot)
+            + pivot
+            + translation_m
+        )
         distances = aligned - places
         is_facing = np.ones(len(places), dtype=bool)
         if camera.depth.camera.matrix is not None:
             ways = rotation.apply(-pivot) + pivot + translation_m - places
-            is_facing = np.sum(normals * ways, axis=1) > GRAZING * np.linalg.norm(ways, axis=1)
+            is_facing = np.sum(
+                normals * ways, axis=1
+            ) > GRAZING * np.linalg.norm(ways, axis=1)
         squares = np.sum(distances**2, axis=1)
         mismatch = (
-            float(np.minimum(squares / gate**2, 1.0)[is_facing].mean()) if is_facing.any() else 1.0
+            float(np.minimum(squares / gate**2, 1.0)[is_facing].mean())
+            if is_facing.any()
+            else 1.0
         )
-        weight = np.sqrt(INDEPENDENT / max(is_facing.sum(), 1)) * is_facing / gate
+        weight = (
+            np.sqrt(INDEPENDENT / max(is_facing.sum(), 1)) * is_facing / gate
+        )
         weight /= 1 + squares / (gate / 2) ** 2
         by = np.concatenate(
             [
@@ -148,15 +182,24 @@ def _iterate_alignment(
             ],
             axis=2,
         )
-        projected = np.einsum("pi,pij->pj", normals, by), np.sum(normals * distances, axis=1)
+        projected = (
+            np.einsum("pi,pij->pj", normals, by),
+            np.sum(normals * distances, axis=1),
+        )
         rows = [
             projected[0] * weight[:, None],
             *(SLIDING * by * weight[:, None, None]).swapaxes(0, 1),
         ]
-        right = [projected[1] * weight, *(SLIDING * distances * weight[:, None]).T]
-        prior_residual = prior * np.concatenate([rotation.as_rotvec(), translation_m])
+        right = [
+            projected[1] * weight,
+            *(SLIDING * distances * weight[:, None]).T,
+        ]
+        prior_residual = prior * np.concatenate(
+            [rotation.as_rotvec(), translation_m]
+        )
         step = np.linalg.lstsq(
-            np.concatenate([*rows, np.diag(prior)]), -np.concatenate([*right, prior_residual])
+            np.concatenate([*rows, np.diag(prior)]),
+            -np.concatenate([*right, prior_residual]),
         )[0]
         rotation = Rotation.from_rotvec(step[:3]) * rotation
         translation_m = translation_m + step[3:]
@@ -167,4 +210,6 @@ def _cross_product_matrices(vectors: Array) -> Array:
     """Return the matrices (P, 3, 3) of cross products with vectors (P, 3)."""
     x, y, z = vectors.T
     none = np.zeros_like(x)
-    return np.stack([[none, -z, y], [z, none, -x], [-y, x, none]]).transpose(2, 0, 1)
+    return np.stack([[none, -z, y], [z, none, -x], [-y, x, none]]).transpose(
+        2, 0, 1
+    )

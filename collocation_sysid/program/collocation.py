@@ -54,7 +54,9 @@ from .sparse_assembly import SparseAssembly
 from .transcription import RowWeights, SegmentOffsets, Transcription
 
 
-def convert_variables(z: Array, source: Collocation, target: Collocation) -> Array:
+def convert_variables(
+    z: Array, source: Collocation, target: Collocation
+) -> Array:
     """Convert the variables z of a program to those of the same program with or without lifted
     variables.
 
@@ -72,7 +74,9 @@ def convert_variables(z: Array, source: Collocation, target: Collocation) -> Arr
     (to.variables,) array
         Variables; lifted ones follow from positions and parameters.
     """
-    return z if len(z) == target.variable_count else target.pack(*source.unpack(z))
+    return (
+        z if len(z) == target.variable_count else target.pack(*source.unpack(z))
+    )
 
 
 @dataclass(frozen=True)
@@ -152,11 +156,17 @@ class Collocation:
 
     def __post_init__(self) -> None:
         if all(experiment.validation for experiment in self.experiments):
-            raise InputError("every experiment is for validation: there is nothing to fit")
+            raise InputError(
+                "every experiment is for validation: there is nothing to fit"
+            )
         if self.substeps < 1:
             raise InputError(f"substeps = {self.substeps}, expected at least 1")
         if self.huber is not None and not self.huber > 0:
-            raise InputError(f"huber = {self.huber:g}, expected a positive number", None, "solver")
+            raise InputError(
+                f"huber = {self.huber:g}, expected a positive number",
+                None,
+                "solver",
+            )
         self.parameters.require_constants_of(
             {id(s.body): s.body for s in self.transcriptions}.values()
         )
@@ -170,7 +180,9 @@ class Collocation:
         """
         fitted = [each for each in self.experiments if not each.validation]
         segments = list[Transcription]()
-        for experiment, local in zip(fitted, nuisance_indices(fitted, self.nq), strict=True):
+        for experiment, local in zip(
+            fitted, nuisance_indices(fitted, self.nq), strict=True
+        ):
             chart = self.associations.get(experiment.name)
             if chart is None or not chart.matches(experiment):
                 chart = MarkerAssociation.from_experiment(experiment)
@@ -182,12 +194,16 @@ class Collocation:
                     substeps=1 if experiment.is_static else self.substeps,
                     has_grasp_constraints=self.has_grasp_constraints,
                     huber=self.huber,
-                    offsets=segments[-1].next_offsets if segments else SegmentOffsets(self.nq, 0),
+                    offsets=segments[-1].next_offsets
+                    if segments
+                    else SegmentOffsets(self.nq, 0),
                     nuisance_indices=local,
                     association=chart,
                 )
             )
-        return _with_shared_associations(segments, [segment.association for segment in segments])
+        return _with_shared_associations(
+            segments, [segment.association for segment in segments]
+        )
 
     @cached_property
     def lifted(self) -> tuple[LiftedVariables, ...]:
@@ -225,7 +241,11 @@ class Collocation:
     @property
     def nphi(self) -> int:
         """Number of nuisance parameters φ of all experiments; shared ones count once."""
-        return int(np.concatenate(self.parameter_indices).max(initial=self.nq - 1)) + 1 - self.nq
+        return (
+            int(np.concatenate(self.parameter_indices).max(initial=self.nq - 1))
+            + 1
+            - self.nq
+        )
 
     @property
     def variable_count(self) -> int:
@@ -245,7 +265,9 @@ class Collocation:
         kind : {"memory", "force", "pressure", "wrench"}, optional
             Kind of lifted variables; None means all.
         """
-        return sum(each.count for each in self.lifted if kind in (None, each.kind))
+        return sum(
+            each.count for each in self.lifted if kind in (None, each.kind)
+        )
 
     @property
     def lifted_nonzeros(self) -> tuple[int, int]:
@@ -283,10 +305,17 @@ class Collocation:
             Scaled variables; lifted ones follow from positions and parameters.
         """
         parts = self.iterates_at(p, positions) if self.lifted else []
-        lifted = [each.consistent_values(parts[each.segment_index]) for each in self.lifted]
-        return np.concatenate([self._pack_without_lifted(p, positions), *lifted])
+        lifted = [
+            each.consistent_values(parts[each.segment_index])
+            for each in self.lifted
+        ]
+        return np.concatenate(
+            [self._pack_without_lifted(p, positions), *lifted]
+        )
 
-    def _pack_without_lifted(self, p: Array, positions: Sequence[Array]) -> Array:
+    def _pack_without_lifted(
+        self, p: Array, positions: Sequence[Array]
+    ) -> Array:
         """Return z without lifted variables from p (nq + nphi,) and the positions (N, 3n) [m] of
         each experiment: q, scaled positions, φ.
         """
@@ -299,7 +328,8 @@ class Collocation:
         [m] from z.
         """
         return self.parameters_from(z), [
-            z[segment.columns].reshape(segment.grid_times, segment.dof_count) * segment.length_m
+            z[segment.columns].reshape(segment.grid_times, segment.dof_count)
+            * segment.length_m
             for segment in self.transcriptions
         ]
 
@@ -317,7 +347,9 @@ class Collocation:
         """Return every experiment at the variables z, with lifted variables taken from z."""
         parts = self.iterates_at(*self.unpack(z))
         for each in self.lifted:
-            parts[each.segment_index] = each.with_lifted(parts[each.segment_index], z)
+            parts[each.segment_index] = each.with_lifted(
+                parts[each.segment_index], z
+            )
         return parts
 
     @cached_property
@@ -330,14 +362,18 @@ class Collocation:
         """Number of threads that all bodies may use."""
         return min(segment.body.threads for segment in self.transcriptions)
 
-    def iterates_at(self, p: Array, positions: Sequence[Array]) -> list[ExperimentIterate]:
+    def iterates_at(
+        self, p: Array, positions: Sequence[Array]
+    ) -> list[ExperimentIterate]:
         """Return every experiment at parameters p (nq + nphi,) and positions (N, 3n) [m], or their
         first rows.
 
         Lifted quantities follow from positions and parameters.
         """
         return [
-            ExperimentIterate(segment, p[: self.nq], p[segment.nuisance_indices.indices], x)
+            ExperimentIterate(
+                segment, p[: self.nq], p[segment.nuisance_indices.indices], x
+            )
             for segment, x in zip(self.transcriptions, positions, strict=True)
         ]
 
@@ -349,7 +385,9 @@ class Collocation:
         names = [item.name for item in self.parameters.free] + [""] * self.nphi
         for segment in self.transcriptions:
             for place, name in zip(
-                segment.nuisance_indices.indices, segment.nuisance.names, strict=True
+                segment.nuisance_indices.indices,
+                segment.nuisance.names,
+                strict=True,
             ):
                 names[place] = name
         return tuple(names)
@@ -373,7 +411,9 @@ class Collocation:
         low, high = (np.full(self.nphi, bound) for bound in (-np.inf, np.inf))
         for segment in self.transcriptions:
             indices = segment.nuisance_indices.indices - self.nq
-            least, most = segment.nuisance.bounds(segment.association.clock_samples)
+            least, most = segment.nuisance.bounds(
+                segment.association.clock_samples
+            )
             low[indices] = np.maximum(low[indices], least)
             high[indices] = np.minimum(high[indices], most)
         return np.concatenate([lower, low]), np.concatenate([upper, high])
@@ -398,9 +438,14 @@ class Collocation:
         (Collocation, array)
             The program with the new associations, which is self if none has changed, and p in it.
         """
-        rows = positions or [np.zeros((0, segment.dof_count)) for segment in self.transcriptions]
+        rows = positions or [
+            np.zeros((0, segment.dof_count)) for segment in self.transcriptions
+        ]
         pairs = zip(self.transcriptions, rows, strict=True)
-        updates = [s.follow_estimates(p[s.nuisance_indices.indices], x) for s, x in pairs]
+        updates = [
+            s.follow_estimates(p[s.nuisance_indices.indices], x)
+            for s, x in pairs
+        ]
         if all(
             chart is s.association
             for (chart, _), s in zip(updates, self.transcriptions, strict=True)
@@ -443,13 +488,22 @@ class Collocation:
         experiment.
         """
         charts = [
-            s.association.centred_at(m) for s, m in zip(self.transcriptions, places_m, strict=True)
+            s.association.centred_at(m)
+            for s, m in zip(self.transcriptions, places_m, strict=True)
         ]
-        segments = [s.with_association(c) for s, c in zip(self.transcriptions, charts, strict=True)]
-        return self._with_associations(charts, self.guess_p, [s.guess_phi for s in segments])[0]
+        segments = [
+            s.with_association(c)
+            for s, c in zip(self.transcriptions, charts, strict=True)
+        ]
+        return self._with_associations(
+            charts, self.guess_p, [s.guess_phi for s in segments]
+        )[0]
 
     def _with_associations(
-        self, charts: Sequence[MarkerAssociation], p: Array, phis: Sequence[Array]
+        self,
+        charts: Sequence[MarkerAssociation],
+        p: Array,
+        phis: Sequence[Array],
     ) -> tuple[Collocation, Array]:
         """Return the program with another association of each experiment, and p (nq + nphi,) with
         the φ of each experiment in `phis`, which refer to these associations.
@@ -475,7 +529,9 @@ class Collocation:
         of the first experiment.
         """
         p = np.concatenate([q, np.zeros(self.nphi)])
-        for segment, phi in reversed([*zip(self.transcriptions, phis, strict=True)]):
+        for segment, phi in reversed(
+            [*zip(self.transcriptions, phis, strict=True)]
+        ):
             p[segment.nuisance_indices.indices] = phi
         return p
 
@@ -483,18 +539,24 @@ class Collocation:
     def reach_p(self) -> Array:
         """Scale of p: the change of each entry that a trust region of radius one allows."""
         return self._combine_parameters(
-            np.ones(self.nq), [s.nuisance.step_limits for s in self.transcriptions]
+            np.ones(self.nq),
+            [s.nuisance.step_limits for s in self.transcriptions],
         )
 
     def bounds(self) -> tuple[Array, Array]:
         """Return lower and upper bounds of z; equal where a value is prescribed."""
         lower, upper = self.parameter_bounds
-        lows, highs = zip(*(segment.bounds() for segment in self.transcriptions), strict=True)
+        lows, highs = zip(
+            *(segment.bounds() for segment in self.transcriptions), strict=True
+        )
         least = [np.full(each.count, each.lower_bound) for each in self.lifted]
         return (
             np.concatenate([self._pack_without_lifted(lower, lows), *least]),
             np.concatenate(
-                [self._pack_without_lifted(upper, highs), np.full(self.lifted_count(), np.inf)]
+                [
+                    self._pack_without_lifted(upper, highs),
+                    np.full(self.lifted_count(), np.inf),
+                ]
             ),
         )
 
@@ -516,8 +578,13 @@ class Collocation:
             of_x, of_p = part.gradient()
             by_x.append(of_x.ravel() * part.segment.length_m)
             by_p[part.segment.parameter_indices] += of_p
-        further = [each.loss_gradient(parts[each.segment_index]) for each in self.lifted]
-        return self.loss_scale * np.concatenate([by_p[: self.nq], *by_x, by_p[self.nq :], *further])
+        further = [
+            each.loss_gradient(parts[each.segment_index])
+            for each in self.lifted
+        ]
+        return self.loss_scale * np.concatenate(
+            [by_p[: self.nq], *by_x, by_p[self.nq :], *further]
+        )
 
     # Constraints ------------------------------------------------------------------------------
 
@@ -527,9 +594,14 @@ class Collocation:
         """
         parts = self.iterates(z)
         rows = [
-            part.segment.constraint_values(part.x, part.equations, part.histories) for part in parts
+            part.segment.constraint_values(
+                part.x, part.equations, part.histories
+            )
+            for part in parts
         ]
-        further = [each.residuals(parts[each.segment_index], z) for each in self.lifted]
+        further = [
+            each.residuals(parts[each.segment_index], z) for each in self.lifted
+        ]
         return np.concatenate([*rows, *further])
 
     @property
@@ -547,14 +619,21 @@ class Collocation:
         for segment in self.transcriptions:
             indptr.append(indptr[-1][-1] + segment.jacobian.indptr[1:])
             indices.append(segment.offsets.row + segment.jacobian.indices)
-            moving = segment.nuisance_indices.indices[segment.nuisance.motion_indices] - self.nq
+            moving = (
+                segment.nuisance_indices.indices[
+                    segment.nuisance.motion_indices
+                ]
+                - self.nq
+            )
             rows = segment.offsets.row + np.arange(segment.constraint_count)
             columns = self.phi_columns.start + np.repeat(moving, len(rows))
             of_phi.append((np.tile(rows, len(moving)), columns))
         structure = np.concatenate(indptr), np.concatenate(indices)
         further = [each.jacobian_entries() for each in self.lifted]
         return SparseAssembly.from_groups(
-            structure, (self.constraint_count, self.variable_count), of_phi + further
+            structure,
+            (self.constraint_count, self.variable_count),
+            of_phi + further,
         )
 
     def jacobian_values(self, z: Array, out: Array | None = None) -> Array:
@@ -569,7 +648,9 @@ class Collocation:
         """
         return self.constraints_and_jacobian(z, out)[1]
 
-    def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
+    def constraints_and_jacobian(
+        self, z: Array, out: Array | None = None
+    ) -> tuple[Array, Array]:
         """Return constraints g and the values of ∂g/∂z, from one evaluation of the elements.
 
         Parameters
@@ -581,7 +662,9 @@ class Collocation:
         """
         parts = self.iterates(z)
         height = self.transcriptions[-1].next_offsets.row
-        count = self.nq * height + sum(s.jacobian.nnz for s in self.transcriptions)
+        count = self.nq * height + sum(
+            s.jacobian.nnz for s in self.transcriptions
+        )
         values, own = self._jacobian.allocate(out, count)
         columns = own[: self.nq * height].reshape(self.nq, height)
         rows = np.empty(height)
@@ -597,9 +680,16 @@ class Collocation:
             columns[:, segment.rows] = by_p[:, : self.nq].T
             further.append(by_p[:, self.nq :].T.ravel())
             used += segment.jacobian.nnz
-        added = [each.jacobian_values(parts[each.segment_index], z) for each in self.lifted]
-        self._jacobian.assemble(values, own, further + [entries for _, entries in added])
-        return np.concatenate([rows, *(equations for equations, _ in added)]), values
+        added = [
+            each.jacobian_values(parts[each.segment_index], z)
+            for each in self.lifted
+        ]
+        self._jacobian.assemble(
+            values, own, further + [entries for _, entries in added]
+        )
+        return np.concatenate(
+            [rows, *(equations for equations, _ in added)]
+        ), values
 
     def jacobian(self, z: Array) -> sp.csc_array:
         """Return ∂g/∂z as a sparse matrix; history variables that are eliminated are
@@ -607,7 +697,9 @@ class Collocation:
         """
         indptr, indices = self.jacobian_structure
         shape = (self.constraint_count, self.variable_count)
-        return sp.csc_array((self.jacobian_values(z), indices, indptr), shape=shape)
+        return sp.csc_array(
+            (self.jacobian_values(z), indices, indptr), shape=shape
+        )
 
     @property
     def has_eliminated_histories(self) -> bool:
@@ -625,7 +717,9 @@ class Collocation:
         slope = self.jacobian(z).T @ multipliers
         for part in self.iterates(z) if self.has_eliminated_histories else ():
             segment = part.segment
-            weights = segment.lagrangian_weights(multipliers[segment.rows]).forces
+            weights = segment.lagrangian_weights(
+                multipliers[segment.rows]
+            ).forces
             by_x, by_p = segment.history_vjp(part.x, part.equations, weights)
             slope[segment.columns] += segment.length_m * by_x.ravel()
             slope[segment.dynamic_columns(self.phi_columns.start)] += by_p
@@ -652,10 +746,14 @@ class Collocation:
         for segment in self.transcriptions:
             indptr.append(indptr[-1][-1] + segment.hessian.indptr[1:])
             shift = np.where(
-                segment.hessian.indices < self.nq, 0, segment.offsets.position - self.nq
+                segment.hessian.indices < self.nq,
+                0,
+                segment.offsets.position - self.nq,
             )
             indices.append(segment.hessian.indices + shift)
-            further += segment.additional_hessian_entries(self.phi_columns.start)
+            further += segment.additional_hessian_entries(
+                self.phi_columns.start
+            )
         further += [each.hessian_entries() for each in self.lifted]
         structure = np.concatenate(indptr), np.concatenate(indices)
         return SparseAssembly.from_groups(
@@ -674,7 +772,11 @@ class Collocation:
         return of_q, self._hessian.positions_of(np.concatenate(of_x))
 
     def hessian_values(
-        self, z: Array, loss_weight: float, multipliers: Array | None, out: Array | None = None
+        self,
+        z: Array,
+        loss_weight: float,
+        multipliers: Array | None,
+        out: Array | None = None,
     ) -> Array:
         """Return the values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle.
 
@@ -696,9 +798,15 @@ class Collocation:
             replace(part, has_observation_curvature=uses_observation_curvature)
             for part in self.iterates(z)
         ]
-        multipliers = np.zeros(self.constraint_count) if multipliers is None else multipliers
+        multipliers = (
+            np.zeros(self.constraint_count)
+            if multipliers is None
+            else multipliers
+        )
         used = self.nq * (self.nq + 1) // 2
-        count = used + sum(segment.hessian.nnz for segment in self.transcriptions)
+        count = used + sum(
+            segment.hessian.nnz for segment in self.transcriptions
+        )
         values, own = self._hessian.allocate(out, count)
         by_q = np.zeros((self.nq, self.nq))
         further = list[Array]()
@@ -707,9 +815,15 @@ class Collocation:
         for number, part in enumerate(parts):
             segment = part.segment
             here = own[used : used + segment.hessian.nnz]
-            mine = [each for each in self.lifted if each.segment_index == number]
-            of_rows = sum((each.residual_weights(multipliers) for each in mine), start=0.0)
-            weights.append(segment.lagrangian_weights(multipliers[segment.rows], of_rows))
+            mine = [
+                each for each in self.lifted if each.segment_index == number
+            ]
+            of_rows = sum(
+                (each.residual_weights(multipliers) for each in mine), start=0.0
+            )
+            weights.append(
+                segment.lagrangian_weights(multipliers[segment.rows], of_rows)
+            )
             lifted_histories = [
                 each.weighted_history(part, multipliers)
                 for each in mine
@@ -763,9 +877,13 @@ class Collocation:
             at_upper = (upper - z)[part] < tolerance
             slope[part][at_lower] = np.minimum(slope[part][at_lower], 0)
             slope[part][at_upper] = np.maximum(slope[part][at_upper], 0)
-        return float(max(np.abs(slope).max(initial=0.0), np.abs(rows).max(initial=0.0)))
+        return float(
+            max(np.abs(slope).max(initial=0.0), np.abs(rows).max(initial=0.0))
+        )
 
-    def hessian(self, z: Array, loss_weight: float, multipliers: Array | None) -> sp.csc_array:
+    def hessian(
+        self, z: Array, loss_weight: float, multipliers: Array | None
+    ) -> sp.csc_array:
         """Return ∇²_z (loss_weight · objective + multipliers · g), both triangles, as a sparse
         matrix.
 
@@ -805,7 +923,9 @@ class Collocation:
             segment = part.segment
             residual = part.residual_n
             worst = np.argsort(-np.abs(residual), axis=None)[:count]
-            for t, place in zip(*np.unravel_index(worst, residual.shape), strict=True):
+            for t, place in zip(
+                *np.unravel_index(worst, residual.shape), strict=True
+            ):
                 node, axis = divmod(int(segment.free_dofs[place]), 3)
                 violations.append(
                     Violation(
@@ -816,7 +936,9 @@ class Collocation:
                         residual_n=float(residual[t, place]),
                     )
                 )
-        return sorted(violations, key=lambda violation: -abs(violation.residual_n))[:count]
+        return sorted(
+            violations, key=lambda violation: -abs(violation.residual_n)
+        )[:count]
 
     def rms_marker_distance_m(self, z: Array) -> float:
         """Return the root mean square distance of the markers from their measurements [m];
@@ -824,7 +946,9 @@ class Collocation:
         """
         squares = samples = 0.0
         for part in self.iterates(z):
-            squares_m2 = part.segment.markers.squared_distances_m2(part.x, part.phi)
+            squares_m2 = part.segment.markers.squared_distances_m2(
+                part.x, part.phi
+            )
             squares = squares + float(squares_m2.sum())
             samples = samples + len(squares_m2)
         return float(np.sqrt(squares / max(1.0, samples)))
@@ -841,5 +965,10 @@ def _with_shared_associations(
     are shared.
     """
     parts = zip(transcriptions, charts, strict=True)
-    same = shared_charts((s.nuisance_indices, s.nuisance, chart) for s, chart in parts)
-    return tuple(s.with_association(chart) for s, chart in zip(transcriptions, same, strict=True))
+    same = shared_charts(
+        (s.nuisance_indices, s.nuisance, chart) for s, chart in parts
+    )
+    return tuple(
+        s.with_association(chart)
+        for s, chart in zip(transcriptions, same, strict=True)
+    )

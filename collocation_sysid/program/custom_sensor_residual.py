@@ -94,9 +94,14 @@ class CustomSensorResidual(MeasurementResidual):
         """
         count = sensor.measured_values.shape[1]
         groups = -(-count // GROUP)
-        padded = np.full((len(sensor.sample_times_s), 1, GROUP * groups), np.nan)
+        padded = np.full(
+            (len(sensor.sample_times_s), 1, GROUP * groups), np.nan
+        )
         padded[:, 0, :count] = sensor.measured_values
-        is_compared = np.isfinite(padded) & _is_within(sensor.sample_times_s, at_s)[:, None, None]
+        is_compared = (
+            np.isfinite(padded)
+            & _is_within(sensor.sample_times_s, at_s)[:, None, None]
+        )
         which = [f" {k + 1}" if groups > 1 else "" for k in range(groups)]
         return cls(
             observable=observable,
@@ -107,7 +112,9 @@ class CustomSensorResidual(MeasurementResidual):
             sigmas=np.full(groups, sensor.sigma),
             measured=padded,
             is_compared=is_compared.reshape(len(padded), groups, GROUP),
-            own_parameters=nuisance.indices_of_rows(GAUGE, component=number)[None],
+            own_parameters=nuisance.indices_of_rows(GAUGE, component=number)[
+                None
+            ],
             sensor=sensor,
             observable_s=at_s,
             is_static=static,
@@ -117,18 +124,29 @@ class CustomSensorResidual(MeasurementResidual):
         self, known_s: Array, t_s: Array, indices: Array, **changes: Any
     ) -> CustomSensorResidual:
         """Return the model of other samples, see `MeasurementResidual.with_samples`."""
-        return super().with_samples(known_s, t_s, indices, observable_s=known_s, **changes)
+        return super().with_samples(
+            known_s, t_s, indices, observable_s=known_s, **changes
+        )
 
     @cached_property
     def _stencil(self) -> RowStencil:
         """Stencil of all samples: indices of the neighbouring times, and the data of the
         expression.
         """
-        used = min(STATIC_NEIGHBOURS if self.is_static else NEIGHBOURS, len(self.observable_s))
-        times = neighbouring_times(self.observable_s, self.t_s + TIME_TOLERANCE_S, used)
+        used = min(
+            STATIC_NEIGHBOURS if self.is_static else NEIGHBOURS,
+            len(self.observable_s),
+        )
+        times = neighbouring_times(
+            self.observable_s, self.t_s + TIME_TOLERANCE_S, used
+        )
         each = np.arange(self.observable.vector_count)
-        places = (times[..., None] * self.observable.vector_count + each).reshape(len(times), 1, -1)
-        data = np.column_stack([self.observable_s[times] - self.t_s[:, None], self.t_s])
+        places = (
+            times[..., None] * self.observable.vector_count + each
+        ).reshape(len(times), 1, -1)
+        data = np.column_stack(
+            [self.observable_s[times] - self.t_s[:, None], self.t_s]
+        )
         return RowStencil(places, data.T[..., None])
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
@@ -137,7 +155,9 @@ class CustomSensorResidual(MeasurementResidual):
         """
         last = self._stencil.indices[:, 0, -1] // self.observable.vector_count
         samples = int(np.count_nonzero(last < known))
-        return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
+        return RowStencil(
+            self._stencil.indices[:samples], self._stencil.data[:, :samples]
+        )
 
     @property
     def first_needed_s(self) -> float:
@@ -146,7 +166,10 @@ class CustomSensorResidual(MeasurementResidual):
         """
         first = int(self.is_compared.any(axis=(1, 2)).argmax())
         return float(
-            self.observable_s[self._stencil.indices[first, 0, -1] // self.observable.vector_count]
+            self.observable_s[
+                self._stencil.indices[first, 0, -1]
+                // self.observable.vector_count
+            ]
         )
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
@@ -173,18 +196,26 @@ class CustomSensorResidual(MeasurementResidual):
             weights = ca.jacobian(weights, late)
         if self.sensor.grasp is not None:
             at = ca.horzsplit(at[0])
-        unknowns = ca.vertsplit(phi * self.nuisance.scales[self.own_parameters[0]][:, None])
+        unknowns = ca.vertsplit(
+            phi * self.nuisance.scales[self.own_parameters[0]][:, None]
+        )
         predicted = self.sensor.read(t_s, at, unknowns)
-        return ca.vertcat(predicted, ca.SX.zeros(self.measured.shape[2] - predicted.numel()))
+        return ca.vertcat(
+            predicted, ca.SX.zeros(self.measured.shape[2] - predicted.numel())
+        )
 
     @cached_property
     def observable_sigmas(self) -> Array:
         """Standard deviations (3 e,) of the observable as one sample determines it, from the
         derivatives at zero; infinite where the readings do not depend on an entry.
         """
-        nothing = np.zeros((self.observable.count, self.observable.vector_count, GROUP))
+        nothing = np.zeros(
+            (self.observable.count, self.observable.vector_count, GROUP)
+        )
         _, _, by_u = self._evaluate(nothing, np.zeros(self.nuisance.size))
-        by_observables = np.nan_to_num(by_u[..., : by_u.shape[3] - self.own_parameters.shape[1]])
+        by_observables = np.nan_to_num(
+            by_u[..., : by_u.shape[3] - self.own_parameters.shape[1]]
+        )
         each = GROUP * self.observable.vector_count
         squares = np.sum(by_observables.reshape(-1, each) ** 2, axis=0) / max(
             1, self.is_compared.sum()
@@ -197,11 +228,17 @@ class CustomSensorResidual(MeasurementResidual):
         samples outside these times.
         """
         predicted = self.predict(self.observable.evaluate(motion, phi), phi)
-        return np.where(_is_within(self.t_s, self.observable_s)[:, None, None], predicted, np.nan)
+        return np.where(
+            _is_within(self.t_s, self.observable_s)[:, None, None],
+            predicted,
+            np.nan,
+        )
 
     def without_padding(self, predicted_m: Array) -> Array:
         """Return the m numbers (S, m) of the sensor from predictions (S, G, 3)."""
-        return predicted_m.reshape(len(predicted_m), -1)[:, : self.sensor.measured_values.shape[1]]
+        return predicted_m.reshape(len(predicted_m), -1)[
+            :, : self.sensor.measured_values.shape[1]
+        ]
 
 
 def _is_within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:
@@ -210,7 +247,9 @@ def _is_within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:
     """
     if not len(at_s):
         return np.zeros(len(t_s), dtype=bool)
-    return (t_s >= at_s[0] - TIME_TOLERANCE_S) & (t_s <= at_s[-1] + TIME_TOLERANCE_S)
+    return (t_s >= at_s[0] - TIME_TOLERANCE_S) & (
+        t_s <= at_s[-1] + TIME_TOLERANCE_S
+    )
 
 
 def custom_sensor_residuals(
@@ -244,7 +283,12 @@ def custom_sensor_residuals(
             grasp = experiment.grasps[gauge.grasp - 1]
             origin = np.zeros(3)
             channel = GraspWrench.from_experiment(
-                experiment, grasp, frame=gauge.frame, point_m=origin, grid=grid, nuisance=nuisance
+                experiment,
+                grasp,
+                frame=gauge.frame,
+                point_m=origin,
+                grid=grid,
+                nuisance=nuisance,
             )
             at_s = channel.t_s
         models.append(
@@ -261,7 +305,9 @@ def custom_sensor_residuals(
     return tuple(models)
 
 
-def observed_points(experiment: Experiment, sensor: Gauge, rows: int) -> PointPositions:
+def observed_points(
+    experiment: Experiment, sensor: Gauge, rows: int
+) -> PointPositions:
     """Return the points of a custom sensor as an observable at the first `rows` grid times."""
     body = experiment.body
     points = np.asarray(sensor.points_m)

@@ -26,7 +26,14 @@ from ..recording.nuisance import (
     cayley_rotation,
 )
 
-OF_CAMERA = (DEPTH_TURN, DEPTH_SHIFT, DEPTH_BIAS, DEPTH_SCALE, DEPTH_TIME, DEPTH_EDGE)
+OF_CAMERA = (
+    DEPTH_TURN,
+    DEPTH_SHIFT,
+    DEPTH_BIAS,
+    DEPTH_SCALE,
+    DEPTH_TIME,
+    DEPTH_EDGE,
+)
 # One over the deviation of what counts as exact.
 EXACT = 1e6
 
@@ -63,7 +70,9 @@ class DepthCameraModel:
         """Build the model of camera `camera_index` (index) of an experiment."""
         depth = experiment.depths[camera_index]
         rotations, translations = depth.camera.pose_at(depth.sample_times_s[:1])
-        pivot_m = (experiment.body.nodes_m.mean(axis=0) - translations[0]) @ rotations[0]
+        pivot_m = (
+            experiment.body.nodes_m.mean(axis=0) - translations[0]
+        ) @ rotations[0]
         size_m = float(np.linalg.norm(np.ptp(experiment.body.nodes_m, axis=0)))
         return cls(depth, camera_index, nuisance, pivot_m, size_m)
 
@@ -84,7 +93,9 @@ class DepthCameraModel:
     @cached_property
     def parameter_indices(self) -> Index:
         """Indices in φ of the camera's nuisance parameters."""
-        return self.nuisance.indices_of_rows(*OF_CAMERA, component=self.camera_index)
+        return self.nuisance.indices_of_rows(
+            *OF_CAMERA, component=self.camera_index
+        )
 
     @cached_property
     def poses(self) -> tuple[Array, Array]:
@@ -117,10 +128,14 @@ class DepthCameraModel:
         values : mapping of NuisanceRow to SX
             Errors in physical units; missing ones are zero.
         """
-        point = (1 + values.get(DEPTH_SCALE, 0)) * point + values.get(DEPTH_BIAS, 0) * ray
+        point = (1 + values.get(DEPTH_SCALE, 0)) * point + values.get(
+            DEPTH_BIAS, 0
+        ) * ray
         if DEPTH_TURN in values:
             pivot = ca.DM(self.pivot_m)
-            point = cayley_rotation(values[DEPTH_TURN]) @ (point - pivot) + pivot
+            point = (
+                cayley_rotation(values[DEPTH_TURN]) @ (point - pivot) + pivot
+            )
         return point + values.get(DEPTH_SHIFT, 0)
 
     @cached_property
@@ -131,7 +146,9 @@ class DepthCameraModel:
             values = self.nuisance.values_by_row(own, self.parameter_indices)
             return self.corrected_expression(data[:3], data[3:], values)
 
-        return GeneratedFunction(expression, len(self.parameter_indices), data_size=6)
+        return GeneratedFunction(
+            expression, len(self.parameter_indices), data_size=6
+        )
 
     def world_points(self, phi: Array, image: int) -> Array:
         """Return the points (P, 3) of an image in the world [m].
@@ -143,9 +160,13 @@ class DepthCameraModel:
         image : int
             Index of the image.
         """
-        return self.to_world(phi, self.depth.points_m[image], self.rays[image], image)
+        return self.to_world(
+            phi, self.depth.points_m[image], self.rays[image], image
+        )
 
-    def to_world(self, phi: Array, points: Array, rays: Array, image: int) -> Array:
+    def to_world(
+        self, phi: Array, points: Array, rays: Array, image: int
+    ) -> Array:
         """Return points (P, 3) of the camera's frame in the world [m], corrected at φ (k,).
 
         Parameters
@@ -185,11 +206,16 @@ class DepthCameraModel:
         """Return the camera's nuisance parameters in physical units by label, from φ (k,)."""
         entries = self.nuisance.entries
         values = phi * self.nuisance.scales
-        return {entries[k].label: float(values[k]) for k in self.parameter_indices}
+        return {
+            entries[k].label: float(values[k]) for k in self.parameter_indices
+        }
 
     def parameters_from(self, physical_values: Mapping[str, float]) -> Array:
         """Return φ (k,) with the given values in physical units by label; others are zero."""
-        values = [physical_values.get(entry.label, 0.0) for entry in self.nuisance.entries]
+        values = [
+            physical_values.get(entry.label, 0.0)
+            for entry in self.nuisance.entries
+        ]
         return np.array(values) / self.nuisance.scales
 
     def eye_m(self, phi: Array, sample: int) -> Array | None:
@@ -205,21 +231,35 @@ class DepthCameraModel:
         translation [1/m], whichever `row` states; a large number if it is exact.
         """
         places = self.nuisance.indices_of_rows(row, component=self.camera_index)
-        return 1 / self.nuisance.scales[places] if len(places) else np.full(3, EXACT)
+        return (
+            1 / self.nuisance.scales[places]
+            if len(places)
+            else np.full(3, EXACT)
+        )
 
     def clock_shift_s(self, phi: Array) -> float:
         """Return by how much images are taken later than their times state [s]."""
-        places = self.nuisance.indices_of_rows(DEPTH_TIME, component=self.camera_index)
+        places = self.nuisance.indices_of_rows(
+            DEPTH_TIME, component=self.camera_index
+        )
         return float((phi * self.nuisance.scales)[places].sum())
 
-    def with_pose(self, phi: Array, rotation_vector: Array, shift_m: Array) -> Array:
+    def with_pose(
+        self, phi: Array, rotation_vector: Array, shift_m: Array
+    ) -> Array:
         """Return φ (k,) with another rotation error `rotation_vector` (3,) [rad] and translation
         error `shift_m` (3,) of the camera; an error that is not estimated is ignored.
         """
         updated = phi.copy()
         angle = np.linalg.norm(rotation_vector)
-        cayley = rotation_vector * (2 * np.tan(angle / 2) / angle if angle else 1.0)
+        cayley = rotation_vector * (
+            2 * np.tan(angle / 2) / angle if angle else 1.0
+        )
         for row, values in ((DEPTH_TURN, cayley), (DEPTH_SHIFT, shift_m)):
-            places = self.nuisance.indices_of_rows(row, component=self.camera_index)
-            updated[places] = values[: len(places)] / self.nuisance.scales[places]
+            places = self.nuisance.indices_of_rows(
+                row, component=self.camera_index
+            )
+            updated[places] = (
+                values[: len(places)] / self.nuisance.scales[places]
+            )
         return updated

@@ -141,13 +141,17 @@ class SurfaceComparison:
         sighting = SurfaceCorrespondences.from_shapes(
             view, body, shapes_m=shapes_m, phi=phi, gate_m=reach_m, settled=True
         )
-        return cls(sighting, shapes_m, sighting.signed_distances_m(shapes_m, phi), phi)
+        return cls(
+            sighting, shapes_m, sighting.signed_distances_m(shapes_m, phi), phi
+        )
 
     @cached_property
     def error(self) -> DepthError:
         """Distances summarised as numbers, see `DepthError`."""
         depth = self.correspondences.camera.depth
-        distances_m = np.abs(self.signed_distances_m[np.isfinite(self.signed_distances_m)])
+        distances_m = np.abs(
+            self.signed_distances_m[np.isfinite(self.signed_distances_m)]
+        )
         within_m = distances_m[distances_m <= depth.gate_m]
         sigmas = distances_m / depth.sigma_m
         shortened = np.where(sigmas > HUBER, HUBER * sigmas, sigmas**2)
@@ -157,14 +161,18 @@ class SurfaceComparison:
             rms_m=root_mean(distances_m**2) if len(distances_m) else None,
             reach_m=max(self.correspondences.gate_m, depth.gate_m),
             gate_m=depth.gate_m,
-            share_beyond_gate=1 - len(within_m) / len(distances_m) if len(distances_m) else 0.0,
+            share_beyond_gate=1 - len(within_m) / len(distances_m)
+            if len(distances_m)
+            else 0.0,
             rms_within_gate_m=root_mean(within_m**2) if len(within_m) else None,
             sigmas=root_mean(sigmas**2) if len(distances_m) else 0.0,
             tame_sigmas=root_mean(shortened) if len(distances_m) else 0.0,
         )
 
 
-def _positions_at_observable(residual: DepthResidual, t_s: Array, positions_m: Array) -> Array:
+def _positions_at_observable(
+    residual: DepthResidual, t_s: Array, positions_m: Array
+) -> Array:
     """Return positions (R, 3n) at the times of a measurement's observable, interpolated from
     positions (N, …) at times `t_s` (N,); outside these times the end positions.
     """

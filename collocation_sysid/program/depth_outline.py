@@ -101,20 +101,37 @@ class Outline:
         corners = surface.faces.shape[1]
         edges = []
         for sample, shape_m in enumerate(shapes_m):
-            image_m = camera.depth.images_m[sample] if len(camera.depth.images_m) else None
+            image_m = (
+                camera.depth.images_m[sample]
+                if len(camera.depth.images_m)
+                else None
+            )
             points = None
             if image_m is not None:
-                points = _outline_points(camera, surface, shape_m, phi=phi, sample=sample)
+                points = _outline_points(
+                    camera, surface, shape_m, phi=phi, sample=sample
+                )
             if image_m is None or points is None:
                 edges.append(_no_edges(corners))
                 continue
-            edges.append(_edges(camera, points, image_m, phi=phi, gate_m=gate_m, sample=sample))
+            edges.append(
+                _edges(
+                    camera,
+                    points,
+                    image_m,
+                    phi=phi,
+                    gate_m=gate_m,
+                    sample=sample,
+                )
+            )
         most = max(1, *(len(each["is_compared"]) for each in edges))
 
         def together(name: str) -> NDArray:
             return np.stack([_padded(each[name], most) for each in edges])
 
-        of_points = {name: together(name) for name in edges[0] if name not in ("faces",)}
+        of_points = {
+            name: together(name) for name in edges[0] if name not in ("faces",)
+        }
         faces = together("faces")
         nodes = surface.faces[faces]
         rest_m = body.nodes_m[surface.nodes][nodes]
@@ -148,7 +165,9 @@ class _OutlinePoints:
 
 def _padded(values: NDArray, count: int) -> NDArray:
     """Return values (k, …) padded with zeros to a length of `count`."""
-    return np.pad(values, [(0, count - len(values)), *[(0, 0)] * (values.ndim - 1)])
+    return np.pad(
+        values, [(0, count - len(values)), *[(0, 0)] * (values.ndim - 1)]
+    )
 
 
 def _no_edges(corners: int) -> dict[str, NDArray]:
@@ -183,11 +202,19 @@ def no_depth_is_empty(
     # The middle of the body as stated, which may move with the camera: a coarse measure suffices.
     middle_m = float(camera.body_middle_m(sample)[2])
     background = np.count_nonzero(image_m > middle_m + size_m)
-    return bool(background < LEAST_BACKGROUND_SHARE * np.count_nonzero(np.isnan(image_m)))
+    return bool(
+        background
+        < LEAST_BACKGROUND_SHARE * np.count_nonzero(np.isnan(image_m))
+    )
 
 
 def _outline_points(
-    camera_in: DepthCameraModel, surface: VisibleSurface, shape_m: Array, *, phi: Array, sample: int
+    camera_in: DepthCameraModel,
+    surface: VisibleSurface,
+    shape_m: Array,
+    *,
+    phi: Array,
+    sample: int,
 ) -> _OutlinePoints | None:
     """Return the points where a shape (n, 3) [m] ends in the view of a camera, at φ and the image
     with index `sample`; None if there are none, for a point cloud, or if the body is partly behind
@@ -208,7 +235,8 @@ def _outline_points(
     front_triangle = np.where(is_front[:, 0], first, second)
     parts = len(surface.plane_triangles) // len(surface.faces)
     outline_edges = np.flatnonzero(
-        (is_front[:, 0] != is_front[:, 1]) & surface.is_selected[front_triangle // parts]
+        (is_front[:, 0] != is_front[:, 1])
+        & surface.is_selected[front_triangle // parts]
     )
     if not len(outline_edges):
         return None
@@ -216,9 +244,13 @@ def _outline_points(
     front_triangle = front_triangle[outline_edges]
     corners = surface.plane_triangles[front_triangle]
     lengths_m = np.linalg.norm(np.diff(shape_m[ends], axis=1)[:, 0], axis=1)
-    counts = np.maximum(1, np.ceil(lengths_m / camera_in.depth.spacing_m).astype(int))
+    counts = np.maximum(
+        1, np.ceil(lengths_m / camera_in.depth.spacing_m).astype(int)
+    )
     edge = np.repeat(np.arange(len(outline_edges)), counts)
-    number = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts)
+    number = np.arange(len(edge)) - np.repeat(
+        np.cumsum(counts) - counts, counts
+    )
     share = (number + 0.5) / counts[edge]
     # Barycentric coordinates in the triangle that faces the camera.
     at_first = corners[edge] == ends[edge, :1]
@@ -239,7 +271,10 @@ def _outline_points(
     inwards = np.sum(normals * (places_px - centres), axis=1) < 0
     outwards = np.where(inwards[:, None], -normals, normals)
     separate = _first_of_each_cube(points_m, camera_in.depth.spacing_m)
-    alone = ~_covered(places_px + OUTSIDE_PX * outwards, pixels[surface.plane_triangles[facing]])
+    alone = ~_covered(
+        places_px + OUTSIDE_PX * outwards,
+        pixels[surface.plane_triangles[facing]],
+    )
     selected = separate[(alone & (length_px > 1e-6))[separate]]
     if not len(selected):
         return None
@@ -254,7 +289,9 @@ def _outline_points(
 
 def _first_of_each_cube(points_m: Array, edge_m: float) -> Index:
     """Indices of the first of the points (P, 3) in each cube of a grid with edges [m]."""
-    _, first = np.unique(np.floor(points_m / edge_m).astype(np.int64), axis=0, return_index=True)
+    _, first = np.unique(
+        np.floor(points_m / edge_m).astype(np.int64), axis=0, return_index=True
+    )
     return np.sort(first)
 
 
@@ -268,8 +305,12 @@ def _covered(points: Array, triangles: Array) -> NDArray[np.bool_]:
     middles = triangles.mean(axis=1)
     reach = np.linalg.norm(triangles - middles[:, None], axis=2).max()
     candidates = KDTree(middles).query_ball_point(points, reach)
-    point = np.repeat(np.arange(len(points)), [len(each) for each in candidates])
-    a, b, c = triangles[np.concatenate([*candidates, []]).astype(int)].transpose(1, 0, 2)
+    point = np.repeat(
+        np.arange(len(points)), [len(each) for each in candidates]
+    )
+    a, b, c = triangles[
+        np.concatenate([*candidates, []]).astype(int)
+    ].transpose(1, 0, 2)
 
     def side(start: Array, end: Array) -> Array:
         way = end - start
@@ -308,11 +349,19 @@ def _edges(
         Index of the image.
     """
     camera = camera_in.depth.camera
-    empty = no_depth_is_empty(camera_in, image_m, sample=sample, size_m=camera_in.size_m)
+    empty = no_depth_is_empty(
+        camera_in, image_m, sample=sample, size_m=camera_in.size_m
+    )
     offsets = np.arange(-SEARCH_PX, SEARCH_PX + STEP_PX / 2, STEP_PX)
-    across = points.pixels[:, None] + offsets[:, None] * points.outwards[:, None]
+    across = (
+        points.pixels[:, None] + offsets[:, None] * points.outwards[:, None]
+    )
     shown = _classify_pixels(
-        image_m, across, points.depth_m[:, None], gate_m=gate_m, is_missing_empty=empty
+        image_m,
+        across,
+        points.depth_m[:, None],
+        gate_m=gate_m,
+        is_missing_empty=empty,
     )
     ends = (shown[:, :-1] == BODY) & (shown[:, 1:] == EMPTY)
     middles = (offsets[:-1] + offsets[1:]) / 2
@@ -321,11 +370,17 @@ def _edges(
     outwards = points.outwards.copy()
     edges = points.pixels + middles[nearest, None] * outwards
     here = _classify_pixels(
-        image_m, points.pixels, points.depth_m, gate_m=gate_m, is_missing_empty=empty
+        image_m,
+        points.pixels,
+        points.depth_m,
+        gate_m=gate_m,
+        is_missing_empty=empty,
     )
     is_beyond = ~has_edge & (here == EMPTY)
     if is_beyond.any():
-        is_nothing = (image_m > points.depth_m.max() + gate_m) | (np.isnan(image_m) & empty)
+        is_nothing = (image_m > points.depth_m.max() + gate_m) | (
+            np.isnan(image_m) & empty
+        )
         edges[is_beyond], outwards[is_beyond], has_nearest = _nearest_edges(
             is_nothing, points.pixels[is_beyond]
         )
@@ -347,7 +402,12 @@ def _edges(
 
 
 def _classify_pixels(
-    image_m: Array, pixels: Array, depth_m: Array, *, gate_m: float, is_missing_empty: bool
+    image_m: Array,
+    pixels: Array,
+    depth_m: Array,
+    *,
+    gate_m: float,
+    is_missing_empty: bool,
 ) -> NDArray[np.int64]:
     """Classify pixels (…, 2) of an image beside a body at given depths as BODY, UNKNOWN or EMPTY.
 
@@ -355,7 +415,12 @@ def _classify_pixels(
     means that nothing is there.
     """
     column, row = np.moveaxis(np.round(pixels).astype(np.int64), -1, 0)
-    inside = (column >= 0) & (column < image_m.shape[1]) & (row >= 0) & (row < image_m.shape[0])
+    inside = (
+        (column >= 0)
+        & (column < image_m.shape[1])
+        & (row >= 0)
+        & (row < image_m.shape[0])
+    )
     depths_m = image_m[np.where(inside, row, 0), np.where(inside, column, 0)]
     behind_m = depths_m - depth_m
     shown = np.full(depths_m.shape, UNKNOWN)
@@ -386,7 +451,9 @@ def _nearest_edges(
     if nothing.all():
         return pixels, np.ones_like(pixels), np.zeros(len(pixels), dtype=bool)
     places: Array = np.asarray(
-        distance_transform_edt(nothing, return_distances=False, return_indices=True)
+        distance_transform_edt(
+            nothing, return_distances=False, return_indices=True
+        )
     )
     column, row = np.round(pixels).astype(np.int64).T
     nearest = places[::-1, row, column].T.astype(float)
@@ -426,14 +493,18 @@ def _planes(
     """
     tangents_px = np.column_stack([-outwards[:, 1], outwards[:, 0]])
     at, before, after, outside = _concatenated_rays(
-        camera, [edges, edges - tangents_px, edges + tangents_px, edges + outwards]
+        camera,
+        [edges, edges - tangents_px, edges + tangents_px, edges + outwards],
     )
     normals = np.cross(before, after)
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     pixel = np.sum(normals * (outside - at), axis=1)
     normals *= np.sign(pixel)[:, None]
     corner = camera_in.to_world(phi, np.zeros((1, 3)), np.zeros((1, 3)), sample)
-    ways = camera_in.to_world(phi, normals, np.zeros_like(normals), sample) - corner
+    ways = (
+        camera_in.to_world(phi, normals, np.zeros_like(normals), sample)
+        - corner
+    )
     return {
         "normals": ways / np.linalg.norm(ways, axis=1)[:, None],
         "points": depth_m[:, None] * at,
@@ -441,6 +512,10 @@ def _planes(
     }
 
 
-def _concatenated_rays(camera: DepthCamera, pixels: Sequence[Array]) -> list[Array]:
+def _concatenated_rays(
+    camera: DepthCamera, pixels: Sequence[Array]
+) -> list[Array]:
     """Return the rays (P, 3) of several sets of pixels (P, 2), computed in one call."""
-    return np.split(camera.points_at_unit_depth(np.concatenate(pixels)), len(pixels))
+    return np.split(
+        camera.points_at_unit_depth(np.concatenate(pixels)), len(pixels)
+    )

@@ -98,12 +98,19 @@ class DepthResidual(MeasurementResidual):
         count = len(nodes)
         none = np.zeros(len(nodes))
         placement = Placement(
-            nodes[:, None], np.ones((count, 1)), none, len(correspondences.body.nodes_m)
+            nodes[:, None],
+            np.ones((count, 1)),
+            none,
+            len(correspondences.body.nodes_m),
         )
-        chart = MarkerAssociation.from_exact_places(correspondences.body, placement, points_m)
+        chart = MarkerAssociation.from_exact_places(
+            correspondences.body, placement, points_m
+        )
         samples, points = correspondences.is_compared.shape
         return cls(
-            observable=PointPositions(np.arange(len(at_s)), chart, np.full((count, 3), -1)),
+            observable=PointPositions(
+                np.arange(len(at_s)), chart, np.full((count, 3), -1)
+            ),
             nuisance=nuisance,
             huber=HUBER if huber is None else huber,
             names=(view.depth.name,) * points,
@@ -136,7 +143,8 @@ class DepthResidual(MeasurementResidual):
         """
         nearest = np.abs(self.observable_s - self.t_s[:, None]).argmin(axis=1)
         is_off_grid = (
-            np.abs(self.observable_s[nearest] - self.t_s).max(initial=0.0) > TIME_TOLERANCE_S
+            np.abs(self.observable_s[nearest] - self.t_s).max(initial=0.0)
+            > TIME_TOLERANCE_S
         )
         clock = self.nuisance.indices_of_rows(
             DEPTH_TIME, component=self.correspondences.camera.camera_index
@@ -144,7 +152,9 @@ class DepthResidual(MeasurementResidual):
         if not (is_off_grid or len(clock)) or len(self.observable_s) < 2:
             return nearest[:, None]
         used = min(NEIGHBOURS, len(self.observable_s))
-        return neighbouring_times(self.observable_s, self.t_s + TIME_TOLERANCE_S, used)
+        return neighbouring_times(
+            self.observable_s, self.t_s + TIME_TOLERANCE_S, used
+        )
 
     @cached_property
     def _stencil(self) -> RowStencil:
@@ -154,7 +164,9 @@ class DepthResidual(MeasurementResidual):
         samples, points = pairs.is_compared.shape
         rotations, translations = self.correspondences.camera.poses
         in_camera = np.einsum("sji,sej->sei", rotations, pairs.normals)
-        normal_motion = np.einsum("sei,si->se", pairs.normals, translations)[..., None]
+        normal_motion = np.einsum("sei,si->se", pairs.normals, translations)[
+            ..., None
+        ]
         offsets_s = np.broadcast_to(
             (self.observable_s[times] - self.t_s[:, None])[:, None],
             (samples, points, times.shape[1]),
@@ -168,9 +180,13 @@ class DepthResidual(MeasurementResidual):
             pairs.points,
             pairs.rays,
         ]
-        places = times[:, None, :, None] * self.observable.vector_count + pairs.nodes[:, :, None]
+        places = (
+            times[:, None, :, None] * self.observable.vector_count
+            + pairs.nodes[:, :, None]
+        )
         return RowStencil(
-            places.reshape(samples, points, -1), np.moveaxis(np.concatenate(parts, axis=2), 2, 0)
+            places.reshape(samples, points, -1),
+            np.moveaxis(np.concatenate(parts, axis=2), 2, 0),
         )
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
@@ -178,14 +194,18 @@ class DepthResidual(MeasurementResidual):
         observable; φ is not used.
         """
         samples = int(np.count_nonzero(self._neighbour_times[:, -1] < known))
-        return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
+        return RowStencil(
+            self._stencil.indices[:samples], self._stencil.data[:, :samples]
+        )
 
     @property
     def first_row(self) -> int:
         """Index of the last time of the observable that the first image is computed from."""
         return int(self._neighbour_times[0, -1])
 
-    def aligned_correspondences(self, x: Array, phi: Array) -> SurfaceCorrespondences:
+    def aligned_correspondences(
+        self, x: Array, phi: Array
+    ) -> SurfaceCorrespondences:
         """Align the camera with the first rows of a motion and find the correspondences.
 
         Parameters
@@ -199,7 +219,9 @@ class DepthResidual(MeasurementResidual):
         shapes = self.surface_shapes(x, phi)
         if not len(shapes):
             shapes = x[-1:].reshape(1, -1, 3)[:, correspondences.surface.nodes]
-        all_shapes = np.concatenate([shapes, correspondences.shapes_m[len(shapes) :]])
+        all_shapes = np.concatenate(
+            [shapes, correspondences.shapes_m[len(shapes) :]]
+        )
         return SurfaceCorrespondences.from_alignment(
             correspondences.camera, correspondences.body, all_shapes, phi
         )
@@ -226,15 +248,23 @@ class DepthResidual(MeasurementResidual):
         """
         view = self.correspondences.camera
         nodes = self.correspondences_in_use.nodes.shape[2]
-        sizes = np.cumsum([0, self._neighbour_times.shape[1], nodes, 3, 3, 1, 3, 3]).tolist()
-        offsets, weights, normal, in_camera, normal_motion, point, ray = ca.vertsplit(data, sizes)
+        sizes = np.cumsum(
+            [0, self._neighbour_times.shape[1], nodes, 3, 3, 1, 3, 3]
+        ).tolist()
+        offsets, weights, normal, in_camera, normal_motion, point, ray = (
+            ca.vertsplit(data, sizes)
+        )
         values = self.nuisance.values_by_row(phi, self.own_parameters[0])
         clock_shift = values.get(DEPTH_TIME, ca.SX(0))
         times = ca.vertsplit(offsets)
         in_time = ca.vertcat(*lagrange_weights(clock_shift, times))
         surface = values_in @ ca.kron(in_time, weights)
         corrected = view.corrected_expression(point, ray, values)
-        return ca.dot(normal, surface) - ca.dot(in_camera, corrected) - normal_motion
+        return (
+            ca.dot(normal, surface)
+            - ca.dot(in_camera, corrected)
+            - normal_motion
+        )
 
     def rough_residuals(self, x: Array, phi: Array) -> Array:
         """Return the distances from visible parts of the surface to the points of the first image
@@ -272,7 +302,9 @@ class DepthResidual(MeasurementResidual):
         places = pairs.places_m[pairs.is_compared]
         edge_m = 2 * self.correspondences.camera.depth.spacing_m
         while True:
-            cubes, number = np.unique(np.floor(places / edge_m), axis=0, return_inverse=True)
+            cubes, number = np.unique(
+                np.floor(places / edge_m), axis=0, return_inverse=True
+            )
             if len(cubes) <= PATCHES:
                 break
             edge_m *= GROWING
@@ -285,15 +317,17 @@ class DepthResidual(MeasurementResidual):
         counts (S, 3M) of points.
         """
         samples, points = self._patch_indices.shape
-        patches = GROUP * -(-(int(self._patch_indices.max(initial=0)) + 1) // GROUP)
+        patches = GROUP * -(
+            -(int(self._patch_indices.max(initial=0)) + 1) // GROUP
+        )
         sample, point = np.nonzero(self._patch_indices >= 0)
         row = sample * patches + self._patch_indices[sample, point]
         counts = np.bincount(row, minlength=samples * patches)
         share = 1 / np.sqrt(counts[row])
         shape = samples * patches, samples * points
-        return sp.csr_array((share, (row, sample * points + point)), shape=shape), counts.reshape(
-            samples, patches
-        )
+        return sp.csr_array(
+            (share, (row, sample * points + point)), shape=shape
+        ), counts.reshape(samples, patches)
 
     @cached_property
     def pooled_groups(self) -> PooledResiduals:
@@ -302,7 +336,9 @@ class DepthResidual(MeasurementResidual):
         name = self.names[0]
         count = counts.shape[1] // GROUP
         of_points = self.correspondences_in_use.places_m.reshape(-1, 3)
-        sums = (means @ of_points).reshape(*counts.shape, 3) * np.sqrt(counts)[..., None]
+        sums = (means @ of_points).reshape(*counts.shape, 3) * np.sqrt(counts)[
+            ..., None
+        ]
         places = sums.sum(axis=0) / np.maximum(counts.sum(axis=0), 1)[:, None]
         return PooledResiduals(
             tuple(f"{name} {k + 1}" for k in range(count)),
@@ -316,11 +352,15 @@ class DepthResidual(MeasurementResidual):
         √count so that white noise keeps its variance.
         """
         means, counts = self._pooling
-        columns = int(np.prod(values.shape[3:]))  # zero where nothing is estimated
+        columns = int(
+            np.prod(values.shape[3:])
+        )  # zero where nothing is estimated
         value_rows = means @ values.reshape(
             values.shape[0] * values.shape[1] * values.shape[2], columns
         )
-        return value_rows.reshape(len(counts), counts.shape[1] // GROUP, GROUP, *values.shape[3:])
+        return value_rows.reshape(
+            len(counts), counts.shape[1] // GROUP, GROUP, *values.shape[3:]
+        )
 
     # In pictures ------------------------------------------------------------------------------
 
@@ -336,7 +376,9 @@ class DepthResidual(MeasurementResidual):
         """
         distances = self.predict(values, phi)[..., 0]
         return np.where(
-            self.correspondences_in_use.is_compared[: len(distances)], distances, np.nan
+            self.correspondences_in_use.is_compared[: len(distances)],
+            distances,
+            np.nan,
         )
 
     def surface_shapes(self, x: Array, phi: Array) -> Array:
@@ -349,10 +391,14 @@ class DepthResidual(MeasurementResidual):
         return np.array(
             [
                 np.tensordot(
-                    lagrange_weights(t + clock_shift, self.observable_s[times].tolist()),
+                    lagrange_weights(
+                        t + clock_shift, self.observable_s[times].tolist()
+                    ),
                     nodes[times],
                     1,
                 )
-                for t, times in zip(self.t_s[:known], self._neighbour_times[:known], strict=True)
+                for t, times in zip(
+                    self.t_s[:known], self._neighbour_times[:known], strict=True
+                )
             ]
         ).reshape(known, *nodes.shape[1:])

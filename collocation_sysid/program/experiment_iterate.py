@@ -106,7 +106,11 @@ class ExperimentIterate:
         """
         readings = (*self.segment.depths, *self.segment.outlines)
         return [
-            *zip(readings, self.observables[len(self.observables) - len(readings) :], strict=True)
+            *zip(
+                readings,
+                self.observables[len(self.observables) - len(readings) :],
+                strict=True,
+            )
         ]
 
     @property
@@ -115,7 +119,9 @@ class ExperimentIterate:
         points from their edges [pixels].
         """
         distances = []
-        for reading, observation in self.surface_residuals[len(self.segment.depths) :]:
+        for reading, observation in self.surface_residuals[
+            len(self.segment.depths) :
+        ]:
             assert isinstance(reading, OutlineResidual)
             distances_px = reading.signed_distances_px(observation, self.phi)
             distances.append((reading, distances_px[np.isfinite(distances_px)]))
@@ -125,13 +131,19 @@ class ExperimentIterate:
     def loss(self) -> float:
         """Loss of all measurements, without priors."""
         pairs = zip(self.segment.residuals, self.observables, strict=True)
-        return sum(reading.loss(observation, self.phi) for reading, observation in pairs)
+        return sum(
+            reading.loss(observation, self.phi)
+            for reading, observation in pairs
+        )
 
     @cached_property
     def loss_gradients(self) -> list[tuple[Array, Array]]:
         """Gradient of the loss of each measurement by its observables (n, e, 3) and by φ (k,)."""
         pairs = zip(self.segment.residuals, self.observables, strict=True)
-        return [reading.loss_gradient(observation, self.phi) for reading, observation in pairs]
+        return [
+            reading.loss_gradient(observation, self.phi)
+            for reading, observation in pairs
+        ]
 
     def gradient(self) -> tuple[Array, Array]:
         """Return the gradient of the loss by x (N, 3n) [1/m] and by (q, φ) (nq + k,).
@@ -148,7 +160,9 @@ class ExperimentIterate:
         for k, (reading, (by_observables, by_phi)) in enumerate(pairs):
             by_p[nq:] += by_phi
             if k not in self.lifted_observables:
-                products = reading.observable.vjp(self.motion, phi, by_observables)
+                products = reading.observable.vjp(
+                    self.motion, phi, by_observables
+                )
                 by_x = by_x + products.by_x
                 by_p[nq:] = by_p[nq:] + products.by_phi
                 if products.by_reaction is not None:
@@ -156,7 +170,9 @@ class ExperimentIterate:
                         0.0 if by_reaction is None else by_reaction
                     )
         if by_reaction is not None:
-            through_x, through_p = self.observation.reaction_vjp(self.x, by_reaction)
+            through_x, through_p = self.observation.reaction_vjp(
+                self.x, by_reaction
+            )
             by_x += through_x
             by_p[self.segment.dynamic_parameters] += through_p
         return by_x, by_p

@@ -81,7 +81,11 @@ class ExpressionPattern:
         rows : PatternIndices, (m, …)
             Constraints.
         """
-        shapes = (data.shape, rows.indices.shape, *(each.indices.shape for each in inputs))
+        shapes = (
+            data.shape,
+            rows.indices.shape,
+            *(each.indices.shape for each in inputs),
+        )
         shape = np.broadcast_shapes(*(shape[1:] for shape in shapes))
 
         def one_dimensional(values: NDArray[T], length: int) -> NDArray[T]:
@@ -89,12 +93,21 @@ class ExpressionPattern:
             return broadcast.reshape(length, int(np.prod(shape)))
 
         def concatenated(parts: Sequence[PatternIndices]) -> PatternIndices:
-            places = [one_dimensional(part.indices, len(part.indices)) for part in parts]
-            units = [one_dimensional(np.asarray(part.unit), len(part.indices)) for part in parts]
+            places = [
+                one_dimensional(part.indices, len(part.indices))
+                for part in parts
+            ]
+            units = [
+                one_dimensional(np.asarray(part.unit), len(part.indices))
+                for part in parts
+            ]
             return PatternIndices(np.concatenate(places), np.concatenate(units))
 
         return cls(
-            expression, one_dimensional(data, len(data)), concatenated(inputs), concatenated([rows])
+            expression,
+            one_dimensional(data, len(data)),
+            concatenated(inputs),
+            concatenated([rows]),
         )
 
     @classmethod
@@ -141,7 +154,9 @@ class ExpressionPattern:
             constants,
         ]
         size = recursion.state_size + recursion.input_offsets[-1]
-        return cls.from_arrays(GeneratedFunction(gap, size, recursion.data_size), data, parts, rows)
+        return cls.from_arrays(
+            GeneratedFunction(gap, size, recursion.data_size), data, parts, rows
+        )
 
     def _input_values(self, z: Array) -> Array:
         """Return the inputs (k, I) in physical units."""
@@ -149,7 +164,9 @@ class ExpressionPattern:
 
     def residuals(self, z: Array, count: int) -> Array:
         """Return the contributions to the constraints (count,)."""
-        return self._assemble(self.expression.evaluate(self._input_values(z), self.data), count)
+        return self._assemble(
+            self.expression.evaluate(self._input_values(z), self.data), count
+        )
 
     def _assemble(self, y: Array, count: int) -> Array:
         """Return the sums (count,) of values y (m, I) over the constraints to which they belong,
@@ -168,7 +185,9 @@ class ExpressionPattern:
         """Return the contributions to the scaled constraints (count,) at z, and the values of
         `jacobian_entries`, derivatives by scaled variables.
         """
-        value, slopes = self.expression.evaluate_with_jacobian(self._input_values(z), self.data)
+        value, slopes = self.expression.evaluate_with_jacobian(
+            self._input_values(z), self.data
+        )
         y, u = np.nonzero(self.expression.jacobian_pattern)
         slopes = slopes[y, u] * self.inputs.unit[u] / self.rows.unit[y]
         return self._assemble(value, count), slopes.ravel()
@@ -193,10 +212,14 @@ class ExpressionPattern:
         i, j, above = self._hessian_pairs
         unit = self.inputs.unit
         weights = multipliers[self.rows.indices] / self.rows.unit
-        curvature = self.expression.weighted_hessian(self._input_values(z), self.data, weights)
+        curvature = self.expression.weighted_hessian(
+            self._input_values(z), self.data, weights
+        )
         return (curvature[i, j] * unit[i] * unit[j])[above]
 
 
-def _at_evaluations(indices: PatternIndices, evaluations: Index) -> PatternIndices:
+def _at_evaluations(
+    indices: PatternIndices, evaluations: Index
+) -> PatternIndices:
     """Return the indices of other evaluations; units must be the same at all evaluations."""
     return PatternIndices(indices.indices[:, evaluations], indices.unit)

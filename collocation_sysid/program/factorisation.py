@@ -178,7 +178,9 @@ class _RefinedFactor:
         # What the next correction would be is not worth another solution.
         while (shrinks * last > ACCURACY * size).any():
             product = self.skew @ correction
-            correction = self.symmetric.solve(product if transposed else -product)
+            correction = self.symmetric.solve(
+                product if transposed else -product
+            )
             length = np.abs(correction).max(axis=0, initial=TINY)
             shrinks = float((length / last).max(initial=0.0))
             if not shrinks <= CONTRACTION:
@@ -225,7 +227,9 @@ class Factoriser:
         If a supernodal method is asked for and not installed.
     """
 
-    def __init__(self, pattern: SymmetricPattern, free: Index, choice: Choice = "auto") -> None:
+    def __init__(
+        self, pattern: SymmetricPattern, free: Index, choice: Choice = "auto"
+    ) -> None:
         self.choice: Choice = choice
         position = np.full(pattern.size, -1)
         position[free] = np.arange(len(free))
@@ -236,8 +240,12 @@ class Factoriser:
         columns = columns[self._free_entries]
         self._size = len(free)
         ones = np.ones(len(rows))
-        graph = sp.csr_array((ones, (rows, columns)), shape=(self._size, self._size))
-        self._order = reverse_cuthill_mckee(graph + graph.T, symmetric_mode=True).astype(np.int64)
+        graph = sp.csr_array(
+            (ones, (rows, columns)), shape=(self._size, self._size)
+        )
+        self._order = reverse_cuthill_mckee(
+            graph + graph.T, symmetric_mode=True
+        ).astype(np.int64)
         self._rank = rank = np.empty(self._size, dtype=np.int64)
         rank[self._order] = np.arange(self._size)
         low = np.minimum(rank[rows], rank[columns])
@@ -248,16 +256,22 @@ class Factoriser:
         strict = rows != columns
         self._full_rows = np.concatenate([rows, columns[strict]])
         self._full_columns = np.concatenate([columns, rows[strict]])
-        self._full_source = np.concatenate([self._free_entries, self._free_entries[strict]])
+        self._full_source = np.concatenate(
+            [self._free_entries, self._free_entries[strict]]
+        )
         # Whether an entry has the skew part's own sign; none on the diagonal.
-        self._signs = np.concatenate([strict.astype(float), -np.ones(strict.sum())])
+        self._signs = np.concatenate(
+            [strict.astype(float), -np.ones(strict.sum())]
+        )
         self._entries = pattern.entry_count
         self._pool: list[Pardiso] = []
         if choice == "supernodal":
             self._pool.append(self._pardiso())
 
     @classmethod
-    def cached(cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto") -> Factoriser:
+    def cached(
+        cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto"
+    ) -> Factoriser:
         """Return the analysis of a pattern; the last few are cached."""
         return _cached_analysis(pattern, free.tobytes(), choice)
 
@@ -270,7 +284,9 @@ class Factoriser:
             return self.choice == "band"
         if self.is_supernodal:
             return False
-        return self._band_work <= max(LITTLE_WORK, BAND_SPEED * self._sparse_work)
+        return self._band_work <= max(
+            LITTLE_WORK, BAND_SPEED * self._sparse_work
+        )
 
     @cached_property
     def is_supernodal(self) -> bool:
@@ -291,11 +307,17 @@ class Factoriser:
     def factor_size(self) -> int:
         """Number of floating-point numbers in the factor of a symmetric matrix."""
         if self.is_banded:
-            width = self.skyline.shape[1] if self.skyline else self.half_bandwidth + 1
+            width = (
+                self.skyline.shape[1]
+                if self.skyline
+                else self.half_bandwidth + 1
+            )
             return self._size * width
         if self.is_supernodal:
             return self._supernodal_size
-        return 3 * int(self._column_counts.sum())  # L, U, and their row numbers at half the size
+        return 3 * int(
+            self._column_counts.sum()
+        )  # L, U, and their row numbers at half the size
 
     @property
     def unsymmetric_factor_size(self) -> int:
@@ -319,11 +341,16 @@ class Factoriser:
         """Number of entries of each column of SuperLU's L, from a matrix that needs no pivoting."""
         values = np.full(self._entries, -1.0)
         degree = np.bincount(self._full_rows, minlength=self._size)
-        values[self._full_source[self._full_rows == self._full_columns]] = degree
+        values[self._full_source[self._full_rows == self._full_columns]] = (
+            degree
+        )
         return np.diff(self._superlu(values, pivot_below=0.0).L.indptr)
 
     def factorise(
-        self, values: Array, skew: Array = NONE, buffer: FactorMemory | None = None
+        self,
+        values: Array,
+        skew: Array = NONE,
+        buffer: FactorMemory | None = None,
     ) -> Factor:
         """Factorise a matrix.
 
@@ -346,13 +373,19 @@ class Factoriser:
         if skyline_factor:
             return skyline_factor
         if not (np.isfinite(values).all() and np.isfinite(skew).all()):
-            raise np.linalg.LinAlgError("the matrix has entries that are not finite")
+            raise np.linalg.LinAlgError(
+                "the matrix has entries that are not finite"
+            )
         definite = (
-            self._factorise_in_skyline(values, NONE, buffer) if skew.size else None
+            self._factorise_in_skyline(values, NONE, buffer)
+            if skew.size
+            else None
         ) or self._factorise_definite(values)
         if not skew.size:
             # Without pivoting the factor of an indefinite matrix can be arbitrarily wrong.
-            return definite or _SparseFactor(self._superlu(values, pivot_below=0.1), False)
+            return definite or _SparseFactor(
+                self._superlu(values, pivot_below=0.1), False
+            )
         if not definite:
             # Where a body slides under friction it never is: the pivots of the whole tell then.
             lu = self._superlu(values, pivot_below=0.1, skew=skew)
@@ -360,10 +393,14 @@ class Factoriser:
 
         @cache
         def complete_factor() -> Factor:
-            return _SparseFactor(self._superlu(values, pivot_below=1.0, skew=skew), True)
+            return _SparseFactor(
+                self._superlu(values, pivot_below=1.0, skew=skew), True
+            )
 
         entries = self._signs * skew[self._full_source]
-        return _RefinedFactor(definite, self._sparse_matrix(entries), complete_factor)
+        return _RefinedFactor(
+            definite, self._sparse_matrix(entries), complete_factor
+        )
 
     def _factorise_definite(self, values: Array) -> Factor | None:
         """Return the factor of a symmetric matrix (entries of the lower triangle), or None if it is
@@ -372,18 +409,26 @@ class Factoriser:
         if self.is_supernodal:
             try:
                 pardiso = self._pool.pop()
-            except IndexError:  # not asked for beforehand: other threads take from it too
+            except (
+                IndexError
+            ):  # not asked for beforehand: other threads take from it too
                 pardiso = self._pardiso()
             factor = SupernodalFactor(pardiso, self._pool)
             return factor if pardiso.factorise(values[self._upper[2]]) else None
         if not self.is_banded:
             lu = self._superlu(values, pivot_below=0.0)
-            return _SparseFactor(lu, positive_definite=True) if _has_positive_pivots(lu) else None
+            return (
+                _SparseFactor(lu, positive_definite=True)
+                if _has_positive_pivots(lu)
+                else None
+            )
         if self.skyline:
             return None
         band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
         band.T.reshape(-1)[self._band_places] = values[self._free_entries]
-        return _BandFactor(band, self._order) if cholesky_in_place(band) else None
+        return (
+            _BandFactor(band, self._order) if cholesky_in_place(band) else None
+        )
 
     def _pardiso(self) -> Pardiso:
         """Return a new PARDISO solver for the pattern."""
@@ -432,10 +477,16 @@ class Factoriser:
         buffer = buffer or skyline.allocate(count)
         pivots, growth = skyline.factorise(buffer, values, skew)
         # What is not finite in the matrix is not in its pivots.
-        if not (pivots.min() > 0 and pivots.max() < np.inf and growth.max() < GROWTH):
+        if not (
+            pivots.min() > 0 and pivots.max() < np.inf and growth.max() < GROWTH
+        ):
             return None
         return _SkylineFactor(
-            skyline, buffer.sides[:count], pivots=pivots, order=self._order, rank=self._rank
+            skyline,
+            buffer.sides[:count],
+            pivots=pivots,
+            order=self._order,
+            rank=self._rank,
         )
 
     def factorise_each(
@@ -467,7 +518,9 @@ class Factoriser:
 
         def run(start: int, stop: int) -> None:
             for k in range(start, stop):
-                factors[k] = self.factorise(*matrix(k), buffers[k] if buffers else None)
+                factors[k] = self.factorise(
+                    *matrix(k), buffers[k] if buffers else None
+                )
 
         run_in_slices(run, count, threads)
         return [factors[k] for k in range(count)]
@@ -477,7 +530,9 @@ class Factoriser:
         places = self._full_rows, self._full_columns
         return sp.csc_array((entries, places), shape=(self._size, self._size))
 
-    def _superlu(self, values: Array, pivot_below: float, skew: Array = NONE) -> SuperLU:
+    def _superlu(
+        self, values: Array, pivot_below: float, skew: Array = NONE
+    ) -> SuperLU:
         """Factorise by SuperLU.
 
         Parameters
@@ -514,6 +569,8 @@ def _has_positive_pivots(lu: SuperLU) -> bool:
 
 
 @lru_cache(maxsize=8)
-def _cached_analysis(pattern: SymmetricPattern, free: bytes, choice: Choice) -> Factoriser:
+def _cached_analysis(
+    pattern: SymmetricPattern, free: bytes, choice: Choice
+) -> Factoriser:
     """Return the analysis of a pattern; `free` are the bytes of an array of int64."""
     return Factoriser(pattern, np.frombuffer(free, dtype=np.int64), choice)

@@ -48,7 +48,11 @@ class StreamedWrench(GraspWrench):
 
     @classmethod
     def from_poses(
-        cls, channel: GraspWrench, rotations: Array, shifts: Array, step_s: float
+        cls,
+        channel: GraspWrench,
+        rotations: Array,
+        shifts: Array,
+        step_s: float,
     ) -> StreamedWrench:
         """Return the wrench of a grasp at n consecutive time steps.
 
@@ -63,11 +67,16 @@ class StreamedWrench(GraspWrench):
         step_s : float
             Time between two steps [s].
         """
-        properties = {name: getattr(channel, name) for name in GraspWrench.__dataclass_fields__}
+        properties = {
+            name: getattr(channel, name)
+            for name in GraspWrench.__dataclass_fields__
+        }
         properties["reaction_grid"] = ReactionGrid.from_times(
             step_s * np.arange(len(rotations) - 2, dtype=np.float64)
         )
-        wrench = cls(**properties, rotations=rotations, shifts=shifts, step_s=step_s)
+        wrench = cls(
+            **properties, rotations=rotations, shifts=shifts, step_s=step_s
+        )
         if len(channel.tool_parameters):
             vars(wrench)["tool"] = channel.tool
         return wrench
@@ -114,12 +123,17 @@ class GraspReactions:
     shifts: Array
 
     @classmethod
-    def zeros(cls, rows: int, dofs: int, columns: int, grasps: int) -> GraspReactions:
+    def zeros(
+        cls, rows: int, dofs: int, columns: int, grasps: int
+    ) -> GraspReactions:
         """Return zero arrays for a number of rows, dofs, columns and grasps."""
         moved = np.zeros((rows, dofs, columns))
         rotations = np.zeros((rows, grasps, 3, 3))
         return cls(
-            GraspForces.zeros(rows, dofs, columns), moved, rotations, rotations[..., 0].copy()
+            GraspForces.zeros(rows, dofs, columns),
+            moved,
+            rotations,
+            rotations[..., 0].copy(),
         )
 
     @property
@@ -172,7 +186,10 @@ class GraspReactions:
         force = self.forces.force + self.forces.changes[..., 1:] @ step
         grasp_forces = GraspForces(force, self.forces.changes * grown)
         return GraspReactions(
-            grasp_forces, self.position_columns * grown, self.rotations.copy(), self.shifts.copy()
+            grasp_forces,
+            self.position_columns * grown,
+            self.rotations.copy(),
+            self.shifts.copy(),
         )
 
     def wrenches(
@@ -203,15 +220,18 @@ class GraspReactions:
         known = slice(len(x))
         at = rows - DELAY_STEPS
         dofs = channel.sensed_dofs
-        of_force, of_x = (each[at + channel.reaction_grid.delay_steps, known] for each in weights)
+        of_force, of_x = (
+            each[at + channel.reaction_grid.delay_steps, known]
+            for each in weights
+        )
         mass_kg = dynamics.mass.inertia_kg[0, dofs]
         acceleration = of_x @ x
         reaction = mass_kg * acceleration - of_force @ self.forces.force[known]
         position_slopes = self.position_columns[known, :, 1:]
         slopes = self.forces.changes[known, :, 1:]
-        by = mass_kg[:, None] * np.tensordot(of_x, position_slopes, 1) - np.tensordot(
-            of_force, slopes, 1
-        )
+        by = mass_kg[:, None] * np.tensordot(
+            of_x, position_slopes, 1
+        ) - np.tensordot(of_force, slopes, 1)
         by += setting.inertia_derivatives(0, acceleration, dofs)
         pose_rows = slice(at[0] - 1, at[-1] + 2)
         channels = [
@@ -223,4 +243,6 @@ class GraspReactions:
             )
             for channel, grasp in sensors
         ]
-        return ReactionForces(reaction, x[at], by, position_slopes[at]), channels
+        return ReactionForces(
+            reaction, x[at], by, position_slopes[at]
+        ), channels

@@ -13,7 +13,12 @@ from ..recording.experiment import Experiment
 from ..recording.obstacle import Obstacle
 from .factorisation import NONE
 from .lapack import one_blas_thread
-from .newton_solver import NewtonFailure, NewtonSolver, follow_path, simulation_error
+from .newton_solver import (
+    NewtonFailure,
+    NewtonSolver,
+    follow_path,
+    simulation_error,
+)
 
 
 @one_blas_thread()
@@ -111,15 +116,23 @@ def _solve_equilibrium(
         goal = (
             goals_m
             if share == 1
-            else _partial_displacement(experiment, without_contact, at_s, share).ravel()
+            else _partial_displacement(
+                experiment, without_contact, at_s, share
+            ).ravel()
         )
         return solver.solve(
-            x, residual, linearise, keep_definite=True, prescribed_m=goal[solver.is_prescribed]
+            x,
+            residual,
+            linearise,
+            keep_definite=True,
+            prescribed_m=goal[solver.is_prescribed],
         )
 
     guess = shape.ravel() if start is None and experiment.obstacles else start
     try:
-        return follow_path(solve, without_contact.ravel(), solver.options.max_halvings, guess)
+        return follow_path(
+            solve, without_contact.ravel(), solver.options.max_halvings, guess
+        )
     except NewtonFailure as failure:
         raise simulation_error(
             solver, failure, at_s, "finding the rest state", static=True
@@ -162,8 +175,13 @@ def _partial_displacement(
         if isinstance(grasp, Obstacle):
             positions[nodes] = start + share * (goal - start)
             continue
-        turn = grasp.poses.at(time_s)[0][0] @ experiment.rigid_motion(time_s)[0][0].T
-        part = Rotation.from_rotvec(share * Rotation.from_matrix(turn).as_rotvec())
+        turn = (
+            grasp.poses.at(time_s)[0][0]
+            @ experiment.rigid_motion(time_s)[0][0].T
+        )
+        part = Rotation.from_rotvec(
+            share * Rotation.from_matrix(turn).as_rotvec()
+        )
         middle = start.mean(axis=0)
         way = (goal - start).mean(axis=0)
         partial_m = middle + share * way + part.apply(start - middle)
@@ -201,7 +219,11 @@ def initial_state(
         If no stable equilibrium is found.
     """
     velocity = experiment.start_velocities_m_s
-    v0 = np.zeros(experiment.body.pattern.size) if velocity is None else np.ravel(velocity).copy()
+    v0 = (
+        np.zeros(experiment.body.pattern.size)
+        if velocity is None
+        else np.ravel(velocity).copy()
+    )
     if experiment.start == "equilibrium":
         at_s = float(experiment.t_s[0])
         prescribed_m = (
@@ -210,7 +232,12 @@ def initial_state(
             else prescribed_m
         )
         return _solve_equilibrium(
-            experiment, forces, goals_m=prescribed_m, at_s=at_s, start=guess, solver=solver
+            experiment,
+            forces,
+            goals_m=prescribed_m,
+            at_s=at_s,
+            start=guess,
+            solver=solver,
         ), v0
     if experiment.start_positions_m is not None:
         return experiment.start_positions_m.ravel().copy(), v0

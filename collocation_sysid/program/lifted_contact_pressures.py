@@ -60,29 +60,42 @@ class LiftedContactPressure(LiftedForceHistory):
         xi, _ = iterate.equations.dynamics.evaluation_states(iterate.x)
         return self._contact.scaled_pressures(xi).ravel() / self.unit_m
 
-    def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
+    def with_lifted(
+        self, iterate: ExperimentIterate, z: Array
+    ) -> ExperimentIterate:
         """Return the iterate with the scaled pressures b (1, N, points) [m] taken from z; b is zero
         at a stated initial state.
         """
         b = np.zeros((1, self.segment.grid_times, self._points.count))
-        b[:, self.first_evaluation :] = self.unit_m * z[self.columns].reshape(self.shape)
-        return replace(iterate, lifted_pressures={**iterate.lifted_pressures, self.force_index: b})
+        b[:, self.first_evaluation :] = self.unit_m * z[self.columns].reshape(
+            self.shape
+        )
+        return replace(
+            iterate,
+            lifted_pressures={**iterate.lifted_pressures, self.force_index: b},
+        )
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
         """Return the scaled complementarity equations (count,) at an iterate; z is not used,
         because the iterate contains b.
         """
         return (
-            self._history_of(iterate).internal_variables(slice(self.first_evaluation, None)).ravel()
+            self._history_of(iterate)
+            .internal_variables(slice(self.first_evaluation, None))
+            .ravel()
             / self.unit_m
         )
 
-    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
+    def weighted_history(
+        self, iterate: ExperimentIterate, multipliers: Array
+    ) -> WeightedHistory:
         """Return the history and its weights μ (1, N, I) in the Lagrangian, such that multipliers ·
         equations = Σ μ_k h_k with the unscaled equations h_k of evaluation k.
         """
         mu = np.zeros((1, self.segment.grid_times, self._points.count))
-        mu[:, self.first_evaluation :] = multipliers[self.rows].reshape(self.shape) / self.unit_m
+        mu[:, self.first_evaluation :] = (
+            multipliers[self.rows].reshape(self.shape) / self.unit_m
+        )
         return self._history_of(iterate), mu
 
     def _jacobian_blocks(self) -> Iterator[EntryBlock]:
@@ -95,21 +108,35 @@ class LiftedContactPressure(LiftedForceHistory):
             yield EntryBlock([rows[:, here][..., instance]], [x])
         for pairs, k, row, _ in self._motion_entries():
             yield EntryBlock(
-                [row], [columns[:, k[:, None] - self.first_evaluation, instance[pairs]]]
+                [row],
+                [
+                    columns[
+                        :, k[:, None] - self.first_evaluation, instance[pairs]
+                    ]
+                ],
             )
 
-    def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
+    def jacobian_values(
+        self, iterate: ExperimentIterate, z: Array
+    ) -> tuple[Array, Array]:
         """Return the scaled equations (count,) at an iterate and z, and the values of
         `jacobian_entries`.
         """
         history = self._history_of(iterate)
         d = self._points.dofs
         slopes = history.derivatives(slice(None))
-        by = type(slopes)(*(each[d:, :, self.first_evaluation :] / self.unit_m for each in slopes))
+        by = type(slopes)(
+            *(
+                each[d:, :, self.first_evaluation :] / self.unit_m
+                for each in slopes
+            )
+        )
         blocks = [self.unit_m * by.b]
         blocks += [
             self.segment.length_m * each
             for each in self._position_derivatives(self.first_evaluation, by)
         ]
         blocks += self._motion_derivatives(slopes)
-        return self.residuals(iterate, z), np.concatenate([each.ravel() for each in blocks])
+        return self.residuals(iterate, z), np.concatenate(
+            [each.ravel() for each in blocks]
+        )

@@ -68,40 +68,59 @@ class LiftedForceHistory(LiftedVariables):
     @property
     def _points(self) -> ForcePoints:
         """Points of the body at which the force acts."""
-        return self.segment.dynamics.forces.pointwise_term(self.force_index)[0].points
+        return self.segment.dynamics.forces.pointwise_term(self.force_index)[
+            0
+        ].points
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape (n, N − 1, I): n numbers at N − 1 evaluations and I instances."""
         term = self.segment.dynamics.forces.pointwise_term(self.force_index)[0]
-        return term.internal_variable_count, self.segment.grid_times - 1, self._points.count
+        return (
+            term.internal_variable_count,
+            self.segment.grid_times - 1,
+            self._points.count,
+        )
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
         """Return the scaled variables that satisfy the equations at the part's positions
         and parameters.
         """
         return (
-            self._history_of(iterate).previous_state.before[:, 1:].ravel() / self.segment.length_m
+            self._history_of(iterate).previous_state.before[:, 1:].ravel()
+            / self.segment.length_m
         )
 
-    def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
+    def with_lifted(
+        self, iterate: ExperimentIterate, z: Array
+    ) -> ExperimentIterate:
         """Return the iterate with b (n, N, I) taken from z; b is zero before the first
         evaluation.
         """
         later = z[self.columns].reshape(self.shape) * self.segment.length_m
         before = np.concatenate([np.zeros_like(later[:, :1]), later], axis=1)
         return replace(
-            iterate, lifted_histories={**iterate.lifted_histories, self.history_index: before}
+            iterate,
+            lifted_histories={
+                **iterate.lifted_histories,
+                self.history_index: before,
+            },
         )
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
         """Return the scaled equations (count,) at an iterate and z: b minus its value by the
         recursion.
         """
-        predicted = self._history_of(iterate).internal_variables(slice(self.shape[1])).ravel()
+        predicted = (
+            self._history_of(iterate)
+            .internal_variables(slice(self.shape[1]))
+            .ravel()
+        )
         return z[self.columns] - predicted / self.segment.length_m
 
-    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
+    def weighted_history(
+        self, iterate: ExperimentIterate, multipliers: Array
+    ) -> WeightedHistory:
         """Return the history and its weights in the Lagrangian.
 
         Returns
@@ -110,7 +129,9 @@ class LiftedForceHistory(LiftedVariables):
             The history, and μ such that multipliers · equations contains Σ μ_k h_k.
         """
         mu = -multipliers[self.rows].reshape(self.shape) / self.segment.length_m
-        return self._history_of(iterate), np.concatenate([mu, np.zeros_like(mu[:, :1])], axis=1)
+        return self._history_of(iterate), np.concatenate(
+            [mu, np.zeros_like(mu[:, :1])], axis=1
+        )
 
     def _history_of(self, iterate: ExperimentIterate) -> ForceHistory:
         """Return the force history of a part."""
@@ -130,7 +151,9 @@ class LiftedForceHistory(LiftedVariables):
         """Columns (m,) in z of the parameters that change the motion."""
         return self.segment.dynamic_columns(self.first_phi)
 
-    def _position_lags(self, first: int) -> Iterator[tuple[slice, Index, Array, Array]]:
+    def _position_lags(
+        self, first: int
+    ) -> Iterator[tuple[slice, Index, Array, Array]]:
         """Iterate over the lags of the stencil, for N − 1 evaluations from `first` on.
 
         Yields
@@ -142,7 +165,9 @@ class LiftedForceHistory(LiftedVariables):
         dynamics = self.segment.dynamics
         times = np.arange(first, first + self.shape[1])
         q = dynamics.tables.q / dynamics.step_s
-        for lag, (of_p, of_q) in enumerate(zip(dynamics.state_weights.T, q.T, strict=True)):
+        for lag, (of_p, of_q) in enumerate(
+            zip(dynamics.state_weights.T, q.T, strict=True)
+        ):
             used = (times >= lag) & ((of_p[times] != 0) | (of_q[times] != 0))
             if used.any():
                 here = slice(int(used.argmax()), len(used))
@@ -154,7 +179,9 @@ class LiftedForceHistory(LiftedVariables):
                 )
                 yield here, x, of_p[k], of_q[k]
 
-    def _position_derivatives(self, first: int, derivatives: LawDerivatives) -> Iterator[Array]:
+    def _position_derivatives(
+        self, first: int, derivatives: LawDerivatives
+    ) -> Iterator[Array]:
         """Yield derivatives (a, T, P) by positions at each lag of `_position_lags`, from
         derivatives (a, …) by position and velocity at N − 1 evaluations from `first` on.
         """
@@ -166,7 +193,9 @@ class LiftedForceHistory(LiftedVariables):
             else 0.0
         )
         for here, _, p, q in self._position_lags(first):
-            yield by_y[:, here] * p + (by_v[:, here] * q if isinstance(by_v, np.ndarray) else 0.0)
+            yield by_y[:, here] * p + (
+                by_v[:, here] * q if isinstance(by_v, np.ndarray) else 0.0
+            )
 
     def _motion_entries(self) -> Iterator[tuple[Index, Index, Index, Array]]:
         """Iterate over the entries of equations of motion that contain b.
@@ -181,9 +210,10 @@ class LiftedForceHistory(LiftedVariables):
             pairs = np.flatnonzero(rows.row_of_dof[of_pairs] >= 0)
             dofs = of_pairs[pairs]
             for lag, weights in enumerate(dynamics.tables.w.T):
-                k = np.arange(max(self.first_evaluation, first_row), dynamics.row_count - lag)[
-                    :, None
-                ]
+                k = np.arange(
+                    max(self.first_evaluation, first_row),
+                    dynamics.row_count - lag,
+                )[:, None]
                 if not len(k) or not weights[lag:].any():
                     continue
                 row = (
@@ -210,10 +240,17 @@ class LiftedForceHistory(LiftedVariables):
         yield EntryBlock([rows[:, None, 1:]], [columns[:, :-1]])
         for here, x, *_ in self._position_lags(0):
             yield EntryBlock([rows[:, here][..., instance]], [x])
-        yield EntryBlock([rows[:, None]], [self._dynamic_columns[:, None, None]])
+        yield EntryBlock(
+            [rows[:, None]], [self._dynamic_columns[:, None, None]]
+        )
         for pairs, k, row, _ in self._motion_entries():
             yield EntryBlock(
-                [row], [columns[:, k[:, None] - self.first_evaluation, instance[pairs]]]
+                [row],
+                [
+                    columns[
+                        :, k[:, None] - self.first_evaluation, instance[pairs]
+                    ]
+                ],
             )
 
     def _hessian_blocks(self) -> Iterator[EntryBlock]:
@@ -224,20 +261,30 @@ class LiftedForceHistory(LiftedVariables):
         i, j = np.triu_indices(self.shape[0])
         yield EntryBlock([columns[i]], [columns[j]])
         for here, x, *_ in self._position_lags(self.first_evaluation):
-            yield EntryBlock([x], [columns[:, here][..., self._points.nonzero_weights[0]]])
-        yield EntryBlock([self._dynamic_columns[:, None, None, None]], [columns])
+            yield EntryBlock(
+                [x], [columns[:, here][..., self._points.nonzero_weights[0]]]
+            )
+        yield EntryBlock(
+            [self._dynamic_columns[:, None, None, None]], [columns]
+        )
 
     def jacobian_entries(self) -> tuple[Index, Index]:
         """Return rows and columns of the additional entries of ∂g/∂z, in the order of their
         values.
         """
-        return concatenated_entries(each.indices() for each in self._jacobian_blocks())
+        return concatenated_entries(
+            each.indices() for each in self._jacobian_blocks()
+        )
 
     def hessian_entries(self) -> tuple[Index, Index]:
         """Return rows and columns of the additional entries of the Hessian, upper triangle."""
-        return concatenated_entries(each.indices() for each in self._hessian_blocks())
+        return concatenated_entries(
+            each.indices() for each in self._hessian_blocks()
+        )
 
-    def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
+    def jacobian_values(
+        self, iterate: ExperimentIterate, z: Array
+    ) -> tuple[Array, Array]:
         """Return the scaled equations (count,) at an iterate and z, and the values of
         `jacobian_entries`.
         """
@@ -248,11 +295,15 @@ class LiftedForceHistory(LiftedVariables):
         places = history.input_columns
         by = LawDerivatives(*(-each[d:, :, :-1] / length_m for each in slopes))
         blocks = [np.ones(self.count), length_m * by.b[:, :, 1:]]
-        blocks += [length_m * each for each in self._position_derivatives(0, by)]
+        blocks += [
+            length_m * each for each in self._position_derivatives(0, by)
+        ]
         of_inputs = iterate.equations.input_derivatives[:-1][:, places]
         blocks.append(np.einsum("acti,tcm->amti", by.c, of_inputs))
         blocks += self._motion_derivatives(slopes)
-        return self.residuals(iterate, z), np.concatenate([each.ravel() for each in blocks])
+        return self.residuals(iterate, z), np.concatenate(
+            [each.ravel() for each in blocks]
+        )
 
     def _motion_derivatives(self, slopes: LawDerivatives) -> Iterator[Array]:
         """Yield derivatives of the scaled equations of motion by the scaled b, in the order of
@@ -278,12 +329,19 @@ class LiftedForceHistory(LiftedVariables):
         assert isinstance(history, ForceHistory)
         length_m = self.segment.length_m
         places = history.input_columns
-        second_derivatives = history.mixed_second_derivatives(mu, weights.forces)
+        second_derivatives = history.mixed_second_derivatives(
+            mu, weights.forces
+        )
         first = self.first_evaluation
-        by = LawDerivatives(*(self.unit_m * each[:, :, first:] for each in second_derivatives))
+        by = LawDerivatives(
+            *(self.unit_m * each[:, :, first:] for each in second_derivatives)
+        )
         blocks = [self.unit_m * by.b[np.triu_indices(self.shape[0])]]
         by_state = LawDerivatives(*(each.swapaxes(0, 1) for each in by))
-        blocks += [length_m * each for each in self._position_derivatives(first, by_state)]
+        blocks += [
+            length_m * each
+            for each in self._position_derivatives(first, by_state)
+        ]
         of_inputs = iterate.equations.input_derivatives[first:][:, places]
         blocks.append(np.einsum("cati,tcm->mati", by.c, of_inputs))
         return np.concatenate([each.ravel() for each in blocks])

@@ -89,7 +89,9 @@ class LiftedMemory(LiftedVariables):
     @property
     def shape(self) -> tuple[int, int]:
         """Shape (N − 1, width): evaluations with a past, and history variables of all branches."""
-        return self.segment.grid_times - 1, self.segment.body.memory.branches[-1].columns.stop
+        return self.segment.grid_times - 1, self.segment.body.memory.branches[
+            -1
+        ].columns.stop
 
     @cached_property
     def unit_pa(self) -> Array:
@@ -103,7 +105,8 @@ class LiftedMemory(LiftedVariables):
         memory = body.memory
         change = np.abs(body.stresses.stress_jvp(rest, rest, theta)[0])
         normal = [
-            change[b.points][: (b.points.stop - b.points.start) // 2] for b in memory.branches
+            change[b.points][: (b.points.stop - b.points.start) // 2]
+            for b in memory.branches
         ]
         means = np.array([each.mean() for each in normal])
         return np.broadcast_to(memory.repeat_over_points(means), self.shape[1:])
@@ -114,28 +117,40 @@ class LiftedMemory(LiftedVariables):
         """Return the scaled variables (count,) that satisfy the recursion at the part's
         positions and parameters.
         """
-        return (_body_history(iterate).previous_variables[1:] / self.unit_pa).ravel()
+        return (
+            _body_history(iterate).previous_variables[1:] / self.unit_pa
+        ).ravel()
 
-    def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
+    def with_lifted(
+        self, iterate: ExperimentIterate, z: Array
+    ) -> ExperimentIterate:
         """Return the iterate with the history variables (N, width) [Pa] taken from z; those of the
         first evaluation are zero.
         """
         later = z[self.columns].reshape(self.shape) * self.unit_pa
         memory = np.concatenate([np.zeros((1, self.shape[1])), later])
         return replace(
-            iterate, lifted_histories={**iterate.lifted_histories, self.history_index: memory}
+            iterate,
+            lifted_histories={
+                **iterate.lifted_histories,
+                self.history_index: memory,
+            },
         )
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
         """Return the scaled equations r (count,) at the history variables of the part."""
-        return (_body_history(iterate).recursion_residuals / self.unit_pa).ravel()
+        return (
+            _body_history(iterate).recursion_residuals / self.unit_pa
+        ).ravel()
 
     @property
     def history_index(self) -> int:
         """Index of the history: that of the body is the first."""
         return 0
 
-    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
+    def weighted_history(
+        self, iterate: ExperimentIterate, multipliers: Array
+    ) -> WeightedHistory:
         """Return the history and its weights in the Lagrangian.
 
         Returns
@@ -161,11 +176,22 @@ class LiftedMemory(LiftedVariables):
         index_arrays = []
         for number, branch in enumerate(self.segment.body.memory.branches):
             points = branch.points
-            in_branch = (entries.points >= points.start) & (entries.points < points.stop)
+            in_branch = (entries.points >= points.start) & (
+                entries.points < points.stop
+            )
             places = np.flatnonzero(in_branch)
             own = entries.points[places] - points.start + branch.columns.start
-            index_arrays.append((places, own, entries.dofs[places], np.full(len(places), number)))
-        place, own, dof, number = (np.concatenate(each) for each in zip(*index_arrays, strict=True))
+            index_arrays.append(
+                (
+                    places,
+                    own,
+                    entries.dofs[places],
+                    np.full(len(places), number),
+                )
+            )
+        place, own, dof, number = (
+            np.concatenate(each) for each in zip(*index_arrays, strict=True)
+        )
         return place, own, dof, number
 
     @cached_property
@@ -177,19 +203,25 @@ class LiftedMemory(LiftedVariables):
         dofs = self._stress_entries[2]
         for rows in motion_equations(self.segment, self.reactions):
             slopes = np.flatnonzero(rows.row_of_dof[dofs] >= 0)
-            entries.append(_MotionEntries(slopes, rows.row_of_dof[dofs[slopes]], rows))
+            entries.append(
+                _MotionEntries(slopes, rows.row_of_dof[dofs[slopes]], rows)
+            )
         return entries
 
     @cached_property
     def _stress_lags(self) -> list[_Lag]:
         """Lags of S_k by x_{k−lag}; the last evaluation has no equation."""
-        return self._nonzero_lags(self.segment.dynamics.state_weights, 0, self.shape[0])
+        return self._nonzero_lags(
+            self.segment.dynamics.state_weights, 0, self.shape[0]
+        )
 
     @cached_property
     def _state_lags(self) -> list[_Lag]:
         """Lags of forces at evaluation k with a past by x_{k−lag}."""
         return self._nonzero_lags(
-            self.segment.dynamics.tables.p, self._first_evaluation, self.segment.grid_times
+            self.segment.dynamics.tables.p,
+            self._first_evaluation,
+            self.segment.grid_times,
         )
 
     @staticmethod
@@ -198,7 +230,11 @@ class LiftedMemory(LiftedVariables):
         evaluations `first` … `stop` − 1.
         """
         columns = enumerate(table.T)
-        return [_Lag(lag, max(lag, first), stop, column) for lag, column in columns if column.any()]
+        return [
+            _Lag(lag, max(lag, first), stop, column)
+            for lag, column in columns
+            if column.any()
+        ]
 
     @cached_property
     def _force_lags(self) -> list[_Lag]:
@@ -206,7 +242,8 @@ class LiftedMemory(LiftedVariables):
         table = self.segment.dynamics.tables.w
         count = self.segment.grid_times
         lags = [
-            _Lag(j, self._first_evaluation, count - j, table[j:, j]) for j in range(table.shape[1])
+            _Lag(j, self._first_evaluation, count - j, table[j:, j])
+            for j in range(table.shape[1])
         ]
         return [each for each in lags if each.factors.any()]
 
@@ -219,7 +256,11 @@ class LiftedMemory(LiftedVariables):
         """Return arrays whose sum are the columns (T, K) in z of history variables, which are given
         by their indices (K,).
         """
-        return [self.offsets.variable, (lag.evaluations - 1) * self.shape[1], variables]
+        return [
+            self.offsets.variable,
+            (lag.evaluations - 1) * self.shape[1],
+            variables,
+        ]
 
     def _position_columns(self, lag: _Lag, dofs: Index) -> list[Index | int]:
         """Return arrays whose sum are the columns (T, K) in z of the positions of dofs (K,), at the
@@ -236,36 +277,54 @@ class LiftedMemory(LiftedVariables):
         motion by m.
         """
         _, own, dofs, _ = self._stress_entries
-        equations, variables = (np.arange(s.start, s.stop) for s in (self.rows, self.columns))
+        equations, variables = (
+            np.arange(s.start, s.stop) for s in (self.rows, self.columns)
+        )
         blocks = [
             EntryBlock([equations], [np.arange(self.segment.nq)[:, None]]),
             EntryBlock([equations], [variables]),
-            EntryBlock([equations[self.shape[1] :]], [variables[: -self.shape[1]]]),
+            EntryBlock(
+                [equations[self.shape[1] :]], [variables[: -self.shape[1]]]
+            ),
         ]
         for each in self._stress_lags:
             rows = [self.offsets.row, each.evaluations * self.shape[1], own]
             blocks.append(EntryBlock(rows, self._position_columns(each, dofs)))
         for moved in self._motion_entries:
             for each in self._force_lags:
-                row_times = each.evaluations + each.lag - self.segment.dynamics.first_row
+                row_times = (
+                    each.evaluations
+                    + each.lag
+                    - self.segment.dynamics.first_row
+                )
                 rows = [
                     moved.rows.first_row,
                     row_times * moved.rows.rows_per_time,
                     moved.row_indices,
                 ]
                 blocks.append(
-                    EntryBlock(rows, self._memory_columns(each, own[moved.derivative_indices]))
+                    EntryBlock(
+                        rows,
+                        self._memory_columns(
+                            each, own[moved.derivative_indices]
+                        ),
+                    )
                 )
         return blocks
 
     def _hessian_blocks(self) -> list[EntryBlock]:
         """Return the Hessian's entries in the columns of m: by q, then by x."""
         variables = np.arange(self.columns.start, self.columns.stop)
-        blocks = [EntryBlock([np.arange(self.segment.nq)[:, None]], [variables])]
+        blocks = [
+            EntryBlock([np.arange(self.segment.nq)[:, None]], [variables])
+        ]
         _, own, dofs, _ = self._stress_entries
         for each in self._state_lags:
             blocks.append(
-                EntryBlock(self._position_columns(each, dofs), self._memory_columns(each, own))
+                EntryBlock(
+                    self._position_columns(each, dofs),
+                    self._memory_columns(each, own),
+                )
             )
         return blocks
 
@@ -273,26 +332,36 @@ class LiftedMemory(LiftedVariables):
         """Return rows and columns of the additional entries of ∂g/∂z, in the order of their
         values.
         """
-        return concatenated_entries(each.indices() for each in self._jacobian_blocks())
+        return concatenated_entries(
+            each.indices() for each in self._jacobian_blocks()
+        )
 
     def hessian_entries(self) -> tuple[Index, Index]:
         """Return rows and columns of the additional entries of the Lagrangian's Hessian,
         upper triangle.
         """
-        return concatenated_entries(each.indices() for each in self._hessian_blocks())
+        return concatenated_entries(
+            each.indices() for each in self._hessian_blocks()
+        )
 
     @property
     def entry_counts(self) -> tuple[int, int]:
         """Numbers of additional entries of Jacobian and Hessian, computed without index arrays."""
         groups = self._jacobian_blocks(), self._hessian_blocks()
-        return sum(each.count for each in groups[0]), sum(each.count for each in groups[1])
+        return sum(each.count for each in groups[0]), sum(
+            each.count for each in groups[1]
+        )
 
-    def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
+    def jacobian_values(
+        self, iterate: ExperimentIterate, z: Array
+    ) -> tuple[Array, Array]:
         """Return the scaled equations r (count,), and the values of `jacobian_entries`."""
         history = _body_history(iterate)
         memory = iterate.segment.body.memory
         after = self.shape[0] - 1, self.shape[1]
-        fading = np.broadcast_to(memory.repeat_over_points(-history.fading.d[:, 1:-1]), after)
+        fading = np.broadcast_to(
+            memory.repeat_over_points(-history.fading.d[:, 1:-1]), after
+        )
         values = [
             self._parameter_derivatives(history, iterate.equations.theta_q),
             np.ones(self.count),
@@ -304,7 +373,9 @@ class LiftedMemory(LiftedVariables):
         rows = (history.recursion_residuals / self.unit_pa).ravel()
         return rows, np.concatenate([each.ravel() for each in values])
 
-    def _parameter_derivatives(self, history: MemoryHistory, theta_q: Array) -> Array:
+    def _parameter_derivatives(
+        self, history: MemoryHistory, theta_q: Array
+    ) -> Array:
         """Return the derivatives (nq, N − 1, width) of the scaled equations r by q; `theta_q` (k,
         nq) are those of the constants.
         """
@@ -319,7 +390,9 @@ class LiftedMemory(LiftedVariables):
             rows = slice(rows.start, min(rows.stop, self.shape[0]))
             change = d_q[:, rows] * history.previous_variables[rows]
             change += a_q[:, rows] * memory.to_branches(history.stress[rows])
-            by_modulus = np.moveaxis(memory.to_branches(slopes[: rows.stop - rows.start]), 1, 0)
+            by_modulus = np.moveaxis(
+                memory.to_branches(slopes[: rows.stop - rows.start]), 1, 0
+            )
             derivatives[:, rows] = -(change + a[rows] * by_modulus)
         return derivatives / self.unit_pa
 
@@ -332,21 +405,29 @@ class LiftedMemory(LiftedVariables):
         a = history.fading.a.T
 
         def slopes(times: slice) -> Array:
-            derivatives = history.body.stresses.stress_jacobian(history.xi[times], history.theta)
+            derivatives = history.body.stresses.stress_jacobian(
+                history.xi[times], history.theta
+            )
             return derivatives[:, place] * a[times, number] * scale
 
         return self._scaled_by_lag(self._stress_lags, slopes)
 
-    def _force_derivatives(self, history: MemoryHistory, changes: _MotionEntries) -> list[Array]:
+    def _force_derivatives(
+        self, history: MemoryHistory, changes: _MotionEntries
+    ) -> list[Array]:
         """Return the derivatives of scaled equations of motion by the scaled m, one array (T, K)
         for each of `_force_lags`, with K as in `changes`; zero in rows whose dof is prescribed.
         """
-        place, own, dofs, _ = (each[changes.derivative_indices] for each in self._stress_entries)
+        place, own, dofs, _ = (
+            each[changes.derivative_indices] for each in self._stress_entries
+        )
         scale = self.unit_pa[own] / self.segment.force_n
         is_prescribed = self.segment.dynamics.is_temporarily_prescribed
 
         def slopes(times: slice) -> Array:
-            scaled = history.body.stresses.memory_force_jacobian(history.xi[times], history.theta)
+            scaled = history.body.stresses.memory_force_jacobian(
+                history.xi[times], history.theta
+            )
             return np.where(
                 changes.rows.omits_prescribed & is_prescribed[times, dofs],
                 0.0,
@@ -355,7 +436,9 @@ class LiftedMemory(LiftedVariables):
 
         scaled = self._scaled_by_lag(self._force_lags, slopes)
         for each, values in zip(self._force_lags, scaled, strict=True):
-            is_prescribed_later = is_prescribed[each.start + each.lag : each.stop + each.lag, dofs]
+            is_prescribed_later = is_prescribed[
+                each.start + each.lag : each.stop + each.lag, dofs
+            ]
             values[changes.rows.omits_prescribed & is_prescribed_later] = 0.0
         return scaled
 
@@ -374,9 +457,13 @@ class LiftedMemory(LiftedVariables):
         history = _body_history(iterate)
         theta_q = iterate.equations.theta_q
         d_q = history.memory.repeat_over_points(
-            np.moveaxis(history.fading.jacobian_vector_product(theta_q)[0], 1, 0)
+            np.moveaxis(
+                history.fading.jacobian_vector_product(theta_q)[0], 1, 0
+            )
         )
-        by_q = d_q[:, 1:] * self._history_weights(multipliers)[1:] * self.unit_pa
+        by_q = (
+            d_q[:, 1:] * self._history_weights(multipliers)[1:] * self.unit_pa
+        )
         place, own, _, _ = self._stress_entries
         scale = segment.length_m * self.unit_pa[own]
         # f_H is linear in x and in H, so that its slope by both is that by H at the weights.
@@ -391,7 +478,9 @@ class LiftedMemory(LiftedVariables):
         return np.concatenate([each.ravel() for each in values])
 
     @staticmethod
-    def _scaled_by_lag(lags: list[_Lag], derivatives: Callable[[slice], Array]) -> list[Array]:
+    def _scaled_by_lag(
+        lags: list[_Lag], derivatives: Callable[[slice], Array]
+    ) -> list[Array]:
         """Return derivatives of evaluations times the stencil's factors, (T, K) for each lag.
 
         Parameters
@@ -408,14 +497,20 @@ class LiftedMemory(LiftedVariables):
         for start in range(first, last, EVALUATIONS_PER_CHUNK):
             stop = min(start + EVALUATIONS_PER_CHUNK, last)
             own = derivatives(slice(start, stop))
-            scaled = scaled or [np.empty((e.stop - e.start, own.shape[1])) for e in lags]
+            scaled = scaled or [
+                np.empty((e.stop - e.start, own.shape[1])) for e in lags
+            ]
             for each, values in zip(lags, scaled, strict=True):
                 low = max(start, each.start)
                 high = min(stop, each.stop)
                 if high > low:
                     here = slice(low - each.start, high - each.start)
                     factors = each.factors[low:high, None]
-                    np.multiply(own[low - start : high - start], factors, out=values[here])
+                    np.multiply(
+                        own[low - start : high - start],
+                        factors,
+                        out=values[here],
+                    )
         return scaled
 
 

@@ -49,7 +49,11 @@ class LiftedReactions(LiftedVariables):
             Indices into `sensed_dofs`.
         """
         first = self.segment.dynamics.first_row
-        return self.offsets.variable + (times[:, None] - first) * self.shape[1] + dofs
+        return (
+            self.offsets.variable
+            + (times[:, None] - first) * self.shape[1]
+            + dofs
+        )
 
     def reactions_n(self, z: Array) -> Array:
         """Return the reaction forces R (N, g) [N] from z; zero before the first equation of
@@ -63,7 +67,9 @@ class LiftedReactions(LiftedVariables):
     def residual_weights(self, multipliers: Array) -> Array:
         """Return the derivative (N, 3n) of multipliers · g by the residual c in newtons [1/N]."""
         weights = np.zeros((self.segment.grid_times, self.segment.dof_count))
-        by_row = multipliers[self.rows].reshape(self.shape) / self.segment.force_n
+        by_row = (
+            multipliers[self.rows].reshape(self.shape) / self.segment.force_n
+        )
         weights[self.segment.dynamics.first_row :, self.sensed_dofs] = by_row
         return weights
 
@@ -73,7 +79,10 @@ class LiftedReactions(LiftedVariables):
         segment = self.segment
         dynamics = self.segment.dynamics
         untaken = replace(
-            dynamics, is_temporarily_prescribed=np.zeros_like(dynamics.is_temporarily_prescribed)
+            dynamics,
+            is_temporarily_prescribed=np.zeros_like(
+                dynamics.is_temporarily_prescribed
+            ),
         )
         return MotionJacobian(
             untaken,
@@ -91,7 +100,10 @@ class LiftedReactions(LiftedVariables):
         """Return forces (N, …) [N] as scaled values, without the rows before the first
         equation of motion.
         """
-        return newtons[self.segment.dynamics.first_row :].ravel() / self.segment.force_n
+        return (
+            newtons[self.segment.dynamics.first_row :].ravel()
+            / self.segment.force_n
+        )
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
         """Return the scaled equations (count,)."""
@@ -104,16 +116,26 @@ class LiftedReactions(LiftedVariables):
         segment = self.segment
         band = self._motion_jacobian.structure
         equations = np.arange(self.rows.start, self.rows.stop)
-        of_x = np.repeat(np.arange(segment.variable_count), np.diff(band.indptr))
+        of_x = np.repeat(
+            np.arange(segment.variable_count), np.diff(band.indptr)
+        )
         of_p = segment.dynamic_columns(self.first_phi)
         columns = [
             segment.offsets.position + of_x,
             np.arange(self.columns.start, self.columns.stop),
         ]
-        rows = [self.offsets.row + band.indices, equations, np.repeat(equations, len(of_p))]
-        return np.concatenate(rows), np.concatenate([*columns, np.tile(of_p, self.count)])
+        rows = [
+            self.offsets.row + band.indices,
+            equations,
+            np.repeat(equations, len(of_p)),
+        ]
+        return np.concatenate(rows), np.concatenate(
+            [*columns, np.tile(of_p, self.count)]
+        )
 
-    def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
+    def jacobian_values(
+        self, iterate: ExperimentIterate, z: Array
+    ) -> tuple[Array, Array]:
         """Return the scaled equations (count,) at an iterate and z, and the values of
         `jacobian_entries`.
         """
@@ -122,20 +144,34 @@ class LiftedReactions(LiftedVariables):
         dynamics = setting.dynamics
         first = setting.dynamics.first_row
         by_x = np.empty(motion.structure.nnz)
-        motion.fill(by_x, iterate.forces, dynamics, setting.mass_depends_on_parameters)
-        by_p = np.zeros((len(iterate.x), self.shape[1], len(self.segment.dynamic_parameters)))
-        slopes = setting.force_derivatives(slice(first, None), iterate.forces.by_theta)
+        motion.fill(
+            by_x, iterate.forces, dynamics, setting.mass_depends_on_parameters
+        )
+        by_p = np.zeros(
+            (
+                len(iterate.x),
+                self.shape[1],
+                len(self.segment.dynamic_parameters),
+            )
+        )
+        slopes = setting.force_derivatives(
+            slice(first, None), iterate.forces.by_theta
+        )
         by_p[first:] = slopes[:, self.sensed_dofs]
         by_p = dynamics.combine(dynamics.tables.w, by_p)
         acceleration = dynamics.acceleration(iterate.x)[:, self.sensed_dofs]
-        by_p -= setting.inertia_derivatives(slice(None), acceleration, self.sensed_dofs)
+        by_p -= setting.inertia_derivatives(
+            slice(None), acceleration, self.sensed_dofs
+        )
         force = np.zeros(acceleration.shape)
         force[first:] = iterate.forces.force[:, self.sensed_dofs]
         mass_kg = dynamics.mass.inertia_kg[:, self.sensed_dofs]
         rows = z[self.columns] - self._scaled(
             reaction_forces(dynamics, mass_kg, force, acceleration)
         )
-        return rows, np.concatenate([by_x, np.ones(self.count), self._scaled(by_p)])
+        return rows, np.concatenate(
+            [by_x, np.ones(self.count), self._scaled(by_p)]
+        )
 
 
 class MotionEquations(NamedTuple):
@@ -166,13 +202,27 @@ def motion_equations(
     None without these.
     """
     kinds = [
-        (transcription.free_dofs, transcription.constrained_dofs, transcription.offsets.row, True)
+        (
+            transcription.free_dofs,
+            transcription.constrained_dofs,
+            transcription.offsets.row,
+            True,
+        )
     ]
     if reactions is not None:
-        kinds.append((reactions.sensed_dofs, reactions.sensed_dofs, reactions.offsets.row, False))
+        kinds.append(
+            (
+                reactions.sensed_dofs,
+                reactions.sensed_dofs,
+                reactions.offsets.row,
+                False,
+            )
+        )
     equations = []
     for moving, dofs, first, is_prescribed in kinds:
         number = np.full(transcription.dof_count, -1)
         number[moving] = np.searchsorted(dofs, moving)
-        equations.append(MotionEquations(number, first, len(dofs), is_prescribed))
+        equations.append(
+            MotionEquations(number, first, len(dofs), is_prescribed)
+        )
     return equations

@@ -90,14 +90,20 @@ class LiftedVariables(ABC):
     @property
     def phi_columns(self) -> Index:
         """Indices (k,) in z of the experiment's nuisance parameters."""
-        return self.first_phi + self.segment.nuisance_indices.indices - self.segment.nq
+        return (
+            self.first_phi
+            + self.segment.nuisance_indices.indices
+            - self.segment.nq
+        )
 
     @property
     def lower_bound(self) -> float:
         """Lower bound of the variables."""
         return -np.inf
 
-    def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
+    def with_lifted(
+        self, iterate: ExperimentIterate, z: Array
+    ) -> ExperimentIterate:
         """Return the iterate with those quantities replaced that these variables of z determine;
         the iterate itself if there are none.
         """
@@ -118,7 +124,10 @@ class LiftedVariables(ABC):
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
         """Return the scaled equations (count,) at the iterate and z."""
-        return np.sum([pattern.residuals(z, self.count) for pattern in self.patterns], axis=0)
+        return np.sum(
+            [pattern.residuals(z, self.count) for pattern in self.patterns],
+            axis=0,
+        )
 
     def jacobian_entries(self) -> tuple[Index, Index]:
         """Return rows in g and columns in z of the additional entries of ∂g/∂z, in the order of
@@ -129,11 +138,15 @@ class LiftedVariables(ABC):
         )
         return self.offsets.row + rows, columns
 
-    def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
+    def jacobian_values(
+        self, iterate: ExperimentIterate, z: Array
+    ) -> tuple[Array, Array]:
         """Return the scaled equations (count,) at an iterate and z, and the values of
         `jacobian_entries`.
         """
-        evaluated = [pattern.jacobian_values(z, self.count) for pattern in self.patterns]
+        evaluated = [
+            pattern.jacobian_values(z, self.count) for pattern in self.patterns
+        ]
         values, slopes = zip(*evaluated, strict=True)
         return np.sum(values, axis=0), np.concatenate(slopes)
 
@@ -141,7 +154,9 @@ class LiftedVariables(ABC):
         """Return rows and columns of the additional entries of the Lagrangian's Hessian,
         upper triangle.
         """
-        return concatenated_entries(pattern.hessian_entries() for pattern in self.patterns)
+        return concatenated_entries(
+            pattern.hessian_entries() for pattern in self.patterns
+        )
 
     def hessian_values(
         self,
@@ -190,7 +205,9 @@ class LiftedVariables(ABC):
         """Index of the history among those of the motion, or None if the group is no history."""
         return None
 
-    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
+    def weighted_history(
+        self, iterate: ExperimentIterate, multipliers: Array
+    ) -> WeightedHistory:
         """Return the history, and the weights of each h_k in multipliers · equations.
 
         Raises
@@ -206,7 +223,9 @@ class LiftedVariables(ABC):
         return len(self.jacobian_entries()[0]), len(self.hessian_entries()[0])
 
 
-def concatenated_entries(groups: Iterable[tuple[Index, Index]]) -> tuple[Index, Index]:
+def concatenated_entries(
+    groups: Iterable[tuple[Index, Index]],
+) -> tuple[Index, Index]:
     """Concatenate rows, and columns, of several groups of entries; no group gives empty arrays."""
     none = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     rows, columns = zip(none, *groups, strict=True)

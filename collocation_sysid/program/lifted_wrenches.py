@@ -63,14 +63,20 @@ class LiftedWrench(LiftedVariables):
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape (1 or 2, times, 6): W and, with a low-pass, Y; grid times; forces and moments."""
-        return 1 + len(self.observable.low_pass_parameters), self.observable.count, 6
+        return (
+            1 + len(self.observable.low_pass_parameters),
+            self.observable.count,
+            6,
+        )
 
     @cached_property
     def _unit(self) -> Array:
         """Unit (6,) of W and Y [N, N m], for which the mean loss has a curvature of about one."""
         count = max(1, int(self.residual.is_compared.sum()))
         sigmas = self.residual.observable_sigmas
-        return np.where(np.isfinite(sigmas), np.sqrt(count) * sigmas, self._reaction_unit)
+        return np.where(
+            np.isfinite(sigmas), np.sqrt(count) * sigmas, self._reaction_unit
+        )
 
     @cached_property
     def _row_unit(self) -> Array:
@@ -84,7 +90,9 @@ class LiftedWrench(LiftedVariables):
         """Unit (6,) of reaction forces and their moments [N, N m]."""
         return self.segment.force_n * np.repeat([1.0, self.segment.length_m], 3)
 
-    def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
+    def with_lifted(
+        self, iterate: ExperimentIterate, z: Array
+    ) -> ExperimentIterate:
         """Return the iterate with the measured wrench (times, 2, 3) [N, N m] taken from z."""
         wrench = z[self._observable_columns].reshape(-1, 6) * self._unit
         return replace(
@@ -102,7 +110,11 @@ class LiftedWrench(LiftedVariables):
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
         """Return the scaled W and Y (count,) that follow from the iterate's motion."""
-        own = [self.observable.evaluate_unfiltered(iterate.motion.reactions, iterate.phi)]
+        own = [
+            self.observable.evaluate_unfiltered(
+                iterate.motion.reactions, iterate.phi
+            )
+        ]
         if evolution := self.observable.filter_wrench(own[0], iterate.phi):
             own += [*evolution.states]
         return (np.stack(own) / self._unit).ravel()
@@ -125,29 +137,45 @@ class LiftedWrench(LiftedVariables):
             )
         ]
         reaction_columns = self.reactions.columns_of(
-            channel.known_rows + channel.reaction_grid.delay_steps, channel.node_dofs
+            channel.known_rows + channel.reaction_grid.delay_steps,
+            channel.node_dofs,
         )
         units = np.array([[self.segment.length_m], [self.segment.force_n]])
         observed = [
-            PatternIndices(np.moveaxis(each.reshape(channel.count, -1, 3), 2, 0), unit)
-            for each, unit in zip((self._position_columns, reaction_columns), units, strict=True)
+            PatternIndices(
+                np.moveaxis(each.reshape(channel.count, -1, 3), 2, 0), unit
+            )
+            for each, unit in zip(
+                (self._position_columns, reaction_columns), units, strict=True
+            )
         ]
-        reaction_indices = PatternIndices(of_wrench[..., None], minus[..., None])
+        reaction_indices = PatternIndices(
+            of_wrench[..., None], minus[..., None]
+        )
         terms.append(
-            ExpressionPattern.from_arrays(MOMENT, channel.moment_data, observed, reaction_indices)
+            ExpressionPattern.from_arrays(
+                MOMENT, channel.moment_data, observed, reaction_indices
+            )
         )
         if len(tool := channel.tool_parameters):
-            data = channel.tool_inputs(np.zeros(len(self.phi_columns)), channel.count)[1]
+            data = channel.tool_inputs(
+                np.zeros(len(self.phi_columns)), channel.count
+            )[1]
             by_phi = PatternIndices(self.phi_columns[tool][:, None])
             terms.append(
                 ExpressionPattern.from_arrays(
-                    channel.tool, data, [by_phi], PatternIndices(of_wrench, minus)
+                    channel.tool,
+                    data,
+                    [by_phi],
+                    PatternIndices(of_wrench, minus),
                 )
             )
         if len(lag := channel.low_pass_parameters):
             places = self.offsets.variable + indices
             by_phi = self.phi_columns[lag][:, None, None]
-            unfiltered, filtered = (PatternIndices(places[k : k + 1], self._unit) for k in (0, 1))
+            unfiltered, filtered = (
+                PatternIndices(places[k : k + 1], self._unit) for k in (0, 1)
+            )
             terms.append(
                 ExpressionPattern.from_recursion(
                     LOW_PASS,
@@ -176,14 +204,18 @@ class LiftedWrench(LiftedVariables):
         """Return the gradient of the loss by the scaled variables (count,)."""
         own = np.zeros(self.count)
         by_observables, _ = iterate.loss_gradients[self.residual_index]
-        own[self.count - self._wrench_size :] = (by_observables.reshape(-1, 6) * self._unit).ravel()
+        own[self.count - self._wrench_size :] = (
+            by_observables.reshape(-1, 6) * self._unit
+        ).ravel()
         return own
 
     @cached_property
     def _unit_derivatives(self) -> sp.csr_array:
         """Diagonal matrix of the derivatives of (Y, φ) by (scaled Y, φ)."""
         scale = np.tile(self._unit, self.observable.count)
-        return sp.csr_array(sp.diags_array(np.append(scale, np.ones(len(self.phi_columns)))))
+        return sp.csr_array(
+            sp.diags_array(np.append(scale, np.ones(len(self.phi_columns))))
+        )
 
     @cached_property
     def _loss_entries(self) -> tuple[Index, Index]:
@@ -195,13 +227,18 @@ class LiftedWrench(LiftedVariables):
         rows, columns = super().hessian_entries()
         both = np.concatenate(
             [
-                np.arange(self._observable_columns.start, self._observable_columns.stop),
+                np.arange(
+                    self._observable_columns.start,
+                    self._observable_columns.stop,
+                ),
                 self.phi_columns,
             ]
         )
         i, j = (both[each] for each in self._loss_entries)
         # Experiments that share a φ need not have them in the same order.
-        return np.append(rows, np.minimum(i, j)), np.append(columns, np.maximum(i, j))
+        return np.append(rows, np.minimum(i, j)), np.append(
+            columns, np.maximum(i, j)
+        )
 
     def hessian_values(
         self,
@@ -214,14 +251,21 @@ class LiftedWrench(LiftedVariables):
         """Return the values of `hessian_entries`; arguments as in
         `LiftedVariables.hessian_values`.
         """
-        of_equations = super().hessian_values(iterate, z, loss_weight, multipliers, weights)
+        of_equations = super().hessian_values(
+            iterate, z, loss_weight, multipliers, weights
+        )
         rows, columns = self._loss_entries
         size = self._wrench_size + len(iterate.phi)
         observables = iterate.observables[self.residual_index]
         of_loss = self.residual.hessian(
-            observables, iterate.phi, self._unit_derivatives, iterate.has_observation_curvature
+            observables,
+            iterate.phi,
+            self._unit_derivatives,
+            iterate.has_observation_curvature,
         )
-        positions = np.searchsorted(columns * size + rows, of_loss.columns * size + of_loss.rows)
+        positions = np.searchsorted(
+            columns * size + rows, of_loss.columns * size + of_loss.rows
+        )
         values = np.zeros(len(rows))
         np.add.at(values, positions, loss_weight * of_loss.values)
         return np.append(of_equations, values)

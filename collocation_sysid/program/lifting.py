@@ -14,7 +14,9 @@ from .transcription import Transcription
 
 
 def lift_variables(
-    transcriptions: Sequence[Transcription], first_phi: int, offsets: LiftedOffsets
+    transcriptions: Sequence[Transcription],
+    first_phi: int,
+    offsets: LiftedOffsets,
 ) -> tuple[LiftedVariables, ...]:
     """Create the groups of lifted variables of all experiments.
 
@@ -34,7 +36,11 @@ def lift_variables(
     groups: list[LiftedVariables] = []
     for number, segment in enumerate(transcriptions):
         reactions = None
-        lift = {"segment": segment, "segment_index": number, "first_phi": first_phi}
+        lift = {
+            "segment": segment,
+            "segment_index": number,
+            "first_phi": first_phi,
+        }
         wrenches = [
             (k, reading)
             for k, reading in enumerate(segment.residuals)
@@ -46,7 +52,9 @@ def lift_variables(
             offsets = reactions.next_offsets
         histories = 0
         if segment.body.has_memory:
-            groups.append(LiftedMemory(**lift, offsets=offsets, reactions=reactions))
+            groups.append(
+                LiftedMemory(**lift, offsets=offsets, reactions=reactions)
+            )
             offsets = groups[-1].next_offsets
             histories = 1
         for history, force in enumerate(
@@ -63,7 +71,9 @@ def lift_variables(
             )
             offsets = groups[-1].next_offsets
             histories = history + 1
-        for history, force in enumerate(segment.dynamics.forces.complementarity_terms, histories):
+        for history, force in enumerate(
+            segment.dynamics.forces.complementarity_terms, histories
+        ):
             groups.append(
                 LiftedContactPressure(
                     **lift,
@@ -78,7 +88,11 @@ def lift_variables(
             assert reactions is not None
             groups.append(
                 LiftedWrench(
-                    **lift, offsets=offsets, residual_index=k, residual=reading, reactions=reactions
+                    **lift,
+                    offsets=offsets,
+                    residual_index=k,
+                    residual=reading,
+                    reactions=reactions,
                 )
             )
             offsets = groups[-1].next_offsets

@@ -58,7 +58,9 @@ class LocalLoss:
         """Return one number for each entry, ascending in the order of `structure`."""
         return columns * self._height + rows
 
-    def hessian(self, x: Array, phi: Array, has_observation_curvature: bool = True) -> Array:
+    def hessian(
+        self, x: Array, phi: Array, has_observation_curvature: bool = True
+    ) -> Array:
         """Return the values of the entries.
 
         Parameters
@@ -79,26 +81,37 @@ class LocalLoss:
     @property
     def _is_quadratic(self) -> bool:
         """Whether the values do not depend on x and φ."""
-        return all(reading.is_quadratic and points.is_linear for reading, points in self.residuals)
+        return all(
+            reading.is_quadratic and points.is_linear
+            for reading, points in self.residuals
+        )
 
     @cached_property
     def _constant(self) -> Array:
         """Values of the entries at zero positions."""
-        rows = max((points.rows[-1] + 1 for _, points in self.residuals), default=1)
+        rows = max(
+            (points.rows[-1] + 1 for _, points in self.residuals), default=1
+        )
         return self._evaluate_at(
             np.zeros((rows, self.dof_count)),
             np.zeros(self.nuisance_count),
             has_observation_curvature=True,
         )
 
-    def _evaluate_at(self, x: Array, phi: Array, has_observation_curvature: bool) -> Array:
+    def _evaluate_at(
+        self, x: Array, phi: Array, has_observation_curvature: bool
+    ) -> Array:
         """Return the values of the entries of `structure` at x (N, 3n) and φ (k,), with or without
         the curvature of the observables.
         """
         codes = self._codes(*self.structure)
         values = np.zeros(len(codes))
         for entries in self._entries(x, phi, has_observation_curvature):
-            np.add.at(values, np.searchsorted(codes, self._codes(*entries[:2])), entries.values)
+            np.add.at(
+                values,
+                np.searchsorted(codes, self._codes(*entries[:2])),
+                entries.values,
+            )
         return values
 
     def _entries(

@@ -115,14 +115,20 @@ def explain_failure(
     if error.state_m is None:
         return error
     if experiment.specimen is not None:
-        return SimulationError(specimen_message(experiment, error.time_s), error.time_s)
+        return SimulationError(
+            specimen_message(experiment, error.time_s), error.time_s
+        )
     try:
-        instability = find_stability_loss(experiment, theta, error.state_m, error.time_s)
+        instability = find_stability_loss(
+            experiment, theta, error.state_m, error.time_s
+        )
     except (ArpackError, RuntimeError, np.linalg.LinAlgError):
         return error
     if instability is None:
         return error
-    explained_error = SimulationError(instability.message, error.time_s, error.element)
+    explained_error = SimulationError(
+        instability.message, error.time_s, error.element
+    )
     explained_error.stability_loss = instability
     return explained_error
 
@@ -163,7 +169,10 @@ def find_stability_loss(
     is_prescribed = experiment.is_prescribed([time_s])[0].ravel()
     free = np.flatnonzero(~is_prescribed)
     reference, _ = _lowest(
-        forces, experiment.rigid_positions([time_s])[0].ravel(), free=free, translation_m=0.0
+        forces,
+        experiment.rigid_positions([time_s])[0].ravel(),
+        free=free,
+        translation_m=0.0,
     )
     if not reference > 0:
         return None
@@ -177,10 +186,14 @@ def find_stability_loss(
     mode = mode.reshape(-1, 3)[:own]
     mode = mode / np.linalg.norm(mode, axis=1).max()
     positions_m = x.reshape(-1, 3)[:own]
-    return _on_surface(nodes.points_m, positions_m, mode, experiment.body.mesh.surface)
+    return _on_surface(
+        nodes.points_m, positions_m, mode, experiment.body.mesh.surface
+    )
 
 
-def _lowest(forces: Forces, x: Array, free: Index, translation_m: float) -> tuple[float, Array]:
+def _lowest(
+    forces: Forces, x: Array, free: Index, translation_m: float
+) -> tuple[float, Array]:
     """Return the lowest eigenvalue [1/s²] of K φ = λ M φ near a shift below zero, and φ (free,).
 
     Parameters
@@ -197,16 +210,24 @@ def _lowest(forces: Forces, x: Array, free: Index, translation_m: float) -> tupl
     state = x.reshape(1, -1)
     stiffness = -forces.linearise(state, np.zeros_like(state)).by_position[0]
     root = sp.diags_array(1 / np.sqrt(forces.mass.inertia_kg[0, free]))
-    matrix = sp.csc_array(root @ forces.pattern.matrix(stiffness)[:, free][free] @ root)
+    matrix = sp.csc_array(
+        root @ forces.pattern.matrix(stiffness)[:, free][free] @ root
+    )
     start = np.random.default_rng(0).normal(size=len(free))
-    values, vectors = eigsh(matrix, 1, sigma=-translation_m, which="LM", v0=start)
+    values, vectors = eigsh(
+        matrix, 1, sigma=-translation_m, which="LM", v0=start
+    )
     return float(values[0]), np.asarray(root @ vectors[:, 0])
 
 
-def _on_surface(points_m: Array, positions_m: Array, mode: Array, surface: Index) -> StabilityLoss:
+def _on_surface(
+    points_m: Array, positions_m: Array, mode: Array, surface: Index
+) -> StabilityLoss:
     """Return the mode with stretches and wavelength on the surface's triangles (F, 3)."""
     edges_m, moved_m, differences = (
-        np.stack([each[surface[:, k]] - each[surface[:, 0]] for k in (1, 2)], axis=1)
+        np.stack(
+            [each[surface[:, k]] - each[surface[:, 0]] for k in (1, 2)], axis=1
+        )
         for each in (points_m, positions_m, mode)
     )
     first = edges_m @ edges_m.swapaxes(1, 2)
@@ -225,7 +246,9 @@ def _on_surface(points_m: Array, positions_m: Array, mode: Array, surface: Index
     power = 2 + np.log(large) / np.log(small) if small < 1 else np.inf
     critical = float(BIOT_RATIO ** (1 / power)) if 0 < power < np.inf else 0.0
     slopes2 = np.einsum("fij,fik,fjk->f", inverse, differences, differences)
-    share = (areas_m2 * amplitude2).sum() / max((areas_m2 * slopes2).sum(), np.finfo(float).tiny)
+    share = (areas_m2 * amplitude2).sum() / max(
+        (areas_m2 * slopes2).sum(), np.finfo(float).tiny
+    )
     return StabilityLoss(
         positions_m=positions_m,
         mode=mode,

@@ -21,7 +21,10 @@ from ..array_types import Array, Index
 from ..fem.body import Body
 from ..recording.experiment import Experiment
 from ..recording.placement import LocatedBody, Placement
-from .surface_correspondences import SurfaceCorrespondences, initial_correspondences
+from .surface_correspondences import (
+    SurfaceCorrespondences,
+    initial_correspondences,
+)
 
 # A place leaves its element when another contains it better by this barycentric coordinate, so that
 # it cannot alternate between two.
@@ -158,7 +161,8 @@ class MarkerAssociation:
             self.body is experiment.body
             and self.on_surface == experiment.markers.on_surface
             and np.array_equal(self.sigma_m, experiment.place_sigma_m)
-            and [s.camera.depth for s in self.correspondences] == [*experiment.depths]
+            and [s.camera.depth for s in self.correspondences]
+            == [*experiment.depths]
         )
 
     @cached_property
@@ -176,13 +180,18 @@ class MarkerAssociation:
         `axes`; zero for exact places.
         """
         sigma = np.where(self.sigma_m > 0, self.sigma_m, np.inf)[:, None]
-        return np.einsum("mik,mi->mk", self.axes, points_m - self.prior_places_m) / sigma
+        return (
+            np.einsum("mik,mi->mk", self.axes, points_m - self.prior_places_m)
+            / sigma
+        )
 
     def places_m(self, phi: Array) -> Array:
         """Return the places (M, 3) on the undeformed body [m] for coordinates `phi` (M, k) in prior
         standard deviations along `axes`.
         """
-        moved = np.einsum("mik,mk->mi", self.axes, phi - self.centre_coordinates)
+        moved = np.einsum(
+            "mik,mk->mi", self.axes, phi - self.centre_coordinates
+        )
         return self.centre_places_m + self.sigma_m[:, None] * moved
 
     def shape_functions(self, phi: Array) -> tuple[Index, ShapeFunctions]:
@@ -203,7 +212,9 @@ class MarkerAssociation:
         estimated = self.estimated
         if len(estimated):
             cells = self.cells[estimated]
-            local = self._shape.barycentric(self.places_m(phi)[estimated], cells)
+            local = self._shape.barycentric(
+                self.places_m(phi)[estimated], cells
+            )
             gradients = self._shape.barycentric_gradients(cells) @ (
                 self.sigma_m[estimated, None, None] * self.axes[estimated]
             )
@@ -211,7 +222,10 @@ class MarkerAssociation:
             weights[estimated] = element.shape_functions(local)
             slopes[estimated] = element.shape_gradients(local) @ gradients
             curvatures[estimated] = np.einsum(
-                "mail,mik,mln->makn", _second_derivatives(element, local), gradients, gradients
+                "mail,mik,mln->makn",
+                _second_derivatives(element, local),
+                gradients,
+                gradients,
             )
         return nodes, ShapeFunctions(weights, slopes, curvatures)
 
@@ -232,13 +246,17 @@ class MarkerAssociation:
         axes = self.axes.copy()
         for m in self.estimated:
             if self.on_surface:
-                points[m], axes[m] = self._shape.nearest_surface_point(points[m])
+                points[m], axes[m] = self._shape.nearest_surface_point(
+                    points[m]
+                )
             else:
                 axes[m] = np.eye(3)
             cells[m], _ = self._shape.nearest_cell(points[m])
         return replace(self, centre_places_m=points, cells=cells, axes=axes)
 
-    def follow_estimates(self, phi: Array, shift_samples: float) -> tuple[MarkerAssociation, Array]:
+    def follow_estimates(
+        self, phi: Array, shift_samples: float
+    ) -> tuple[MarkerAssociation, Array]:
         """Return an association for estimates that have left this one, and φ in it.
 
         Parameters
@@ -256,15 +274,21 @@ class MarkerAssociation:
         points = self.places_m(phi)
         changed_cell = False
         for m in self.estimated:
-            changed_cell = changed_cell or self._is_outside(points[m], int(self.cells[m]))
+            changed_cell = changed_cell or self._is_outside(
+                points[m], int(self.cells[m])
+            )
         samples = self.clock_samples
         if abs(shift_samples - samples) > SAMPLES_OFF:
             samples = round(shift_samples)
         if not changed_cell:
             return (
-                self if samples == self.clock_samples else replace(self, clock_samples=samples)
+                self
+                if samples == self.clock_samples
+                else replace(self, clock_samples=samples)
             ), phi
-        chart = replace(self._without_alternation(points), clock_samples=samples)
+        chart = replace(
+            self._without_alternation(points), clock_samples=samples
+        )
         return chart, chart.centre_coordinates
 
     def _without_alternation(self, points_m: Array) -> MarkerAssociation:
@@ -287,7 +311,9 @@ class MarkerAssociation:
             beyond = points_m[m] - points[m]
             if again[m] < AGAIN and np.linalg.norm(beyond) > same_m:
                 edge = np.cross(np.cross(*self.axes[m].T), beyond)
-                off_m = np.linalg.norm(np.cross(points[m] - crossed[m, 0], crossed[m, 1]))
+                off_m = np.linalg.norm(
+                    np.cross(points[m] - crossed[m, 0], crossed[m, 1])
+                )
                 again[m] = again[m] + 1 if off_m < same_m else 0
                 crossed[m] = points[m], edge / np.linalg.norm(edge)
             if again[m] == AGAIN:
@@ -312,9 +338,9 @@ class MarkerAssociation:
         if self._shape.barycentric(point, np.array([cell])).min() >= 0:
             return False  # none holds it better
         best, _ = self._shape.nearest_cell(point)
-        depth = self._shape.barycentric(np.stack([point, point]), np.array([cell, best])).min(
-            axis=1
-        )
+        depth = self._shape.barycentric(
+            np.stack([point, point]), np.array([cell, best])
+        ).min(axis=1)
         return bool(depth[1] > depth[0] + BETTER)
 
     def places_of_points(self, nodes_m: Array, points_m: Array) -> Array:

@@ -22,7 +22,11 @@ from ..model.nuisance_map import NuisanceMap
 from ..recording.markers import Markers
 from ..recording.nuisance import PLACE
 from .marker_association import MarkerAssociation
-from .measurement_residual import MeasurementResidual, RowStencil, lagrange_weights
+from .measurement_residual import (
+    MeasurementResidual,
+    RowStencil,
+    lagrange_weights,
+)
 from .observables import PointPositions
 
 # Samples that a time-shifted marker is interpolated from: an error of (ωΔt)⁵ / 3500 of a swing.
@@ -82,9 +86,17 @@ class MarkerResidual(MeasurementResidual):
             Number of `rows` before the first sample.
         """
         places = np.full((len(markers.names), association.axes.shape[2]), -1)
-        places[association.estimated] = nuisance.indices_of_rows(PLACE).reshape(-1, places.shape[1])
-        shifted = preceding_times + np.arange(len(markers.t_s)) + association.clock_samples
-        covered = (shifted < len(rows)) & ((shifted >= 0) | is_initially_at_rest)
+        places[association.estimated] = nuisance.indices_of_rows(PLACE).reshape(
+            -1, places.shape[1]
+        )
+        shifted = (
+            preceding_times
+            + np.arange(len(markers.t_s))
+            + association.clock_samples
+        )
+        covered = (shifted < len(rows)) & (
+            (shifted >= 0) | is_initially_at_rest
+        )
         is_compared = markers.is_present & covered[:, None]
         return cls(
             observable=PointPositions(rows, association, places),
@@ -126,7 +138,11 @@ class MarkerResidual(MeasurementResidual):
     @cached_property
     def _neighbour_count(self) -> int:
         """Number of samples that a marker is interpolated from; 1 if no clock is estimated."""
-        return min(NEIGHBOURS, self.observable.count) if len(self.nuisance.clock_indices) else 1
+        return (
+            min(NEIGHBOURS, self.observable.count)
+            if len(self.nuisance.clock_indices)
+            else 1
+        )
 
     @cached_property
     def _first_neighbour(self) -> Index:
@@ -144,7 +160,9 @@ class MarkerResidual(MeasurementResidual):
     @cached_property
     def _neighbour_indices(self) -> Index:
         """Indices (T, neighbours) of the samples that each one is interpolated from."""
-        return np.maximum(self._first_neighbour[:, None] + np.arange(self._neighbour_count), 0)
+        return np.maximum(
+            self._first_neighbour[:, None] + np.arange(self._neighbour_count), 0
+        )
 
     @cached_property
     def _stencil(self) -> RowStencil:
@@ -152,8 +170,13 @@ class MarkerResidual(MeasurementResidual):
         expression.
         """
         count = len(self.markers.names)
-        place = np.array([self._sample_indices - self._first_neighbour, self.t_s], dtype=np.float64)
-        places = self._neighbour_indices[:, None] * count + np.arange(count)[:, None]
+        place = np.array(
+            [self._sample_indices - self._first_neighbour, self.t_s],
+            dtype=np.float64,
+        )
+        places = (
+            self._neighbour_indices[:, None] * count + np.arange(count)[:, None]
+        )
         return RowStencil(places, np.repeat(place[..., None], count, axis=2))
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
@@ -161,7 +184,9 @@ class MarkerResidual(MeasurementResidual):
         the observable; φ is not used.
         """
         samples = int(np.count_nonzero(self._neighbour_indices[:, -1] < known))
-        return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
+        return RowStencil(
+            self._stencil.indices[:samples], self._stencil.data[:, :samples]
+        )
 
     def shifted(self, by_s: float) -> MarkerResidual:
         """Return the model of samples taken `by_s` seconds later, at the same stencil; self if the
@@ -190,20 +215,36 @@ class MarkerResidual(MeasurementResidual):
             Position of the sample among the neighbours, in samples, and its time [s].
         """
         place, t_s = ca.vertsplit(data)
-        own = self.own_parameters[0] if len(self.own_parameters) else np.zeros(0, dtype=np.int64)
+        own = (
+            self.own_parameters[0]
+            if len(self.own_parameters)
+            else np.zeros(0, dtype=np.int64)
+        )
         reading = values[:, 0]
         if len(self.nuisance.clock_indices):
-            late = self.nuisance.marker_delay_s(phi, own, t_s) / self.nuisance.interval_s
+            late = (
+                self.nuisance.marker_delay_s(phi, own, t_s)
+                / self.nuisance.interval_s
+            )
             places = [ca.SX(k) for k in range(self._neighbour_count)]
-            reading = values @ ca.vertcat(*lagrange_weights(place + late, places))
+            reading = values @ ca.vertcat(
+                *lagrange_weights(place + late, places)
+            )
         return self.nuisance.marker_measurement(reading, phi, own, t_s)
 
     # Of positions -----------------------------------------------------------------------------
 
     def predict_samples(self, positions_m: Array, phi: Array) -> Array:
         """Return predictions (T, M, 3) [m] from the body's positions (T, n, 3) at the samples."""
-        plain = replace(self, observable=replace(self.observable, rows=np.arange(len(positions_m))))
-        return plain.predict_positions(positions_m.reshape(len(positions_m), -1), phi)
+        plain = replace(
+            self,
+            observable=replace(
+                self.observable, rows=np.arange(len(positions_m))
+            ),
+        )
+        return plain.predict_positions(
+            positions_m.reshape(len(positions_m), -1), phi
+        )
 
     def predict_positions(self, x: Array, phi: Array) -> Array:
         """Return predictions (t, M, 3) [m] from the first grid positions x (rows, 3n), for

@@ -70,19 +70,25 @@ class ResidualExpression:
         """Residual r of u = (c, φ), given the data, ŷ and 1/σ; the latter is zero where
         nothing is measured.
         """
-        return GeneratedFunction(self._residual_expression, self._input_count, self._data_count)
+        return GeneratedFunction(
+            self._residual_expression, self._input_count, self._data_count
+        )
 
     @cached_property
     def loss(self) -> GeneratedFunction:
         """Loss Σ ρ of the residual, of the same inputs."""
-        return GeneratedFunction(self._loss_expression, self._input_count, self._data_count)
+        return GeneratedFunction(
+            self._loss_expression, self._input_count, self._data_count
+        )
 
     @property
     def is_quadratic(self) -> bool:
         """Whether second derivatives of the loss are constant."""
         return self.huber is None and self.residual.is_linear
 
-    def curvature(self, u: Array, data: Array, has_observation_curvature: bool = True) -> Array:
+    def curvature(
+        self, u: Array, data: Array, has_observation_curvature: bool = True
+    ) -> Array:
         """Return second derivatives (k, k, …) of the loss by u.
 
         Parameters
@@ -104,9 +110,13 @@ class ResidualExpression:
             groups = residual.reshape(-1, self.group_size, *residual.shape[1:])
             lengths = np.linalg.norm(groups, axis=1)
             weights *= np.repeat(
-                self.huber / np.maximum(lengths, self.huber), self.group_size, axis=0
+                self.huber / np.maximum(lengths, self.huber),
+                self.group_size,
+                axis=0,
             )
-        return np.einsum("ai...,a...,aj...->ij...", slopes, weights, slopes, optimize=True)
+        return np.einsum(
+            "ai...,a...,aj...->ij...", slopes, weights, slopes, optimize=True
+        )
 
     @property
     def _input_count(self) -> int:
@@ -120,10 +130,19 @@ class ResidualExpression:
 
     def _residual_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
         """Return the expression of the residual (prediction − measurement) / σ."""
-        ends = [0, self.data_count, self.data_count + self.measured_count, self._data_count]
+        ends = [
+            0,
+            self.data_count,
+            self.data_count + self.measured_count,
+            self._data_count,
+        ]
         own, measured, weight = ca.vertsplit(data, ends)
-        vectors, phi = ca.vertsplit(u, [0, GROUP * self.vector_count, self._input_count])
-        predicted = self.expression(ca.reshape(vectors, GROUP, self.vector_count), phi, own)
+        vectors, phi = ca.vertsplit(
+            u, [0, GROUP * self.vector_count, self._input_count]
+        )
+        predicted = self.expression(
+            ca.reshape(vectors, GROUP, self.vector_count), phi, own
+        )
         return weight * (predicted - measured)
 
     def _loss_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
@@ -134,7 +153,8 @@ class ResidualExpression:
         """Expression of Σ ρ over the groups of a residual."""
         groups = ca.vertsplit(residual, self.group_size)
         return sum(
-            (self._robust_loss_of_square(ca.sumsqr(group)) for group in groups), start=ca.SX(0)
+            (self._robust_loss_of_square(ca.sumsqr(group)) for group in groups),
+            start=ca.SX(0),
         )
 
     def _robust_loss_of_square(self, square: ca.SX) -> ca.SX:
@@ -171,7 +191,9 @@ def huber_as_least_squares(
     beyond = np.maximum(length, huber)
     root = np.sqrt(2 * huber * beyond - huber**2)
     shrunk = residual * np.where(length > huber, root / beyond, 1.0)
-    return shrunk, derivatives * np.where(length > huber, huber / root, 1.0)[..., None]
+    return shrunk, derivatives * np.where(length > huber, huber / root, 1.0)[
+        ..., None
+    ]
 
 
 def huber_as_weights(
@@ -329,7 +351,9 @@ class MeasurementResidual(ABC):
 
     def all_stencils(self) -> Index:
         """Return the indices (…, E, v) of vectors that samples may be computed from, for any φ."""
-        return self.stencil(np.zeros(self.nuisance.size), self.observable.count).indices
+        return self.stencil(
+            np.zeros(self.nuisance.size), self.observable.count
+        ).indices
 
     def compared_with(self, known: int) -> NDArray[np.bool_]:
         """Return the mask (S, G, 3) of the numbers that can be compared if the first
@@ -356,7 +380,9 @@ class MeasurementResidual(ABC):
         """Generated functions by the numbers of vectors and of data."""
         return {}
 
-    def with_samples(self, known_s: Array, t_s: Array, indices: Array, **changes: Any) -> Self:
+    def with_samples(
+        self, known_s: Array, t_s: Array, indices: Array, **changes: Any
+    ) -> Self:
         """Return the model of other samples, sharing the generated functions.
 
         Parameters
@@ -373,7 +399,11 @@ class MeasurementResidual(ABC):
         measured = np.full((len(t_s), 1, self.measured.shape[2]), np.nan)
         measured[:, 0, : indices.shape[1]] = indices
         is_compared = np.isfinite(measured).reshape(len(t_s), -1, GROUP)
-        changes |= {"t_s": t_s, "measured": measured, "is_compared": is_compared}
+        changes |= {
+            "t_s": t_s,
+            "measured": measured,
+            "is_compared": is_compared,
+        }
         is_wrench = isinstance(self.observable, GraspWrench)
         times = (
             {"reaction_grid": ReactionGrid.from_times(known_s)}
@@ -405,8 +435,12 @@ class MeasurementResidual(ABC):
     @cached_property
     def _data_and_weights(self) -> tuple[Array, Array]:
         """Measurements ŷ (m, S, E), and 1/σ, which is zero where nothing is compared."""
-        weight = (self.is_compared / self.sigmas[:, None]).reshape(self.measured.shape)
-        return np.moveaxis(np.nan_to_num(self.measured), 2, 0), np.moveaxis(weight, 2, 0)
+        weight = (self.is_compared / self.sigmas[:, None]).reshape(
+            self.measured.shape
+        )
+        return np.moveaxis(np.nan_to_num(self.measured), 2, 0), np.moveaxis(
+            weight, 2, 0
+        )
 
     def _inputs_at(
         self, values: Array, phi: Array
@@ -420,9 +454,12 @@ class MeasurementResidual(ABC):
             samples, each, GROUP * vectors
         )
         own = np.broadcast_to(
-            phi[self.own_parameters.T][:, None], (self.own_parameters.shape[1], samples, each)
+            phi[self.own_parameters.T][:, None],
+            (self.own_parameters.shape[1], samples, each),
         )
-        measured, weight = (part[:, :samples] for part in self._data_and_weights)
+        measured, weight = (
+            part[:, :samples] for part in self._data_and_weights
+        )
         is_covered = self.is_covered(len(values))[:samples, None]
         data = np.concatenate([window.data, measured, weight * is_covered])
         u = np.concatenate([neighbouring.transpose(2, 0, 1), own])
@@ -430,7 +467,9 @@ class MeasurementResidual(ABC):
 
     def _grouped(self, values: Array) -> Array:
         """Return values (m, s, E) as groups (s, G, g)."""
-        return values.transpose(1, 2, 0).reshape(values.shape[1], len(self.names), self.group_size)
+        return values.transpose(1, 2, 0).reshape(
+            values.shape[1], len(self.names), self.group_size
+        )
 
     # All samples ------------------------------------------------------------------------------
 
@@ -459,7 +498,11 @@ class MeasurementResidual(ABC):
         return self._grouped(instrument.residual.evaluate(u, data))
 
     def linearise(
-        self, values: Array, observable_derivatives: ObservableDerivatives, phi: Array, size: int
+        self,
+        values: Array,
+        observable_derivatives: ObservableDerivatives,
+        phi: Array,
+        size: int,
     ) -> tuple[Array, Array]:
         """Return residuals (y − ŷ) / σ (s, G, g), zero where missing, and their derivatives (s, G,
         g, size) by all parameters.
@@ -479,7 +522,13 @@ class MeasurementResidual(ABC):
             Number of all parameters.
         """
         if not len(values):
-            none = np.zeros((len(self.stencil(phi, 0).indices), len(self.names), self.group_size))
+            none = np.zeros(
+                (
+                    len(self.stencil(phi, 0).indices),
+                    len(self.names),
+                    self.group_size,
+                )
+            )
             return none, np.zeros((*none.shape, size))
         window, residual, by_u = self._evaluate(values, phi)
         samples, each, vectors = window.indices.shape
@@ -487,15 +536,23 @@ class MeasurementResidual(ABC):
         by_own = by_u[..., GROUP * vectors :]
         derivatives = np.zeros((*by_u.shape[:3], size))
         first = size - len(phi)
-        derivatives[..., observable_derivatives.columns] = by_observables @ _gather(
-            observable_derivatives.by_common, window.indices
+        derivatives[..., observable_derivatives.columns] = (
+            by_observables
+            @ _gather(observable_derivatives.by_common, window.indices)
         )
         if len(observable_derivatives.entities):
             entities = observable_derivatives.entities
             times = window.indices[:, entities] // values.shape[1]
             number = np.arange(len(entities))[:, None]
-            shape = samples, len(entities), GROUP * vectors, observable_derivatives.by_own.shape[3]
-            neighbouring = observable_derivatives.by_own[times, number].reshape(shape)
+            shape = (
+                samples,
+                len(entities),
+                GROUP * vectors,
+                observable_derivatives.by_own.shape[3],
+            )
+            neighbouring = observable_derivatives.by_own[times, number].reshape(
+                shape
+            )
             _add_columns(
                 derivatives,
                 entities,
@@ -503,25 +560,38 @@ class MeasurementResidual(ABC):
                 by_observables[:, entities] @ neighbouring,
             )
         if self.own_parameters.size:
-            _add_columns(derivatives, np.arange(each), first + self.own_parameters, by_own)
+            _add_columns(
+                derivatives,
+                np.arange(each),
+                first + self.own_parameters,
+                by_own,
+            )
         grouped = residual.reshape(samples, len(self.names), self.group_size)
         return grouped, derivatives.reshape(*grouped.shape, size)
 
-    def _evaluate(self, values: Array, phi: Array) -> tuple[RowStencil, Array, Array]:
+    def _evaluate(
+        self, values: Array, phi: Array
+    ) -> tuple[RowStencil, Array, Array]:
         """Return the stencil, residuals (s, E, m) in standard deviations and their derivatives (s,
         E, m, u) by the inputs, from values (n, e, 3) of the observable at φ.
         """
         if self._linear_part is None or len(values) < self.observable.count:
             instrument, window, u, data = self._inputs_at(values, phi)
             residual, by_u = instrument.residual.evaluate_with_jacobian(u, data)
-            return window, residual.transpose(1, 2, 0), by_u.transpose(2, 3, 0, 1)
+            return (
+                window,
+                residual.transpose(1, 2, 0),
+                by_u.transpose(2, 3, 0, 1),
+            )
         window, at_zero, by_u = self._linear_part
         samples, each, vectors = window.indices.shape
         neighbouring = values.reshape(-1, GROUP)[window.indices].reshape(
             samples, each, GROUP * vectors
         )
         if self.own_parameters.size:
-            own = np.broadcast_to(phi[self.own_parameters], (samples, *self.own_parameters.shape))
+            own = np.broadcast_to(
+                phi[self.own_parameters], (samples, *self.own_parameters.shape)
+            )
             neighbouring = np.concatenate([neighbouring, own], axis=2)
         return window, at_zero + (by_u @ neighbouring[..., None])[..., 0], by_u
 
@@ -530,10 +600,17 @@ class MeasurementResidual(ABC):
         """Stencil, residuals and derivatives at zero inputs; None if derivatives are not
         constant.
         """
-        if not self.has_fixed_stencils or not self._full_expression.residual.is_linear:
+        if (
+            not self.has_fixed_stencils
+            or not self._full_expression.residual.is_linear
+        ):
             return None
-        nothing = np.zeros((self.observable.count, self.observable.vector_count, GROUP))
-        instrument, window, u, data = self._inputs_at(nothing, np.zeros(self.nuisance.size))
+        nothing = np.zeros(
+            (self.observable.count, self.observable.vector_count, GROUP)
+        )
+        instrument, window, u, data = self._inputs_at(
+            nothing, np.zeros(self.nuisance.size)
+        )
         residual, by_u = instrument.residual.evaluate_with_jacobian(u, data)
         by_u = np.ascontiguousarray(by_u.transpose(2, 3, 0, 1))
         return window, np.ascontiguousarray(residual.transpose(1, 2, 0)), by_u
@@ -544,7 +621,9 @@ class MeasurementResidual(ABC):
         """
         size = by.shape[3] + len(phi)
         slopes = ObservableDerivatives.without_own(np.arange(by.shape[3]), by)
-        return self.pool_values(self.linearise(values, slopes, phi, size)[1][..., : by.shape[3]])
+        return self.pool_values(
+            self.linearise(values, slopes, phi, size)[1][..., : by.shape[3]]
+        )
 
     def loss(self, values: Array, phi: Array) -> float:
         """Return the loss Σ ρ of values (n, e, 3) of the observable at φ (k,), over the samples
@@ -565,7 +644,9 @@ class MeasurementResidual(ABC):
         by_u = instrument.loss.evaluate_with_jacobian(u, data)[1][0]
         places = window.indices
         by_observables, by_own = np.split(by_u, [GROUP * places.shape[2]])
-        by_observables = by_observables.reshape(places.shape[2], GROUP, *places.shape[:2])
+        by_observables = by_observables.reshape(
+            places.shape[2], GROUP, *places.shape[:2]
+        )
         where = np.moveaxis(places, 2, 0).ravel()
         count = values.size // GROUP
         for axis in range(GROUP):
@@ -582,13 +663,18 @@ class MeasurementResidual(ABC):
         samples, each, vectors = places.shape
         observable_columns = GROUP * places[..., None] + np.arange(GROUP)
         first = GROUP * self.observable.count * self.observable.vector_count
-        own = np.broadcast_to(first + self.own_parameters, (samples, *self.own_parameters.shape))
+        own = np.broadcast_to(
+            first + self.own_parameters, (samples, *self.own_parameters.shape)
+        )
         columns = np.concatenate(
-            [observable_columns.reshape(samples, each, GROUP * vectors), own], axis=2
+            [observable_columns.reshape(samples, each, GROUP * vectors), own],
+            axis=2,
         )
         rows = np.arange(columns.size + 1)
         shape = columns.size, first + self.nuisance.size
-        return sp.csr_array((np.ones(columns.size), columns.ravel(), rows), shape=shape)
+        return sp.csr_array(
+            (np.ones(columns.size), columns.ravel(), rows), shape=shape
+        )
 
     @property
     def is_quadratic(self) -> bool:
@@ -598,7 +684,9 @@ class MeasurementResidual(ABC):
     @cached_property
     def _full_expression(self) -> ResidualExpression:
         """Generated functions for the stencil of all times."""
-        window = self.stencil(np.zeros(self.nuisance.size), self.observable.count)
+        window = self.stencil(
+            np.zeros(self.nuisance.size), self.observable.count
+        )
         return self.expression_for(window.indices.shape[2], len(window.data))
 
     @cached_property
@@ -606,7 +694,9 @@ class MeasurementResidual(ABC):
         """Mask (u, u) of the second derivatives that a sample may have."""
         return self._full_expression.loss.hessian_pattern
 
-    def hessian_structure(self, derivatives: sp.csr_array) -> tuple[Index, Index]:
+    def hessian_structure(
+        self, derivatives: sp.csr_array
+    ) -> tuple[Index, Index]:
         """Return rows and columns of ∂²loss by some variables, upper triangle, sorted by column.
 
         Parameters
@@ -617,7 +707,8 @@ class MeasurementResidual(ABC):
         places = self.all_stencils()
         instances = int(np.prod(places.shape[:2]))
         ones = np.broadcast_to(
-            self._curvature_pattern.astype(float), (instances, *self._curvature_pattern.shape)
+            self._curvature_pattern.astype(float),
+            (instances, *self._curvature_pattern.shape),
         )
         # Positive numbers cannot cancel, so that no entry is lost.
         entries = _congruence(self._gather_matrix(places) @ derivatives, ones)
@@ -646,9 +737,15 @@ class MeasurementResidual(ABC):
             If false, neglect the curvature of the observations, see `ResidualExpression.curvature`.
         """
         instrument, window, u, data = self._inputs_at(values, phi)
-        by_u = np.moveaxis(instrument.curvature(u, data, has_observation_curvature), (0, 1), (2, 3))
+        by_u = np.moveaxis(
+            instrument.curvature(u, data, has_observation_curvature),
+            (0, 1),
+            (2, 3),
+        )
         by_u = by_u.reshape(-1, *by_u.shape[2:])
-        return _congruence(self._gather_matrix(window.indices) @ derivatives, by_u)
+        return _congruence(
+            self._gather_matrix(window.indices) @ derivatives, by_u
+        )
 
 
 def _gather(by: Array, places: Index) -> Array:
@@ -660,7 +757,9 @@ def _gather(by: Array, places: Index) -> Array:
     return rows.reshape(*places.shape[:2], GROUP * places.shape[2], count)
 
 
-def _add_columns(slope: Array, entities: Index, columns: Index, values: Array) -> None:
+def _add_columns(
+    slope: Array, entities: Index, columns: Index, values: Array
+) -> None:
     """Add values (s, e, m, k) to columns (e, k) of the derivatives (s, E, m, size) of
     entities (e,), in place.
     """
@@ -673,9 +772,15 @@ def _congruence(slopes: sp.csr_array, blocks: Array) -> SparseEntries:
     """
     count = np.arange(len(blocks) + 1)
     middle = sp.bsr_array((blocks, count[:-1], count))
-    upper = sp.coo_array(sp.triu(slopes.T @ (middle.tocsr() @ slopes), format="coo"))
-    rows, columns = (np.asarray(index, dtype=np.int64) for index in upper.coords)
-    return SparseEntries(rows, columns, np.asarray(upper.data, dtype=np.float64))
+    upper = sp.coo_array(
+        sp.triu(slopes.T @ (middle.tocsr() @ slopes), format="coo")
+    )
+    rows, columns = (
+        np.asarray(index, dtype=np.int64) for index in upper.coords
+    )
+    return SparseEntries(
+        rows, columns, np.asarray(upper.data, dtype=np.float64)
+    )
 
 
 def neighbouring_times(known_s: Array, at_s: Array, count: int) -> Index:
@@ -706,6 +811,10 @@ def lagrange_weights(position: T, places: Sequence[T]) -> list[Any]:
         Distinct places of the values.
     """
     return [
-        math.prod((position - other) / (own - other) for j, other in enumerate(places) if j != i)
+        math.prod(
+            (position - other) / (own - other)
+            for j, other in enumerate(places)
+            if j != i
+        )
         for i, own in enumerate(places)
     ]

@@ -84,7 +84,9 @@ class DeclaredMotion:
         tracks = experiment.markers.positions_m[:MOST_SAMPLES]
         name = f"'{experiment.name}'"
         gravity_m_s2 = experiment.gravity_m_s2
-        return cls(t_s, rotations, translations, tracks, gravity_m_s2, name=name)
+        return cls(
+            t_s, rotations, translations, tracks, gravity_m_s2, name=name
+        )
 
     def to_world(self, points_m: Array) -> Array:
         """Return points (..., T, M, 3) of the grasp's frame in the world [m]."""
@@ -93,14 +95,22 @@ class DeclaredMotion:
 
     def to_grasp_frame(self, points_m: Array) -> Array:
         """Return points (T, M, 3) of the world in the grasp's frame [m]."""
-        return np.einsum("tji,tmj->tmi", self.rotations, points_m - self.translations_m[:, None])
+        return np.einsum(
+            "tji,tmj->tmi",
+            self.rotations,
+            points_m - self.translations_m[:, None],
+        )
 
-    def with_prior_motion(self, rotation: Array, translation_m: Array) -> DeclaredMotion:
+    def with_prior_motion(
+        self, rotation: Array, translation_m: Array
+    ) -> DeclaredMotion:
         """Return the statements with a rigid motion C (rotation (3, 3), translation (3,) [m]) of
         the body before the poses U: x → U(Cx).
         """
         shifted = self.translations_m + self.rotations @ translation_m
-        return replace(self, rotations=self.rotations @ rotation, translations_m=shifted)
+        return replace(
+            self, rotations=self.rotations @ rotation, translations_m=shifted
+        )
 
 
 def carrying_grasp(experiment: Experiment) -> Grasp | None:
@@ -108,7 +118,11 @@ def carrying_grasp(experiment: Experiment) -> Grasp | None:
 
     It must prescribe all axes at all samples, and all other grasps must move with it.
     """
-    holding = [grasp for grasp in experiment.grasps if grasp.is_active(experiment.t_s).any()]
+    holding = [
+        grasp
+        for grasp in experiment.grasps
+        if grasp.is_active(experiment.t_s).any()
+    ]
     holding.sort(key=lambda grasp: grasp.axes != "xyz")
     if not holding or holding[0].axes != "xyz":
         return None
@@ -214,9 +228,13 @@ class ModalResponse:
         """Return the angular frequencies (S, K) [rad/s] of the assumed stiffnesses for a
         mesh scale.
         """
-        softest = np.sqrt(STANDARD_GRAVITY_M_S2 / (SOFTEST_SAG * scale * self.size_m))
+        softest = np.sqrt(
+            STANDARD_GRAVITY_M_S2 / (SOFTEST_SAG * scale * self.size_m)
+        )
         stiffnesses = softest * np.geomspace(1.0, STIFFEST, STIFFNESSES)
-        return np.asarray(np.outer(stiffnesses, self.relative_frequencies), dtype=np.float64)
+        return np.asarray(
+            np.outer(stiffnesses, self.relative_frequencies), dtype=np.float64
+        )
 
     def _modal_loads(self, declared: DeclaredMotion) -> Array:
         """Return the modal loads (T, K) of gravity and of the grasp's acceleration, for a declared
@@ -224,9 +242,15 @@ class ModalResponse:
         """
         inverse = declared.rotations.transpose(0, 2, 1)
         step_s = float(declared.t_s[1] - declared.t_s[0])
-        lift = declared.gravity_m_s2 - _second_differences(declared.translations_m, step_s)
+        lift = declared.gravity_m_s2 - _second_differences(
+            declared.translations_m, step_s
+        )
         pushed = np.einsum("tij,tj->ti", inverse, lift)
-        rotated = inverse @ _second_differences(declared.rotations, step_s) * declared.mesh_scale
+        rotated = (
+            inverse
+            @ _second_differences(declared.rotations, step_s)
+            * declared.mesh_scale
+        )
         return pushed @ self.translation_loads.T - np.einsum(
             "tij,kij->tk", rotated, self.rotation_loads
         )
@@ -239,7 +263,9 @@ def delayed_tracks(predictions: Array, t_s: Array, lag_s: float) -> Array:
     at = np.arange(len(t_s)) - lag_s / (t_s[1] - t_s[0])
     low = np.clip(np.floor(at).astype(int), 0, len(t_s) - 2)
     share = (at - low)[:, None, None]
-    shifted = (1 - share) * predictions[:, low] + share * predictions[:, low + 1]
+    shifted = (1 - share) * predictions[:, low] + share * predictions[
+        :, low + 1
+    ]
     shifted[:, (at < 0) | (at > len(t_s) - 1)] = np.nan
     return shifted
 
@@ -255,7 +281,11 @@ def _second_differences(x: Array, step_s: float) -> Array:
 
 
 def _oscillator_responses(
-    omega: Array, ratio: float, loads: Array, step_s: float, is_initially_at_rest: bool
+    omega: Array,
+    ratio: float,
+    loads: Array,
+    step_s: float,
+    is_initially_at_rest: bool,
 ) -> Array:
     """Return the coordinates (S, T, K) of oscillators (S, K), exact for loads that are linear
     between samples.
@@ -280,7 +310,10 @@ def _oscillator_responses(
     fading = np.exp(root * step_s)
     of_constant = np.expm1(root * step_s) / root
     of_rise = (of_constant - step_s) / (root * step_s)
-    pushes = of_constant * loads[:-1, None] + of_rise * np.diff(loads, axis=0)[:, None]
+    pushes = (
+        of_constant * loads[:-1, None]
+        + of_rise * np.diff(loads, axis=0)[:, None]
+    )
     at_rest = -root.conj() * loads[0] / omega**2
     coordinates = [at_rest if is_initially_at_rest else np.zeros_like(root)]
     for push in pushes:

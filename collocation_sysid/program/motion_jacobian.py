@@ -18,7 +18,13 @@ from ..array_types import Array, Index
 from ..fem.body import Linearisation
 from ..fem.pattern import SymmetricPattern
 from ..model.dynamics import Dynamics
-from .block_band import BandBlock, BlockBand, BlockTerm, full_skew_values, skew_block_band
+from .block_band import (
+    BandBlock,
+    BlockBand,
+    BlockTerm,
+    full_skew_values,
+    skew_block_band,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,14 +67,19 @@ class MotionJacobian:
         """Plan that adds the skew parts of ∂F/∂x and ∂F/∂v to the values of `structure`."""
         has_skew_damping = self.dynamics.forces.has_skew_damping
         return skew_block_band(
-            self.pattern.size, self._row_starts, self._blocks(), by_velocity=has_skew_damping
+            self.pattern.size,
+            self._row_starts,
+            self._blocks(),
+            by_velocity=has_skew_damping,
         )
 
     @property
     def _row_starts(self) -> Index:
         """Return the index of the first row of each grid time, −1 where there are no rows."""
         first_row = self.dynamics.first_row
-        starts = (np.arange(self.dynamics.row_count) - first_row) * len(self.constrained_dofs)
+        starts = (np.arange(self.dynamics.row_count) - first_row) * len(
+            self.constrained_dofs
+        )
         return np.maximum(starts, -1) if first_row else starts
 
     def _blocks(self) -> list[BandBlock]:
@@ -92,7 +103,9 @@ class MotionJacobian:
                 )
                 for j, a, b in self.dynamics.block_terms(lag)
             ]
-            is_stored = has_motion.copy() if terms else has_motion & (rows == columns)
+            is_stored = (
+                has_motion.copy() if terms else has_motion & (rows == columns)
+            )
             if lag == 0:
                 is_stored |= is_prescribed & (rows == columns)
             # Grasp rows hold constants only: they are written after the terms.
@@ -110,7 +123,9 @@ class MotionJacobian:
 
     def _inertia_rows(self, lag: int) -> Index:
         """Return the grid times whose equations of motion have inertia at a lag."""
-        rows = np.arange(max(self.dynamics.first_row, lag), self.dynamics.row_count)
+        rows = np.arange(
+            max(self.dynamics.first_row, lag), self.dynamics.row_count
+        )
         return rows[self.dynamics.inertia_coefficient(lag)[rows] != 0]
 
     @cached_property
@@ -122,17 +137,28 @@ class MotionJacobian:
         positions = [np.zeros(0, dtype=np.int64)]
         for lag in range(self.dynamics.largest_lag + 1):
             columns = self._inertia_rows(lag) - lag
-            positions.append(self.structure.positions(columns, lag, place, self.free_dofs).ravel())
+            positions.append(
+                self.structure.positions(
+                    columns, lag, place, self.free_dofs
+                ).ravel()
+            )
         prescribed = np.setdiff1d(self.constrained_dofs, self.free_dofs)
         rows = np.arange(self.dynamics.first_row, self.dynamics.row_count)
         grasps = self.structure.positions(
-            rows, 0, np.searchsorted(self.constrained_dofs, prescribed), prescribed
+            rows,
+            0,
+            np.searchsorted(self.constrained_dofs, prescribed),
+            prescribed,
         )
         return np.concatenate(positions), grasps.ravel()
 
     def _inertia(self, dynamics: Dynamics) -> Array:
         """Return the inertia entries of ∂c/∂x in the order of their positions."""
-        mass = dynamics.mass.inertia_kg[:, self.free_dofs] * self.length_m / self.force_n
+        mass = (
+            dynamics.mass.inertia_kg[:, self.free_dofs]
+            * self.length_m
+            / self.force_n
+        )
         values = [np.zeros(0)]
         for lag in range(self.dynamics.largest_lag + 1):
             rows = self._inertia_rows(lag)
@@ -159,7 +185,11 @@ class MotionJacobian:
         )
 
     def fill(
-        self, values: Array, forces: Linearisation, dynamics: Dynamics, has_variable_mass: bool
+        self,
+        values: Array,
+        forces: Linearisation,
+        dynamics: Dynamics,
+        has_variable_mass: bool,
     ) -> None:
         """Write the values of ∂c/∂x.
 
@@ -175,17 +205,27 @@ class MotionJacobian:
             Whether the mass depends on the parameters; if not, the stated mass is used.
         """
         threads = dynamics.body.threads
-        self.structure.fill(values, forces.by_position, forces.by_velocity, threads)
+        self.structure.fill(
+            values, forces.by_position, forces.by_velocity, threads
+        )
         positions, grasps = self._constant_positions
         values[positions] += (
-            self._inertia(dynamics) if has_variable_mass else self._constant_inertia
+            self._inertia(dynamics)
+            if has_variable_mass
+            else self._constant_inertia
         )
         skew = full_skew_values(self.pattern, forces.by_position_skew)
         of_rates = full_skew_values(self.pattern, forces.by_velocity_skew)
         if skew.size:
-            self._skew.fill(values, skew, of_rates if of_rates.size else skew, threads)
+            self._skew.fill(
+                values, skew, of_rates if of_rates.size else skew, threads
+            )
         self._released_grasps.correct(
-            values, forces.by_position, forces.by_velocity, skew=skew, rate_skew=of_rates
+            values,
+            forces.by_position,
+            forces.by_velocity,
+            skew=skew,
+            rate_skew=of_rates,
         )
         values[grasps] = 1.0
 
@@ -219,7 +259,9 @@ class _DroppedForce:
     positions: Index
     evaluation: int
     source: Index
-    complete: Index  # the same in both triangles, as `full_skew_values` has them
+    complete: (
+        Index  # the same in both triangles, as `full_skew_values` has them
+    )
     a: float
     b: float
 
@@ -277,16 +319,29 @@ class ReleasedGrasps:
         has_row = times >= dynamics.first_row
         times = times[has_row]
         dofs = dofs[has_row]
-        zeros = np.flatnonzero(np.isin(band.indices, row_starts[times] + place[dofs]))
+        zeros = np.flatnonzero(
+            np.isin(band.indices, row_starts[times] + place[dofs])
+        )
         ones = [
-            band.positions(np.array([t]), 0, place[[dof]], np.array([dof])).ravel()
+            band.positions(
+                np.array([t]), 0, place[[dof]], np.array([dof])
+            ).ravel()
             for t, dof in zip(times, dofs, strict=True)
         ]
-        dropped = tuple(_dropped_forces(dynamics, band, pattern=pattern, place=place, scale=scale))
+        dropped = tuple(
+            _dropped_forces(
+                dynamics, band, pattern=pattern, place=place, scale=scale
+            )
+        )
         return cls(dropped, zeros, np.concatenate([nothing, *ones]))
 
     def correct(
-        self, values: Array, by_position: Array, by_velocity: Array, skew: Array, rate_skew: Array
+        self,
+        values: Array,
+        by_position: Array,
+        by_velocity: Array,
+        skew: Array,
+        rate_skew: Array,
     ) -> None:
         """Correct the values of ∂c/∂x in place.
 
@@ -302,17 +357,27 @@ class ReleasedGrasps:
         """
         for entry in self.dropped:
             force = entry.a * by_position[entry.evaluation, entry.source]
-            values[entry.positions] -= force + entry.b * by_velocity[entry.evaluation, entry.source]
+            values[entry.positions] -= (
+                force + entry.b * by_velocity[entry.evaluation, entry.source]
+            )
             if skew.size:
-                values[entry.positions] -= entry.a * skew[entry.evaluation, entry.complete]
+                values[entry.positions] -= (
+                    entry.a * skew[entry.evaluation, entry.complete]
+                )
             if rate_skew.size:
-                values[entry.positions] -= entry.b * rate_skew[entry.evaluation, entry.complete]
+                values[entry.positions] -= (
+                    entry.b * rate_skew[entry.evaluation, entry.complete]
+                )
         values[self.zeros] = 0.0
         values[self.ones] = 1.0
 
 
 def _dropped_forces(
-    dynamics: Dynamics, band: BlockBand, pattern: SymmetricPattern, place: Index, scale: float
+    dynamics: Dynamics,
+    band: BlockBand,
+    pattern: SymmetricPattern,
+    place: Index,
+    scale: float,
 ) -> list[_DroppedForce]:
     """Return the entries of forces that act while a dof is prescribed, in later rows where
     it is free.
@@ -322,10 +387,13 @@ def _dropped_forces(
     dropped = []
     rows, columns, source = pattern.full
     for k in range(dynamics.first_row, dynamics.row_count):
-        for j in range(1, min(dynamics.largest_lag, dynamics.row_count - 1 - k) + 1):
+        for j in range(
+            1, min(dynamics.largest_lag, dynamics.row_count - 1 - k) + 1
+        ):
             weight = scale * tables.w[k + j, j]
             released = (
-                dynamics.is_temporarily_prescribed[k] & ~dynamics.is_temporarily_prescribed[k + j]
+                dynamics.is_temporarily_prescribed[k]
+                & ~dynamics.is_temporarily_prescribed[k + j]
             )
             if weight == 0 or not released.any():
                 continue
@@ -335,7 +403,10 @@ def _dropped_forces(
                 b = weight * tables.q[k, i] / step_s
                 if a or b:
                     positions = band.positions(
-                        np.array([k - i]), i + j, place[rows[entries]], columns[entries]
+                        np.array([k - i]),
+                        i + j,
+                        place[rows[entries]],
+                        columns[entries],
                     )
                     dropped.append(
                         _DroppedForce(

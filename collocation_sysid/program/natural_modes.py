@@ -59,7 +59,9 @@ class Modes:
         return 2 * np.pi * self.frequencies_hz
 
 
-def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6) -> Modes:
+def natural_modes(
+    forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
+) -> Modes:
     """Return the lowest modes of a body about a state; those without restoring force are left out
     and counted in `omitted_count`.
 
@@ -89,7 +91,11 @@ def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
         lower[pattern.diagonal[free_dofs]] += SHIFT * largest * mass
         factor = Factoriser.cached(pattern, free_dofs).factorise(lower)
         squares, vectors = _lanczos_modes(
-            stiffness, mass, factor=factor, translation_m=-SHIFT * largest, requested=requested
+            stiffness,
+            mass,
+            factor=factor,
+            translation_m=-SHIFT * largest,
+            requested=requested,
         )
     oscillating = squares > RIGID * largest
     shapes = np.zeros((int(oscillating.sum()), pattern.size))
@@ -105,7 +111,9 @@ def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
     )
 
 
-def _dense_modes(stiffness: sp.csc_array, mass: Array, requested: int) -> tuple[Array, Array]:
+def _dense_modes(
+    stiffness: sp.csc_array, mass: Array, requested: int
+) -> tuple[Array, Array]:
     """Return the `requested` lowest eigenvalues [1/s²] and eigenvectors (n, k) of K φ = λ M φ by a
     dense solver, fewer if n is smaller; `mass` (n,) is the diagonal of M.
     """
@@ -128,7 +136,11 @@ class _ShiftedInverse(LinearOperator):
 
 
 def _lanczos_modes(
-    stiffness: sp.csc_array, mass: Array, factor: Factor, translation_m: float, requested: int
+    stiffness: sp.csc_array,
+    mass: Array,
+    factor: Factor,
+    translation_m: float,
+    requested: int,
 ) -> tuple[Array, Array]:
     """Return the `requested` eigenvalues [1/s²] and eigenvectors (n, k) of K φ = λ M φ nearest to a
     shift, by shift-invert Lanczos iterations, ascending.

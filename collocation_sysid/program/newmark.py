@@ -65,7 +65,9 @@ class _State:
     v: Array
     a: Array
     previous_histories: tuple[PreviousState, ...] = ()
-    contact_n: Array | None = None  # (3n,) mean over the step that led here, where there is contact
+    contact_n: Array | None = (
+        None  # (3n,) mean over the step that led here, where there is contact
+    )
 
 
 @one_blas_thread()
@@ -110,13 +112,19 @@ def simulate_newmark(
     """
     stepper = _Stepper(experiment, theta, options)
     times = experiment.t_s
-    x, v = (np.zeros((len(times), experiment.body.pattern.size)) for _ in range(2))
+    x, v = (
+        np.zeros((len(times), experiment.body.pattern.size)) for _ in range(2)
+    )
     state = stepper.initial_state()
     x[0] = state.x
     v[0] = state.v
     step = experiment.timestep_s / steps_per_sample
-    reactions_and_positions = np.zeros((2, (len(times) - 1) * steps_per_sample + 1, len(sensed)))
-    reactions_and_positions[:, 0] = stepper.reactions_and_positions(state, sensed)
+    reactions_and_positions = np.zeros(
+        (2, (len(times) - 1) * steps_per_sample + 1, len(sensed))
+    )
+    reactions_and_positions[:, 0] = stepper.reactions_and_positions(
+        state, sensed
+    )
     means_n = np.zeros_like(reactions_and_positions[0])
     if state.contact_n is not None:
         means_n[0] = state.contact_n[sensed]
@@ -124,7 +132,9 @@ def simulate_newmark(
         for j in range(1, steps_per_sample + 1):
             state = stepper.advance(state, float(times[k - 1] + j * step))
             row = (k - 1) * steps_per_sample + j
-            reactions_and_positions[:, row] = stepper.reactions_and_positions(state, sensed)
+            reactions_and_positions[:, row] = stepper.reactions_and_positions(
+                state, sensed
+            )
             if state.contact_n is not None:
                 means_n[row] = state.contact_n[sensed]
         x[k] = state.x
@@ -140,7 +150,12 @@ def simulate_newmark(
 class _Stepper:
     """Newmark steps of one experiment."""
 
-    def __init__(self, experiment: Experiment, theta: Array, options: NewtonOptions | None) -> None:
+    def __init__(
+        self,
+        experiment: Experiment,
+        theta: Array,
+        options: NewtonOptions | None,
+    ) -> None:
         self.experiment = experiment
         self.theta = theta
         self.body = experiment.body
@@ -155,7 +170,13 @@ class _Stepper:
         previous_histories = start_states(
             self._forces(time_s), x, v, self.experiment.loaded_since_s
         )
-        state = _State(time_s, x, v=v, a=np.zeros_like(x), previous_histories=previous_histories)
+        state = _State(
+            time_s,
+            x,
+            v=v,
+            a=np.zeros_like(x),
+            previous_histories=previous_histories,
+        )
         if self.experiment.obstacles:
             state = replace(state, contact_n=self._contact_n(x, v, time_s))
         return self._balanced(state, time_s, solver.free)
@@ -174,7 +195,11 @@ class _Stepper:
         while target_s - state.t_s > 0.5 * smallest:
             solver = self._solver(target_s)
             try:
-                end_s = target_s if step >= target_s - state.t_s else state.t_s + step
+                end_s = (
+                    target_s
+                    if step >= target_s - state.t_s
+                    else state.t_s + step
+                )
                 state = self._step(solver, state, end_s, target_s)
             except NewtonFailure as failure:
                 step /= 2
@@ -184,11 +209,15 @@ class _Stepper:
                     ) from failure
         return state
 
-    def reactions_and_positions(self, state: _State, dofs: Index) -> tuple[Array, Array]:
+    def reactions_and_positions(
+        self, state: _State, dofs: Index
+    ) -> tuple[Array, Array]:
         """Return the reaction forces without contact on dofs [N], and their positions [m]."""
         if not len(dofs):
             return np.zeros(0), np.zeros(0)
-        reaction = self._mass(state.t_s) * state.a - self._force(state, state.t_s)
+        reaction = self._mass(state.t_s) * state.a - self._force(
+            state, state.t_s
+        )
         return reaction[dofs], state.x[dofs]
 
     def _force(self, state: _State, load_s: float) -> Array:
@@ -204,9 +233,13 @@ class _Stepper:
         """Return the forces under the loads at a time; contact is averaged over a step of
         `step_s` if it is not zero.
         """
-        return Forces.from_experiment(self.experiment, load_s, self.theta, step_s=step_s)
+        return Forces.from_experiment(
+            self.experiment, load_s, self.theta, step_s=step_s
+        )
 
-    def _contact_n(self, x: Array, v: Array, load_s: float, step_s: float = 0.0) -> Array:
+    def _contact_n(
+        self, x: Array, v: Array, load_s: float, step_s: float = 0.0
+    ) -> Array:
         """Return the contact forces (3n,) [N] at positions x and velocities v, (3n,) each, and the
         time `load_s`; averaged over a step of `step_s` about this state, unless that is zero.
         """
@@ -219,7 +252,9 @@ class _Stepper:
 
     def _solver(self, time_s: float) -> NewtonSolver:
         """Return the solver with the dofs that are prescribed at a time."""
-        return self.solvers.for_prescribed(self.experiment.is_prescribed(time_s)[0])
+        return self.solvers.for_prescribed(
+            self.experiment.is_prescribed(time_s)[0]
+        )
 
     def _mass(self, time_s: float) -> Array:
         """Return the masses (3n,) at a time [kg]."""
@@ -237,17 +272,25 @@ class _Stepper:
         after = self._solver(goal_s)
         if before is after:
             return state
-        return self._balanced(state, goal_s, np.setdiff1d(after.free, before.free))
+        return self._balanced(
+            state, goal_s, np.setdiff1d(after.free, before.free)
+        )
 
-    def _balanced(self, state: _State, load_s: float, dofs: NDArray[np.int64]) -> _State:
+    def _balanced(
+        self, state: _State, load_s: float, dofs: NDArray[np.int64]
+    ) -> _State:
         """Return the state with the accelerations of some dofs (indices) computed from the forces
         on them, without contact, under the loads at the time `load_s`.
         """
         acceleration = state.a.copy()
-        acceleration[dofs] = self._force(state, load_s)[dofs] / self._mass(load_s)[dofs]
+        acceleration[dofs] = (
+            self._force(state, load_s)[dofs] / self._mass(load_s)[dofs]
+        )
         return replace(state, a=acceleration)
 
-    def _step(self, solver: NewtonSolver, state: _State, end_s: float, load_s: float) -> _State:
+    def _step(
+        self, solver: NewtonSolver, state: _State, end_s: float, load_s: float
+    ) -> _State:
         """Return the state after one step to `end_s`, with loads and grasps of the time
         `load_s`.
         """
@@ -257,7 +300,9 @@ class _Stepper:
         ).without_contact()
         contact = StepContact(touching, self.theta, forces.pattern)
         mass = forces.mass.inertia_kg[0]
-        x_prescribed, v_prescribed, a_prescribed = self._prescribed_motion(solver, end_s, h, load_s)
+        x_prescribed, v_prescribed, a_prescribed = self._prescribed_motion(
+            solver, end_s, h, load_s
+        )
         slope = 2.0 / h
         known_v = -slope * state.x - state.v
         known_a = -(slope**2) * state.x - 2 * slope * state.v - state.a
@@ -276,7 +321,11 @@ class _Stepper:
         def residual(x: Array) -> Array:
             v, a = kinematics(x)
             balance = forces.total(x, v)[0] - mass * a
-            return balance + 2 * contact.force(*middle(x)) if contact.acts else balance
+            return (
+                balance + 2 * contact.force(*middle(x))
+                if contact.acts
+                else balance
+            )
 
         def linearise(x: Array) -> tuple[Array, Array, Array]:
             v, a = kinematics(x)
@@ -288,7 +337,9 @@ class _Stepper:
                 skew = skew - slope * at.by_velocity_skew[0]
             balance = at.force[0] - mass * a
             if contact.acts:
-                contact_force, symmetric, askew = contact.linearise(*middle(x), (0.5, 1 / h))
+                contact_force, symmetric, askew = contact.linearise(
+                    *middle(x), (0.5, 1 / h)
+                )
                 balance = balance + 2 * contact_force
                 matrix -= 2 * symmetric
                 skew = skew - 2 * askew
@@ -296,7 +347,9 @@ class _Stepper:
 
         guess = state.x + h * state.v + 0.5 * h * h * state.a
         if state.contact_n is not None:
-            guess += 0.5 * h * h * state.contact_n / np.where(mass > 0, mass, np.inf)
+            guess += (
+                0.5 * h * h * state.contact_n / np.where(mass > 0, mass, np.inf)
+            )
         guess[solver.is_prescribed] = x_prescribed
         if not solver.has_no_inverted_element(guess):
             guess = state.x.copy()
@@ -309,16 +362,27 @@ class _Stepper:
             contact_n = self._contact_n(xi[0], nu[0], load_s, step_s=h)
             # Held dofs have the acceleration of the grasp.
             free = solver.free
-            a[free] -= 2 * contact_n[free] / np.where(mass[free] > 0, mass[free], 1.0)
+            a[free] -= (
+                2 * contact_n[free] / np.where(mass[free] > 0, mass[free], 1.0)
+            )
         previous_histories = advance_states(
             forces, state.previous_histories, x=x, v=v, interval_s=h
         )
         return _State(
-            end_s, x, v=v, a=a, previous_histories=previous_histories, contact_n=contact_n
+            end_s,
+            x,
+            v=v,
+            a=a,
+            previous_histories=previous_histories,
+            contact_n=contact_n,
         )
 
     def _prescribed_motion(
-        self, solver: NewtonSolver, time_s: float, step_s: float, holding_s: float
+        self,
+        solver: NewtonSolver,
+        time_s: float,
+        step_s: float,
+        holding_s: float,
     ) -> tuple[Array, Array, Array]:
         """Return position, velocity and acceleration of the solver's prescribed dofs at `time_s`,
         by central differences over `step_s`; grasps are those that hold at `holding_s`.
@@ -332,14 +396,22 @@ class _Stepper:
             # What it does before it holds and after it has let go means nothing.
             first = max(grasp.from_s, float(experiment.t_s[0]))
             last = min(grasp.until_s, float(experiment.t_s[-1]))
-            times = np.clip([time_s - step_s, time_s, time_s + step_s], first, last)
-            before, now, after = grasp.positions_at(nodes_m, times)[..., grasp.axis_indices]
+            times = np.clip(
+                [time_s - step_s, time_s, time_s + step_s], first, last
+            )
+            before, now, after = grasp.positions_at(nodes_m, times)[
+                ..., grasp.axis_indices
+            ]
             velocity = (after - before) / (times[2] - times[0])
             is_central = times[2] - times[1] > 0.5 * step_s
             acceleration = (
-                (after - 2 * now + before) / step_s**2 if is_central else np.zeros_like(now)
+                (after - 2 * now + before) / step_s**2
+                if is_central
+                else np.zeros_like(now)
             )
             place = np.ix_(grasp.nodes, grasp.axis_indices)
             motion[:, *place] = now, velocity, acceleration
-        now, velocity, acceleration = motion.reshape(3, -1)[:, solver.is_prescribed]
+        now, velocity, acceleration = motion.reshape(3, -1)[
+            :, solver.is_prescribed
+        ]
         return now, velocity, acceleration

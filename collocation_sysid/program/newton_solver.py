@@ -158,7 +158,11 @@ class NewtonSolver:
         NewtonFailure
             If the method does not converge.
         """
-        x = x.copy() if prescribed_m is None else self._with_prescribed(x, prescribed_m, linearise)
+        x = (
+            x.copy()
+            if prescribed_m is None
+            else self._with_prescribed(x, prescribed_m, linearise)
+        )
         self._require_upright(x)
         if not keep_definite:
             # What these lead to without end may be far off: the search then begins where they did.
@@ -182,7 +186,8 @@ class NewtonSolver:
                 keep_definite=keep_definite,
             )
         raise NewtonFailure(
-            x, f"Newton's method took more than {self.options.max_iterations} iterations"
+            x,
+            f"Newton's method took more than {self.options.max_iterations} iterations",
         )
 
     def _simplified_newton(
@@ -198,7 +203,9 @@ class NewtonSolver:
         is_own = False
         for _ in range(self.options.max_iterations):
             if self._last_factor is not None:
-                improved, done = self._chord_steps(x, residual, self._last_factor)
+                improved, done = self._chord_steps(
+                    x, residual, self._last_factor
+                )
                 if done:
                     return improved, True
                 if improved is x and is_own:
@@ -212,7 +219,9 @@ class NewtonSolver:
                 break
         return x, False
 
-    def _chord_steps(self, x: Array, residual: Residual, factor: Factor) -> tuple[Array, bool]:
+    def _chord_steps(
+        self, x: Array, residual: Residual, factor: Factor
+    ) -> tuple[Array, bool]:
         """Iterate with a given factor while steps shrink fast.
 
         Returns
@@ -235,9 +244,15 @@ class NewtonSolver:
             if done or (before and rate > FAST):
                 break
             before = length
-        return (improved, done) if self.has_no_inverted_element(improved) else (x, False)
+        return (
+            (improved, done)
+            if self.has_no_inverted_element(improved)
+            else (x, False)
+        )
 
-    def _with_prescribed(self, x: Array, goal: Array, linearise: Linearise) -> Array:
+    def _with_prescribed(
+        self, x: Array, goal: Array, linearise: Linearise
+    ) -> Array:
         """Return the state x (3n,) [m] with the prescribed dofs at `goal` (prescribed,), and the
         free dofs in equilibrium to first order.
 
@@ -290,7 +305,11 @@ class NewtonSolver:
         """
         length = np.linalg.norm(step)
         share = 1.0
-        update = self._retraction if keep_definite and self._is_free_of_contact else add_increment
+        update = (
+            self._retraction
+            if keep_definite and self._is_free_of_contact
+            else add_increment
+        )
         for _ in range(self.options.max_backtracks):
             increment = np.zeros_like(x)
             increment[self.free] = share * step
@@ -314,7 +333,9 @@ class NewtonSolver:
                     except NewtonFailure:
                         pass
             share /= 2
-        raise NewtonFailure(x, "no step along the Newton direction decreases the residual")
+        raise NewtonFailure(
+            x, "no step along the Newton direction decreases the residual"
+        )
 
     @cached_property
     def _retraction(self) -> Retraction:
@@ -330,7 +351,9 @@ class NewtonSolver:
         tolerance = share * self.options.tolerance * self._size_m
         return bool(np.abs(step).max(initial=0.0) <= tolerance)
 
-    def _factorise(self, matrix: Sequence[Array], x: Array, keep_definite: bool) -> Factor:
+    def _factorise(
+        self, matrix: Sequence[Array], x: Array, keep_definite: bool
+    ) -> Factor:
         """Return the factor of a matrix on the free dofs.
 
         Parameters
@@ -351,7 +374,9 @@ class NewtonSolver:
             with self.stopwatch.solving():
                 factor = self.factoriser.factorise(matrix[0], matrix[1])
         except np.linalg.LinAlgError as error:
-            raise NewtonFailure(x, f"the equations are singular: {error}") from error
+            raise NewtonFailure(
+                x, f"the equations are singular: {error}"
+            ) from error
         if keep_definite and not factor.positive_definite:
             raise NewtonFailure(x, "the stiffness is not positive definite")
         return factor
@@ -373,7 +398,9 @@ class NewtonSolver:
     def _require_upright(self, x: Array) -> None:
         """Raise NewtonFailure if an element is inverted at x (3n,)."""
         if not self.has_no_inverted_element(x):
-            raise NewtonFailure(x, "an element is inverted before the first iteration")
+            raise NewtonFailure(
+                x, "an element is inverted before the first iteration"
+            )
 
     def worst_element(self, x: Array) -> int:
         """Return the index of the element with the smallest det F at x (3n,)."""
@@ -381,7 +408,10 @@ class NewtonSolver:
 
 
 def follow_path(
-    solve: Callable[[Array, float], Array], x: Array, halvings: int, guess: Array | None = None
+    solve: Callable[[Array, float], Array],
+    x: Array,
+    halvings: int,
+    guess: Array | None = None,
 ) -> Array:
     """Follow the solution x(s) from x(0) to x(1) in increments that shrink on failure, and grow
     after two successes.
@@ -465,7 +495,12 @@ class NewtonSolvers:
 
 
 def simulation_error(
-    solver: NewtonSolver, failure: NewtonFailure, time_s: float, what: str, *, static: bool = False
+    solver: NewtonSolver,
+    failure: NewtonFailure,
+    time_s: float,
+    what: str,
+    *,
+    static: bool = False,
 ) -> SimulationError:
     """Return the error for the user: what failed, when, at which element, and what to change.
 

@@ -20,7 +20,12 @@ from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.internal_variables import AnyHistory
 from .block_band import Submatrix
 from .observables import ObservedMotion, ReactionForces
-from .reaction_forces import GraspForces, forces_on_dofs, reaction_changes, reaction_forces
+from .reaction_forces import (
+    GraspForces,
+    forces_on_dofs,
+    reaction_changes,
+    reaction_forces,
+)
 from .transcription import Transcription
 
 
@@ -60,7 +65,9 @@ class Observation:
     equations: EquationsAtParameters
     phi: Array
 
-    def motion(self, x: Array, histories: Sequence[AnyHistory] = ()) -> ObservedMotion:
+    def motion(
+        self, x: Array, histories: Sequence[AnyHistory] = ()
+    ) -> ObservedMotion:
         """Return a motion with the reaction forces that follow from it, computed on demand.
 
         Parameters
@@ -72,7 +79,9 @@ class Observation:
         """
         return ObservedMotion(x, partial(self._reactions_at, x, histories))
 
-    def _reactions_at(self, x: Array, histories: Sequence[AnyHistory] = ()) -> ReactionForces:
+    def _reactions_at(
+        self, x: Array, histories: Sequence[AnyHistory] = ()
+    ) -> ReactionForces:
         """Return the reaction forces on the sensed dofs at positions x (rows, 3n) [m]; internal
         variables are computed from x where `histories` is empty.
         """
@@ -80,13 +89,17 @@ class Observation:
         dofs = self.segment.sensed_dofs
         force = forces_on_dofs(dynamics, x, dofs, histories)
         mass_kg = self._mass_kg[: len(x)]
-        reaction = reaction_forces(dynamics, mass_kg, force, dynamics.acceleration(x)[:, dofs])
+        reaction = reaction_forces(
+            dynamics, mass_kg, force, dynamics.acceleration(x)[:, dofs]
+        )
         return ReactionForces(reaction, x[:, dofs])
 
     @property
     def _mass_kg(self) -> Array:
         """Masses (N, g) of the sensed dofs [kg]."""
-        return self.equations.dynamics.mass.inertia_kg[:, self.segment.sensed_dofs]
+        return self.equations.dynamics.mass.inertia_kg[
+            :, self.segment.sensed_dofs
+        ]
 
     # Along the equations of motion ------------------------------------------------------------
 
@@ -107,22 +120,34 @@ class Observation:
         needed_rows = [frozenset(channel.rows.tolist()) for channel in channels]
         observed: list[list[Array]] = [[] for _ in channels]
         for t, row in enumerate(rows):
-            for changes, operator, times in zip(observed, operators, needed_rows, strict=True):
+            for changes, operator, times in zip(
+                observed, operators, needed_rows, strict=True
+            ):
                 if t in times:
                     changes.append(operator @ row)
         return ObservableResponse(tuple(map(np.stack, observed)), grasp_forces)
 
-    def response_of_array(self, changes_m: Array, grasp_forces: GraspForces) -> ObservableResponse:
+    def response_of_array(
+        self, changes_m: Array, grasp_forces: GraspForces
+    ) -> ObservableResponse:
         """Return the changes of the observables, computed at once from changes (rows, 3n, m) [m] of
         the first rows of x and from changes of the grasp forces.
         """
         changes = []
         _, dofs, count = changes_m.shape
-        for channel in (reading.observable for reading in self.segment.residuals):
+        for channel in (
+            reading.observable for reading in self.segment.residuals
+        ):
             rows = channel.rows[channel.rows < len(changes_m)]
-            columns = changes_m[rows].transpose(1, 0, 2).reshape(dofs, len(rows) * count)
+            columns = (
+                changes_m[rows]
+                .transpose(1, 0, 2)
+                .reshape(dofs, len(rows) * count)
+            )
             at = channel.operator(self.phi) @ columns
-            changes.append(at.reshape(len(at), len(rows), count).transpose(1, 0, 2))
+            changes.append(
+                at.reshape(len(at), len(rows), count).transpose(1, 0, 2)
+            )
         return ObservableResponse(tuple(changes), grasp_forces)
 
     def linearised_motions(
@@ -154,7 +179,11 @@ class Observation:
 
         def forced(changes: Array) -> ReactionForces:
             return self._linearised_reactions(
-                x, response.grasp_forces, changes_m=changes, step=step, by_p=is_by_parameters
+                x,
+                response.grasp_forces,
+                changes_m=changes,
+                step=step,
+                by_p=is_by_parameters,
             )
 
         at = x if step is None else x + step
@@ -164,7 +193,12 @@ class Observation:
         ]
 
     def _linearised_reactions(
-        self, x: Array, grasp_forces: GraspForces, changes_m: Array, step: Array | None, by_p: bool
+        self,
+        x: Array,
+        grasp_forces: GraspForces,
+        changes_m: Array,
+        step: Array | None,
+        by_p: bool,
     ) -> ReactionForces:
         """Return reaction forces with their changes.
 
@@ -187,16 +221,25 @@ class Observation:
             changes_m = np.concatenate([step[:, dofs, None], changes_m], axis=2)
         acceleration = dynamics.acceleration(x)[:, dofs]
         mass_kg = self._mass_kg[: len(x)]
-        reaction = reaction_forces(dynamics, mass_kg, grasp_forces.force, acceleration)
+        reaction = reaction_forces(
+            dynamics, mass_kg, grasp_forces.force, acceleration
+        )
         at = x[:, dofs]
-        by = reaction_changes(dynamics, mass_kg, grasp_forces.changes, changes_m)
+        by = reaction_changes(
+            dynamics, mass_kg, grasp_forces.changes, changes_m
+        )
         if by_p:
             first = 0 if step is None else 1
-            by[..., first:] += self.equations.inertia_derivatives(slice(len(x)), acceleration, dofs)
+            by[..., first:] += self.equations.inertia_derivatives(
+                slice(len(x)), acceleration, dofs
+            )
         if step is None:
             return ReactionForces(reaction, at, by, changes_m)
         return ReactionForces(
-            reaction + by[..., 0], at + changes_m[..., 0], by[..., 1:], changes_m[..., 1:]
+            reaction + by[..., 0],
+            at + changes_m[..., 0],
+            by[..., 1:],
+            changes_m[..., 1:],
         )
 
     def linearise(
@@ -227,7 +270,9 @@ class Observation:
             values_and_slopes = reading.observable.linearise(
                 motion, self.phi, segment.dynamic_parameters, size
             )
-            linearisations.append(reading.linearise(*values_and_slopes, self.phi, size))
+            linearisations.append(
+                reading.linearise(*values_and_slopes, self.phi, size)
+            )
         return linearisations
 
     def linearise_fixed_motion(self, x: Array) -> list[tuple[Array, Array]]:
@@ -255,8 +300,12 @@ class Observation:
         for reading in self.segment.residuals:
             motion = ObservedMotion(x, reactions)
             count = len(self.phi)
-            values_and_slopes = reading.observable.linearise(motion, self.phi, none, count)
-            linearised.append(reading.linearise(*values_and_slopes, self.phi, count))
+            values_and_slopes = reading.observable.linearise(
+                motion, self.phi, none, count
+            )
+            linearised.append(
+                reading.linearise(*values_and_slopes, self.phi, count)
+            )
         return linearised
 
     def predict_wrenches(self, x: Array) -> list[Array]:
@@ -264,7 +313,8 @@ class Observation:
         NaN at samples for which the rows do not suffice.
         """
         return [
-            s.predict_reactions(self.motion(x).reactions, self.phi) for s in self.segment.sensors
+            s.predict_reactions(self.motion(x).reactions, self.phi)
+            for s in self.segment.sensors
         ]
 
     # Backward ---------------------------------------------------------------------------------
@@ -294,7 +344,9 @@ class Observation:
         force_weights[:, dofs] = -dynamics.combine_transposed(t.w, weights)
         at = dynamics.linearise(x, segment.linearisation_buffer)
         slopes = setting.force_derivatives(slice(first, None), at.by_theta)
-        by_p = np.einsum("tg,tgp->p", force_weights[first:, dofs], slopes[:, dofs])
+        by_p = np.einsum(
+            "tg,tgp->p", force_weights[first:, dofs], slopes[:, dofs]
+        )
         if setting.mass_depends_on_parameters:
             acceleration = dynamics.acceleration(x)[:, dofs]
             own = setting.inertia_derivatives(slice(None), acceleration, dofs)
@@ -305,8 +357,13 @@ class Observation:
         for k, weight in enumerate(force_weights[first:, dofs]):
             if weight.any():
                 skew = at.by_position_skew[k]
-                state[first + k] = rows.extract(at.by_position[k], skew).T @ weight
-                rate[first + k] = rows.extract(at.by_velocity[k], at.by_velocity_skew[k]).T @ weight
+                state[first + k] = (
+                    rows.extract(at.by_position[k], skew).T @ weight
+                )
+                rate[first + k] = (
+                    rows.extract(at.by_velocity[k], at.by_velocity_skew[k]).T
+                    @ weight
+                )
         by_x = dynamics.combine_transposed(t.p, state)
         by_x += dynamics.combine_transposed(t.q, rate) / dynamics.step_s
         inertia = dynamics.combine_transposed(t.s, self._mass_kg * weights)

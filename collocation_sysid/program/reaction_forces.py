@@ -40,13 +40,17 @@ def centred_rows(dynamics: Dynamics) -> tuple[NDArray[np.bool_], int]:
     """
     t = dynamics.tables
     lags = np.arange(dynamics.largest_lag + 1.0)
-    second = np.column_stack([t.s.sum(axis=1), t.s @ lags, t.s @ lags**2 - 2, t.r])
+    second = np.column_stack(
+        [t.s.sum(axis=1), t.s @ lags, t.s @ lags**2 - 2, t.r]
+    )
     is_complete = np.isclose(t.w.sum(axis=1), 1.0)
     moving = is_complete & np.isclose(second, 0.0).all(axis=1)
     rows = moving if moving.any() else is_complete & ~t.s.any(axis=1)
     evaluated = t.p @ lags
     last = int(np.flatnonzero(rows)[-1]) if rows.any() else 0
-    delay = sum(t.w[last, j] * (j + evaluated[last]) for j in range(t.w.shape[1]))
+    delay = sum(
+        t.w[last, j] * (j + evaluated[last]) for j in range(t.w.shape[1])
+    )
     return rows, round(float(delay))
 
 
@@ -78,7 +82,10 @@ class GraspForces:
 
 
 def forces_on_dofs(
-    dynamics: Dynamics, x: Array, dofs: Index, histories: Sequence[AnyHistory] = ()
+    dynamics: Dynamics,
+    x: Array,
+    dofs: Index,
+    histories: Sequence[AnyHistory] = (),
 ) -> Array:
     """Return the forces F (N, g) [N] on dofs (g,) at the evaluations of x (N, 3n) [m], including
     those on prescribed dofs; zero before the first equation of motion. Internal variables are
@@ -89,7 +96,9 @@ def forces_on_dofs(
     return force
 
 
-def reaction_forces(dynamics: Dynamics, mass_kg: Array, force: Array, acceleration: Array) -> Array:
+def reaction_forces(
+    dynamics: Dynamics, mass_kg: Array, force: Array, acceleration: Array
+) -> Array:
     """Return the reaction forces R (N, g) [N] of dofs.
 
     Parameters
@@ -107,7 +116,10 @@ def reaction_forces(dynamics: Dynamics, mass_kg: Array, force: Array, accelerati
 
 
 def reaction_changes(
-    dynamics: Dynamics, mass_kg: Array, force_changes: Array, position_changes: Array
+    dynamics: Dynamics,
+    mass_kg: Array,
+    force_changes: Array,
+    position_changes: Array,
 ) -> Array:
     """Return the changes dR (N, g, columns) of reaction forces.
 
@@ -122,5 +134,10 @@ def reaction_changes(
     position_changes : (N, g, columns) array
         Changes of the positions of the dofs.
     """
-    second = dynamics.combine(dynamics.tables.s, position_changes) / dynamics.step_s**2
-    return mass_kg[..., None] * second - dynamics.combine(dynamics.tables.w, force_changes)
+    second = (
+        dynamics.combine(dynamics.tables.s, position_changes)
+        / dynamics.step_s**2
+    )
+    return mass_kg[..., None] * second - dynamics.combine(
+        dynamics.tables.w, force_changes
+    )

@@ -64,10 +64,14 @@ class Retraction:
     def __init__(self, body: Body, prescribed: NDArray[np.bool_]) -> None:
         self._gradient = body.shape_gradients
         self._weights = np.tile(body.geometry[..., -1].ravel(), 3)
-        laplacian = self._gradient.T @ sp.diags_array(self._weights) @ self._gradient
+        laplacian = (
+            self._gradient.T @ sp.diags_array(self._weights) @ self._gradient
+        )
         size_m = float(np.linalg.norm(np.ptp(body.nodes_m, axis=0)))
         # Nodes of obstacle frames belong to no element: the anchor alone determines them.
-        anchor = np.full(len(body.nodes_m), ANCHOR * float(self._weights.sum()) / size_m**2)
+        anchor = np.full(
+            len(body.nodes_m), ANCHOR * float(self._weights.sum()) / size_m**2
+        )
         self._anchor = anchor
         normal = sp.csc_array(laplacian + sp.diags_array(anchor))
         known: dict[bytes, _Axis] = {}
@@ -80,7 +84,9 @@ class Retraction:
     def __call__(self, x: Array, increment: Array) -> Array:
         """Return the positions (3n,) after an increment (3n,) of the positions x (3n,) [m]."""
         moved = (x + increment).reshape(-1, 3)
-        right = self._gradient.T @ (self._weights[:, None] * self._target(x, increment))
+        right = self._gradient.T @ (
+            self._weights[:, None] * self._target(x, increment)
+        )
         right += self._anchor[:, None] * moved
         for k, axis in enumerate(self._axes):
             known = axis.coupling @ moved[axis.prescribed, k]
@@ -97,7 +103,9 @@ class Retraction:
         relative = self._deformation(increment) @ np.linalg.inv(deformation)
         strain = (relative + relative.transpose(0, 2, 1)) / 2
         spin = (relative - relative.transpose(0, 2, 1)) / 2
-        vectors = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
+        vectors = np.stack(
+            [spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1
+        )
         rotation = Rotation.from_rotvec(vectors).as_matrix()
         target = rotation @ (np.eye(3) + strain) @ deformation
         return target.transpose(2, 0, 1).reshape(-1, 3)
@@ -115,7 +123,12 @@ def _axis(normal: sp.csc_array, prescribed: NDArray[np.bool_]) -> _Axis:
     free = np.flatnonzero(~prescribed)
     fixed = np.flatnonzero(prescribed)
     rows = normal[free]
-    return _Axis(free, fixed, splu(sp.csc_matrix(rows[:, free])), sp.csc_array(rows[:, fixed]))
+    return _Axis(
+        free,
+        fixed,
+        splu(sp.csc_matrix(rows[:, free])),
+        sp.csc_array(rows[:, fixed]),
+    )
 
 
 def add_increment(x: Array, increment: Array) -> Array:

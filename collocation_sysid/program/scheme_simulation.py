@@ -13,7 +13,11 @@ from ..array_types import Array, Index
 from ..errors import SimulationError
 from ..fem.rest_shape import RestShapeError
 from ..model.dynamics import Dynamics, StencilRow, weighted_sum_of_past
-from ..model.internal_variables import PreviousState, advance_states, insert_previous_states
+from ..model.internal_variables import (
+    PreviousState,
+    advance_states,
+    insert_previous_states,
+)
 from ..recording.experiment import Experiment
 from .initial_equilibrium import initial_state
 from .lapack import one_blas_thread
@@ -106,10 +110,16 @@ def continue_simulation(
     """
     if (massless := dynamics.body.mass_problem(dynamics.theta)) is not None:
         failure = SimulationError(massless, float(dynamics.t_s[0]))
-        return np.zeros((0, dynamics.body.pattern.size)) if known is None else known, failure
-    if (unreachable := dynamics.body.rest_shape_failure(dynamics.theta)) is not None:
+        return np.zeros(
+            (0, dynamics.body.pattern.size)
+        ) if known is None else known, failure
+    if (
+        unreachable := dynamics.body.rest_shape_failure(dynamics.theta)
+    ) is not None:
         failure = RestShapeError(unreachable)
-        return np.zeros((0, dynamics.body.pattern.size)) if known is None else known, failure
+        return np.zeros(
+            (0, dynamics.body.pattern.size)
+        ) if known is None else known, failure
     solvers = NewtonSolvers(experiment, options, stopwatch)
     is_prescribed = ~np.isnan(dynamics.prescribed_m)
     x = np.zeros((dynamics.row_count, dynamics.body.pattern.size))
@@ -117,11 +127,19 @@ def continue_simulation(
     if known is None:
         try:
             at_start = dynamics.forces.at_times(slice(1))
-            start_guess = None if approximate_solution is None else approximate_solution[0]
+            start_guess = (
+                None
+                if approximate_solution is None
+                else approximate_solution[0]
+            )
             solver = solvers.for_prescribed(is_prescribed[0])
             goals_m = dynamics.prescribed_m[0]
             x[0], v0 = initial_state(
-                experiment, at_start, solver=solver, guess=start_guess, prescribed_m=goals_m
+                experiment,
+                at_start,
+                solver=solver,
+                guess=start_guess,
+                prescribed_m=goals_m,
             )
         except SimulationError as failure:
             return x[:0], failure
@@ -136,13 +154,15 @@ def continue_simulation(
     intervals = dynamics.interval_to_next_s
     if known_evaluations > 0:
         known_rows = slice(first, done)
-        forces[known_rows] = dynamics.forces_with_histories(histories, known_rows).total(
-            xi[:known_evaluations], nu[:known_evaluations]
-        )
+        forces[known_rows] = dynamics.forces_with_histories(
+            histories, known_rows
+        ).total(xi[:known_evaluations], nu[:known_evaluations])
     dynamics.zero_prescribed_forces(forces)
     previous_histories = tuple(history.final_state for history in histories)
     for t in range(done, dynamics.row_count):
-        row = RowEquations(dynamics, x, forces=forces, t=t, previous=previous_histories)
+        row = RowEquations(
+            dynamics, x, forces=forces, t=t, previous=previous_histories
+        )
         solver = solvers.for_prescribed(is_prescribed[t])
         goal = dynamics.prescribed_m[t, solver.is_prescribed]
         if not dynamics.is_static:
@@ -152,7 +172,9 @@ def continue_simulation(
         else:
             guess = approximate_solution[t]
         try:
-            x[t] = solve_row(solver, row, guess=guess, previous=x[t - 1], prescribed_m=goal)
+            x[t] = solve_row(
+                solver, row, guess=guess, previous=x[t - 1], prescribed_m=goal
+            )
         except NewtonFailure as failure:
             time_s = float(dynamics.t_s[t])
             static = dynamics.is_static
@@ -164,7 +186,11 @@ def continue_simulation(
         if previous_histories:
             (xi_t,), (nu_t,) = row.states(x[t])
             previous_histories = advance_states(
-                row.forces, previous_histories, x=xi_t, v=nu_t, interval_s=intervals[t - 1]
+                row.forces,
+                previous_histories,
+                x=xi_t,
+                v=nu_t,
+                interval_s=intervals[t - 1],
             )
         if progress:
             progress(t / (dynamics.row_count - 1))
@@ -188,7 +214,9 @@ def _extrapolate_static(x: Array, prescribed: Index, goal: Array) -> Array:
         return x[-1]
     before = x[-1, prescribed] - x[-2, prescribed]
     way = goal - x[-1, prescribed]
-    share = float(before @ way) / max(float(before @ before), np.finfo(float).tiny)
+    share = float(before @ way) / max(
+        float(before @ before), np.finfo(float).tiny
+    )
     return x[-1] + share * (x[-1] - x[-2])
 
 
@@ -225,7 +253,9 @@ class RowEquations:
                 self.forces, previous, float(dynamics.interval_to_next_s[t - 1])
             )
         self.forces_before = (
-            dynamics.forces.at_times(slice(t - 1, t)) if dynamics.is_static else None
+            dynamics.forces.at_times(slice(t - 1, t))
+            if dynamics.is_static
+            else None
         )
         self.rest = self.forces
         contacts = []
@@ -262,7 +292,9 @@ class RowEquations:
 
     def states(self, x: Array) -> tuple[Array, Array]:
         """Return ξ_t [m] and ν_t [m/s], each (1, 3n), from x_t (3n,)."""
-        return (self.xi + self.row.p[0] * x)[None], (self.nu + self.row.q[0] * x)[None]
+        return (self.xi + self.row.p[0] * x)[None], (
+            self.nu + self.row.q[0] * x
+        )[None]
 
     def residual_from(self, force: Array, x: Array) -> Array:
         """Return c_t (3n,) [N] from the force F_t (3n,) [N] and x_t (3n,) [m]."""
@@ -280,11 +312,15 @@ class RowEquations:
         states = self.states(x)
         row = self.row
         at = self.rest.linearise(*states)
-        matrix = row.block(at.by_position[0], at.by_velocity[0], self.rest.pattern)
+        matrix = row.block(
+            at.by_position[0], at.by_velocity[0], self.rest.pattern
+        )
         skew = row.skew_block(at.by_position_skew[0], at.by_velocity_skew[0])
         if not self.contact.acts:
             return self.residual_from(at.force[0], x), matrix, skew
-        force, symmetric, askew = self.contact.linearise(*states, (row.p[0], row.q[0]))
+        force, symmetric, askew = self.contact.linearise(
+            *states, (row.p[0], row.q[0])
+        )
         matrix -= row.w[0] * symmetric
         if askew.size:
             skew -= row.w[0] * askew
@@ -292,7 +328,11 @@ class RowEquations:
 
 
 def solve_row(
-    solver: NewtonSolver, row: RowEquations, guess: Array, previous: Array, prescribed_m: Array
+    solver: NewtonSolver,
+    row: RowEquations,
+    guess: Array,
+    previous: Array,
+    prescribed_m: Array,
 ) -> Array:
     """Solve one row; where Newton's method fails, apply the grasps' displacement (and a static
     load) in smaller increments.
@@ -323,9 +363,15 @@ def solve_row(
         start = guess.copy()
         step = row.with_load_step(share)
         # To the last digit at the end: bounds hold it there.
-        goal = prescribed_m if share == 1 else origin + share * (prescribed_m - origin)
+        goal = (
+            prescribed_m
+            if share == 1
+            else origin + share * (prescribed_m - origin)
+        )
         if row.dynamics.is_static:
-            return solver.solve(start, step.residual, step.linearise, True, goal)
+            return solver.solve(
+                start, step.residual, step.linearise, True, goal
+            )
         start[solver.is_prescribed] = goal
         return solver.solve(start, step.residual, step.linearise)
 

@@ -50,7 +50,9 @@ class NuisanceIndices:
     pivot_m: Array | None = None
 
 
-def nuisance_indices(experiments: Sequence[Experiment], first: int) -> list[NuisanceIndices]:
+def nuisance_indices(
+    experiments: Sequence[Experiment], first: int
+) -> list[NuisanceIndices]:
     """Assign the nuisance parameters of each experiment to entries of p.
 
     Parameters
@@ -77,19 +79,29 @@ def nuisance_indices(experiments: Sequence[Experiment], first: int) -> list[Nuis
             scope = scopes.get(entry.row.name)
             # What is not shared is nobody else's.
             which = (len(indices), k) if scope is None else (scope, entry.label)
-            places[k], other, of = known.setdefault(which, (first, entry, experiment))
+            places[k], other, of = known.setdefault(
+                which, (first, entry, experiment)
+            )
             first += places[k] == first
             leader = leaders.setdefault((scope, entry.row), experiment)
             if scope is not None:
                 _require_same_objects(leader, experiment, entry.row)
                 _require_same_prior((of, other), (experiment, entry))
-        leader = leaders.get((scopes.get(POSE_TURN.name), POSE_TURN), experiment)
-        pivot_m = None if leader is experiment else NuisanceMap.from_experiment(leader).pivot_m
+        leader = leaders.get(
+            (scopes.get(POSE_TURN.name), POSE_TURN), experiment
+        )
+        pivot_m = (
+            None
+            if leader is experiment
+            else NuisanceMap.from_experiment(leader).pivot_m
+        )
         indices.append(NuisanceIndices(places, places >= before, pivot_m))
     return indices
 
 
-def _require_same_objects(leader: Experiment, experiment: Experiment, row: NuisanceRow) -> None:
+def _require_same_objects(
+    leader: Experiment, experiment: Experiment, row: NuisanceRow
+) -> None:
     """Check that the objects on which a shared nuisance parameter depends are the same in two
     experiments.
 
@@ -103,12 +115,16 @@ def _require_same_objects(leader: Experiment, experiment: Experiment, row: Nuisa
     for entry in ours:
         if theirs[entry] != ours[entry]:
             raise _sharing_error(
-                experiment, row, f"'{leader.name}', which has another {entry}", f"the same {entry}"
+                experiment,
+                row,
+                f"'{leader.name}', which has another {entry}",
+                f"the same {entry}",
             )
 
 
 def _require_same_prior(
-    one: tuple[Experiment, NuisanceEntry], other: tuple[Experiment, NuisanceEntry]
+    one: tuple[Experiment, NuisanceEntry],
+    other: tuple[Experiment, NuisanceEntry],
 ) -> None:
     """Check that a nuisance parameter shared by two experiments has one prior, and a shared marker
     one stated place.
@@ -123,16 +139,24 @@ def _require_same_prior(
     row = second.row
     label = second.label
     if not np.isclose(first.sigma, second.sigma, rtol=1e-9):
-        difference = f"'{leader.name}', where the {label} has the prior {first.sigma:g}"
+        difference = (
+            f"'{leader.name}', where the {label} has the prior {first.sigma:g}"
+        )
         raise _sharing_error(
-            experiment, row, difference, f"the same prior as here, {second.sigma:g}"
+            experiment,
+            row,
+            difference,
+            f"the same prior as here, {second.sigma:g}",
         )
     if row == PLACE:
         places = [_declared_place(*one), _declared_place(*other)]
         if not np.allclose(*places, rtol=0, atol=1e-9, equal_nan=True):
             difference = f"'{leader.name}', which states another {label.partition(',')[0]}"
             raise _sharing_error(
-                experiment, row, difference, "the same position in both, or in neither"
+                experiment,
+                row,
+                difference,
+                "the same position in both, or in neither",
             )
 
 
@@ -153,7 +177,9 @@ def _sharing_error(
 
 
 def shared_charts(
-    experiments: Iterable[tuple[NuisanceIndices, NuisanceMap, MarkerAssociation]],
+    experiments: Iterable[
+        tuple[NuisanceIndices, NuisanceMap, MarkerAssociation]
+    ],
 ) -> list[MarkerAssociation]:
     """Return the associations, with shared places and clocks equal to those of the first experiment
     that shares them.
@@ -169,8 +195,14 @@ def shared_charts(
             if leader[0] is not chart:
                 replaced.append((number, *leader))
         for k in nuisance.clock_indices:
-            shared = samples.setdefault(int(local.indices[k]), chart.clock_samples)
-            chart = chart if shared == chart.clock_samples else replace(chart, clock_samples=shared)
+            shared = samples.setdefault(
+                int(local.indices[k]), chart.clock_samples
+            )
+            chart = (
+                chart
+                if shared == chart.clock_samples
+                else replace(chart, clock_samples=shared)
+            )
         if replaced:
             own = {name: getattr(chart, name).copy() for name in OF_MARKERS}
             for name, values in own.items():

@@ -174,16 +174,24 @@ def _simulate(
     that `simulate` adds.
     """
     if timestep_s is not None and not timestep_s > 0:
-        raise InputError(f"timestep_s = {timestep_s:g}, expected a positive time")
+        raise InputError(
+            f"timestep_s = {timestep_s:g}, expected a positive time"
+        )
     if isinstance(substeps, str) and substeps != "auto":
-        raise InputError(f"substeps = {substeps!r}, expected a whole number or 'auto'")
+        raise InputError(
+            f"substeps = {substeps!r}, expected a whole number or 'auto'"
+        )
     if isinstance(substeps, int) and substeps < 1:
         raise InputError(f"substeps = {substeps}, expected at least 1")
     if (massless := experiment.body.mass_problem(theta)) is not None:
         raise InputError(massless)
     if (unreachable := experiment.body.rest_shape_failure(theta)) is not None:
         raise InputError(unreachable)
-    if integrator == NEWMARK and timestep_s is not None and not experiment.is_static:
+    if (
+        integrator == NEWMARK
+        and timestep_s is not None
+        and not experiment.is_static
+    ):
         require_steps(experiment, timestep_s)
         substeps = max(1, round(experiment.timestep_s / timestep_s))
     if experiment.is_static:
@@ -198,7 +206,11 @@ def _simulate(
             progress=progress,
         )
     return _with_automatic_steps(
-        experiment, theta, integrator=integrator, options=options, progress=progress
+        experiment,
+        theta,
+        integrator=integrator,
+        options=options,
+        progress=progress,
     )
 
 
@@ -237,7 +249,9 @@ def _with_automatic_steps(
                 raise
             finer = None
         if finer is not None and coarser is not None:
-            change_m = np.linalg.norm(finer.positions_m - coarser.positions_m, axis=2).max()
+            change_m = np.linalg.norm(
+                finer.positions_m - coarser.positions_m, axis=2
+            ).max()
             error_m = float(change_m) / (2**order - 1)
             finer = replace(finer, step_error_m=error_m)
             if error_m <= _accepted_error_m(finer):
@@ -280,23 +294,35 @@ def _with_steps(
             sensed=sensed,
         )
         rows = (len(x) - 1) * steps + 1
-        at = ReactionGrid.from_times(np.linspace(experiment.t_s[0], experiment.t_s[-1], rows))
+        at = ReactionGrid.from_times(
+            np.linspace(experiment.t_s[0], experiment.t_s[-1], rows)
+        )
     else:
-        dynamics = Dynamics.from_experiment(experiment, integrator, steps).with_theta(theta)
+        dynamics = Dynamics.from_experiment(
+            experiment, integrator, steps
+        ).with_theta(theta)
         grid = simulate_scheme(experiment, dynamics, options, progress)
         x = grid[::steps]
         zeros = np.zeros_like(grid)
-        v = zeros if experiment.is_static else np.gradient(grid, dynamics.step_s, axis=0)[::steps]
+        v = (
+            zeros
+            if experiment.is_static
+            else np.gradient(grid, dynamics.step_s, axis=0)[::steps]
+        )
         at = ReactionGrid.from_dynamics(dynamics)
         force = forces_on_dofs(dynamics, grid, sensed)
         mass_kg = dynamics.mass.inertia_kg[:, sensed]
         acceleration = dynamics.acceleration(grid)
-        reaction = reaction_forces(dynamics, mass_kg, force, acceleration[:, sensed])
+        reaction = reaction_forces(
+            dynamics, mass_kg, force, acceleration[:, sensed]
+        )
         forced = ReactionForces(reaction, grid[:, sensed])
     shape = (len(x), -1, 3)
     positions = x.reshape(shape)
     markers = experiment.markers.predict_positions(positions)
-    ideal = NuisanceMap.from_experiment(replace(experiment, nuisance=Nuisance.none()))
+    ideal = NuisanceMap.from_experiment(
+        replace(experiment, nuisance=Nuisance.none())
+    )
     wrenches = tuple(
         sensor.predict_reactions(forced, np.zeros(ideal.size))
         for sensor in wrench_residuals(experiment, at, ideal)
@@ -308,7 +334,9 @@ def _with_steps(
         markers_m=markers,
         reactions=(at, forced),
         wrenches=wrenches,
-        custom_sensor_values=_custom_sensor_values(experiment, positions, (at, forced), ideal),
+        custom_sensor_values=_custom_sensor_values(
+            experiment, positions, (at, forced), ideal
+        ),
         steps_per_sample=steps,
     )
 
@@ -331,19 +359,27 @@ def _custom_sensor_values(
     ideal : NuisanceMap
         Nuisance map without parameters.
     """
-    readings = custom_sensor_residuals(experiment, experiment.t_s, reactions[0], ideal)
+    readings = custom_sensor_residuals(
+        experiment, experiment.t_s, reactions[0], ideal
+    )
 
     def known_reactions() -> ReactionForces:
         return reactions[1]
 
-    motion = ObservedMotion(positions_m.reshape(len(positions_m), -1), known_reactions)
+    motion = ObservedMotion(
+        positions_m.reshape(len(positions_m), -1), known_reactions
+    )
     return tuple(
-        reading.without_padding(reading.predict_motion(motion, np.zeros(ideal.size)))
+        reading.without_padding(
+            reading.predict_motion(motion, np.zeros(ideal.size))
+        )
         for reading in readings
     )
 
 
-def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experiment:
+def with_wrenches(
+    experiment: Experiment, wrenches: Sequence[Array]
+) -> Experiment:
     """Return the experiment with other samples (S, 6) [N, N m] of its force–torque sensors, one
     array for each grasp that has one, in the order of the grasps.
     """
@@ -355,10 +391,14 @@ def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experime
     return replace(experiment, grasps=grasps)
 
 
-def with_readings(experiment: Experiment, values: Sequence[ArrayLike]) -> Experiment:
+def with_readings(
+    experiment: Experiment, values: Sequence[ArrayLike]
+) -> Experiment:
     """Return the experiment with other samples (S, m) of its custom sensors, one array for each."""
     pairs = zip(experiment.readings, values, strict=True)
-    return replace(experiment, readings=[replace(g, values=v) for g, v in pairs])
+    return replace(
+        experiment, readings=[replace(g, values=v) for g, v in pairs]
+    )
 
 
 def with_markers(experiment: Experiment, positions_m: ArrayLike) -> Experiment:
@@ -371,4 +411,6 @@ def with_markers(experiment: Experiment, positions_m: ArrayLike) -> Experiment:
             f"marker tracks have shape {tracks.shape}, "
             f"expected {experiment.markers.positions_m.shape}"
         )
-    return replace(experiment, markers=replace(experiment.markers, positions_m=tracks))
+    return replace(
+        experiment, markers=replace(experiment.markers, positions_m=tracks)
+    )

@@ -29,7 +29,11 @@ class EntryBlock(NamedTuple):
     @property
     def count(self) -> int:
         """Number of entries."""
-        return int(np.prod(np.broadcast_shapes(*map(np.shape, (*self.rows, *self.columns)))))
+        return int(
+            np.prod(
+                np.broadcast_shapes(*map(np.shape, (*self.rows, *self.columns)))
+            )
+        )
 
     def indices(self) -> tuple[Index, Index]:
         """Return row and column index of each entry, flat."""
@@ -84,7 +88,9 @@ class SparseAssembly:
         indptr, indices = structure
         height, width = shape
         group_codes = [columns * height + rows for rows, columns in groups]
-        codes = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *group_codes]))
+        codes = np.unique(
+            np.concatenate([np.zeros(0, dtype=np.int64), *group_codes])
+        )
         before, absent = _locate(structure, height, codes)
         own = before + np.cumsum(absent) - absent
         added = own[absent]
@@ -100,9 +106,14 @@ class SparseAssembly:
         return cls(
             np.concatenate([[0], np.cumsum(counts)]),
             all_indices,
-            None if is_initial[: len(indices)].all() else np.flatnonzero(is_initial),
+            None
+            if is_initial[: len(indices)].all()
+            else np.flatnonzero(is_initial),
             tuple(own[each] for each in group_indices),
-            tuple(bool(np.bincount(each, minlength=1).max() > 1) for each in group_indices),
+            tuple(
+                bool(np.bincount(each, minlength=1).max() > 1)
+                for each in group_indices
+            ),
         )
 
     @property
@@ -114,7 +125,11 @@ class SparseAssembly:
         """Return the positions of values of the initial structure, given by their positions
         there.
         """
-        return positions if self.initial_positions is None else self.initial_positions[positions]
+        return (
+            positions
+            if self.initial_positions is None
+            else self.initial_positions[positions]
+        )
 
     def allocate(self, out: Array | None, count: int) -> tuple[Array, Array]:
         """Return arrays for all values, and for the `count` values of the initial structure.
@@ -129,9 +144,13 @@ class SparseAssembly:
             Number of values of the initial structure.
         """
         values = np.empty(len(self.indices)) if out is None else out
-        return values, values[:count] if self.initial_positions is None else np.empty(count)
+        return values, values[
+            :count
+        ] if self.initial_positions is None else np.empty(count)
 
-    def assemble(self, values: Array, initial: Array, groups: Sequence[Array]) -> None:
+    def assemble(
+        self, values: Array, initial: Array, groups: Sequence[Array]
+    ) -> None:
         """Compute all values in place.
 
         Parameters
@@ -179,7 +198,12 @@ def _locate(
     """
     indptr, indices = structure
     if not len(codes) or codes[0] >= (len(indptr) - 1) * height:
-        return np.full(len(codes), len(indices)), np.ones(len(codes), dtype=bool)
-    own = np.repeat(np.arange(len(indptr) - 1) * height, np.diff(indptr)) + indices
+        return np.full(len(codes), len(indices)), np.ones(
+            len(codes), dtype=bool
+        )
+    own = (
+        np.repeat(np.arange(len(indptr) - 1) * height, np.diff(indptr))
+        + indices
+    )
     before = np.searchsorted(own, codes)
     return before, np.append(own, -1)[before] != codes

@@ -12,7 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs, eigsh, splu
+from scipy.sparse.linalg import (
+    ArpackNoConvergence,
+    LinearOperator,
+    eigs,
+    eigsh,
+    splu,
+)
 
 from ..array_types import Array, Index
 from ..fem.pattern import SymmetricPattern
@@ -56,7 +62,9 @@ class Instability:
     e_foldings: float
 
 
-def find_instabilities(collocation: Collocation, z: Array) -> tuple[Instability, ...]:
+def find_instabilities(
+    collocation: Collocation, z: Array
+) -> tuple[Instability, ...]:
     """Return the instabilities of the motions at z, at most one for each experiment."""
     unstable = (_instability(part) for part in collocation.iterates(z))
     return tuple(each for each in unstable if each is not None)
@@ -76,16 +84,24 @@ def _instability(iterate: ExperimentIterate) -> Instability | None:
     growths = np.array(
         [
             growth_rate_1_s(
-                Forces.from_experiment(experiment, time, theta), x, np.flatnonzero(~there)
+                Forces.from_experiment(experiment, time, theta),
+                x,
+                np.flatnonzero(~there),
             )
-            for time, x, there in zip(t_s, iterate.x[rows], is_prescribed, strict=True)
+            for time, x, there in zip(
+                t_s, iterate.x[rows], is_prescribed, strict=True
+            )
         ]
     )
     worst = int(np.argmax(growths))
     if growths[worst] <= 0:
         return None
-    e_foldings = np.inf if experiment.is_static else float(np.trapezoid(growths, t_s))
-    return Instability(experiment.name, float(t_s[worst]), float(growths[worst]), e_foldings)
+    e_foldings = (
+        np.inf if experiment.is_static else float(np.trapezoid(growths, t_s))
+    )
+    return Instability(
+        experiment.name, float(t_s[worst]), float(growths[worst]), e_foldings
+    )
 
 
 def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
@@ -112,7 +128,9 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
         return 0.0
     root = sp.diags_array(1 / np.sqrt(mass))
     stiffness, damping = (
-        sp.csc_array(root @ pattern.matrix(lower)[:, free_dofs][free_dofs] @ root)
+        sp.csc_array(
+            root @ pattern.matrix(lower)[:, free_dofs][free_dofs] @ root
+        )
         for lower in lowers
     )
     noise = SHIFT * np.sqrt(stiffness.diagonal().max())
@@ -120,7 +138,9 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
     return growth if growth > noise else 0.0
 
 
-def _is_definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array) -> bool:
+def _is_definite(
+    lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array
+) -> bool:
     """Whether a matrix on the free dofs, given by its lower triangle, is positive semidefinite up
     to rounding relative to `mass` (free,); true for zero.
     """
@@ -130,7 +150,11 @@ def _is_definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass
         return not lower[own].any()
     shifted = lower.copy()
     shifted[own] += SHIFT * largest * mass
-    return Factoriser.cached(pattern, free_dofs).factorise(shifted).positive_definite
+    return (
+        Factoriser.cached(pattern, free_dofs)
+        .factorise(shifted)
+        .positive_definite
+    )
 
 
 def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
@@ -139,8 +163,12 @@ def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
     """
     size = len(stiffness.diagonal())
     if size <= DENSE:
-        return float(_exponents(stiffness.toarray(), damping.toarray()).real.max())
-    lowest = [_lowest_eigenvectors(each) for each in (stiffness, damping) if each.nnz]
+        return float(
+            _exponents(stiffness.toarray(), damping.toarray()).real.max()
+        )
+    lowest = [
+        _lowest_eigenvectors(each) for each in (stiffness, damping) if each.nnz
+    ]
     basis, _ = np.linalg.qr(np.hstack(lowest))
     in_basis = [basis.T @ (each @ basis) for each in (stiffness, damping)]
     exponents = _exponents(*in_basis)
@@ -153,7 +181,12 @@ def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
     early, those that have converged and the start vector.
     """
     start = np.random.default_rng(0).normal(size=len(matrix.diagonal()))
-    options = {"which": "SA", "tol": TOLERANCE, "v0": start, "ncv": 12 * DIRECTIONS}
+    options = {
+        "which": "SA",
+        "tol": TOLERANCE,
+        "v0": start,
+        "ncv": 12 * DIRECTIONS,
+    }
     try:
         return np.asarray(eigsh(matrix, DIRECTIONS, **options)[1])
     except ArpackNoConvergence as stopped:
@@ -163,7 +196,9 @@ def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
 def _exponents(stiffness: Array, damping: Array) -> NDArray[np.complex128]:
     """Return all s of s² + D s + K for dense matrices."""
     size = len(stiffness)
-    chain = np.block([[np.zeros((size, size)), np.eye(size)], [-stiffness, -damping]])
+    chain = np.block(
+        [[np.zeros((size, size)), np.eye(size)], [-stiffness, -damping]]
+    )
     return np.linalg.eigvals(chain).astype(np.complex128)
 
 
@@ -174,31 +209,44 @@ class _CayleyTransform(LinearOperator):
     method finds them first.
     """
 
-    def __init__(self, stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> None:
+    def __init__(
+        self, stiffness: sp.csc_array, damping: sp.csc_array, sigma: float
+    ) -> None:
         size = len(stiffness.diagonal())
         super().__init__(np.dtype(float), (2 * size, 2 * size))
         self.damping = damping
         self.sigma = sigma
         self.solver = splu(
-            sp.csc_array(sigma**2 * sp.eye_array(size) + sigma * damping + stiffness)
+            sp.csc_array(
+                sigma**2 * sp.eye_array(size) + sigma * damping + stiffness
+            )
         )
 
     def _matvec(self, x: Array) -> Array:
         first, second = np.split(np.ravel(x), 2)
         # (A − σ)(y, w) = (first, second), by way of (σ² + σ D + K) y.
-        y = self.solver.solve(-second - self.damping @ first - self.sigma * first)
+        y = self.solver.solve(
+            -second - self.damping @ first - self.sigma * first
+        )
         w = first + self.sigma * y
-        return np.concatenate([first + 2 * self.sigma * y, second + 2 * self.sigma * w])
+        return np.concatenate(
+            [first + 2 * self.sigma * y, second + 2 * self.sigma * w]
+        )
 
 
-def _growth_about(stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> float:
+def _growth_about(
+    stiffness: sp.csc_array, damping: sp.csc_array, sigma: float
+) -> float:
     """Return the largest Re(s) of the exponents s with |s| of about `sigma` [1/s] that solve det(s²
     + D s + K) = 0, for sparse matrices; at least 0.
     """
     turning = _CayleyTransform(stiffness, damping, sigma)
     try:
         eigenpairs = eigs(
-            turning, 4, v0=np.random.default_rng(0).normal(size=turning.shape[0]), ncv=60
+            turning,
+            4,
+            v0=np.random.default_rng(0).normal(size=turning.shape[0]),
+            ncv=60,
         )
         turned = np.asarray(eigenpairs[0])
     except ArpackNoConvergence as stopped:

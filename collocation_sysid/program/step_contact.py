@@ -88,7 +88,9 @@ class ContactCandidates:
             skew_factors=np.sign(row - column) / 2,
         )
 
-    def inputs(self, contact: Contact, xi: Array, nu: Array, theta: Array) -> tuple[Array, Array]:
+    def inputs(
+        self, contact: Contact, xi: Array, nu: Array, theta: Array
+    ) -> tuple[Array, Array]:
         """Return the inputs (k, i) and the data (d, i) of the law's `point_force_function` at the i
         candidates.
 
@@ -102,19 +104,29 @@ class ContactCandidates:
             Constants of the body.
         """
         frame = self.law.obstacle.nodes
-        moving = [each.reshape(-1, 3) for each in (xi, nu)[: 1 + self.law.depends_on_velocity]]
-        own = [np.einsum("ik,ikj->ji", self.weights, x[self.nodes] - x[frame[0]]) for x in moving]
+        moving = [
+            each.reshape(-1, 3)
+            for each in (xi, nu)[: 1 + self.law.depends_on_velocity]
+        ]
+        own = [
+            np.einsum("ik,ikj->ji", self.weights, x[self.nodes] - x[frame[0]])
+            for x in moving
+        ]
         ends = [(x[frame[1:]] - x[frame[0]]).ravel() for x in moving]
         same = np.concatenate([*ends, theta[self.law.constant_columns]])
         data = np.broadcast_to(same[:, None], (len(same), len(self.nodes)))
-        return np.concatenate(own), np.concatenate([data, contact.data_of(self.point_indices)])
+        return np.concatenate(own), np.concatenate(
+            [data, contact.data_of(self.point_indices)]
+        )
 
     def assemble(self, push: Array, size: int) -> Array:
         """Return forces (size,) [N] on the dofs of a body from forces `push` (3, i) [N] on the i
         candidates.
         """
         on_nodes = self.weights[:, :, None] * push.T[:, None]
-        summed = np.bincount(self.dofs.ravel(), weights=on_nodes.ravel(), minlength=size)
+        summed = np.bincount(
+            self.dofs.ravel(), weights=on_nodes.ravel(), minlength=size
+        )
         return np.asarray(summed, dtype=float)
 
 
@@ -137,7 +149,10 @@ class StepContact:
     """
 
     def __init__(
-        self, contacts: Sequence[Contact], theta: Array, pattern: SymmetricPattern
+        self,
+        contacts: Sequence[Contact],
+        theta: Array,
+        pattern: SymmetricPattern,
     ) -> None:
         self._contacts = contacts
         self._theta = theta
@@ -181,11 +196,17 @@ class StepContact:
             Lower triangle of its skew part; empty without friction or other velocity dependence.
         """
         force = np.zeros(xi.size)
-        has_friction = any(each.law_of_contact.depends_on_velocity for each in self._contacts)
+        has_friction = any(
+            each.law_of_contact.depends_on_velocity for each in self._contacts
+        )
         symmetric = np.zeros(self._pattern.entry_count)
         skew = np.zeros(self._pattern.entry_count * has_friction)
         for candidates, u, data in self._candidates(xi[0], nu[0]):
-            push, slopes = candidates.law.point_force_function.evaluate_with_jacobian(u, data)
+            push, slopes = (
+                candidates.law.point_force_function.evaluate_with_jacobian(
+                    u, data
+                )
+            )
             force += candidates.assemble(push, xi.size)
             (touch,) = np.nonzero(push.any(axis=0))
             by_way = rates[0] * slopes[:, :3, touch]
@@ -200,11 +221,15 @@ class StepContact:
             ]
             for part, counts in zip((symmetric, skew), counted, strict=False):
                 part += np.bincount(
-                    here, weights=(counts[touch] * blocks).ravel(), minlength=len(part)
+                    here,
+                    weights=(counts[touch] * blocks).ravel(),
+                    minlength=len(part),
                 )
         return force, symmetric, skew
 
-    def _candidates(self, xi: Array, nu: Array) -> Iterator[tuple[ContactCandidates, Array, Array]]:
+    def _candidates(
+        self, xi: Array, nu: Array
+    ) -> Iterator[tuple[ContactCandidates, Array, Array]]:
         """Yield for each contact its candidates, and the inputs and data of its law at ξ and ν,
         (3n,) each.
 
@@ -216,8 +241,12 @@ class StepContact:
             self._from = ends
             self._candidates_of_contacts = []
             for each in self._contacts:
-                gaps = each.law_of_contact.gaps(each.points.vectors(ends)).min(axis=0)
-                (chosen,) = np.nonzero(gaps < each.law_of_contact.widths_m + self._margin_m)
+                gaps = each.law_of_contact.gaps(each.points.vectors(ends)).min(
+                    axis=0
+                )
+                (chosen,) = np.nonzero(
+                    gaps < each.law_of_contact.widths_m + self._margin_m
+                )
                 if len(chosen):
                     candidates = ContactCandidates.from_indices(
                         each.law_of_contact, self._pattern, chosen.tobytes()

@@ -45,7 +45,9 @@ class Stopwatch:
             with self._adding:
                 setattr(self, kind, getattr(self, kind) + self.clock() - began)
 
-    def add(self, build: float, evaluations: float, linear_algebra: float) -> None:
+    def add(
+        self, build: float, evaluations: float, linear_algebra: float
+    ) -> None:
         """Add times measured by another stopwatch [s]."""
         with self._adding:
             self.build += build

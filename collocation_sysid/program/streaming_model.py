@@ -72,7 +72,11 @@ class StreamStencil(NamedTuple):
     def rows_of_sample(self, at: float) -> range:
         """Return the rows that a sample at a position `at`, in rows, needs."""
         begins, ends = (
-            max(int(np.floor(at + off + ROW_TOLERANCE)) - (self.neighbours - 1) // 2, self.first)
+            max(
+                int(np.floor(at + off + ROW_TOLERANCE))
+                - (self.neighbours - 1) // 2,
+                self.first,
+            )
             for off in (-self.clock_error, self.clock_error)
         )
         return range(begins, ends + self.neighbours)
@@ -112,7 +116,9 @@ class StreamingModel:
     collocation: Collocation
 
     @classmethod
-    def from_collocation(cls, experiment: Experiment, collocation: Collocation) -> StreamingModel:
+    def from_collocation(
+        cls, experiment: Experiment, collocation: Collocation
+    ) -> StreamingModel:
         """Return the model of an experiment that is fitted by a program.
 
         Parameters
@@ -122,7 +128,10 @@ class StreamingModel:
         collocation : Collocation
             Program of this experiment, in which every parameter has a guess.
         """
-        still = replace(collocation, experiments=[_still_experiment(experiment, collocation)])
+        still = replace(
+            collocation,
+            experiments=[_still_experiment(experiment, collocation)],
+        )
         return cls(experiment, still)
 
     def at_start(self, poses: Poses) -> Experiment:
@@ -142,13 +151,19 @@ class StreamingModel:
         x : (3n,)
             Node positions of the start [m].
         """
-        unknown = ~self.segment.experiment.markers.located & np.isfinite(tracks_m).all(axis=1)
+        unknown = ~self.segment.experiment.markers.located & np.isfinite(
+            tracks_m
+        ).all(axis=1)
         if not unknown.any():
             return self
         places_m = self.segment.marker_places_m(self.segment.guess_phi)
         nodes_m = x.reshape(-1, 3)
-        places_m[unknown] = self.segment.association.places_of_points(nodes_m, tracks_m[unknown])
-        return replace(self, collocation=self.collocation.with_marker_places([places_m]))
+        places_m[unknown] = self.segment.association.places_of_points(
+            nodes_m, tracks_m[unknown]
+        )
+        return replace(
+            self, collocation=self.collocation.with_marker_places([places_m])
+        )
 
     @cached_property
     def segment(self) -> Transcription:
@@ -200,7 +215,9 @@ class StreamingModel:
         p (logarithms) at the guess.
         """
         free = self.collocation.parameters.free
-        places = np.flatnonzero([without_region(item.name) == GAMMA_M.name for item in free])
+        places = np.flatnonzero(
+            [without_region(item.name) == GAMMA_M.name for item in free]
+        )
         return places, self.collocation.guess_p[places]
 
     def transformed(self, p: Array) -> Array:
@@ -237,12 +254,19 @@ class StreamingModel:
         residual, slopes = self.collocation.prior_residuals(p)
         nq = self.collocation.nq
         transformed_values = self.transformed(p)
-        from_guess = (p[:nq] - self.collocation.parameters.guess_q) / WEAK_PRIOR_DEVIATION
+        from_guess = (
+            p[:nq] - self.collocation.parameters.guess_q
+        ) / WEAK_PRIOR_DEVIATION
         rows = np.vstack(
-            [np.diag(slopes), np.eye(nq, self.parameter_count) / WEAK_PRIOR_DEVIATION]
+            [
+                np.diag(slopes),
+                np.eye(nq, self.parameter_count) / WEAK_PRIOR_DEVIATION,
+            ]
         ) / self.transformation_derivatives(transformed_values)
         empty = SquareRootInformation.empty(self.parameter_count)
-        return empty.with_rows(np.concatenate([residual, from_guess]), rows, transformed_values)
+        return empty.with_rows(
+            np.concatenate([residual, from_guess]), rows, transformed_values
+        )
 
     @cached_property
     def neighbouring_samples(self) -> int:
@@ -250,7 +274,9 @@ class StreamingModel:
 
         0 if no clock is estimated.
         """
-        return NEIGHBOURS // 2 if len(self.segment.nuisance.clock_indices) else 0
+        return (
+            NEIGHBOURS // 2 if len(self.segment.nuisance.clock_indices) else 0
+        )
 
     @cached_property
     def marker_model(self) -> MarkerResidual:
@@ -260,12 +286,18 @@ class StreamingModel:
         neighbours = self.neighbouring_samples
         markers = self.segment.experiment.markers
         origin = replace(
-            markers, t_s=markers.t_s[:1], positions_m=np.zeros((1, len(markers.names), 3))
+            markers,
+            t_s=markers.t_s[:1],
+            positions_m=np.zeros((1, len(markers.names), 3)),
         )
         rows = np.arange(2 * neighbours + 1)
         segment = self.segment
         return MarkerResidual.from_markers(
-            origin, rows, segment.nuisance, segment.association, preceding_times=neighbours
+            origin,
+            rows,
+            segment.nuisance,
+            segment.association,
+            preceding_times=neighbours,
         )
 
     @cached_property
@@ -280,8 +312,12 @@ class StreamingModel:
             is_custom = reading in self.segment.custom_sensors
             stencil = StreamStencil(GAUGE_NEIGHBOURS)
             if isinstance(channel, GraspWrench):
-                observable = [other for other, _ in self.wrench_sensors].index(channel)
-                stencil = stencil._replace(first=int(channel.known_rows[0]), delay=DELAY_STEPS)
+                observable = [other for other, _ in self.wrench_sensors].index(
+                    channel
+                )
+                stencil = stencil._replace(
+                    first=int(channel.known_rows[0]), delay=DELAY_STEPS
+                )
                 if not is_custom:
                     clock_error = channel.clock_limit_s / step_s
                     stencil = stencil._replace(
@@ -298,7 +334,10 @@ class StreamingModel:
     @cached_property
     def largest_delay_rows(self) -> int:
         """Largest number of rows that instruments need in addition to those of the markers."""
-        spans = (2 * each.stencil.clock_error + each.stencil.delay for each in self.instruments)
+        spans = (
+            2 * each.stencil.clock_error + each.stencil.delay
+            for each in self.instruments
+        )
         return int(np.ceil(max(spans, default=0.0)))
 
     @cached_property
@@ -306,21 +345,31 @@ class StreamingModel:
         """Points that custom sensors of points observe."""
         still = self.segment.experiment
         gauges = [gauge for gauge in still.readings if gauge.grasp is None]
-        return tuple(observed_points(still, gauge, GAUGE_NEIGHBOURS) for gauge in gauges)
+        return tuple(
+            observed_points(still, gauge, GAUGE_NEIGHBOURS) for gauge in gauges
+        )
 
     @cached_property
     def wrench_sensors(self) -> tuple[Sensor, ...]:
         """Wrenches of grasps that sensors observe, each with the index of its grasp."""
         channels = [reading.observable for reading in self.segment.residuals]
         grasps = [id(grasp) for grasp in self.segment.experiment.grasps]
-        wrenches = (channel for channel in channels if isinstance(channel, GraspWrench))
-        return tuple((channel, grasps.index(id(channel.grasp))) for channel in wrenches)
+        wrenches = (
+            channel for channel in channels if isinstance(channel, GraspWrench)
+        )
+        return tuple(
+            (channel, grasps.index(id(channel.grasp))) for channel in wrenches
+        )
 
     @cached_property
     def wrenches(self) -> dict[int, Wrench]:
         """Wrench sensors of the problem's recording, by the number of their grasp, from 1 on."""
         pairs = enumerate(self.experiment.grasps, 1)
-        return {number: grasp.wrench for number, grasp in pairs if grasp.wrench is not None}
+        return {
+            number: grasp.wrench
+            for number, grasp in pairs
+            if grasp.wrench is not None
+        }
 
     @cached_property
     def moving_grasps(self) -> Index:
@@ -348,12 +397,16 @@ class StreamingModel:
     @cached_property
     def factor_memory(self) -> FactorMemory | None:
         """Memory for the factor of a row, shared by all passes; None without native code."""
-        return self.solver.factoriser.allocate(1 + self.segment.body.is_unsymmetric)
+        return self.solver.factoriser.allocate(
+            1 + self.segment.body.is_unsymmetric
+        )
 
     @cached_property
     def linearisation_memory(self) -> Array:
         """Memory for rows that are linearised together."""
-        return np.empty((ROWS_PER_CHUNK, self.segment.dynamics.forces.linearisation_width))
+        return np.empty(
+            (ROWS_PER_CHUNK, self.segment.dynamics.forces.linearisation_width)
+        )
 
     @cached_property
     def body_size_m(self) -> float:
@@ -379,8 +432,12 @@ class StreamingModel:
         poses : sequence of Poses
             K poses of all grasps.
         """
-        rotations = np.array([[turn for turn, _ in each] for each in poses])[:, *self._axes]
-        shifts = np.array([[shift for _, shift in each] for each in poses])[:, *self._axes]
+        rotations = np.array([[turn for turn, _ in each] for each in poses])[
+            :, *self._axes
+        ]
+        shifts = np.array([[shift for _, shift in each] for each in poses])[
+            :, *self._axes
+        ]
         goal = np.einsum("kgj,gj->kg", rotations, displaced_nodes[0]) + shifts
         return goal, np.einsum("kgj,gjm->kgm", rotations, displaced_nodes[1])
 
@@ -403,13 +460,21 @@ class StreamingModel:
         tables = dynamics.tables
         step_s = dynamics.step_s
         p, q, w, s = (
-            np.sum([np.diag(each[lag:, lag], -lag) for lag in range(each.shape[1])], axis=0)
+            np.sum(
+                [
+                    np.diag(each[lag:, lag], -lag)
+                    for lag in range(each.shape[1])
+                ],
+                axis=0,
+            )
             for each in (tables.p, tables.q, tables.w, tables.s)
         )
         return p, q / step_s, w, s / step_s**2
 
 
-def _still_experiment(experiment: Experiment, collocation: Collocation) -> Experiment:
+def _still_experiment(
+    experiment: Experiment, collocation: Collocation
+) -> Experiment:
     """Return the experiment as a few samples in which nothing moves."""
     reach = collocation.transcriptions[0].dynamics.largest_lag
     # The rows of the start, and room for a reading.
@@ -419,14 +484,18 @@ def _still_experiment(experiment: Experiment, collocation: Collocation) -> Exper
     first, _ = markers.first_samples
     tracks = np.tile(np.nan_to_num(first), (count, 1, 1))
     gauges = [
-        replace(g, t_s=t_s, values=np.zeros((count, g.measured_values.shape[1])))
+        replace(
+            g, t_s=t_s, values=np.zeros((count, g.measured_values.shape[1]))
+        )
         for g in experiment.readings
     ]
     return replace(
         experiment,
         t_s=t_s,
         grasps=[
-            replace(grasp, wrench=grasp.wrench and _still_wrench(grasp.wrench, t_s))
+            replace(
+                grasp, wrench=grasp.wrench and _still_wrench(grasp.wrench, t_s)
+            )
             for grasp in _grasps_at(experiment, _first_poses(experiment))
         ],
         markers=replace(markers, t_s=t_s, positions_m=tracks),
@@ -438,7 +507,9 @@ def _still_wrench(wrench: Wrench, t_s: NDArray) -> Wrench:
     """Return a wrench sensor with values of zero at the times t_s, NaN for components that it does
     not measure.
     """
-    values = np.where(wrench.measured_components, np.zeros((len(t_s), 1)), np.nan)
+    values = np.where(
+        wrench.measured_components, np.zeros((len(t_s), 1)), np.nan
+    )
     return replace(wrench, t_s=t_s, values=values)
 
 
@@ -455,5 +526,9 @@ def _grasps_at(experiment: Experiment, poses: Poses) -> list:
         matrix = np.eye(4)
         matrix[:3, :3] = turn
         matrix[:3, 3] = shift
-        grasps.append(replace(grasp, poses=PoseSequence.from_matrices([0.0], matrix[None])))
+        grasps.append(
+            replace(
+                grasp, poses=PoseSequence.from_matrices([0.0], matrix[None])
+            )
+        )
     return grasps

@@ -206,14 +206,22 @@ class StreamingSweep:
         self.setting = segment.equations_at(p[: collocation.nq], self.phi)
         self.dynamics = self.setting.dynamics
         self.displaced_nodes = model.displaced_nodes(self.phi)
-        self.shape_functions = segment.markers.observable.shape_functions(self.phi)
+        self.shape_functions = segment.markers.observable.shape_functions(
+            self.phi
+        )
         points_and_weights = [
             self.shape_functions,
-            *(points.shape_functions(self.phi) for points in model.observed_points),
+            *(
+                points.shape_functions(self.phi)
+                for points in model.observed_points
+            ),
         ]
         self._observables = tuple(
             np.concatenate(part)
-            for part in zip(*((nodes, at.weights) for nodes, at in points_and_weights), strict=True)
+            for part in zip(
+                *((nodes, at.weights) for nodes, at in points_and_weights),
+                strict=True,
+            )
         )
         self.longest_m = 0.0
         self.grasped = segment.prescribed_motion.dofs
@@ -223,10 +231,14 @@ class StreamingSweep:
         self.mass_kg = self.dynamics.mass.inertia_kg[0]
         # Loads are always there: what acts on one row acts on every one.
         self.forces = self.dynamics.forces.at_times(slice(1))
-        self._rows = {} if self.setting.mass_depends_on_parameters else model.cached_rows
+        self._rows = (
+            {} if self.setting.mass_depends_on_parameters else model.cached_rows
+        )
         self.information = prior_information
         state = (
-            self._initial_state() if start is None or at is None else self._moved_state(start, at)
+            self._initial_state()
+            if start is None or at is None
+            else self._moved_state(start, at)
         )
         self._resume(state)
 
@@ -278,19 +290,27 @@ class StreamingSweep:
         )
         memory = replace(memory, solutions=solutions, increments=increments)
         stored = [each for each, *_ in state.observed_rows]
-        columns_of_rows = np.empty((len(stored), self.segment.dof_count, self.count))
+        columns_of_rows = np.empty(
+            (len(stored), self.segment.dof_count, self.count)
+        )
         columns_of_rows[..., 1:] = [each.columns for each in stored]
-        columns_of_rows[..., 0] = columns_of_rows[..., 1:] @ change + [each.x for each in stored]
+        columns_of_rows[..., 0] = columns_of_rows[..., 1:] @ change + [
+            each.x for each in stored
+        ]
         x = state.x.copy()
         known_rows = min(len(stored), state.end)
-        x[state.end - known_rows : state.end] = columns_of_rows[len(stored) - known_rows :, :, 0]
+        x[state.end - known_rows : state.end] = columns_of_rows[
+            len(stored) - known_rows :, :, 0
+        ]
         point_columns = self._at_points(columns_of_rows)
         point_columns[..., 1:] *= self.rates[moving]
         stored_rows = [
             StoredRow(self.transformed, w[:, 0], k.columns)
             for w, k in zip(columns_of_rows, stored, strict=True)
         ]
-        all_wrenches = np.array([wrenches for *_, wrenches in state.observed_rows])
+        all_wrenches = np.array(
+            [wrenches for *_, wrenches in state.observed_rows]
+        )
         all_wrenches[..., 0] += all_wrenches[..., 1:] @ (
             (self.transformed - transformed) / old_rates
         )
@@ -298,7 +318,12 @@ class StreamingSweep:
         read = tuple(zip(stored_rows, point_columns, all_wrenches, strict=True))
         reactions = state.reactions.moved_to(step, factors)
         return replace(
-            state, x=x, force=force, reactions=reactions, last_rows=memory, observed_rows=read
+            state,
+            x=x,
+            force=force,
+            reactions=reactions,
+            last_rows=memory,
+            observed_rows=read,
         )
 
     def _resume(self, state: SweepState) -> None:
@@ -313,13 +338,16 @@ class StreamingSweep:
             grasped = PrescribedColumns.from_columns(
                 self.solver, self.grasped, self.prescribed_columns
             )
-        self.columns = SweepColumns(self.setting, self.count, has_step=True, prescribed=grasped)
+        self.columns = SweepColumns(
+            self.setting, self.count, has_step=True, prescribed=grasped
+        )
         self.reactions = state.reactions.copy()
         self.forward = ForwardSubstitution(
             self.solver, self.columns, state.last_rows, self.reactions.forces
         )
         most = (
-            (2 * self.model.neighbouring_samples + LARGEST_SAMPLE_DELAY + 2) * self.model.substeps
+            (2 * self.model.neighbouring_samples + LARGEST_SAMPLE_DELAY + 2)
+            * self.model.substeps
             + 4
             + ROWS_PER_CHUNK
         )
@@ -347,7 +375,9 @@ class StreamingSweep:
 
     # Rows -------------------------------------------------------------------------------------
 
-    def advance(self, poses: Sequence[Poses], guesses: Sequence[Array] = ()) -> list[StoredRow]:
+    def advance(
+        self, poses: Sequence[Poses], guesses: Sequence[Array] = ()
+    ) -> list[StoredRow]:
         """Compute further rows with given poses; return them for later passes.
 
         Fewer rows than given are computed if one is far from its initial guess: later guesses are
@@ -373,15 +403,21 @@ class StreamingSweep:
         poses = [self.model.all_poses(each) for each in poses]
         first = self._make_room(len(poses))
         count = len(poses)
-        goals, slopes = self.model.prescribed_positions(self.displaced_nodes, poses)
+        goals, slopes = self.model.prescribed_positions(
+            self.displaced_nodes, poses
+        )
         self.reactions.set_poses(first, poses)
-        self.prescribed_columns[first : first + count, :, 1 + self.segment.nq :] = slopes
+        self.prescribed_columns[
+            first : first + count, :, 1 + self.segment.nq :
+        ] = slopes
         if first < self.dynamics.first_row:
             self.x[first] = self._start_positions(poses[0])
             self._count_rows(1)
             return self._store_rows([np.zeros(self.forward.shape)])
         for k, t in enumerate(range(first, first + count)):
-            self.x[t] = guesses[k] if guesses else self._extrapolate(t, poses[k])
+            self.x[t] = (
+                guesses[k] if guesses else self._extrapolate(t, poses[k])
+            )
             self.x[t, self.grasped] = goals[k]
         remaining = range(first, first + count)
         computed = []
@@ -408,7 +444,11 @@ class StreamingSweep:
                 is_careful = True
                 last_length = np.inf
             else:
-                self._fail(NewtonFailure(self.x[t], "Newton's steps do not get shorter"))
+                self._fail(
+                    NewtonFailure(
+                        self.x[t], "Newton's steps do not get shorter"
+                    )
+                )
             remaining = range(t, t + 1)
         return self._store_rows(computed)
 
@@ -423,7 +463,12 @@ class StreamingSweep:
         """
         surplus = self.end + count - self.model.template_rows
         if surplus > 0:
-            for each in (self.x, self.force, self.prescribed_columns, *self.reactions.arrays):
+            for each in (
+                self.x,
+                self.force,
+                self.prescribed_columns,
+                *self.reactions.arrays,
+            ):
                 each[:-surplus] = each[surplus:]
             self.end -= surplus
         return self.end
@@ -436,18 +481,28 @@ class StreamingSweep:
             return self._start_positions(poses)
         if t < 4:
             return extrapolate(self.x[:t], np.zeros(self.segment.dof_count))
-        return 4 * (self.x[t - 1] + self.x[t - 3]) - 6 * self.x[t - 2] - self.x[t - 4]
+        return (
+            4 * (self.x[t - 1] + self.x[t - 3])
+            - 6 * self.x[t - 2]
+            - self.x[t - 4]
+        )
 
     def _start_positions(self, poses: Poses) -> Array:
         """Return the positions (3n,) of the initial state with grasps at given poses, which a
         Newton solve computes.
         """
         goals_m = np.full(self.segment.dof_count, np.nan)
-        goals_m[self.grasped] = self.model.prescribed_positions(self.displaced_nodes, [poses])[0][0]
+        goals_m[self.grasped] = self.model.prescribed_positions(
+            self.displaced_nodes, [poses]
+        )[0][0]
         experiment = self.model.at_start(poses)
-        return initial_state(experiment, self.forces, self.model.newton, prescribed_m=goals_m)[0]
+        return initial_state(
+            experiment, self.forces, self.model.newton, prescribed_m=goals_m
+        )[0]
 
-    def _linearise(self, here: range) -> tuple[Linearisation, tuple[Array, Array]]:
+    def _linearise(
+        self, here: range
+    ) -> tuple[Linearisation, tuple[Array, Array]]:
         """Return forces with derivatives at guessed rows, and the right-hand sides of their
         columns.
 
@@ -463,10 +518,14 @@ class StreamingSweep:
         free = self.solver.free
         nu = q @ x
         acceleration = s @ x
-        at = self.forces.linearise(p @ x, nu, self.model.linearisation_memory[: len(here)])
+        at = self.forces.linearise(
+            p @ x, nu, self.model.linearisation_memory[: len(here)]
+        )
         force[rows] = at.force
         residual = (w @ force - self.mass_kg * acceleration)[:, free]
-        return at, self.columns.right_hand_sides(rows, at, acceleration, residual, free)
+        return at, self.columns.right_hand_sides(
+            rows, at, acceleration, residual, free
+        )
 
     def _stencil_row(self, t: int) -> StencilRow:
         """Return the coefficients of a row, cached while the masses do not depend on parameters."""
@@ -474,7 +533,9 @@ class StreamingSweep:
             self._rows[t] = StencilRow.from_dynamics(self.dynamics, t)
         return self._rows[t]
 
-    def _solve_rows(self, here: range, limit: float) -> tuple[list[Array], float | None]:
+    def _solve_rows(
+        self, here: range, limit: float
+    ) -> tuple[list[Array], float | None]:
         """Take one Newton step in each row; return their columns (3n, 1 + m), and None if all
         corrections are accepted.
 
@@ -507,7 +568,9 @@ class StreamingSweep:
             skew_block = row.skew_block(by_position_skew, by_velocity_skew)
             solved.append(row_columns)
             try:
-                factor = solver.factoriser.factorise(block, skew_block, self.model.factor_memory)
+                factor = solver.factoriser.factorise(
+                    block, skew_block, self.model.factor_memory
+                )
                 step = FactorisedStep(
                     t,
                     row,
@@ -544,7 +607,9 @@ class StreamingSweep:
         rows = slice(self.end - len(columns), self.end)
         all_columns = np.array(columns)
         all_columns[:, :, 0] = self.x[rows]
-        by_transformed = (all_columns[:, :, 1:] / self.rates[self.moving]).astype(np.float32)
+        by_transformed = (
+            all_columns[:, :, 1:] / self.rates[self.moving]
+        ).astype(np.float32)
         pairs = zip(self.x[rows].copy(), by_transformed, strict=True)
         stored_rows = [StoredRow(self.transformed, *pair) for pair in pairs]
         self.reactions.apply_correction(rows, all_columns[:, self.sensed])
@@ -576,10 +641,14 @@ class StreamingSweep:
         *_, w, s = self.model.stencils
         x = self.x[: here.stop, self.sensed]
         rows = np.arange(first, here.stop)
-        reactions, channels = self.reactions.wrenches(sensors, self.setting, x, (w, s), rows)
+        reactions, channels = self.reactions.wrenches(
+            sensors, self.setting, x, (w, s), rows
+        )
         motion = ObservedMotion(x, lambda: reactions)
         for k, channel in enumerate(channels):
-            value, slopes = channel.linearise(motion, self.phi, self.moving, size)
+            value, slopes = channel.linearise(
+                motion, self.phi, self.moving, size
+            )
             sensor_wrenches = wrenches[first - here.start :, k]
             sensor_wrenches[..., 0] = value.reshape(-1, 6)
             sensor_wrenches[..., 1:] = slopes.by_common.reshape(-1, 6, size)
@@ -592,7 +661,9 @@ class StreamingSweep:
         nodes, weights = self._observables
         *rows, dofs, count = columns.shape
         at = columns.reshape(*rows, dofs // 3, 3, count)[..., nodes, :, :]
-        return np.einsum("ma,...maik->...mik", weights, at).reshape(*rows, -1, count)
+        return np.einsum("ma,...maik->...mik", weights, at).reshape(
+            *rows, -1, count
+        )
 
     def _solve_carefully(self, t: int, poses: Poses) -> Array:
         """Return the positions x_t (3n,) of row t by a full Newton solve, with the displacement of
@@ -627,7 +698,9 @@ class StreamingSweep:
 
     # Readings ---------------------------------------------------------------------------------
 
-    def linearise_samples(self, pairs: Sequence[tuple[Sample, int]]) -> list[LinearisedResidual]:
+    def linearise_samples(
+        self, pairs: Sequence[tuple[Sample, int]]
+    ) -> list[LinearisedResidual]:
         """Return the linearised residuals of samples, in the order of `pairs`.
 
         Parameters
@@ -638,16 +711,24 @@ class StreamingSweep:
         """
         residuals: list[LinearisedResidual | None] = [None] * len(pairs)
         for of in {sample.instrument for sample, _ in pairs}:
-            positions = [k for k, (sample, _) in enumerate(pairs) if sample.instrument == of]
+            positions = [
+                k
+                for k, (sample, _) in enumerate(pairs)
+                if sample.instrument == of
+            ]
             samples = [pairs[k] for k in positions]
             pairs_of_instrument = (
                 self._instrument_residuals(of, samples)
                 if of
                 else (self._marker_residuals(*pair) for pair in samples)
             )
-            for k, (residual, slope) in zip(positions, pairs_of_instrument, strict=True):
+            for k, (residual, slope) in zip(
+                positions, pairs_of_instrument, strict=True
+            ):
                 slope /= self.rates
-                residuals[k] = LinearisedResidual(residual - slope @ self.transformed, slope, of)
+                residuals[k] = LinearisedResidual(
+                    residual - slope @ self.transformed, slope, of
+                )
         return [each for each in residuals if each is not None]
 
     def _instrument_residuals(
@@ -669,14 +750,18 @@ class StreamingSweep:
         reading, stencil, observable = self.model.instruments[of - 1]
         at = [self.row - 1 - sample.rows_back - rows for sample, rows in pairs]
         needed_rows = range(
-            stencil.rows_of_sample(min(at)).start, stencil.rows_of_sample(max(at)).stop
+            stencil.rows_of_sample(min(at)).start,
+            stencil.rows_of_sample(max(at)).stop,
         )
         _, point_columns, wrenches = zip(
-            *(self.read[k + stencil.delay - self.row] for k in needed_rows), strict=True
+            *(self.read[k + stencil.delay - self.row] for k in needed_rows),
+            strict=True,
         )
         step_s = model.interval_s / model.substeps
         begins_s = float(model.experiment.t_s[0])
-        known_s, t_s = (begins_s + step_s * np.array(rows) for rows in (needed_rows, at))
+        known_s, t_s = (
+            begins_s + step_s * np.array(rows) for rows in (needed_rows, at)
+        )
         sensor = reading.with_samples(
             known_s, t_s, np.array([sample.values for sample, _ in pairs])
         )
@@ -689,12 +774,18 @@ class StreamingSweep:
             values = np.array(wrenches)[:, observable]
         values = values.reshape(len(needed_rows), -1, 3, 1 + len(columns))
         slopes = ObservableDerivatives.without_own(columns, values[..., 1:])
-        residual, slope = sensor.linearise(values[..., 0], slopes, self.phi, model.parameter_count)
+        residual, slope = sensor.linearise(
+            values[..., 0], slopes, self.phi, model.parameter_count
+        )
         return zip(
-            np.where(sensor.compared_with(len(needed_rows)), residual, np.nan), slope, strict=True
+            np.where(sensor.compared_with(len(needed_rows)), residual, np.nan),
+            slope,
+            strict=True,
         )
 
-    def _marker_residuals(self, reading: Sample, rows: int) -> tuple[Array, Array]:
+    def _marker_residuals(
+        self, reading: Sample, rows: int
+    ) -> tuple[Array, Array]:
         """Return residuals (M, 3) of a marker sample, in standard deviations, and their derivatives
         (M, 3, P) with respect to p.
 
@@ -710,9 +801,13 @@ class StreamingSweep:
         neighbours = self.model.neighbouring_samples
         markers = self.model.marker_model
         back = reading.rows_back + rows
-        backs = [back - k * model.substeps for k in range(-neighbours, neighbours + 1)]
+        backs = [
+            back - k * model.substeps
+            for k in range(-neighbours, neighbours + 1)
+        ]
         x, point_columns = (
-            np.array(part) for part in zip(*map(self._interpolated_row, backs), strict=True)
+            np.array(part)
+            for part in zip(*map(self._interpolated_row, backs), strict=True)
         )
         point_columns = point_columns[:, : 3 * len(self.shape_functions[0])]
         values = point_columns[..., 0].reshape(len(point_columns), -1, 3)
@@ -721,7 +816,9 @@ class StreamingSweep:
         )
         since_s = (self.row - 1 - back) / model.substeps * model.interval_s
         markers = markers.shifted(since_s)
-        residual, slope = markers.linearise(values, slopes, self.phi, model.parameter_count)
+        residual, slope = markers.linearise(
+            values, slopes, self.phi, model.parameter_count
+        )
         return residual[0] - reading.values / markers.sigmas[:, None], slope[0]
 
     def _interpolated_row(self, back: float) -> tuple[Array, Array]:
@@ -739,12 +836,16 @@ class StreamingSweep:
         nearest = round(back)
         last = len(self.read) - 1
         if abs(back - nearest) <= ROW_TOLERANCE or not last:
-            stored, point_columns, _ = self.read[min(max(last - nearest, 0), last)]
+            stored, point_columns, _ = self.read[
+                min(max(last - nearest, 0), last)
+            ]
             return stored.x, point_columns
         first = int(np.clip(np.floor(back) - 1, 0, max(0, last - 3)))
         rows = [first + k for k in range(min(4, last + 1))]
         weights = lagrange_weights(back, rows)
-        stored, point_columns, _ = zip(*(self.read[last - row] for row in rows), strict=True)
+        stored, point_columns, _ = zip(
+            *(self.read[last - row] for row in rows), strict=True
+        )
         return np.tensordot(weights, [k.x for k in stored], 1), np.tensordot(
             weights, point_columns, 1
         )
@@ -754,7 +855,9 @@ class StreamingSweep:
         self.information = self.with_residuals(self.information, residuals)
 
     def with_residuals(
-        self, known: SquareRootInformation, residuals: Sequence[LinearisedResidual]
+        self,
+        known: SquareRootInformation,
+        residuals: Sequence[LinearisedResidual],
     ) -> SquareRootInformation:
         """Return information with linearised residuals added, with the weights of the loss at p."""
         if not residuals:
@@ -762,8 +865,16 @@ class StreamingSweep:
         at_zero = np.concatenate([each.at_zero for each in residuals])
         is_present = np.isfinite(at_zero)
         rows_present = is_present.any(axis=1)
-        slopes = np.concatenate([each.slope for each in residuals])[rows_present]
+        slopes = np.concatenate([each.slope for each in residuals])[
+            rows_present
+        ]
         is_present = is_present[rows_present]
-        residual = np.where(is_present, at_zero[rows_present] + slopes @ self.transformed, 0.0)
-        rows, slopes = huber_as_least_squares(residual, slopes, self.model.collocation.huber)
-        return known.with_rows(rows[is_present], slopes[is_present], self.transformed)
+        residual = np.where(
+            is_present, at_zero[rows_present] + slopes @ self.transformed, 0.0
+        )
+        rows, slopes = huber_as_least_squares(
+            residual, slopes, self.model.collocation.huber
+        )
+        return known.with_rows(
+            rows[is_present], slopes[is_present], self.transformed
+        )

@@ -103,7 +103,9 @@ class Pardiso:
         self._columns = columns.astype(np.int32)
         self._values = np.zeros(len(columns))
         kind = ctypes.c_int(POSITIVE_DEFINITE)
-        load_mkl().pardisoinit(_pointer(self._handle), ctypes.byref(kind), _pointer(self._options))
+        load_mkl().pardisoinit(
+            _pointer(self._handle), ctypes.byref(kind), _pointer(self._options)
+        )
         self._options[FROM_ZERO] = 1
         self._options[COUNTED] = -1
         self._call(ANALYSE)
@@ -124,7 +126,12 @@ class Pardiso:
             self._call(SOLVE, columns, result)
         return result
 
-    def _call(self, phase: int, right: Array | None = None, result: Array | None = None) -> int:
+    def _call(
+        self,
+        phase: int,
+        right: Array | None = None,
+        result: Array | None = None,
+    ) -> int:
         """Call one phase of PARDISO and return its error code.
 
         Raises
@@ -136,7 +143,9 @@ class Pardiso:
         """
         count = 1 if right is None else right.size // self.size
         settings = (1, 1, POSITIVE_DEFINITE, phase, self.size)
-        one, which, kind, stage, size = (ctypes.byref(ctypes.c_int(k)) for k in settings)
+        one, which, kind, stage, size = (
+            ctypes.byref(ctypes.c_int(k)) for k in settings
+        )
         error = ctypes.c_int(0)
         silent = ctypes.byref(ctypes.c_int(0))
         columns = ctypes.byref(ctypes.c_int(count))
@@ -161,7 +170,9 @@ class Pardiso:
         if error.value == NO_MEMORY:
             raise MemoryError("no memory for the factors of a timestep")
         if error.value not in (0, NOT_POSITIVE):
-            raise np.linalg.LinAlgError(f"PARDISO failed with error {error.value}")
+            raise np.linalg.LinAlgError(
+                f"PARDISO failed with error {error.value}"
+            )
         return error.value
 
     def __del__(self) -> None:

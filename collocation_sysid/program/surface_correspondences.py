@@ -136,7 +136,14 @@ class SurfaceCorrespondences:
         skin = VisibleSurface.from_body(body, camera.depth)
         images = [
             _match_image(
-                camera, skin, body=body, sample=k, x=x, phi=phi, gate_m=gate_m, settled=settled
+                camera,
+                skin,
+                body=body,
+                sample=k,
+                x=x,
+                phi=phi,
+                gate_m=gate_m,
+                settled=settled,
             )
             for k, x in enumerate(shapes_m)
         ]
@@ -144,7 +151,13 @@ class SurfaceCorrespondences:
         arrays: dict[str, Any] = {
             name: np.stack(
                 [
-                    np.pad(s[name], [(0, most - len(s[name])), *[(0, 0)] * (s[name].ndim - 1)])
+                    np.pad(
+                        s[name],
+                        [
+                            (0, most - len(s[name])),
+                            *[(0, 0)] * (s[name].ndim - 1),
+                        ],
+                    )
                     for s in images
                 ]
             )
@@ -152,7 +165,9 @@ class SurfaceCorrespondences:
             if name != "reasons"
         }
         total = np.sum([each["reasons"] for each in images], axis=0).tolist()
-        own: dict[str, Any] = {"excluded_counts": dict(zip(EXCLUSION_REASONS, total, strict=True))}
+        own: dict[str, Any] = {
+            "excluded_counts": dict(zip(EXCLUSION_REASONS, total, strict=True))
+        }
         own |= {
             "start_values": camera.parameter_values(phi),
             "gate_m": gate_m,
@@ -188,14 +203,18 @@ class SurfaceCorrespondences:
         skin = VisibleSurface.from_body(body, camera.depth)
         turn, shift_m = align_camera(camera, skin, shapes_m[first], first)
         moved = camera.with_pose(phi, turn, shift_m)
-        is_implausible = np.abs(moved[camera.parameter_indices]).max(initial=0.0) > FARTHEST
+        is_implausible = (
+            np.abs(moved[camera.parameter_indices]).max(initial=0.0) > FARTHEST
+        )
         gate_m = max(initial_gate_m(body.nodes_m), camera.depth.gate_m)
         phi = phi if is_implausible else moved
         clouds = tuple(map(thinned, camera.depth.clouds))
-        thinned_view = replace(camera, depth=replace(camera.depth, clouds=clouds, images_m=()))
-        gate_m = cls.from_shapes(thinned_view, body, shapes_m, phi, gate_m).next_gate_m(
-            shapes_m, phi
+        thinned_view = replace(
+            camera, depth=replace(camera.depth, clouds=clouds, images_m=())
         )
+        gate_m = cls.from_shapes(
+            thinned_view, body, shapes_m, phi, gate_m
+        ).next_gate_m(shapes_m, phi)
         return cls.from_shapes(camera, body, shapes_m, phi, gate_m)
 
     def updated(self, shapes_m: Array, phi: Array) -> SurfaceCorrespondences:
@@ -219,14 +238,25 @@ class SurfaceCorrespondences:
         before = self.camera.parameters_from(self.start_values)
         moved_m = np.abs(shapes_m - self.shapes_m[:known]).max(initial=0.0)
         for k in range(known if moved_m < FRONT * depth.spacing_m else 0):
-            way = self.camera.world_points(phi, k) - self.camera.world_points(before, k)
+            way = self.camera.world_points(phi, k) - self.camera.world_points(
+                before, k
+            )
             moved_m = max(moved_m, np.abs(way).max(initial=0.0))
         gate_m = self.next_gate_m(all_shapes_m, phi)
         settled = moved_m < FRONT * depth.spacing_m
-        if moved_m < SAME * depth.sigma_m and gate_m == self.gate_m and self.has_converged:
+        if (
+            moved_m < SAME * depth.sigma_m
+            and gate_m == self.gate_m
+            and self.has_converged
+        ):
             return self
         return SurfaceCorrespondences.from_shapes(
-            self.camera, self.body, shapes_m=all_shapes_m, phi=phi, gate_m=gate_m, settled=settled
+            self.camera,
+            self.body,
+            shapes_m=all_shapes_m,
+            phi=phi,
+            gate_m=gate_m,
+            settled=settled,
         )
 
     def distance_to_cloud_m(self, x: Array, phi: Array) -> Array:
@@ -236,7 +266,9 @@ class SurfaceCorrespondences:
         Distances are limited to `initial_gate_m` of the body.
         """
         view = self.camera
-        is_facing = self.surface.is_facing(x, self.camera.eye_m(phi, 0), GRAZING)
+        is_facing = self.surface.is_facing(
+            x, self.camera.eye_m(phi, 0), GRAZING
+        )
         middles = x[self.surface.plane_triangles[is_facing]].mean(axis=1)
         distances_m, _ = KDTree(view.world_points(phi, 0)).query(middles)
         return np.minimum(distances_m, initial_gate_m(self.body.nodes_m))
@@ -245,7 +277,9 @@ class SurfaceCorrespondences:
         """Return the gate for the next search [m]: narrower if the points are near enough to the
         surfaces (S, n, 3), else the present one.
         """
-        gate_m = max(self._expected_distance_m(shapes_m, phi), self.camera.depth.gate_m)
+        gate_m = max(
+            self._expected_distance_m(shapes_m, phi), self.camera.depth.gate_m
+        )
         return gate_m if gate_m <= NARROWER * self.gate_m else self.gate_m
 
     def _expected_distance_m(self, shapes_m: Array, phi: Array) -> float:
@@ -254,7 +288,11 @@ class SurfaceCorrespondences:
         """
         distances_m = self.signed_distances_m(shapes_m, phi)
         all_of_them = np.abs(distances_m[np.isfinite(distances_m)])
-        return SPREAD * float(np.median(all_of_them)) if len(all_of_them) else np.inf
+        return (
+            SPREAD * float(np.median(all_of_them))
+            if len(all_of_them)
+            else np.inf
+        )
 
     def signed_distances_m(self, shapes_m: Array, phi: Array) -> Array:
         """Return how far points (S, E) are behind shapes (S, n, 3), along the normals [m].
@@ -264,7 +302,9 @@ class SurfaceCorrespondences:
         distances_m = np.full(self.is_compared.shape, np.nan)
         for k, x in enumerate(shapes_m):
             surface = np.einsum("ea,eai->ei", self.weights[k], x[self.nodes[k]])
-            measured = self.camera.to_world(phi, self.points[k], self.rays[k], k)
+            measured = self.camera.to_world(
+                phi, self.points[k], self.rays[k], k
+            )
             behind_m = np.sum(self.normals[k] * (surface - measured), axis=1)
             distances_m[k] = np.where(self.is_compared[k], behind_m, np.nan)
         return distances_m
@@ -309,16 +349,24 @@ def _match_image(
     cloud = camera.depth.clouds[sample]
     world = camera.world_points(phi, sample)
     eye_m = camera.eye_m(phi, sample)
-    indices, faces, places = _nearest_facing(world, surface, x=x, eye_m=eye_m, gate_m=gate_m)
+    indices, faces, places = _nearest_facing(
+        world, surface, x=x, eye_m=eye_m, gate_m=gate_m
+    )
     weights, feet, normals = surface.evaluate(x, faces, places)
     ways = normals if eye_m is None else eye_m - feet
-    is_frontal = np.sum(normals * ways, axis=1) >= GRAZING * np.linalg.norm(ways, axis=1)
+    is_frontal = np.sum(normals * ways, axis=1) >= GRAZING * np.linalg.norm(
+        ways, axis=1
+    )
     offsets = world[indices] - feet
     distance = np.linalg.norm(offsets, axis=1)
-    lateral = np.linalg.norm(offsets - np.sum(offsets * normals, axis=1)[:, None] * normals, axis=1)
+    lateral = np.linalg.norm(
+        offsets - np.sum(offsets * normals, axis=1)[:, None] * normals, axis=1
+    )
     # A point beyond an edge of what the camera sees pulls that along the way to it.
     is_beyond_edge = lateral > LARGEST_OFFSET_EDGES * distance + depth.sigma_m
-    normals[is_beyond_edge] = offsets[is_beyond_edge] / distance[is_beyond_edge, None]
+    normals[is_beyond_edge] = (
+        offsets[is_beyond_edge] / distance[is_beyond_edge, None]
+    )
     has_similar_normal = is_visible = is_any = np.ones(len(indices), dtype=bool)
     if cloud.shape[1] == 6:
         measured = cloud[indices, 3:] @ camera.poses[0][sample].T
@@ -339,7 +387,9 @@ def _match_image(
     )
     reasons = -np.diff(remaining.sum(axis=1))
     reasons[0] += len(cloud) - len(indices)
-    rest_m = np.einsum("pa,pai->pi", weights, body.nodes_m[surface.nodes][surface.faces[faces]])
+    rest_m = np.einsum(
+        "pa,pai->pi", weights, body.nodes_m[surface.nodes][surface.faces[faces]]
+    )
     of_points = {
         "nodes": surface.faces[faces],
         "weights": weights,
@@ -349,11 +399,17 @@ def _match_image(
         "places_m": rest_m,
         "is_compared": remaining[-1].astype(bool),
     }
-    return {name: each[is_within_gate] for name, each in of_points.items()} | {"reasons": reasons}
+    return {name: each[is_within_gate] for name, each in of_points.items()} | {
+        "reasons": reasons
+    }
 
 
 def _nearest_facing(
-    world: Array, surface: VisibleSurface, x: Array, eye_m: Array | None, gate_m: float
+    world: Array,
+    surface: VisibleSurface,
+    x: Array,
+    eye_m: Array | None,
+    gate_m: float,
 ) -> tuple[Index, Index, Array]:
     """Return indices of points near a shape, and the nearest points of faces towards the camera:
     faces and barycentric coordinates.
@@ -380,7 +436,9 @@ def _nearest_facing(
     return in_box, *surface.nearest_points(x, world[in_box], facing)
 
 
-def initial_correspondences(experiment: Experiment) -> tuple[SurfaceCorrespondences, ...]:
+def initial_correspondences(
+    experiment: Experiment,
+) -> tuple[SurfaceCorrespondences, ...]:
     """Return the correspondences of an experiment's depth cameras with the undeformed body
     in its grasps.
     """
@@ -394,6 +452,8 @@ def initial_correspondences(experiment: Experiment) -> tuple[SurfaceCorresponden
         shapes_m = experiment.rigid_positions(depth.sample_times_s)[:, nodes]
         nothing = np.zeros(nuisance.size)
         sightings.append(
-            SurfaceCorrespondences.from_alignment(view, experiment.body, shapes_m, nothing)
+            SurfaceCorrespondences.from_alignment(
+                view, experiment.body, shapes_m, nothing
+            )
         )
     return tuple(sightings)

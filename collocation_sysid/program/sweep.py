@@ -173,12 +173,15 @@ class PrescribedColumns:
     is_prescribed: NDArray[np.bool_]
 
     @classmethod
-    def from_columns(cls, sweep: Sweep, dofs: Index, columns: Array) -> PrescribedColumns:
+    def from_columns(
+        cls, sweep: Sweep, dofs: Index, columns: Array
+    ) -> PrescribedColumns:
         """Build the prescribed rows of dofs (g,) that change by `columns` (N, g, c) [m]."""
         return cls(
             dofs,
             columns,
-            sweep.dynamics.is_temporarily_prescribed[:, dofs] | ~np.isin(dofs, sweep.free),
+            sweep.dynamics.is_temporarily_prescribed[:, dofs]
+            | ~np.isin(dofs, sweep.free),
         )
 
     @property
@@ -195,7 +198,9 @@ class PrescribedColumns:
         """Return the contribution (free, c) [N] of the prescribed changes at a time step to the
         changes of the force on the free dofs; 0 if nothing changes.
         """
-        now = np.where(self.is_prescribed[step.t, :, None], self.columns[step.t], 0.0)
+        now = np.where(
+            self.is_prescribed[step.t, :, None], self.columns[step.t], 0.0
+        )
         # What is only parameters of other kinds does not move them.
         changed = np.flatnonzero(now.any(axis=0))
         if not len(changed):
@@ -204,7 +209,9 @@ class PrescribedColumns:
         q = step.row.q[0]
         force = np.zeros((len(sweep.free), self.column_count))
         skew = step.row.skew(0, step.skew, step.rate_skew)
-        matrix = sweep.prescribed_block.extract(p * step.by_position + q * step.by_velocity, skew)
+        matrix = sweep.prescribed_block.extract(
+            p * step.by_position + q * step.by_velocity, skew
+        )
         force[:, changed] = matrix @ now[:, changed]
         return force
 
@@ -235,7 +242,10 @@ class SweepColumns:
 
     @classmethod
     def by_parameters(
-        cls, sweep: Sweep, equations: EquationsAtParameters, x: Array | None = None
+        cls,
+        sweep: Sweep,
+        equations: EquationsAtParameters,
+        x: Array | None = None,
     ) -> SweepColumns:
         """Build the columns of all parameters that change the motion.
 
@@ -255,11 +265,17 @@ class SweepColumns:
             prescribed = equations.prescribed
             goals = prescribed.positions_m[: sweep.dynamics.row_count]
             columns = np.zeros((*goals.shape, first + count))
-            columns[..., first + sweep.segment.nq :] = prescribed.by_phi[: len(goals)]
+            columns[..., first + sweep.segment.nq :] = prescribed.by_phi[
+                : len(goals)
+            ]
             if x is not None:
                 columns[..., 0] = np.nan_to_num(goals - x[:, prescribed.dofs])
-            grasped = PrescribedColumns.from_columns(sweep, prescribed.dofs, columns)
-        return cls(equations, first + count, has_step=x is not None, prescribed=grasped)
+            grasped = PrescribedColumns.from_columns(
+                sweep, prescribed.dofs, columns
+            )
+        return cls(
+            equations, first + count, has_step=x is not None, prescribed=grasped
+        )
 
     @classmethod
     def from_prescribed(
@@ -268,8 +284,15 @@ class SweepColumns:
         """Build the columns of prescribed changes `changes_m` (N, g, c) of the grasped dofs
         [m], without parameters.
         """
-        grasped = PrescribedColumns.from_columns(sweep, equations.prescribed.dofs, changes_m)
-        return cls(equations, grasped.column_count, has_parameters=False, prescribed=grasped)
+        grasped = PrescribedColumns.from_columns(
+            sweep, equations.prescribed.dofs, changes_m
+        )
+        return cls(
+            equations,
+            grasped.column_count,
+            has_parameters=False,
+            prescribed=grasped,
+        )
 
     def right_hand_sides(
         self,
@@ -295,12 +318,16 @@ class SweepColumns:
             Free dofs.
         """
         count, size = acceleration.shape
-        right, force = (np.zeros((count, k, self.count)) for k in (len(free), size))
+        right, force = (
+            np.zeros((count, k, self.count)) for k in (len(free), size)
+        )
         if residual is not None:
             right[..., 0] = residual
         if self.has_parameters:
             first = int(self.has_step)
-            force[..., first:] = self.equations.force_derivatives(rows, linearisation.by_theta)
+            force[..., first:] = self.equations.force_derivatives(
+                rows, linearisation.by_theta
+            )
             right[..., first:] -= self.equations.inertia_derivatives(
                 rows, acceleration[:, free], free
             )
@@ -311,7 +338,12 @@ class SweepColumns:
         zeros for the feasibility step.
         """
         own = self.equations.input_derivatives[t]
-        none = np.zeros((len(own), int(self.has_step) if self.has_parameters else self.count))
+        none = np.zeros(
+            (
+                len(own),
+                int(self.has_step) if self.has_parameters else self.count,
+            )
+        )
         return np.hstack([none, own]) if self.has_parameters else none
 
 
@@ -339,13 +371,17 @@ class Sweep:
     ) -> None:
         self.stopwatch = stopwatch or Stopwatch()
         self.factorisation: Choice = factorisation
-        self.dynamics = transcription.dynamics.truncated_to(rows or transcription.grid_times)
+        self.dynamics = transcription.dynamics.truncated_to(
+            rows or transcription.grid_times
+        )
         self.segment = transcription
         self.body = transcription.body
         self.pattern = transcription.pattern
         self.free = transcription.free_dofs
         self.sensed = transcription.sensed_dofs
-        self.factoriser = Factoriser.cached(self.pattern, self.free, factorisation)
+        self.factoriser = Factoriser.cached(
+            self.pattern, self.free, factorisation
+        )
         self.matrix = Submatrix(self.pattern, self.free)
         self.prescribed_block = Submatrix(
             self.pattern, self.free, transcription.prescribed_motion.dofs
@@ -353,12 +389,22 @@ class Sweep:
         self.of_sensed = Submatrix(self.pattern, self.sensed)
         self._takes = bool(self.dynamics.is_temporarily_prescribed.any())
 
-    def __reduce__(self) -> tuple[type[Sweep], tuple[Transcription, int, None, Choice]]:
-        return Sweep, (self.segment, self.dynamics.row_count, None, self.factorisation)
+    def __reduce__(
+        self,
+    ) -> tuple[type[Sweep], tuple[Transcription, int, None, Choice]]:
+        return Sweep, (
+            self.segment,
+            self.dynamics.row_count,
+            None,
+            self.factorisation,
+        )
 
     @one_blas_thread()
     def forward(
-        self, x: Array, equations: EquationsAtParameters, known: Tangent | None = None
+        self,
+        x: Array,
+        equations: EquationsAtParameters,
+        known: Tangent | None = None,
     ) -> Tangent:
         """Compute the feasibility step p and the sensitivities Z.
 
@@ -378,7 +424,9 @@ class Sweep:
         """
         sweep_columns = SweepColumns.by_parameters(self, equations, x)
         columns = np.zeros((*x.shape, sweep_columns.count))
-        grasp_forces = GraspForces.zeros(len(x), len(self.sensed), sweep_columns.count)
+        grasp_forces = GraspForces.zeros(
+            len(x), len(self.sensed), sweep_columns.count
+        )
         march = ForwardSubstitution(
             self, sweep_columns, known.last if known else None, grasp_forces
         )
@@ -389,7 +437,9 @@ class Sweep:
             march.violation_n = known.violation_n
             march.indefinite = known.indefinite_count
             grasp_forces.copy_first_rows(known.grasp_forces)
-        for _ in march.iterate_rows(x, 0 if known is None else len(known.step), columns):
+        for _ in march.iterate_rows(
+            x, 0 if known is None else len(known.step), columns
+        ):
             pass
         return Tangent(
             step=columns[:, :, 0],
@@ -401,7 +451,10 @@ class Sweep:
         )
 
     def sensitivities(
-        self, x: Array, equations: EquationsAtParameters, grasp_forces: GraspForces | None = None
+        self,
+        x: Array,
+        equations: EquationsAtParameters,
+        grasp_forces: GraspForces | None = None,
     ) -> Iterator[Array]:
         """Iterate over the sensitivities Z_t (3n, m) row by row, keeping only the last few rows in
         memory.
@@ -424,11 +477,15 @@ class Sweep:
             If the equations of a time step are singular or not finite.
         """
         return ForwardSubstitution(
-            self, SweepColumns.by_parameters(self, equations), grasp_forces=grasp_forces
+            self,
+            SweepColumns.by_parameters(self, equations),
+            grasp_forces=grasp_forces,
         ).iterate_rows(x)
 
     @one_blas_thread()
-    def backward(self, x: Array, equations: EquationsAtParameters, gradient: Array) -> Array:
+    def backward(
+        self, x: Array, equations: EquationsAtParameters, gradient: Array
+    ) -> Array:
         """Solve the adjoint equations c_xᵀ y = −`gradient` backward in time.
 
         Parameters
@@ -448,11 +505,15 @@ class Sweep:
         reach = self.dynamics.largest_lag
         free = self.free
         y = np.zeros_like(x)
-        remaining = -gradient[:, free]  # what is left for the rows that are still to come
+        remaining = -gradient[
+            :, free
+        ]  # what is left for the rows that are still to come
         histories = self.dynamics_at(equations).histories(x)
         later = deque[StencilRow](maxlen=reach)
         adjoints = [history.adjoint() for history in histories]
-        for chunk in self.chunks(x, equations, backward=True, histories=histories):
+        for chunk in self.chunks(
+            x, equations, backward=True, histories=histories
+        ):
             for step in reversed(chunk.steps):
                 t = step.t
                 row = step.row
@@ -469,18 +530,28 @@ class Sweep:
                 known[self.dynamics.is_temporarily_prescribed[t]] = 0
                 remaining[t] -= p[0] * by_state + q[0] * by_rate
                 if known.any():
-                    by_position = self.matrix.extract(step.by_position, -step.skew) @ known
+                    by_position = (
+                        self.matrix.extract(step.by_position, -step.skew)
+                        @ known
+                    )
                     remaining[t] -= p[0] * by_position
                     remaining[t] -= q[0] * (
-                        self.matrix.extract(step.by_velocity, -step.rate_skew) @ known
+                        self.matrix.extract(step.by_velocity, -step.rate_skew)
+                        @ known
                     )
                 # (w_0 (p_0 G + q_0 C) − s_0 M) y_t = what is left; the factor is of its negative.
                 right = self.without_prescribed(t, remaining[t])
                 y[t, free] = -step.factor.solve(right, transposed=True)
                 force_weight = known + row.w[0] * y[t]
-                by_position = self.matrix.extract(step.by_position, -step.skew) @ force_weight
+                by_position = (
+                    self.matrix.extract(step.by_position, -step.skew)
+                    @ force_weight
+                )
                 by_position += by_state
-                by_velocity = self.matrix.extract(step.by_velocity, -step.rate_skew) @ force_weight
+                by_velocity = (
+                    self.matrix.extract(step.by_velocity, -step.rate_skew)
+                    @ force_weight
+                )
                 by_velocity += by_rate
                 for each in adjoints:
                     each.step_back(force_weight)
@@ -504,7 +575,14 @@ class Sweep:
         most = ROOMS if self.factoriser.skyline else self.dynamics.row_count
         # Each thread has one to factorise, however large it is.
         least = min(self.body.threads, self.dynamics.row_count)
-        return max(least, min(self.dynamics.row_count, most, int(CHUNK_BYTES / self._step_bytes)))
+        return max(
+            least,
+            min(
+                self.dynamics.row_count,
+                most,
+                int(CHUNK_BYTES / self._step_bytes),
+            ),
+        )
 
     @property
     def chunk_bytes(self) -> int:
@@ -515,7 +593,11 @@ class Sweep:
     def _step_bytes(self) -> int:
         """Memory of one time step: element results and one factor [bytes]."""
         solver = self.factoriser
-        values = solver.unsymmetric_factor_size if self.body.is_unsymmetric else solver.factor_size
+        values = (
+            solver.unsymmetric_factor_size
+            if self.body.is_unsymmetric
+            else solver.factor_size
+        )
         return 8 * (self.body.linearisation_width + values)
 
     def dynamics_at(self, equations: EquationsAtParameters) -> Dynamics:
@@ -552,19 +634,29 @@ class Sweep:
         """
         dynamics = self.dynamics_at(equations)
         xi, nu = dynamics.evaluation_states(x)
-        starts = range(max(first, dynamics.first_row), dynamics.row_count, self.chunk_rows)
+        starts = range(
+            max(first, dynamics.first_row), dynamics.row_count, self.chunk_rows
+        )
         rooms = [
-            self.factoriser.allocate(1 + self.body.is_unsymmetric) for _ in range(self.chunk_rows)
+            self.factoriser.allocate(1 + self.body.is_unsymmetric)
+            for _ in range(self.chunk_rows)
         ]
         for start in reversed(starts) if backward else starts:
-            here = slice(start, min(start + self.chunk_rows, dynamics.row_count))
-            evaluations = slice(start - dynamics.first_row, here.stop - dynamics.first_row)
+            here = slice(
+                start, min(start + self.chunk_rows, dynamics.row_count)
+            )
+            evaluations = slice(
+                start - dynamics.first_row, here.stop - dynamics.first_row
+            )
             with self.stopwatch.evaluating():
                 at = dynamics.forces_with_histories(histories, here).linearise(
                     xi[evaluations], nu[evaluations]
                 )
             with self.stopwatch.solving():
-                rows = [StencilRow.from_dynamics(dynamics, t) for t in range(start, here.stop)]
+                rows = [
+                    StencilRow.from_dynamics(dynamics, t)
+                    for t in range(start, here.stop)
+                ]
                 factors = self._factorise(dynamics, at, here, rows, rooms)
             steps = map(
                 FactorisedStep,
@@ -612,14 +704,20 @@ class Sweep:
 
         def matrix(k: int) -> tuple[Array, Array]:
             values = rows[k].block(
-                linearisation.by_position[k], linearisation.by_velocity[k], pattern
+                linearisation.by_position[k],
+                linearisation.by_velocity[k],
+                pattern,
             )
             skew = rows[k].skew_block(
-                linearisation.by_position_skew[k], linearisation.by_velocity_skew[k]
+                linearisation.by_position_skew[k],
+                linearisation.by_velocity_skew[k],
             )
             if is_prescribed[k].any():
                 size = np.abs(values[pattern.diagonal]).mean()
-                removed = is_prescribed[k][pattern.rows] | is_prescribed[k][pattern.columns]
+                removed = (
+                    is_prescribed[k][pattern.rows]
+                    | is_prescribed[k][pattern.columns]
+                )
                 values[removed] = 0
                 values[pattern.diagonal[is_prescribed[k]]] = size
                 if skew.size:
@@ -629,7 +727,9 @@ class Sweep:
         try:
             count = len(linearisation.force)
             threads = self.body.threads
-            return self.factoriser.factorise_each(matrix, count, threads, buffers)
+            return self.factoriser.factorise_each(
+                matrix, count, threads, buffers
+            )
         except np.linalg.LinAlgError as error:
             raise SimulationError(
                 f"experiment '{self.segment.experiment.name}': the linearised equations of "
@@ -676,7 +776,10 @@ class ForwardSubstitution:
         reach = solver.dynamics.largest_lag
         self.shape = (size, columns.count)
         self._of_free = (len(solver.free), columns.count)
-        nothing = (np.zeros(shape) for shape in (self.shape, self._of_free, len(solver.free)))
+        nothing = (
+            np.zeros(shape)
+            for shape in (self.shape, self._of_free, len(solver.free))
+        )
         solutions, increments, forces = ((each,) * reach for each in nothing)
         last = last or ForwardState(solutions, increments, forces)
         self.past = deque(last.solutions, maxlen=reach)
@@ -684,7 +787,9 @@ class ForwardSubstitution:
         self.past_forces = deque(last.forces, maxlen=reach)
         # Also where these rows do not: they may be continued.
         self.weighs_past = bool(solver.segment.dynamics.tables.w[:, 1:].any())
-        self.internal_states: list[MemoryForwardColumns | ForceForwardColumns] = []
+        self.internal_states: list[
+            MemoryForwardColumns | ForceForwardColumns
+        ] = []
         self._known = last.history_columns
 
     @property
@@ -694,10 +799,14 @@ class ForwardSubstitution:
             solutions=tuple(self.past),
             increments=tuple(self.past_increments),
             forces=tuple(self.past_forces),
-            history_columns=tuple(each.columns for each in self.internal_states),
+            history_columns=tuple(
+                each.columns for each in self.internal_states
+            ),
         )
 
-    def iterate_rows(self, x: Array, done: int = 0, out: Array | None = None) -> Iterator[Array]:
+    def iterate_rows(
+        self, x: Array, done: int = 0, out: Array | None = None
+    ) -> Iterator[Array]:
         """Iterate over the solutions Y_t (3n, c).
 
         Parameters
@@ -719,11 +828,14 @@ class ForwardSubstitution:
         known = self._known or [None] * len(histories)
         pairs = zip(histories, known, strict=True)
         self.internal_states = [
-            each.forward_columns(columns.input_derivatives, done, own) for each, own in pairs
+            each.forward_columns(columns.input_derivatives, done, own)
+            for each, own in pairs
         ]
         for t in range(done, first):  # the start is given
             for each in self.internal_states:
-                each.advance(partial(np.zeros, self.shape), partial(np.zeros, self.shape))
+                each.advance(
+                    partial(np.zeros, self.shape), partial(np.zeros, self.shape)
+                )
             start = np.zeros(self.shape)
             if columns.prescribed is not None:
                 columns.prescribed.write_into(t, start)
@@ -732,8 +844,12 @@ class ForwardSubstitution:
         for chunk in solver.chunks(x, setting, first=done, histories=histories):
             residual = None
             if columns.has_step:
-                residual = np.stack([self._residual(s, acceleration[s.t]) for s in chunk.steps])
-                self.violation_n = max(self.violation_n, float(np.abs(residual).max(initial=0.0)))
+                residual = np.stack(
+                    [self._residual(s, acceleration[s.t]) for s in chunk.steps]
+                )
+                self.violation_n = max(
+                    self.violation_n, float(np.abs(residual).max(initial=0.0))
+                )
             sides = columns.right_hand_sides(
                 chunk.rows,
                 chunk.linearisation,
@@ -763,7 +879,9 @@ class ForwardSubstitution:
             self.past_forces.appendleft(force)
         return solver.without_prescribed(step.t, total)
 
-    def solve_step(self, step: FactorisedStep, right: Array, force: Array, out: Array) -> None:
+    def solve_step(
+        self, step: FactorisedStep, right: Array, force: Array, out: Array
+    ) -> None:
         """Solve one row and store Y_t in `out`.
 
         Parameters
@@ -786,8 +904,12 @@ class ForwardSubstitution:
         s = row.s
         mass = row.mass_kg.take(free)[:, None]
         if self.weighs_past:
-            right += weighted_sum_of_past(w, self.past_increments, self._of_free)
-        right -= mass * weighted_sum_of_past(s, self.past, self.shape).take(free, axis=0)
+            right += weighted_sum_of_past(
+                w, self.past_increments, self._of_free
+            )
+        right -= mass * weighted_sum_of_past(s, self.past, self.shape).take(
+            free, axis=0
+        )
         for each in self.internal_states:
             force = force + each.force_columns()
         forced = force.take(free, axis=0)
@@ -798,20 +920,27 @@ class ForwardSubstitution:
         solver.without_prescribed(t, forced)
         solution = step.factor.solve(right + w[0] * forced)
         if self.weighs_past:
-            self.past_increments.appendleft((s[0] * mass * solution - right) / w[0])
+            self.past_increments.appendleft(
+                (s[0] * mass * solution - right) / w[0]
+            )
         out[free] = solution
         if prescribed is not None:
             prescribed.write_into(t, out)
         for each in self.internal_states:
             each.advance(
-                partial(self._stencil_sum, row.p, out), partial(self._stencil_sum, row.q, out)
+                partial(self._stencil_sum, row.p, out),
+                partial(self._stencil_sum, row.q, out),
             )
         if self.grasp_forces is not None:
             self._store_grasp_forces(self.grasp_forces, step, force, out)
         self.past.appendleft(out)
 
     def _store_grasp_forces(
-        self, grasp_forces: GraspForces, step: FactorisedStep, force: Array, solution: Array
+        self,
+        grasp_forces: GraspForces,
+        step: FactorisedStep,
+        force: Array,
+        solution: Array,
     ) -> None:
         """Store the force F_t and its changes on the dofs of instrumented grasps in `grasp_forces`,
         in place.
@@ -830,8 +959,12 @@ class ForwardSubstitution:
         dofs = self.solver.sensed
         matrix = self.solver.of_sensed
         grasp_forces.force[step.t] = step.force[dofs]
-        state, rate = (self._stencil_sum(weights, solution) for weights in (row.p, row.q))
-        slopes = force[dofs] + matrix.extract(step.by_position, step.skew) @ state
+        state, rate = (
+            self._stencil_sum(weights, solution) for weights in (row.p, row.q)
+        )
+        slopes = (
+            force[dofs] + matrix.extract(step.by_position, step.skew) @ state
+        )
         grasp_forces.changes[step.t] = (
             slopes + matrix.extract(step.by_velocity, step.rate_skew) @ rate
         )
@@ -840,9 +973,13 @@ class ForwardSubstitution:
         """Return Σ_i weights[i] Y_{t−i} (3n, c) with Y_t = `solution`: the change of ξ or ν of row
         t for the weights p or q.
         """
-        return weights[0] * solution + weighted_sum_of_past(weights, self.past, self.shape)
+        return weights[0] * solution + weighted_sum_of_past(
+            weights, self.past, self.shape
+        )
 
-    def _past_force(self, step: FactorisedStep, row: StencilRow) -> Array | float:
+    def _past_force(
+        self, step: FactorisedStep, row: StencilRow
+    ) -> Array | float:
         """Return the change of force G Σ p_i Y_{t−i} + C Σ q_i Y_{t−i} of earlier rows, i ≥ 1,
         (free, c) [N], with as few products as possible; 0 if the row has no such lag.
         """
@@ -853,7 +990,10 @@ class ForwardSubstitution:
             (i,) = row.nonzero_lags
             block = row.p[i] * step.by_position
             block += row.q[i] * step.by_velocity
-            return matrix.extract(block, row.skew(i, step.skew, step.rate_skew)) @ self.past[i - 1]
+            return (
+                matrix.extract(block, row.skew(i, step.skew, step.rate_skew))
+                @ self.past[i - 1]
+            )
         past = weighted_sum_of_past(row.q, self.past, self.shape)
         total = matrix.extract(step.by_velocity, step.rate_skew) @ past
         if any(row.p[1:]):

@@ -33,8 +33,17 @@ from ..model.parameters import Parameters, ThetaMap
 from ..model.schemes import Scheme
 from ..recording.experiment import Experiment
 from ..recording.nuisance import TIME
-from .block_band import BandBlock, BlockBand, BlockTerm, full_skew_values, skew_block_band
-from .custom_sensor_residual import CustomSensorResidual, custom_sensor_residuals
+from .block_band import (
+    BandBlock,
+    BlockBand,
+    BlockTerm,
+    full_skew_values,
+    skew_block_band,
+)
+from .custom_sensor_residual import (
+    CustomSensorResidual,
+    custom_sensor_residuals,
+)
 from .depth_camera_model import DepthCameraModel
 from .depth_residual import DepthResidual
 from .local_loss import LocalLoss
@@ -52,7 +61,14 @@ T = TypeVar("T", bound=np.generic)
 Factors = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
 WeightedHistory = tuple[AnyHistory, Array]
 
-CHARTED = ("markers", "depths", "outlines", "residuals", "local_loss", "_loss_scale")
+CHARTED = (
+    "markers",
+    "depths",
+    "outlines",
+    "residuals",
+    "local_loss",
+    "_loss_scale",
+)
 
 
 @dataclass(frozen=True)
@@ -153,13 +169,18 @@ class Transcription:
         any estimate.
         """
         return with_inputs(
-            Dynamics.from_experiment(self.experiment, self.scheme, self.substeps), self.nuisance
+            Dynamics.from_experiment(
+                self.experiment, self.scheme, self.substeps
+            ),
+            self.nuisance,
         )
 
     @cached_property
     def nuisance(self) -> NuisanceMap:
         """Nuisance parameters φ of the experiment."""
-        return NuisanceMap.from_experiment(self.experiment, self.nuisance_indices.pivot_m)
+        return NuisanceMap.from_experiment(
+            self.experiment, self.nuisance_indices.pivot_m
+        )
 
     @cached_property
     def markers(self) -> MarkerResidual:
@@ -177,7 +198,10 @@ class Transcription:
     def sensors(self) -> tuple[WrenchResidual, ...]:
         """Measurement models of the grasps' force–torque sensors."""
         return wrench_residuals(
-            self.experiment, ReactionGrid.from_dynamics(self.dynamics), self.nuisance, self.huber
+            self.experiment,
+            ReactionGrid.from_dynamics(self.dynamics),
+            self.nuisance,
+            self.huber,
         )
 
     @cached_property
@@ -185,7 +209,11 @@ class Transcription:
         """Measurement models of the custom sensors."""
         grid = ReactionGrid.from_dynamics(self.dynamics)
         return custom_sensor_residuals(
-            self.experiment, grid.t_s, grid=grid, nuisance=self.nuisance, huber=self.huber
+            self.experiment,
+            grid.t_s,
+            grid=grid,
+            nuisance=self.nuisance,
+            huber=self.huber,
         )
 
     @cached_property
@@ -199,7 +227,9 @@ class Transcription:
                 huber=self.huber,
             )
             for sighting, view in zip(
-                self.association.correspondences, self.camera_models, strict=True
+                self.association.correspondences,
+                self.camera_models,
+                strict=True,
             )
         )
 
@@ -209,7 +239,9 @@ class Transcription:
         that have images.
         """
         with_images = (
-            depth for depth in self.depths if len(depth.correspondences.camera.depth.images_m)
+            depth
+            for depth in self.depths
+            if len(depth.correspondences.camera.depth.images_m)
         )
         return tuple(OutlineResidual.from_depth(depth) for depth in with_images)
 
@@ -218,7 +250,8 @@ class Transcription:
         """Camera models of the depth cameras, in their order."""
         cameras = range(len(self.experiment.depths))
         return tuple(
-            DepthCameraModel.from_experiment(self.experiment, k, self.nuisance) for k in cameras
+            DepthCameraModel.from_experiment(self.experiment, k, self.nuisance)
+            for k in cameras
         )
 
     @cached_property
@@ -226,18 +259,30 @@ class Transcription:
         """All measurement models: markers, wrench sensors, custom sensors, depth cameras,
         outlines.
         """
-        return self.markers, *self.sensors, *self.custom_sensors, *self.depths, *self.outlines
+        return (
+            self.markers,
+            *self.sensors,
+            *self.custom_sensors,
+            *self.depths,
+            *self.outlines,
+        )
 
     @cached_property
     def local_loss(self) -> LocalLoss:
         """Second derivatives of the loss by x and φ, for the measurements that depend on
         few positions.
         """
-        pairs = ((reading, reading.observable.local) for reading in self.residuals)
-        local = tuple(
-            (reading, points) for reading, points in pairs if points and points.vector_count
+        pairs = (
+            (reading, reading.observable.local) for reading in self.residuals
         )
-        return LocalLoss(local, self.variable_count, self.nuisance.size, self.dof_count)
+        local = tuple(
+            (reading, points)
+            for reading, points in pairs
+            if points and points.vector_count
+        )
+        return LocalLoss(
+            local, self.variable_count, self.nuisance.size, self.dof_count
+        )
 
     @cached_property
     def sensed_dofs(self) -> Index:
@@ -257,7 +302,9 @@ class Transcription:
         vars(other).update(independent | {"association": association})
         return other
 
-    def follow_estimates(self, phi: Array, x: Array) -> tuple[MarkerAssociation, Array]:
+    def follow_estimates(
+        self, phi: Array, x: Array
+    ) -> tuple[MarkerAssociation, Array]:
         """Update the association where estimates have left it.
 
         Markers get the elements that contain their estimated places, clocks the nearest samples,
@@ -278,18 +325,27 @@ class Transcription:
         nuisance = self.nuisance
         places = self.markers.coordinate_parameters
         shifts_s = (
-            phi[nuisance.indices_of_rows(TIME)] * nuisance.scales[nuisance.indices_of_rows(TIME)]
+            phi[nuisance.indices_of_rows(TIME)]
+            * nuisance.scales[nuisance.indices_of_rows(TIME)]
         )
         shift = float(shifts_s.sum()) / self.experiment.timestep_s
         chart, place_coordinates = self.association.follow_estimates(
             np.append(phi, 0.0)[places], shift
         )
-        sightings = [d.correspondences.updated(d.surface_shapes(x, phi), phi) for d in self.depths]
-        if any(s is not d.correspondences for s, d in zip(sightings, self.depths, strict=True)):
+        sightings = [
+            d.correspondences.updated(d.surface_shapes(x, phi), phi)
+            for d in self.depths
+        ]
+        if any(
+            s is not d.correspondences
+            for s, d in zip(sightings, self.depths, strict=True)
+        ):
             chart = replace(chart, correspondences=tuple(sightings))
         return chart, self._with_marker_places(phi, place_coordinates)
 
-    def place_unknown_markers(self, phi: Array, x: Array) -> tuple[MarkerAssociation, Array]:
+    def place_unknown_markers(
+        self, phi: Array, x: Array
+    ) -> tuple[MarkerAssociation, Array]:
         """Initialise unknown marker places and depth cameras from the first rows of a motion.
 
         A marker without a stated place is put where its first sample lies on the body; depth
@@ -308,15 +364,21 @@ class Transcription:
             The association, and φ in it.
         """
         phi = phi.copy()
-        sightings = tuple(depth.aligned_correspondences(x, phi) for depth in self.depths)
+        sightings = tuple(
+            depth.aligned_correspondences(x, phi) for depth in self.depths
+        )
         for each in sightings:
-            phi[each.camera.parameter_indices] = each.camera.parameters_from(each.start_values)[
-                each.camera.parameter_indices
-            ]
+            phi[each.camera.parameter_indices] = each.camera.parameters_from(
+                each.start_values
+            )[each.camera.parameter_indices]
         chart, phi = self._place_markers(phi, x)
-        return (replace(chart, correspondences=sightings) if sightings else chart), phi
+        return (
+            replace(chart, correspondences=sightings) if sightings else chart
+        ), phi
 
-    def _place_markers(self, phi: Array, x: Array) -> tuple[MarkerAssociation, Array]:
+    def _place_markers(
+        self, phi: Array, x: Array
+    ) -> tuple[MarkerAssociation, Array]:
         """Return the association and φ (k,) with unknown marker places initialised from rows x
         (rows, 3n) [m]; unchanged if all places are stated.
         """
@@ -327,7 +389,9 @@ class Transcription:
         points_m, _ = markers.first_samples
         first = rows[markers.is_present.argmax(axis=0)]
         places_m = self.marker_places_m(phi)
-        unknown = ~markers.located & (first < len(x)) & markers.is_present.any(axis=0)
+        unknown = (
+            ~markers.located & (first < len(x)) & markers.is_present.any(axis=0)
+        )
         for row in np.unique(first[unknown]):
             starting = np.flatnonzero(unknown & (first == row))
             places_m[starting] = self.association.places_of_points(
@@ -345,8 +409,12 @@ class Transcription:
         """
         unknown = ~self.experiment.markers.located
         first = self.experiment.markers.is_present[:, unknown].argmax(axis=0)
-        rows = [int(self.markers.sample_rows[first].max())] if len(first) else []
-        return 1 + max(rows + [depth.first_row for depth in self.depths], default=-1)
+        rows = (
+            [int(self.markers.sample_rows[first].max())] if len(first) else []
+        )
+        return 1 + max(
+            rows + [depth.first_row for depth in self.depths], default=-1
+        )
 
     @property
     def rows_to_follow(self) -> int:
@@ -355,7 +423,9 @@ class Transcription:
 
     def marker_places_m(self, phi: Array) -> Array:
         """Return the places (M, 3) of the markers on the undeformed body at φ (k,) [m]."""
-        return self.association.places_m(np.append(phi, 0.0)[self.markers.coordinate_parameters])
+        return self.association.places_m(
+            np.append(phi, 0.0)[self.markers.coordinate_parameters]
+        )
 
     @property
     def guess_phi(self) -> Array:
@@ -370,16 +440,24 @@ class Transcription:
             / self.nuisance.scales[time_shifts]
         )
         for depth in self.depths:
-            phi += depth.correspondences.camera.parameters_from(depth.correspondences.start_values)
-        return self._with_marker_places(phi, self.association.centre_coordinates)
+            phi += depth.correspondences.camera.parameters_from(
+                depth.correspondences.start_values
+            )
+        return self._with_marker_places(
+            phi, self.association.centre_coordinates
+        )
 
-    def _with_marker_places(self, phi: Array, place_coordinates: Array) -> Array:
+    def _with_marker_places(
+        self, phi: Array, place_coordinates: Array
+    ) -> Array:
         """Return φ (k,) with other coordinates of the estimated marker places, from
         `place_coordinates` (M, k').
         """
         updated = phi.copy()
         estimated = self.association.estimated
-        updated[self.markers.coordinate_parameters[estimated]] = place_coordinates[estimated]
+        updated[self.markers.coordinate_parameters[estimated]] = (
+            place_coordinates[estimated]
+        )
         return updated
 
     # Sizes and places -------------------------------------------------------------------------
@@ -407,7 +485,11 @@ class Transcription:
     @cached_property
     def constrained_dofs(self) -> Index:
         """Dof of each constraint of one grid time, (rows_per_time,)."""
-        return np.arange(self.dof_count) if self.has_constraints_of_grasps else self.free_dofs
+        return (
+            np.arange(self.dof_count)
+            if self.has_constraints_of_grasps
+            else self.free_dofs
+        )
 
     @property
     def has_constraints_of_grasps(self) -> bool:
@@ -444,7 +526,9 @@ class Transcription:
     @property
     def columns(self) -> slice:
         """Slice of its positions in z."""
-        return slice(self.offsets.position, self.offsets.position + self.variable_count)
+        return slice(
+            self.offsets.position, self.offsets.position + self.variable_count
+        )
 
     @property
     def rows(self) -> slice:
@@ -454,7 +538,9 @@ class Transcription:
     @property
     def parameter_indices(self) -> Index:
         """Indices of its (q, φ) in p."""
-        return np.concatenate([np.arange(self.nq), self.nuisance_indices.indices])
+        return np.concatenate(
+            [np.arange(self.nq), self.nuisance_indices.indices]
+        )
 
     @property
     def next_offsets(self) -> SegmentOffsets:
@@ -466,9 +552,13 @@ class Transcription:
     @cached_property
     def prescribed_motion(self) -> GraspConstraint:
         """Prescribed displacements of the grasps as a function of φ."""
-        return GraspConstraint(self.experiment, self.nuisance, self.dynamics.t_s)
+        return GraspConstraint(
+            self.experiment, self.nuisance, self.dynamics.t_s
+        )
 
-    def _prescribed_positions(self, prescribed: PrescribedDisplacements) -> Array:
+    def _prescribed_positions(
+        self, prescribed: PrescribedDisplacements
+    ) -> Array:
         """Return the prescribed positions (N, 3n) of the grasped dofs [m], NaN elsewhere."""
         goals = np.full((self.grid_times, self.dof_count), np.nan)
         goals[:, prescribed.dofs] = prescribed.positions_m
@@ -492,7 +582,9 @@ class Transcription:
         at_last = dynamics.forces.at_times(slice(dynamics.row_count - 1, None))
         forces = at_last.linearise(at_rest, np.zeros_like(at_rest))
         last = StencilRow.from_dynamics(dynamics, dynamics.row_count - 1)
-        block = last.block(forces.by_position[0], forces.by_velocity[0], pattern)
+        block = last.block(
+            forces.by_position[0], forces.by_velocity[0], pattern
+        )
         stiffness = np.abs(block[pattern.diagonal[self.free_dofs]]).mean()
         return self.length_m * float(stiffness)
 
@@ -514,7 +606,9 @@ class Transcription:
         lower = np.full((self.grid_times, self.dof_count), -np.inf)
         upper = np.full((self.grid_times, self.dof_count), np.inf)
         if not self.has_constraints_of_grasps:
-            lower[:, self.prescribed_dofs] = self.dynamics.prescribed_m[:, self.prescribed_dofs]
+            lower[:, self.prescribed_dofs] = self.dynamics.prescribed_m[
+                :, self.prescribed_dofs
+            ]
             upper[:, self.prescribed_dofs] = lower[:, self.prescribed_dofs]
         start = self.start_positions()
         if start is not None:
@@ -526,7 +620,9 @@ class Transcription:
     @cached_property
     def dynamic_parameters(self) -> Index:
         """Indices in (q, φ) of the parameters that change the motion, not only the measurements."""
-        return np.concatenate([np.arange(self.nq), self.nq + self.nuisance.motion_indices])
+        return np.concatenate(
+            [np.arange(self.nq), self.nq + self.nuisance.motion_indices]
+        )
 
     def dynamic_columns(self, first_phi: int) -> Index:
         """Return the indices in z of the parameters that change the motion.
@@ -536,13 +632,19 @@ class Transcription:
         first_phi : int
             Index in z where the nuisance parameters of all experiments begin.
         """
-        phi = first_phi - self.nq + self.nuisance_indices.indices[self.nuisance.motion_indices]
+        phi = (
+            first_phi
+            - self.nq
+            + self.nuisance_indices.indices[self.nuisance.motion_indices]
+        )
         return np.concatenate([np.arange(self.nq), phi])
 
     @property
     def has_histories(self) -> bool:
         """Whether its body or a force on it has history variables."""
-        return self.body.has_memory or bool(self.dynamics.forces.terms_with_internal_variables)
+        return self.body.has_memory or bool(
+            self.dynamics.forces.terms_with_internal_variables
+        )
 
     def equations_at(self, q: Array, phi: Array) -> EquationsAtParameters:
         """Return the equations of motion at shared parameters q (nq,) and nuisance
@@ -553,7 +655,9 @@ class Transcription:
         dynamics = self.dynamics.with_inputs(u)
         prescribed = self.prescribed_motion.evaluate_at(phi)
         if prescribed.depends_on_phi:
-            dynamics = replace(dynamics, prescribed_m=self._prescribed_positions(prescribed))
+            dynamics = replace(
+                dynamics, prescribed_m=self._prescribed_positions(prescribed)
+            )
         return EquationsAtParameters(
             self.inputs,
             p,
@@ -569,7 +673,10 @@ class Transcription:
         evaluations.
         """
         return inputs_from_experiment(
-            self.experiment, self.parameters, self.nuisance, self.dynamics.evaluated_s
+            self.experiment,
+            self.parameters,
+            self.nuisance,
+            self.dynamics.evaluated_s,
         )
 
     def corrected_experiment(self, phi: Array) -> Experiment:
@@ -583,8 +690,14 @@ class Transcription:
             grasps = self.nuisance.with_grasps(grasps, phi)
         drive_errors = iter(self.nuisance.actuator_calibration(phi))
         tendons, pressures = (
-            tuple(actuator.with_calibration(*next(drive_errors)) for actuator in actuators)
-            for actuators in (self.experiment.tendons, self.experiment.pressures)
+            tuple(
+                actuator.with_calibration(*next(drive_errors))
+                for actuator in actuators
+            )
+            for actuators in (
+                self.experiment.tendons,
+                self.experiment.pressures,
+            )
         )
         changed = replace(
             self.experiment,
@@ -599,13 +712,18 @@ class Transcription:
         """Return positions x (N, 3n) [m] with the prescribed dofs at the positions to which their
         grasps move at φ (k,).
         """
-        goals = self._prescribed_positions(self.prescribed_motion.evaluate_at(phi))
+        goals = self._prescribed_positions(
+            self.prescribed_motion.evaluate_at(phi)
+        )
         return np.where(np.isnan(goals), x, goals)
 
     # Values ---------------------------------------------------------------------------------
 
     def constraint_values(
-        self, x: Array, equations: EquationsAtParameters, histories: Sequence[AnyHistory] = ()
+        self,
+        x: Array,
+        equations: EquationsAtParameters,
+        histories: Sequence[AnyHistory] = (),
     ) -> Array:
         """Return the scaled constraints (constraints,).
 
@@ -619,7 +737,9 @@ class Transcription:
             History variables at x, of the body and of forces; empty if there are none, or if they
             are to be computed from x.
         """
-        return self._scaled_constraints(x, equations.dynamics.residual(x, histories), equations)
+        return self._scaled_constraints(
+            x, equations.dynamics.residual(x, histories), equations
+        )
 
     def _scaled_constraints(
         self, x: Array, residual: Array, equations: EquationsAtParameters
@@ -646,7 +766,10 @@ class Transcription:
         return self.select_rows(grasped)
 
     def residual_n(
-        self, x: Array, equations: EquationsAtParameters, histories: Sequence[AnyHistory] = ()
+        self,
+        x: Array,
+        equations: EquationsAtParameters,
+        histories: Sequence[AnyHistory] = (),
     ) -> Array:
         """Return the residuals of the equations of motion (N, free dofs) [N], zero while a grasp
         prescribes the dof; arguments as in `constraint_values`.
@@ -671,7 +794,11 @@ class Transcription:
         return self.motion_rows.structure
 
     def constraints_and_jacobian(
-        self, x: Array, equations: EquationsAtParameters, forces: Linearisation, values: Array
+        self,
+        x: Array,
+        equations: EquationsAtParameters,
+        forces: Linearisation,
+        values: Array,
     ) -> tuple[Array, Array]:
         """Evaluate the constraints and their derivatives; history variables are treated as
         constant.
@@ -693,14 +820,22 @@ class Transcription:
             Scaled constraints c, and ∂c/∂(q, φ) by the parameters of `dynamic_parameters`.
         """
         dynamics = equations.dynamics
-        self.motion_rows.fill(values, forces, dynamics, equations.mass_depends_on_parameters)
-        by_p = np.zeros((self.grid_times, self.dof_count, len(self.dynamic_parameters)))
+        self.motion_rows.fill(
+            values, forces, dynamics, equations.mass_depends_on_parameters
+        )
+        by_p = np.zeros(
+            (self.grid_times, self.dof_count, len(self.dynamic_parameters))
+        )
         rows = slice(dynamics.first_row, None)
         by_p[rows] = equations.force_derivatives(rows, forces.by_theta)
-        by_p = dynamics.combine(dynamics.tables.w, dynamics.zero_prescribed_forces(by_p))
+        by_p = dynamics.combine(
+            dynamics.tables.w, dynamics.zero_prescribed_forces(by_p)
+        )
         if equations.mass_depends_on_parameters:
             all_rows = slice(None)
-            by_p -= equations.inertia_derivatives(all_rows, dynamics.acceleration(x), all_rows)
+            by_p -= equations.inertia_derivatives(
+                all_rows, dynamics.acceleration(x), all_rows
+            )
         by_p /= self.force_n
         dynamics.zero_prescribed_forces(by_p)
         by_p[:, self.prescribed_dofs] = 0
@@ -709,8 +844,12 @@ class Transcription:
                 equations.prescribed.by_phi / self.length_m
             )
         by_p = by_p[dynamics.first_row :, self.constrained_dofs]
-        rows = self._scaled_constraints(x, dynamics.assemble_residual(x, forces.force), equations)
-        return rows, by_p.reshape(self.constraint_count, len(self.dynamic_parameters))
+        rows = self._scaled_constraints(
+            x, dynamics.assemble_residual(x, forces.force), equations
+        )
+        return rows, by_p.reshape(
+            self.constraint_count, len(self.dynamic_parameters)
+        )
 
     def lagrangian_weights(
         self, multipliers: Array, reaction_weights: Array | float = 0.0
@@ -728,11 +867,17 @@ class Transcription:
         dynamics = self.dynamics
         t = self.dynamics.tables
         rows = np.zeros((self.grid_times, self.dof_count))
-        by_time = multipliers.reshape(self.constraint_times, self.constraints_per_time)
-        rows[dynamics.first_row :, self.constrained_dofs] = by_time / self.force_n
+        by_time = multipliers.reshape(
+            self.constraint_times, self.constraints_per_time
+        )
+        rows[dynamics.first_row :, self.constrained_dofs] = (
+            by_time / self.force_n
+        )
         rows[:, self.prescribed_dofs] = 0
         rows = dynamics.zero_prescribed_forces(rows)
-        forces = dynamics.zero_prescribed_forces(dynamics.combine_transposed(t.w, rows))
+        forces = dynamics.zero_prescribed_forces(
+            dynamics.combine_transposed(t.w, rows)
+        )
         if isinstance(reaction_weights, np.ndarray):
             rows = rows + reaction_weights
             forces = forces + dynamics.combine_transposed(t.w, reaction_weights)
@@ -766,7 +911,10 @@ class Transcription:
                 weights, equations.input_derivatives
             )
             by_x += dynamics.combine_transposed(dynamics.state_weights, by_xi)
-            by_x += dynamics.combine_transposed(dynamics.tables.q, by_nu) / dynamics.step_s
+            by_x += (
+                dynamics.combine_transposed(dynamics.tables.q, by_nu)
+                / dynamics.step_s
+            )
             by_p += own
         return by_x, by_p
 
@@ -774,7 +922,9 @@ class Transcription:
     def linearisation_buffer(self) -> Array:
         """Work space (constraint_times, width) for linearisations; overwritten by each of them."""
         # Kept between calls: fresh pages would cost as much as the numbers in them.
-        return np.zeros((self.constraint_times, self.dynamics.forces.linearisation_width))
+        return np.zeros(
+            (self.constraint_times, self.dynamics.forces.linearisation_width)
+        )
 
     # Second derivatives -----------------------------------------------------------------------
 
@@ -785,19 +935,27 @@ class Transcription:
         The nq rows of q stand above the rows of x.
         """
         blocks = self._hessian_blocks(_state_factors)
-        return BlockBand(self.dof_count, self._hessian_starts, blocks, top_rows=self.nq)
+        return BlockBand(
+            self.dof_count, self._hessian_starts, blocks, top_rows=self.nq
+        )
 
     @cached_property
     def _skew_hessian(self) -> BlockBand:
         """Structure of `hessian` for adding the contribution of the skew part of ∂²φ/∂x∂v."""
-        blocks = self._hessian_blocks(lambda p, q, pp, qq: (pp * q - qq * p, 0 * q))
-        return skew_block_band(self.dof_count, self._hessian_starts, blocks, top_rows=self.nq)
+        blocks = self._hessian_blocks(
+            lambda p, q, pp, qq: (pp * q - qq * p, 0 * q)
+        )
+        return skew_block_band(
+            self.dof_count, self._hessian_starts, blocks, top_rows=self.nq
+        )
 
     @cached_property
     def _rate_hessian(self) -> BlockBand:
         """Structure of `hessian` for adding the contribution of ∂²φ/∂v²."""
         blocks = self._hessian_blocks(lambda p, q, pp, qq: (q * qq, 0 * q))
-        return BlockBand(self.dof_count, self._hessian_starts, blocks, self.nq, adds=True)
+        return BlockBand(
+            self.dof_count, self._hessian_starts, blocks, self.nq, adds=True
+        )
 
     @property
     def _hessian_starts(self) -> Index:
@@ -816,9 +974,15 @@ class Transcription:
         rows, columns, source = self.pattern.full
         blocks = []
         for distance in range(self.dynamics.largest_lag + 1):
-            if distance > 0 and not self._curvature_terms(distance, _state_factors):
+            if distance > 0 and not self._curvature_terms(
+                distance, _state_factors
+            ):
                 continue
-            is_stored = rows <= columns if distance == 0 else np.ones(len(rows), dtype=bool)
+            is_stored = (
+                rows <= columns
+                if distance == 0
+                else np.ones(len(rows), dtype=bool)
+            )
             entries = np.flatnonzero(is_stored)
             terms = self._curvature_terms(distance, factors)
             blocks.append(
@@ -833,7 +997,9 @@ class Transcription:
             )
         return blocks
 
-    def _curvature_terms(self, distance: int, factors: Factors) -> list[BlockTerm]:
+    def _curvature_terms(
+        self, distance: int, factors: Factors
+    ) -> list[BlockTerm]:
         """Return the terms of the Hessian's block between rows at a distance in time, a sum over
         the evaluations k = t + i.
 
@@ -848,10 +1014,18 @@ class Transcription:
         q = self.dynamics.tables.q / self.dynamics.step_s
         terms = []
         for i in range(self.dynamics.largest_lag + 1 - distance):
-            pair = factors(p[:, i], q[:, i], p[:, i + distance], q[:, i + distance])
+            pair = factors(
+                p[:, i], q[:, i], p[:, i + distance], q[:, i + distance]
+            )
             if any(each.any() for each in pair):
                 terms.append(
-                    BlockTerm(i, *(shifted_back(self.length_m**2 * each, i) for each in pair))
+                    BlockTerm(
+                        i,
+                        *(
+                            shifted_back(self.length_m**2 * each, i)
+                            for each in pair
+                        ),
+                    )
                 )
         return terms
 
@@ -896,9 +1070,14 @@ class Transcription:
         """
         dynamics = equations.dynamics
         band = self.hessian
-        curvature = self._curvature(x, equations, weights.forces, lifted_histories)
+        curvature = self._curvature(
+            x, equations, weights.forces, lifted_histories
+        )
         band.fill(
-            values, curvature.position_position, curvature.position_velocity, self.body.threads
+            values,
+            curvature.position_position,
+            curvature.position_velocity,
+            self.body.threads,
         )
         if curvature.velocity_velocity.size:
             rates = curvature.velocity_velocity
@@ -906,27 +1085,48 @@ class Transcription:
         skew = full_skew_values(self.pattern, curvature.position_velocity_skew)
         if skew.size:
             self._skew_hessian.fill(values, skew, skew, self.body.threads)
-        by_x, twice = equations.weighted_second_derivatives(x, curvature, weights.rows)
+        by_x, twice = equations.weighted_second_derivatives(
+            x, curvature, weights.rows
+        )
         of_q = self.length_m * by_x[..., : self.nq]
         values[band.top_positions] = of_q.reshape(band.top_positions.shape)
-        by_phi = np.diag(2 * loss_weight * self.nuisance_indices.is_first)  # the prior
+        by_phi = np.diag(
+            2 * loss_weight * self.nuisance_indices.is_first
+        )  # the prior
         of_motion = twice[self.nq :, self.nq :]
         if equations.prescribed.depends_on_phi:
             of_goals = np.zeros((self.grid_times, self.dof_count))
-            by_time = weights.multipliers.reshape(self.constraint_times, self.constraints_per_time)
-            of_goals[dynamics.first_row :, self.constrained_dofs] = -by_time / self.length_m
+            by_time = weights.multipliers.reshape(
+                self.constraint_times, self.constraints_per_time
+            )
+            of_goals[dynamics.first_row :, self.constrained_dofs] = (
+                -by_time / self.length_m
+            )
             grasped = ~np.isnan(equations.prescribed.positions_m)
-            of_goals = np.where(grasped, of_goals[:, equations.prescribed.dofs], 0.0)
-            of_motion = of_motion + self.prescribed_motion.weighted_hessian(phi, of_goals)
-        by_phi[np.ix_(self.nuisance.motion_indices, self.nuisance.motion_indices)] += of_motion
+            of_goals = np.where(
+                grasped, of_goals[:, equations.prescribed.dofs], 0.0
+            )
+            of_motion = of_motion + self.prescribed_motion.weighted_hessian(
+                phi, of_goals
+            )
+        by_phi[
+            np.ix_(self.nuisance.motion_indices, self.nuisance.motion_indices)
+        ] += of_motion
         of_loss = (
             loss_weight
             * self._loss_scale
             * self.local_loss.hessian(x, phi, has_observation_curvature)
         )
-        of_states = self.length_m * by_x[..., self.state_dependent_nuisance].ravel()
+        of_states = (
+            self.length_m * by_x[..., self.state_dependent_nuisance].ravel()
+        )
         of_pairs = by_phi[np.triu_indices(len(by_phi))]
-        further = [of_loss, twice[: self.nq, self.nq :].ravel(), of_states, of_pairs]
+        further = [
+            of_loss,
+            twice[: self.nq, self.nq :].ravel(),
+            of_states,
+            of_pairs,
+        ]
         return twice[: self.nq, : self.nq], further
 
     def _curvature(
@@ -954,7 +1154,9 @@ class Transcription:
         xi, nu = dynamics.all_evaluation_states(x)
         for history, mu in lifted_histories:
             forces = history.with_variable_weights(forces, mu)
-        curvature = forces.weighted_hessian(xi, nu, weights, self._curvature_buffer)
+        curvature = forces.weighted_hessian(
+            xi, nu, weights, self._curvature_buffer
+        )
         for history, mu in lifted_histories:
             history.add_curvature(curvature, mu)
         return curvature
@@ -964,7 +1166,9 @@ class Transcription:
         """Indices in (q, φ of the motion) of the nuisance parameters with a mixed second
         derivative with the state.
         """
-        return self.nq + np.flatnonzero(self.inputs.is_coupled_to_state[self.nq :])
+        return self.nq + np.flatnonzero(
+            self.inputs.is_coupled_to_state[self.nq :]
+        )
 
     @cached_property
     def _curvature_buffer(self) -> Array:
@@ -975,9 +1179,13 @@ class Transcription:
     def hessian_diagonal_positions(self) -> Index:
         """Positions of the diagonal entries of x in the values of `hessian`."""
         dofs = np.arange(self.dof_count)
-        return self.hessian.positions(np.arange(self.grid_times), 0, dofs, dofs).ravel()
+        return self.hessian.positions(
+            np.arange(self.grid_times), 0, dofs, dofs
+        ).ravel()
 
-    def additional_hessian_entries(self, first_phi: int) -> list[tuple[Index, Index]]:
+    def additional_hessian_entries(
+        self, first_phi: int
+    ) -> list[tuple[Index, Index]]:
         """Return rows and columns in z of the Hessian's entries besides `hessian`, upper triangle.
 
         In order: the loss by x and φ; the motion by q and φ; the motion by x and φ; φ by φ.
@@ -996,7 +1204,10 @@ class Transcription:
         rows, columns = self.local_loss.structure
         entries = [
             (in_z[rows], in_z[columns]),
-            (np.repeat(np.arange(self.nq), len(moving)), np.tile(moving, self.nq)),
+            (
+                np.repeat(np.arange(self.nq), len(moving)),
+                np.tile(moving, self.nq),
+            ),
             (np.repeat(of_x, len(states)), np.tile(states, len(of_x))),
             (of_phi[pairs[0]], of_phi[pairs[1]]),
         ]
@@ -1007,11 +1218,15 @@ class Transcription:
     def _loss_scale(self) -> Array:
         """Factor from SI units to scaled variables of each entry of the loss's Hessian."""
         rows, columns = self.local_loss.structure
-        powers = (rows < self.variable_count).astype(float) + (columns < self.variable_count)
+        powers = (rows < self.variable_count).astype(float) + (
+            columns < self.variable_count
+        )
         return self.length_m**powers
 
 
-def _state_factors(p: Array, q: Array, p_second: Array, q_second: Array) -> tuple[Array, Array]:
+def _state_factors(
+    p: Array, q: Array, p_second: Array, q_second: Array
+) -> tuple[Array, Array]:
     """Coefficients of ∂²φ/∂x² and ∂²φ/∂x∂v in the block of two positions.
 
     Parameters

@@ -62,21 +62,27 @@ class VisibleSurface:
         if depth.faces is not None:
             chosen[:] = False
             chosen[depth.faces.resolve_faces(body.mesh)] = True
-        nodes, faces = np.unique(body.nodes.nodes_of_faces(triangles), return_inverse=True)
+        nodes, faces = np.unique(
+            body.nodes.nodes_of_faces(triangles), return_inverse=True
+        )
         return cls(nodes, faces.reshape(len(triangles), -1), chosen)
 
-    def initial_positions_m(self, experiment: Experiment, depth: Depth) -> Array:
+    def initial_positions_m(
+        self, experiment: Experiment, depth: Depth
+    ) -> Array:
         """Return the node positions (n, 3) of the undeformed body in its grasps at the
         camera's first image with points [m].
         """
-        return experiment.rigid_positions(depth.sample_times_s[[depth.first_sample_with_points]])[
-            0, self.nodes
-        ]
+        return experiment.rigid_positions(
+            depth.sample_times_s[[depth.first_sample_with_points]]
+        )[0, self.nodes]
 
     @property
     def plane_triangles(self) -> Index:
         """Flat triangles (F·k, 3) as indices into `nodes`; those of a face are consecutive."""
-        return self.faces[:, TRIANGLES_OF_FACE[self.faces.shape[1]]].reshape(-1, 3)
+        return self.faces[:, TRIANGLES_OF_FACE[self.faces.shape[1]]].reshape(
+            -1, 3
+        )
 
     @cached_property
     def edges(self) -> tuple[Index, Index]:
@@ -84,15 +90,24 @@ class VisibleSurface:
         of these triangles; edges with another number of triangles are omitted.
         """
         triangles = self.plane_triangles
-        ends = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        unique, number, counts = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+        ends = np.sort(
+            triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1
+        )
+        unique, number, counts = np.unique(
+            ends, axis=0, return_inverse=True, return_counts=True
+        )
         order = np.argsort(number.ravel(), kind="stable")
         first = np.cumsum(counts) - counts
         paired = counts == 2
-        faces_of_edges = np.stack([order[first[paired]], order[first[paired] + 1]], axis=1) // 3
+        faces_of_edges = (
+            np.stack([order[first[paired]], order[first[paired] + 1]], axis=1)
+            // 3
+        )
         return unique[paired], faces_of_edges
 
-    def to_faces(self, triangles: Index, barycentric: Array) -> tuple[Index, Array]:
+    def to_faces(
+        self, triangles: Index, barycentric: Array
+    ) -> tuple[Index, Array]:
         """Return faces (P,), and barycentric coordinates (P, 3) on them, of points on flat
         triangles.
 
@@ -105,9 +120,13 @@ class VisibleSurface:
         """
         parts = TRIANGLES_OF_FACE[self.faces.shape[1]]
         corners = CORNERS[parts[triangles % len(parts)]]
-        return triangles // len(parts), np.einsum("pc,pci->pi", barycentric, corners)
+        return triangles // len(parts), np.einsum(
+            "pc,pci->pi", barycentric, corners
+        )
 
-    def evaluate(self, x: Array, faces: Index, barycentric: Array) -> tuple[Array, Array, Array]:
+    def evaluate(
+        self, x: Array, faces: Index, barycentric: Array
+    ) -> tuple[Array, Array, Array]:
         """Evaluate points on faces of a deformed surface.
 
         Parameters
@@ -124,7 +143,9 @@ class VisibleSurface:
         ((P, v) array, (P, 3) array, (P, 3) array)
             Shape functions of the nodes, points [m], and outward unit normals.
         """
-        weights, points, tangents = self._evaluate_tangents(x, faces, barycentric)
+        weights, points, tangents = self._evaluate_tangents(
+            x, faces, barycentric
+        )
         normals = np.cross(tangents[:, 0], tangents[:, 1])
         normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
         return weights, points, normals
@@ -137,7 +158,9 @@ class VisibleSurface:
         """
         weights, slopes = face_shape_functions(barycentric, self.faces.shape[1])
         corners = x[self.faces[faces]]
-        tangents = np.einsum("pak,pai->pki", slopes[:, :, :2] - slopes[:, :, 2:], corners)
+        tangents = np.einsum(
+            "pak,pai->pki", slopes[:, :, :2] - slopes[:, :, 2:], corners
+        )
         return weights, np.einsum("pa,pai->pi", weights, corners), tangents
 
     def subdivided_triangles(self, x: Array, divisions: int = 4) -> Array:
@@ -149,10 +172,15 @@ class VisibleSurface:
         down = i + j < divisions - 1
         upward = np.stack([[i, j], [i + 1, j], [i, j + 1]])[..., up]
         downward = np.stack([[i + 1, j], [i + 1, j + 1], [i, j + 1]])[..., down]
-        of_b, of_c = np.concatenate([upward, downward], axis=2).transpose(1, 2, 0) / divisions
+        of_b, of_c = (
+            np.concatenate([upward, downward], axis=2).transpose(1, 2, 0)
+            / divisions
+        )
         places = np.stack([1 - of_b - of_c, of_b, of_c], axis=-1).reshape(-1, 3)
         faces = np.repeat(np.arange(len(self.faces)), len(places))
-        points = self.evaluate(x, faces, np.tile(places, (len(self.faces), 1)))[1]
+        points = self.evaluate(x, faces, np.tile(places, (len(self.faces), 1)))[
+            1
+        ]
         return points.reshape(-1, 3, 3)
 
     def is_facing(
@@ -206,9 +234,13 @@ class VisibleSurface:
         places = ((x - eye_m) @ np.transpose(across) / depths[:, None])[corners]
         projected = (points_m - eye_m) @ np.transpose(across) / away[:, None]
         middles = places.mean(axis=1)
-        reach = np.linalg.norm(places - middles[:, None], axis=2).max(initial=0.0)
+        reach = np.linalg.norm(places - middles[:, None], axis=2).max(
+            initial=0.0
+        )
         candidates = KDTree(middles).query_ball_point(projected, reach)
-        point = np.repeat(np.arange(len(projected)), [len(each) for each in candidates])
+        point = np.repeat(
+            np.arange(len(projected)), [len(each) for each in candidates]
+        )
         triangle = np.concatenate([*candidates, []]).astype(int)
         first = depths[corners[triangle]].min(axis=1) < away[point] - front_m
         point = point[first]
@@ -220,11 +252,16 @@ class VisibleSurface:
         of_c = _cross_2d(b - a, way) / double_area
         shares = np.column_stack([1 - of_b - of_c, of_b, of_c])
         # What is linear on a triangle is one over the depth in the plane.
-        hit = 1 / np.sum(shares / depths[corners[triangle]], axis=1) < away[point] - front_m
+        hit = (
+            1 / np.sum(shares / depths[corners[triangle]], axis=1)
+            < away[point] - front_m
+        )
         behind[point[(shares >= 0).all(axis=1) & hit]] = True
         return behind
 
-    def nearest_points(self, x: Array, points: Array, candidates: Index) -> tuple[Index, Array]:
+    def nearest_points(
+        self, x: Array, points: Array, candidates: Index
+    ) -> tuple[Index, Array]:
         """Return the nearest points of some flat triangles, and of the curved faces they belong to.
 
         Parameters
@@ -245,7 +282,9 @@ class VisibleSurface:
         middles = corners.mean(axis=1)
         sizes = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
         neighbours = KDTree(middles).query(points, min(NEARBY, len(corners)))
-        away, nearest_triangles = (np.reshape(each, (len(points), -1)) for each in neighbours)
+        away, nearest_triangles = (
+            np.reshape(each, (len(points), -1)) for each in neighbours
+        )
         # Triangles whose middles are farther than this by their own size cannot be nearer.
         triangles = nearest_triangles[:, 0].copy()
         least = np.full(len(points), np.inf)
@@ -267,20 +306,33 @@ class VisibleSurface:
         of_b = np.sum(np.cross(feet - a, c - a) * normal, axis=1) / squares
         of_c = np.sum(np.cross(b - a, feet - a) * normal, axis=1) / squares
         faces, places = self.to_faces(
-            candidates[triangles], np.column_stack([1 - of_b - of_c, of_b, of_c])
+            candidates[triangles],
+            np.column_stack([1 - of_b - of_c, of_b, of_c]),
         )
         moving = np.arange(len(points) if self.faces.shape[1] > 3 else 0)
         for _ in range(SETTLING):
             # Faces are curved: what is nearest on the flat triangle is beside what is on them.
-            _, feet, tangents = self._evaluate_tangents(x, faces[moving], places[moving])
+            _, feet, tangents = self._evaluate_tangents(
+                x, faces[moving], places[moving]
+            )
             by_a, by_b = tangents.transpose(1, 0, 2)
             aa, ab, bb = (
-                np.sum(u * v, axis=1) for u, v in ((by_a, by_a), (by_a, by_b), (by_b, by_b))
+                np.sum(u * v, axis=1)
+                for u, v in ((by_a, by_a), (by_a, by_b), (by_b, by_b))
             )
-            to_a, to_b = (np.sum(u * (points[moving] - feet), axis=1) for u in (by_a, by_b))
-            step = np.column_stack([bb * to_a - ab * to_b, aa * to_b - ab * to_a])
+            to_a, to_b = (
+                np.sum(u * (points[moving] - feet), axis=1)
+                for u in (by_a, by_b)
+            )
+            step = np.column_stack(
+                [bb * to_a - ab * to_b, aa * to_b - ab * to_a]
+            )
             step /= (aa * bb - ab**2)[:, None]
-            settled = np.clip(places[moving] + np.column_stack([step, -step.sum(axis=1)]), 0.0, 1.0)
+            settled = np.clip(
+                places[moving] + np.column_stack([step, -step.sum(axis=1)]),
+                0.0,
+                1.0,
+            )
             settled /= settled.sum(axis=1, keepdims=True)
             has_moved = np.abs(settled - places[moving]).max(axis=1) > STILL
             places[moving] = settled

@@ -77,7 +77,12 @@ class ReactionGrid:
     @classmethod
     def from_dynamics(cls, dynamics: Dynamics) -> ReactionGrid:
         """Build the grid of discrete equations of motion."""
-        return cls(dynamics.t_s, *centred_rows(dynamics), dynamics.largest_lag, dynamics.is_static)
+        return cls(
+            dynamics.t_s,
+            *centred_rows(dynamics),
+            dynamics.largest_lag,
+            dynamics.is_static,
+        )
 
     @classmethod
     def from_times(cls, t_s: Array) -> ReactionGrid:
@@ -179,7 +184,11 @@ class GraspWrench:
 
     def known_count(self, rows: int) -> int:
         """Return how many of the times are known if the first `rows` grid rows are."""
-        return int(np.count_nonzero(self.known_rows + self.reaction_grid.delay_steps < rows))
+        return int(
+            np.count_nonzero(
+                self.known_rows + self.reaction_grid.delay_steps < rows
+            )
+        )
 
     def parameter_indices(self, row: NuisanceRow) -> Index:
         """Return the indices in φ of this sensor's nuisance parameters of one kind."""
@@ -227,7 +236,9 @@ class GraspWrench:
             dof_count=3 * len(experiment.body.nodes_m),
             sensed_dofs=sensed,
             node_dofs=np.searchsorted(sensed, own),
-            is_prescribed=np.isin(own, grasp.prescribed_dofs).astype(np.float64),
+            is_prescribed=np.isin(own, grasp.prescribed_dofs).astype(
+                np.float64
+            ),
         )
 
     @property
@@ -258,21 +269,32 @@ class GraspWrench:
         nodes = len(self.is_prescribed) // 3
         of_time = np.concatenate([axes.reshape(-1, 9), points], axis=1).T
         is_prescribed = np.broadcast_to(
-            self.is_prescribed.reshape(nodes, 3).T[:, None], (3, self.count, nodes)
+            self.is_prescribed.reshape(nodes, 3).T[:, None],
+            (3, self.count, nodes),
         )
-        return np.concatenate([np.repeat(of_time[:, :, None], nodes, axis=2), is_prescribed])
+        return np.concatenate(
+            [np.repeat(of_time[:, :, None], nodes, axis=2), is_prescribed]
+        )
 
     def moment_inputs(self, reactions: ReactionForces) -> tuple[Array, Array]:
         """Return inputs (6, n, h) and data of `MOMENT`, at the times that the reaction
         forces cover.
         """
         k = self.known_rows[: self.known_count(len(reactions.reaction))]
-        both = reactions.position_m[k], reactions.reaction[k + self.reaction_grid.delay_steps]
+        both = (
+            reactions.position_m[k],
+            reactions.reaction[k + self.reaction_grid.delay_steps],
+        )
         shape = len(k), len(self.node_dofs) // 3, 3
-        u = [np.moveaxis(each[:, self.node_dofs].reshape(shape), 2, 0) for each in both]
+        u = [
+            np.moveaxis(each[:, self.node_dofs].reshape(shape), 2, 0)
+            for each in both
+        ]
         return np.concatenate(u), self.moment_data[:, : len(k)]
 
-    def reaction_jacobians(self, reactions: ReactionForces) -> tuple[Array, Array]:
+    def reaction_jacobians(
+        self, reactions: ReactionForces
+    ) -> tuple[Array, Array]:
         """Return A and B (n, 6, d) of the change dW = A dR + B dx of the wrench without tool, with
         the d dofs of the grasp.
         """
@@ -299,14 +321,20 @@ class GraspWrench:
         """Generated wrench (6,) of the tool, m (a_c − g) at c, as a function of `tool_parameters`,
         see `tool_inputs`.
         """
-        return GeneratedFunction(self._tool_wrench, len(self.tool_parameters), sum(TOOL_DATA))
+        return GeneratedFunction(
+            self._tool_wrench, len(self.tool_parameters), sum(TOOL_DATA)
+        )
 
     def _tool_wrench(self, phi: ca.SX, data: ca.SX) -> ca.SX:
         """Expression of the wrench (6,) of the tool in the sensor's axes [N, N m], from its
         parameters φ and the data of `tool_inputs`.
         """
-        axes, turn, turn_rate, shift, shift_rate = ca.vertsplit(data, np.cumsum([0, *TOOL_DATA]))
-        axes, turn, turn_rate = (ca.reshape(each, 3, 3).T for each in (axes, turn, turn_rate))
+        axes, turn, turn_rate, shift, shift_rate = ca.vertsplit(
+            data, np.cumsum([0, *TOOL_DATA])
+        )
+        axes, turn, turn_rate = (
+            ca.reshape(each, 3, 3).T for each in (axes, turn, turn_rate)
+        )
         count = len(self.tool_parameters) - len(self.nuisance.gravity_indices)
         own, tilts = ca.vertsplit(phi, [0, count, len(self.tool_parameters)])
         own *= self.nuisance.scales[self.tool_parameters[:count]][:, None]
@@ -315,7 +343,9 @@ class GraspWrench:
         centre = centre + own[1:] if own.numel() > 1 else centre
         gravity = self.nuisance.gravity_expression(tilts)
         pull = own[0] * (turn_rate @ centre + shift_rate - gravity)
-        return ca.vertcat(axes.T @ pull, axes.T @ ca.cross(turn @ centre + shift, pull))
+        return ca.vertcat(
+            axes.T @ pull, axes.T @ ca.cross(turn @ centre + shift, pull)
+        )
 
     def tool_inputs(self, phi: Array, count: int) -> tuple[Array, Array]:
         """Return inputs (k,) and data (33, n) of `tool` at the first `count` times, at φ.
@@ -328,7 +358,9 @@ class GraspWrench:
         rotations, shifts = self.poses_at(self.known_rows[:count])
         turn_rates, shift_rates = self.pose_accelerations(count)
         parts = (axes, rotations, turn_rates, shifts - points, shift_rates)
-        data = np.concatenate([each.reshape(count, -1) for each in parts], axis=1)
+        data = np.concatenate(
+            [each.reshape(count, -1) for each in parts], axis=1
+        )
         return phi[self.tool_parameters], data.T
 
     def pose_accelerations(self, count: int) -> tuple[Array, Array]:
@@ -339,19 +371,29 @@ class GraspWrench:
         poses = self.grasp.poses
         if len(poses.t_s) < 3 or self.reaction_grid.is_static:
             return np.zeros((count, 3, 3)), np.zeros((count, 3))
-        middle = np.clip(self.t_s[:count], poses.t_s[0] + step_s, poses.t_s[-1] - step_s)
-        before, now, after = (poses.at(middle + way * step_s) for way in (-1, 0, 1))
+        middle = np.clip(
+            self.t_s[:count], poses.t_s[0] + step_s, poses.t_s[-1] - step_s
+        )
+        before, now, after = (
+            poses.at(middle + way * step_s) for way in (-1, 0, 1)
+        )
         pairs = zip(before, now, after, strict=True)
-        rotation_rates, translation_rates = ((b - 2 * n + a) / step_s**2 for b, n, a in pairs)
+        rotation_rates, translation_rates = (
+            (b - 2 * n + a) / step_s**2 for b, n, a in pairs
+        )
         return rotation_rates, translation_rates
 
-    def evaluate_unfiltered(self, reactions: ReactionForces, phi: Array) -> Array:
+    def evaluate_unfiltered(
+        self, reactions: ReactionForces, phi: Array
+    ) -> Array:
         """Return the wrench W (n, 6) [N, N m] of reaction forces at φ including the tool, before
         the low-pass.
         """
         value = self.evaluate_without_tool(reactions)
         if len(self.tool_parameters):
-            value = value + self.tool.evaluate(*self.tool_inputs(phi, len(value))).T
+            value = (
+                value + self.tool.evaluate(*self.tool_inputs(phi, len(value))).T
+            )
         return value
 
     # The low-pass -----------------------------------------------------------------------------
@@ -361,7 +403,9 @@ class GraspWrench:
         """Index in φ of the time constant of the low-pass; empty without a low-pass."""
         return self.parameter_indices(SENSOR_LAG)
 
-    def filter_wrench(self, value: Array, phi: Array) -> RecursionTrajectory | None:
+    def filter_wrench(
+        self, value: Array, phi: Array
+    ) -> RecursionTrajectory | None:
         """Return the low-pass filtered W (n, 6) as a recursion with derivatives; None without a
         low-pass or without times.
         """
@@ -375,8 +419,13 @@ class GraspWrench:
     @cached_property
     def low_pass_data(self) -> Array:
         """Data (2, n) of `LOW_PASS`."""
-        per_step = self.nuisance.scales[self.low_pass_parameters] / self.reaction_grid.step_s
-        return np.stack([np.arange(self.count) == 0, np.repeat(per_step, self.count)])
+        per_step = (
+            self.nuisance.scales[self.low_pass_parameters]
+            / self.reaction_grid.step_s
+        )
+        return np.stack(
+            [np.arange(self.count) == 0, np.repeat(per_step, self.count)]
+        )
 
     # As channels are --------------------------------------------------------------------------
 
@@ -414,14 +463,25 @@ class GraspWrench:
         value = self.evaluate_unfiltered(forced, phi)
         slope = np.zeros((len(k), 6, size))
         slope[..., columns] = (
-            of_force @ forced.reaction_by[k + self.reaction_grid.delay_steps][:, self.node_dofs]
+            of_force
+            @ forced.reaction_by[k + self.reaction_grid.delay_steps][
+                :, self.node_dofs
+            ]
         )
-        slope[..., columns] += of_place @ forced.position_by[k][:, self.node_dofs]
+        slope[..., columns] += (
+            of_place @ forced.position_by[k][:, self.node_dofs]
+        )
         if len(self.tool_parameters):
-            by_phi = self.tool.evaluate_with_jacobian(*self.tool_inputs(phi, len(k)))[1]
-            slope[..., first + self.tool_parameters] += np.moveaxis(by_phi, 2, 0)
+            by_phi = self.tool.evaluate_with_jacobian(
+                *self.tool_inputs(phi, len(k))
+            )[1]
+            slope[..., first + self.tool_parameters] += np.moveaxis(
+                by_phi, 2, 0
+            )
         if evolution := self.filter_wrench(value, phi):
-            by_lag = np.arange(size) == first + self.low_pass_parameters[:, None]
+            by_lag = (
+                np.arange(size) == first + self.low_pass_parameters[:, None]
+            )
             value = evolution.states[0]
             slope = evolution.jacobian_vector_product(slope[None], by_lag)[0]
         slope = slope.reshape(len(k), 2, 3, size)
@@ -429,7 +489,9 @@ class GraspWrench:
             np.arange(size), slope
         )
 
-    def vjp(self, motion: ObservedMotion, phi: Array, by_values: Array) -> VectorJacobianProduct:
+    def vjp(
+        self, motion: ObservedMotion, phi: Array, by_values: Array
+    ) -> VectorJacobianProduct:
         """Vector–Jacobian product at a motion and φ: the derivatives of a scalar by positions,
         reaction forces and φ, from those by Y (n, 2, 3).
         """
@@ -438,23 +500,34 @@ class GraspWrench:
         by_x = np.zeros_like(motion.x)
         by_reaction = np.zeros_like(forced.reaction)
         by_w = by_values.reshape(-1, 6)
-        if evolution := self.filter_wrench(self.evaluate_unfiltered(forced, phi), phi):
-            (by_w,), by_phi[self.low_pass_parameters] = evolution.vector_jacobian_product(
-                by_w[None]
+        if evolution := self.filter_wrench(
+            self.evaluate_unfiltered(forced, phi), phi
+        ):
+            (by_w,), by_phi[self.low_pass_parameters] = (
+                evolution.vector_jacobian_product(by_w[None])
             )
         if len(self.tool_parameters):
-            slopes = self.tool.evaluate_with_jacobian(*self.tool_inputs(phi, len(by_w)))[1]
+            slopes = self.tool.evaluate_with_jacobian(
+                *self.tool_inputs(phi, len(by_w))
+            )[1]
             by_phi[self.tool_parameters] += np.einsum("na,abn->b", by_w, slopes)
         of_force, of_place = self.reaction_jacobians(forced)
         k = self.known_rows[: len(by_w)]
-        by_reaction[np.ix_(k + self.reaction_grid.delay_steps, self.node_dofs)] = np.einsum(
-            "ka,kag->kg", by_w, of_force
+        by_reaction[
+            np.ix_(k + self.reaction_grid.delay_steps, self.node_dofs)
+        ] = np.einsum("ka,kag->kg", by_w, of_force)
+        by_x[np.ix_(k, self.sensed_dofs[self.node_dofs])] = np.einsum(
+            "ka,kag->kg", by_w, of_place
         )
-        by_x[np.ix_(k, self.sensed_dofs[self.node_dofs])] = np.einsum("ka,kag->kg", by_w, of_place)
         return VectorJacobianProduct(by_x, by_reaction, by_phi)
 
     def frame_changes(
-        self, grasp: Grasp, motion: ObservedMotion, phi: Array, shifts: Array, rotations: Array
+        self,
+        grasp: Grasp,
+        motion: ObservedMotion,
+        phi: Array,
+        shifts: Array,
+        rotations: Array,
     ) -> Array | float:
         """Return the changes (n, 2, 3, c) of Y due to pose errors that move the frame of the
         sensor.
@@ -477,7 +550,11 @@ class GraspWrench:
             return 0.0
         value = self.evaluate_without_tool(motion.reactions)
         axes = self.frames[0][: len(value)]
-        data = [axes.reshape(-1, 9), value, np.tile(self.point_m, (len(value), 1))]
+        data = [
+            axes.reshape(-1, 9),
+            value,
+            np.tile(self.point_m, (len(value), 1)),
+        ]
         slopes = IN_MOVED_FRAME.evaluate_with_jacobian(
             np.zeros((6, len(value))), np.concatenate(data, axis=1).T
         )[1]
@@ -493,7 +570,10 @@ class GraspWrench:
 
 def sensed_dofs(experiment: Experiment) -> Index:
     """Return the dofs (g,) of the nodes of all grasps that a sensor measures, ascending."""
-    grasp_dofs = [dofs_of(experiment.grasps[k].nodes) for k in experiment.instrumented_grasps]
+    grasp_dofs = [
+        dofs_of(experiment.grasps[k].nodes)
+        for k in experiment.instrumented_grasps
+    ]
     return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *grasp_dofs]))
 
 
@@ -522,7 +602,9 @@ def _in_moved_frame(offset: ca.SX, data: ca.SX) -> ca.SX:
     turned = cayley_rotation(turn) @ axes
     force = axes @ force
     moved = shift + (turned - axes) @ point
-    return ca.vertcat(turned.T @ force, turned.T @ (axes @ torque - ca.cross(moved, force)))
+    return ca.vertcat(
+        turned.T @ force, turned.T @ (axes @ torque - ca.cross(moved, force))
+    )
 
 
 def _by_dof(by_node: Array) -> Array:
@@ -530,7 +612,9 @@ def _by_dof(by_node: Array) -> Array:
     return np.ascontiguousarray(by_node).reshape(*by_node.shape[:2], -1)
 
 
-def _low_pass_step(before: ca.SX, now: ca.SX, last: ca.SX, lag: ca.SX, data: ca.SX) -> ca.SX:
+def _low_pass_step(
+    before: ca.SX, now: ca.SX, last: ca.SX, lag: ca.SX, data: ca.SX
+) -> ca.SX:
     """One step of Y' = (W − Y) / T, with W linear between grid times and constant before the first.
 
     Parameters
@@ -548,7 +632,9 @@ def _low_pass_step(before: ca.SX, now: ca.SX, last: ca.SX, lag: ca.SX, data: ca.
     share = lag * data[1]
     e = ca.exp(-1 / ca.fmax(share, 1e-6))
     a = share * (1 - e) - e
-    return began * now + (1 - began) * (e * before + a * last + (1 - e - a) * now)
+    return began * now + (1 - began) * (
+        e * before + a * last + (1 - e - a) * now
+    )
 
 
 # Force and torque (6,) of one node, by x_g and R_g; data are Q, o and what is held.

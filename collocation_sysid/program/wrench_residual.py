@@ -76,7 +76,8 @@ class WrenchResidual(MeasurementResidual):
         """
         rows = (SENSOR_TIME, TARE)
         is_compared = (
-            wrench.is_measured & _is_covered(observable, wrench.t_s, observable.count)[:, None]
+            wrench.is_measured
+            & _is_covered(observable, wrench.t_s, observable.count)[:, None]
         )
         return cls(
             observable=observable,
@@ -87,9 +88,9 @@ class WrenchResidual(MeasurementResidual):
             sigmas=wrench.sigmas[[0, 3]],
             measured=wrench.values[:, None],
             is_compared=is_compared.reshape(-1, 2, 3),
-            own_parameters=np.concatenate([observable.parameter_indices(row) for row in rows])[
-                None
-            ],
+            own_parameters=np.concatenate(
+                [observable.parameter_indices(row) for row in rows]
+            )[None],
             wrench=wrench,
         )
 
@@ -111,7 +112,9 @@ class WrenchResidual(MeasurementResidual):
 
     def _neighbour_count(self, known: int) -> int:
         """Return the number of grid times that a sample is interpolated from."""
-        return min(2 if self.observable.reaction_grid.is_static else NEIGHBOURS, known)
+        return min(
+            2 if self.observable.reaction_grid.is_static else NEIGHBOURS, known
+        )
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
         """Return the stencil of all samples: the grid times around each, among the first `known`,
@@ -129,7 +132,8 @@ class WrenchResidual(MeasurementResidual):
         """Return the indices (…, 1, v) of neighbouring times, for any shift of the clock."""
         used = self._neighbour_count(self.observable.count)
         return _vector_indices(
-            np.arange(self.observable.count - used + 1)[:, None] + np.arange(used)
+            np.arange(self.observable.count - used + 1)[:, None]
+            + np.arange(used)
         )
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
@@ -159,7 +163,9 @@ class WrenchResidual(MeasurementResidual):
 
     # Of reactions -----------------------------------------------------------------------------
 
-    def predict_reactions(self, known_reactions: ReactionForces, phi: Array) -> Array:
+    def predict_reactions(
+        self, known_reactions: ReactionForces, phi: Array
+    ) -> Array:
         """Return the prediction (S, 6) from reaction forces [N, N m]; NaN for samples
         outside the known times.
         """
@@ -172,19 +178,27 @@ class WrenchResidual(MeasurementResidual):
         if not len(values):
             return np.full(self.wrench.values.shape, np.nan)
         predicted = self.predict(values, phi).reshape(-1, 6)
-        return np.where(self.is_covered(len(values))[:, None], predicted, np.nan)
+        return np.where(
+            self.is_covered(len(values))[:, None], predicted, np.nan
+        )
 
     def on_grid(self, grid: ReactionGrid) -> WrenchResidual:
         """Return the model with reaction forces at the times of another grid."""
-        return WrenchResidual.from_sensor(replace(self.observable, reaction_grid=grid), self.wrench)
+        return WrenchResidual.from_sensor(
+            replace(self.observable, reaction_grid=grid), self.wrench
+        )
 
     def with_wrench(self, wrench: Wrench) -> WrenchResidual:
         """Return the model of other samples, in their own frame."""
-        observable = replace(self.observable, frame=wrench.frame, point_m=wrench.point_m)
+        observable = replace(
+            self.observable, frame=wrench.frame, point_m=wrench.point_m
+        )
         return WrenchResidual.from_sensor(observable, wrench)
 
 
-def _is_covered(observable: GraspWrench, t_s: Array, known: int) -> NDArray[np.bool_]:
+def _is_covered(
+    observable: GraspWrench, t_s: Array, known: int
+) -> NDArray[np.bool_]:
     """Return the mask (S,) of the samples at times (S,) that lie within the first `known` grid
     times for any admissible shift of the clock; all false if none are known.
     """
@@ -193,7 +207,9 @@ def _is_covered(observable: GraspWrench, t_s: Array, known: int) -> NDArray[np.b
     first, last = observable.t_s[[0, known - 1]]
     rounding = 1e-6 * observable.reaction_grid.step_s + TIME_TOLERANCE_S
     limit_s = observable.clock_limit_s
-    return (t_s >= first + limit_s - rounding) & (t_s <= last - limit_s + rounding)
+    return (t_s >= first + limit_s - rounding) & (
+        t_s <= last - limit_s + rounding
+    )
 
 
 def _vector_indices(times: Index) -> Index:
@@ -202,7 +218,10 @@ def _vector_indices(times: Index) -> Index:
 
 
 def wrench_residuals(
-    experiment: Experiment, grid: ReactionGrid, nuisance: NuisanceMap, huber: float | None = None
+    experiment: Experiment,
+    grid: ReactionGrid,
+    nuisance: NuisanceMap,
+    huber: float | None = None,
 ) -> tuple[WrenchResidual, ...]:
     """Build the measurement models of all grasps of an experiment that have a force–torque sensor.
 

@@ -69,7 +69,9 @@ class Actuator(ABC, Generic[S]):
         """
         if self.body_measure is not None and self.body_measure.body is body:
             return self
-        return replace(self, body_measure=BodyMeasure(body, self._measure_on(body)))
+        return replace(
+            self, body_measure=BodyMeasure(body, self._measure_on(body))
+        )
 
     @abstractmethod
     def _measure_on(self, body: Body) -> S:
@@ -90,7 +92,9 @@ class Actuator(ABC, Generic[S]):
         """Factor, offset, and logarithm of the lag over the stated lag, as stated: zero."""
         return self.factor, getattr(self, self.offset_field), 0.0
 
-    def with_calibration(self, factor: float, offset: float, log_lag_ratio: float) -> Self:
+    def with_calibration(
+        self, factor: float, offset: float, log_lag_ratio: float
+    ) -> Self:
         """Return the actuator with another calibration; without a lag, `log_lag_ratio` has no
         effect.
         """
@@ -109,7 +113,9 @@ class Actuator(ABC, Generic[S]):
         return self.energy_amplitude(data, factor, offset)
 
     @abstractmethod
-    def energy_amplitude(self, declared_value: Any, factor: Any, offset: Any) -> Any:
+    def energy_amplitude(
+        self, declared_value: Any, factor: Any, offset: Any
+    ) -> Any:
         """Return the amplitude c for a stated tension or pressure: numbers, arrays or CasADi
         expressions.
         """
@@ -117,4 +123,6 @@ class Actuator(ABC, Generic[S]):
     def energy_amplitude_at(self, t_s: Array) -> Array:
         """Return the amplitude c at the times `t_s` (T,), as (T,)."""
         factor, offset, _ = self.calibration
-        return self.energy_amplitude(self.declared_values.values_at(t_s), factor, offset)
+        return self.energy_amplitude(
+            self.declared_values.values_at(t_s), factor, offset
+        )

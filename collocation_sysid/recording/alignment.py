@@ -92,9 +92,13 @@ def align(
     """
     table = table if window_s is None else _cut_to_window(table, window_s)
     grasp_intervals_s = grasp_intervals_s or [(-np.inf, np.inf)] * len(poses)
-    table, notes = _cut_to_poses(table, poses, grasp_intervals_s, 1 if static else _FEWEST_SAMPLES)
+    table, notes = _cut_to_poses(
+        table, poses, grasp_intervals_s, 1 if static else _FEWEST_SAMPLES
+    )
     if every > 1:
-        table = MarkerTable(table.t_s[::every], table.names, table.positions_m[::every])
+        table = MarkerTable(
+            table.t_s[::every], table.names, table.positions_m[::every]
+        )
     if static:
         t_s = grid = table.t_s
     elif resample_hz is None:
@@ -104,7 +108,9 @@ def align(
         table = MarkerTable(grid, table.names, table.positions_m)
     else:
         t_s = grid = _even_grid(table.t_s, resample_hz)
-        table = MarkerTable(grid, table.names, _interpolate_markers(table, grid))
+        table = MarkerTable(
+            grid, table.names, _interpolate_markers(table, grid)
+        )
     moved = []
     for k, sequence in enumerate(poses):
         name = "the poses" if len(poses) == 1 else f"the poses of grasp {k + 1}"
@@ -167,7 +173,10 @@ def _cut_to_poses(
     cut = t_s[is_inside]
     ends = [
         f"{length_s:.6g} s at the {end}"
-        for length_s, end in ((cut[0] - t_s[0], "start"), (t_s[-1] - cut[-1], "end"))
+        for length_s, end in (
+            (cut[0] - t_s[0], "start"),
+            (t_s[-1] - cut[-1], "end"),
+        )
         if length_s > 0
     ]
     note = (
@@ -180,18 +189,24 @@ def _cut_to_poses(
     return MarkerTable(cut, table.names, table.positions_m[is_inside]), [note]
 
 
-def _cut_to_window(table: MarkerTable, window_s: tuple[float, float]) -> MarkerTable:
+def _cut_to_window(
+    table: MarkerTable, window_s: tuple[float, float]
+) -> MarkerTable:
     """Return the samples within a window; an `InputError` if there are none."""
     first_s, last_s = window_s
     steps = np.diff(table.t_s)
     slack_s = STEP_TOLERANCE * float(np.median(steps)) if steps.size else 0.0
-    is_inside = (table.t_s >= first_s - slack_s) & (table.t_s <= last_s + slack_s)
+    is_inside = (table.t_s >= first_s - slack_s) & (
+        table.t_s <= last_s + slack_s
+    )
     if not is_inside.any():
         raise InputError(
             f"window_s = [{first_s:g}, {last_s:g}] holds no marker sample; "
             f"the markers run from {table.t_s[0]:.9g} s to {table.t_s[-1]:.9g} s"
         )
-    return MarkerTable(table.t_s[is_inside], table.names, table.positions_m[is_inside])
+    return MarkerTable(
+        table.t_s[is_inside], table.names, table.positions_m[is_inside]
+    )
 
 
 def _even_grid(t_s: Array, rate_hz: float) -> Array:
@@ -227,10 +242,14 @@ def _interpolate_markers(table: MarkerTable, grid: Array) -> Array:
     # On a sample its neighbour does not matter, even if that one is missing.
     on_previous_sample = fraction <= _SAME_TIME_STEPS
     on_later = fraction >= 1.0 - _SAME_TIME_STEPS
-    return np.where(on_previous_sample, x[k], np.where(on_later, x[k + 1], between))
+    return np.where(
+        on_previous_sample, x[k], np.where(on_later, x[k + 1], between)
+    )
 
 
-def _poses_on_grid(poses: PoseSequence, t_s: Array, grid: Array) -> PoseSequence | None:
+def _poses_on_grid(
+    poses: PoseSequence, t_s: Array, grid: Array
+) -> PoseSequence | None:
     """Return poses whose samples at the marker times are moved onto the grid.
 
     None if a marker time within the span of the poses has no pose.
@@ -254,9 +273,13 @@ def _poses_on_grid(poses: PoseSequence, t_s: Array, grid: Array) -> PoseSequence
     nearest = later - (times - poses.t_s[later - 1] < poses.t_s[later] - times)
     if (np.abs(poses.t_s[nearest] - times) > slack_s).any():
         return None
-    moved = poses.t_s + np.interp(poses.t_s, times, grid[within] - poses.t_s[nearest])
+    moved = poses.t_s + np.interp(
+        poses.t_s, times, grid[within] - poses.t_s[nearest]
+    )
     moved[nearest] = grid[within]
-    samples = slice(nearest[0] if within[0] else 0, nearest[-1] + 1 if within[-1] else None)
+    samples = slice(
+        nearest[0] if within[0] else 0, nearest[-1] + 1 if within[-1] else None
+    )
     return replace(
         poses,
         t_s=moved[samples],
@@ -270,15 +293,25 @@ def _tolerance_s(poses: PoseSequence, t_s: Array) -> float:
     [s].
     """
     step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
-    return STEP_TOLERANCE * step_s + 0.5 * (printed_rounding_s(t_s) + printed_rounding_s(poses.t_s))
+    return STEP_TOLERANCE * step_s + 0.5 * (
+        printed_rounding_s(t_s) + printed_rounding_s(poses.t_s)
+    )
 
 
 def _interpolation_note(poses: PoseSequence, grid: Array) -> str:
     """Return the predicate of a note on poses that were interpolated to the times `grid` (G,), and
     on gaps of the poses; the caller adds the subject.
     """
-    how = "held" if poses.interpolation == "hold" else f"interpolated ({poses.interpolation})"
-    at = f"{_rate_hz(grid):.6g} Hz {_span_text(grid)}" if len(grid) > 1 else _span_text(grid)
+    how = (
+        "held"
+        if poses.interpolation == "hold"
+        else f"interpolated ({poses.interpolation})"
+    )
+    at = (
+        f"{_rate_hz(grid):.6g} Hz {_span_text(grid)}"
+        if len(grid) > 1
+        else _span_text(grid)
+    )
     note = f", recorded at {_rate_hz(poses.t_s):.6g} Hz, were {how} at the markers' times, {at}"
     steps = np.diff(poses.t_s)
     is_gap = (steps > _GAP_STEPS * np.median(steps)) & (poses.t_s[1:] > grid[0])
@@ -298,11 +331,15 @@ def _jump_notes(poses: PoseSequence, grid: Array) -> list[str]:
     """
     if poses.interpolation != "smooth":
         return []
-    at_s = poses.jumps_s[(poses.jumps_s >= grid[0]) & (poses.jumps_s < grid[-1])]
+    at_s = poses.jumps_s[
+        (poses.jumps_s >= grid[0]) & (poses.jumps_s < grid[-1])
+    ]
     if not at_s.size:
         return []
     others = f" and {at_s.size - 1} more times" if at_s.size > 1 else ""
-    return [f" jump after t = {at_s[0]:.6g} s{others}; the motion is linear there, not smooth"]
+    return [
+        f" jump after t = {at_s[0]:.6g} s{others}; the motion is linear there, not smooth"
+    ]
 
 
 def _rate_hz(t_s: Array) -> float:

@@ -96,7 +96,9 @@ class Gauge:
     values: ArrayLike | None
     sigma: float = key(Positive)
     points_m: ArrayLike = key(list[Vector], converter=identity, default=())
-    unknowns: Mapping[str, float] = key(dict[str, Positive], default_factory=dict)
+    unknowns: Mapping[str, float] = key(
+        dict[str, Positive], default_factory=dict
+    )
     grasp: int | None = key(AtLeastOne | None, converter=identity, default=None)
     frame: Frame = key(Frame, default="grasp")
     columns: Sequence[str] = key(list[Text], converter=identity, default=())
@@ -107,19 +109,34 @@ class Gauge:
         points = cast(Sequence[Any], self.points_m)
         times = read_only_floats(self.t_s, (None,), f"t_s of {where}")
         points = read_only_floats(
-            points if len(points) else np.zeros((0, 3)), (None, 3), f"points_m of {where}"
+            points if len(points) else np.zeros((0, 3)),
+            (None, 3),
+            f"points_m of {where}",
         )
         vars(self).update(t_s=times, points_m=points)
         if fault := first_unordered_time(times):
-            raise InputError(f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}")
+            raise InputError(
+                f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}"
+            )
         if (self.grasp is None) == (not len(points)):
-            both = "both points_m and grasp" if len(points) else "neither points_m nor grasp"
+            both = (
+                "both points_m and grasp"
+                if len(points)
+                else "neither points_m nor grasp"
+            )
             raise InputError(
                 f"{where} has {both}; expected exactly one of them, as the measured quantity"
             )
         count = self._count_of_values()
-        names = [f"{self.name}_{k + 1}" for k in range(count)] if count > 1 else [self.name]
-        vars(self).update(values=self._checked_values(count), columns=tuple(self.columns or names))
+        names = (
+            [f"{self.name}_{k + 1}" for k in range(count)]
+            if count > 1
+            else [self.name]
+        )
+        vars(self).update(
+            values=self._checked_values(count),
+            columns=tuple(self.columns or names),
+        )
 
     def _checked_values(self, count: int) -> Array:
         """Return the measured values as a read-only array (S, m); zeros if none were given. NaN
@@ -138,14 +155,22 @@ class Gauge:
         where = f"the reading '{self.name}'"
         samples = len(self.sample_times_s)
         if self.values is None:
-            return read_only_floats(np.zeros((samples, count)), (None, None), where)
+            return read_only_floats(
+                np.zeros((samples, count)), (None, None), where
+            )
         columns = np.array(self.values, dtype=float)
         columns = columns[:, None] if columns.ndim == 1 else columns
-        values = read_only_floats(columns, (samples, None), f"values of {where}", finite=False)
+        values = read_only_floats(
+            columns, (samples, None), f"values of {where}", finite=False
+        )
         if np.isinf(values).any():
-            raise InputError(f"{where} holds an infinite value; expected numbers, NaN if missing")
+            raise InputError(
+                f"{where} holds an infinite value; expected numbers, NaN if missing"
+            )
         if not np.isfinite(values).any():
-            raise InputError(f"{where} has no sample; remove it, or check its file")
+            raise InputError(
+                f"{where} has no sample; remove it, or check its file"
+            )
         if values.shape[1] != count:
             raise InputError(
                 f"the expression of {where} gives {count} numbers; expected {values.shape[1]}, as "
@@ -175,7 +200,9 @@ class Gauge:
 
     # The expression ---------------------------------------------------------------------------
 
-    def read(self, t_s: ca.SX, inputs: Sequence[ca.SX], unknowns: Sequence[ca.SX]) -> ca.SX:
+    def read(
+        self, t_s: ca.SX, inputs: Sequence[ca.SX], unknowns: Sequence[ca.SX]
+    ) -> ca.SX:
         """Evaluate the expression of the sensor.
 
         Parameters
@@ -195,8 +222,14 @@ class Gauge:
         """
         names = POINT_INPUTS if self.grasp is None else GRASP_INPUTS
         at = Look(t_s, **dict(zip(names, inputs, strict=True)))
-        read = self.expression(at, **dict(zip(self.unknowns, unknowns, strict=True)))
-        return ca.vec(ca.SX(ca.vertcat(*read) if isinstance(read, (list, tuple)) else read))
+        read = self.expression(
+            at, **dict(zip(self.unknowns, unknowns, strict=True))
+        )
+        return ca.vec(
+            ca.SX(
+                ca.vertcat(*read) if isinstance(read, (list, tuple)) else read
+            )
+        )
 
     def _count_of_values(self) -> int:
         """Evaluate the expression and its Jacobian at rest, and return the number m of its values.
@@ -213,12 +246,17 @@ class Gauge:
         zero_rates = np.zeros_like(points)
         of_points = [points, zero_rates, zero_rates]
         rest = of_points if self.grasp is None else [np.ones(3), np.ones(3)]
-        observables = [ca.SX.sym("c", *np.atleast_2d(np.transpose(each)).T.shape) for each in rest]
+        observables = [
+            ca.SX.sym("c", *np.atleast_2d(np.transpose(each)).T.shape)
+            for each in rest
+        ]
         t_s = ca.SX.sym("t_s")
         own = ca.SX.sym("own", len(self.unknowns))
         names = POINT_INPUTS if self.grasp is None else GRASP_INPUTS
         try:
-            read = self.read(t_s, observables, ca.vertsplit(own) if self.unknowns else [])
+            read = self.read(
+                t_s, observables, ca.vertsplit(own) if self.unknowns else []
+            )
         except (Exception, SystemExit) as error:
             raise InputError(
                 f"the reading '{self.name}' cannot be evaluated ({reason(error)}); expected a "
@@ -227,8 +265,13 @@ class Gauge:
             ) from error
         u = ca.veccat(*observables, own)
         slopes = ca.Function("slopes", [t_s, u], [read, ca.jacobian(read, u)])
-        at_rest = np.concatenate([*(each.ravel("F") for each in rest), np.zeros(own.numel())])
-        if not all(np.isfinite(e.full()).all() for e in slopes(self.sample_times_s[0], at_rest)):
+        at_rest = np.concatenate(
+            [*(each.ravel("F") for each in rest), np.zeros(own.numel())]
+        )
+        if not all(
+            np.isfinite(e.full()).all()
+            for e in slopes(self.sample_times_s[0], at_rest)
+        ):
             raise InputError(
                 f"the reading '{self.name}' or its derivative is not finite for the body at rest; "
                 "expected a smooth expression, such as sqrt(v·v + 1e-12) in place of |v|"

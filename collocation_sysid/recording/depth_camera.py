@@ -40,7 +40,9 @@ Background = Literal["auto", "empty", "unknown"]
 def _require_poses(poses: Any) -> PoseSequence:
     """Return `poses` unchanged; an `InputError` if it is no `PoseSequence`."""
     if not isinstance(poses, PoseSequence):
-        raise InputError(f"poses of a camera is {type(poses).__name__}; expected a PoseSequence")
+        raise InputError(
+            f"poses of a camera is {type(poses).__name__}; expected a PoseSequence"
+        )
     return poses
 
 
@@ -67,21 +69,30 @@ class DepthCamera:
         If the matrix is not that of a pinhole camera, or the pose is no rigid motion.
     """
 
-    matrix: Any = key(tuple[Vector, Vector, Vector] | None, converter=identity, default=None)
+    matrix: Any = key(
+        tuple[Vector, Vector, Vector] | None, converter=identity, default=None
+    )
     distortion: Any = key(list[Finite], converter=identity, default=())
     pose: Any = key(PoseMatrix | None, converter=identity, default=None)
     poses: PoseSequence | None = key(converter=_require_poses, default=None)
 
     def __post_init__(self) -> None:
-        pose = read_only_floats(np.eye(4) if self.pose is None else self.pose, (4, 4), "pose")
+        pose = read_only_floats(
+            np.eye(4) if self.pose is None else self.pose, (4, 4), "pose"
+        )
         turn = pose[:3, :3]
-        rigid = np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) and np.linalg.det(turn) > 0
+        rigid = (
+            np.allclose(turn @ turn.T, np.eye(3), atol=1e-4)
+            and np.linalg.det(turn) > 0
+        )
         if not rigid or not np.allclose(pose[3], [0, 0, 0, 1]):
             raise InputError(
                 f"pose of a camera is {pose.tolist()}; expected a rigid motion "
                 "[[R, p], [0, 0, 0, 1]] from its frame to the world, in metres"
             )
-        distortion = read_only_floats(self.distortion, (None,), "distortion of a camera")
+        distortion = read_only_floats(
+            self.distortion, (None,), "distortion of a camera"
+        )
         if len(distortion) > 5:
             raise InputError(
                 f"distortion has {len(distortion)} numbers; expected k1, k2, p1, p2, k3"
@@ -90,7 +101,9 @@ class DepthCamera:
         if self.matrix is not None:
             matrix = read_only_floats(self.matrix, (3, 3), "matrix of a camera")
             lower = matrix[[1, 2, 2, 2], [0, 0, 1, 2]]
-            if not (np.diag(matrix) > 0).all() or not np.allclose(lower, [0, 0, 0, 1]):
+            if not (np.diag(matrix) > 0).all() or not np.allclose(
+                lower, [0, 0, 0, 1]
+            ):
                 raise InputError(
                     f"matrix of a camera is {matrix.tolist()}; expected "
                     "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
@@ -105,7 +118,9 @@ class DepthCamera:
         rotation = self.pose[:3, :3]
         translation = self.pose[:3, 3]
         if self.poses is None:
-            return np.tile(rotation, (len(times), 1, 1)), np.tile(translation, (len(times), 1))
+            return np.tile(rotation, (len(times), 1, 1)), np.tile(
+                translation, (len(times), 1)
+            )
         rotations, translations = self.poses.at(times)
         return rotations @ rotation, rotations @ translation + translations
 
@@ -117,7 +132,9 @@ class DepthCamera:
         distorted = np.linalg.solve(
             self.matrix, np.column_stack([pixels, np.ones(len(pixels))]).T
         ).T
-        k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
+        k1, k2, p1, p2, k3 = np.append(
+            self.distortion, np.zeros(5 - len(self.distortion))
+        )
         undistorted = distorted[:, :2].copy()
         for _ in range(UNDISTORTION_ITERATIONS if len(self.distortion) else 0):
             x, y = undistorted.T
@@ -125,7 +142,9 @@ class DepthCamera:
             radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
             across = 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
             down = p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
-            undistorted = (distorted[:, :2] - np.column_stack([across, down])) / radial[:, None]
+            undistorted = (
+                distorted[:, :2] - np.column_stack([across, down])
+            ) / radial[:, None]
         return np.column_stack([undistorted, np.ones(len(undistorted))])
 
     def distorted_pixels(self, points_m: Array) -> Array:
@@ -135,7 +154,9 @@ class DepthCamera:
         This is the inverse of `points_at_unit_depth`. Points must be in front of the camera, z > 0.
         """
         x, y = (points_m[:, :2] / points_m[:, 2:]).T
-        k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
+        k1, k2, p1, p2, k3 = np.append(
+            self.distortion, np.zeros(5 - len(self.distortion))
+        )
         r2 = x**2 + y**2
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         distorted = np.stack(
@@ -158,7 +179,9 @@ class DepthCamera:
 def _require_selection(faces: Any) -> Selection:
     """Return `faces` unchanged; an `InputError` if it is no `Selection`."""
     if not isinstance(faces, Selection):
-        raise InputError(f"faces of a depth camera is {faces!r}; expected a selection")
+        raise InputError(
+            f"faces of a depth camera is {faces!r}; expected a selection"
+        )
     return faces
 
 
@@ -216,7 +239,10 @@ class Depth:
     spacing_m: float = key(Positive, default=0.004)
     gate_m: float = key(Positive, default=0.01)
     faces: Selection | None = key(
-        Nodes | None, converter=_require_selection, read=selection_from_section, default=None
+        Nodes | None,
+        converter=_require_selection,
+        read=selection_from_section,
+        default=None,
     )
     background: Background = key(Background, default="auto")
     outline_sigma_px: float = key(Positive, default=0.5)
@@ -226,16 +252,25 @@ class Depth:
         where = f"the depth camera '{self.name}'"
         times = read_only_floats(self.t_s, (None,), f"t_s of {where}")
         if fault := first_unordered_time(times):
-            raise InputError(f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}")
+            raise InputError(
+                f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}"
+            )
         if len(times) != len(self.clouds):
             raise InputError(
                 f"{where} has {len(times)} times and {len(self.clouds)} images or clouds; "
                 "expected as many"
             )
-        clouds = tuple(self._thin_cloud(np.asarray(cloud, dtype=float)) for cloud in self.clouds)
+        clouds = tuple(
+            self._thin_cloud(np.asarray(cloud, dtype=float))
+            for cloud in self.clouds
+        )
         if not any(len(cloud) for cloud in clouds):
-            raise InputError(f"{where} has no points; check its file and the unit of its depth")
-        vars(self).update(t_s=times, clouds=clouds, images_m=self._check_images(len(times)))
+            raise InputError(
+                f"{where} has no points; check its file and the unit of its depth"
+            )
+        vars(self).update(
+            t_s=times, clouds=clouds, images_m=self._check_images(len(times))
+        )
 
     def _check_images(self, count: int) -> tuple[Array | None, ...]:
         """Return `images_m` in single precision, with NaN for pixels without depth; empty if there
@@ -307,7 +342,9 @@ class Depth:
         images = images[None] if images.ndim == 2 else images
         clouds = [points_from_image(image, camera) for image in images]
         outlined = samples_with_outlines(len(images))
-        options["images_m"] = [image if k in outlined else None for k, image in enumerate(images)]
+        options["images_m"] = [
+            image if k in outlined else None for k, image in enumerate(images)
+        ]
         return cls(name, t_s, clouds, sigma_m, camera, **options)
 
     def _thin_cloud(self, cloud: Array) -> Array:
@@ -329,7 +366,9 @@ class Depth:
         cloud = cloud[np.isfinite(cloud).all(axis=1)]
         cubes = np.floor(cloud[:, :3] / self.spacing_m)
         # Across the view only: noise of the depth must not choose.
-        away = np.linalg.norm((cloud[:, :3] / self.spacing_m - cubes - 0.5)[:, :2], axis=1)
+        away = np.linalg.norm(
+            (cloud[:, :3] / self.spacing_m - cubes - 0.5)[:, :2], axis=1
+        )
         order = np.lexsort((away, *cubes.T))
         first = np.ones(len(order), dtype=bool)
         first[1:] = (np.diff(cubes[order], axis=0) != 0).any(axis=1)
@@ -356,7 +395,10 @@ class Depth:
             return None
         images_m = self.images_m[:count]
         return replace(
-            self, t_s=self.sample_times_s[:count], clouds=self.clouds[:count], images_m=images_m
+            self,
+            t_s=self.sample_times_s[:count],
+            clouds=self.clouds[:count],
+            images_m=images_m,
         )
 
     @property
@@ -370,7 +412,11 @@ def samples_with_outlines(count: int) -> set[int]:
     most `MOST_OUTLINE_IMAGES`, evenly spread.
     """
     return set(
-        np.unique(np.linspace(0, count - 1, min(count, MOST_OUTLINE_IMAGES)).astype(int)).tolist()
+        np.unique(
+            np.linspace(0, count - 1, min(count, MOST_OUTLINE_IMAGES)).astype(
+                int
+            )
+        ).tolist()
     )
 
 
@@ -398,9 +444,14 @@ def until_all_cameras_see(
     """
     for depth in depths:
         last_s = depth.sample_times_s[
-            min(max(fewest - 1, depth.first_sample_with_points), len(depth.sample_times_s) - 1)
+            min(
+                max(fewest - 1, depth.first_sample_with_points),
+                len(depth.sample_times_s) - 1,
+            )
         ]
-        count = max(count, int(np.searchsorted(t_s, last_s - TIME_TOLERANCE_S)) + 1)
+        count = max(
+            count, int(np.searchsorted(t_s, last_s - TIME_TOLERANCE_S)) + 1
+        )
     end_s = t_s[:count][-1] + TIME_TOLERANCE_S
     shorter = (depth.until_time(end_s) for depth in depths)
     return count, [depth for depth in shorter if depth is not None]
@@ -430,10 +481,15 @@ def points_from_image(image_m: Array, camera: DepthCamera) -> Array:
             ) < LARGEST_RELATIVE_JUMP * np.nan_to_num(depth)
     is_inner[[0, -1]] = is_inner[:, [0, -1]] = False
     v, u = np.nonzero(is_inner)
-    return camera.points_at_unit_depth(np.column_stack([u, v]).astype(float)) * depth[v, u][:, None]
+    return (
+        camera.points_at_unit_depth(np.column_stack([u, v]).astype(float))
+        * depth[v, u][:, None]
+    )
 
 
-def depth_image(camera: DepthCamera, shape: tuple[int, int], triangles_m: Array) -> Array:
+def depth_image(
+    camera: DepthCamera, shape: tuple[int, int], triangles_m: Array
+) -> Array:
     """Render a depth image [m] of opaque triangles.
 
     Parameters
@@ -454,15 +510,25 @@ def depth_image(camera: DepthCamera, shape: tuple[int, int], triangles_m: Array)
     for corners in triangles_m[(triangles_m[:, :, 2] > 0).all(axis=1)]:
         pixels = camera.undistorted_pixels(corners)
         low = np.maximum(np.ceil(pixels.min(axis=0)), 0).astype(int)
-        high = np.minimum(np.floor(pixels.max(axis=0)), [shape[1] - 1, shape[0] - 1]).astype(int)
+        high = np.minimum(
+            np.floor(pixels.max(axis=0)), [shape[1] - 1, shape[0] - 1]
+        ).astype(int)
         sides = (pixels[1:] - pixels[0]).T
         if (high < low).any() or abs(np.linalg.det(sides)) < 1e-12:
             continue
-        u, v = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
-        share = np.linalg.solve(sides, np.stack([u.ravel(), v.ravel()]) - pixels[0][:, None])
+        u, v = np.meshgrid(
+            np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)
+        )
+        share = np.linalg.solve(
+            sides, np.stack([u.ravel(), v.ravel()]) - pixels[0][:, None]
+        )
         share = np.vstack([1 - share.sum(axis=0), share])
         # What is linear over a triangle in the image is one over the depth.
-        depth = np.where((share >= -1e-9).all(axis=0), 1 / (share.T @ (1 / corners[:, 2])), np.inf)
+        depth = np.where(
+            (share >= -1e-9).all(axis=0),
+            1 / (share.T @ (1 / corners[:, 2])),
+            np.inf,
+        )
         window = image[low[1] : high[1] + 1, low[0] : high[0] + 1]
         np.minimum(window, depth.reshape(window.shape), out=window)
     return np.where(np.isfinite(image), image, np.nan)

@@ -28,7 +28,12 @@ from .measured_wrench import Wrench
 from .nuisance import Nuisance
 from .obstacle import Obstacle, with_obstacle_frames
 from .pressure import Pressure
-from .sample_times import STEP_TOLERANCE, TIME_TOLERANCE_S, first_unordered_time, sample_interval_s
+from .sample_times import (
+    STEP_TOLERANCE,
+    TIME_TOLERANCE_S,
+    first_unordered_time,
+    sample_interval_s,
+)
 from .tendon import Tendon
 from .time_tables import is_within_experiment
 
@@ -118,15 +123,21 @@ class Experiment:
     grasps: tuple[Grasp, ...] = key(converter=tuple[Grasp, ...])
     markers: Markers = key(converter=identity, default=None)
     gravity_m_s2: Array = key(
-        Vector, converter=float_converter((3,), "gravity_m_s2"), default=EARTH_M_S2
+        Vector,
+        converter=float_converter((3,), "gravity_m_s2"),
+        default=EARTH_M_S2,
     )
     name: str = "experiment"
     _: KW_ONLY
     kind: Kind = key(Kind, default="dynamic")
     start: Start = key(Start, default="equilibrium")
     start_rule: StartRule = key(StartRule, default="standard")
-    start_positions_m: Array | None = key(converter=_state("positions_m"), default=None)
-    start_velocities_m_s: Array | None = key(converter=_state("velocities_m_s"), default=None)
+    start_positions_m: Array | None = key(
+        converter=_state("positions_m"), default=None
+    )
+    start_velocities_m_s: Array | None = key(
+        converter=_state("velocities_m_s"), default=None
+    )
     loaded_since_s: float = key(NotNegative | None, default=np.inf)
     validation: bool = key(Flag, default=False)
     masses: tuple[PointMass, ...] = key(converter=tuple, default=())
@@ -136,7 +147,9 @@ class Experiment:
     readings: tuple[Gauge, ...] = key(converter=tuple[Gauge, ...], default=())
     depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=())
     nuisance: Nuisance = DEFAULT_NUISANCE
-    air_density_kg_m3: float = key(converter=air_density, default_factory=usual_air_density)
+    air_density_kg_m3: float = key(
+        converter=air_density, default_factory=usual_air_density
+    )
     specimen: HomogeneousDeformation | None = None
 
     def __post_init__(self) -> None:
@@ -147,18 +160,30 @@ class Experiment:
         framed = zip(self.obstacles, self.body.frames, strict=True)
         vars(self).update(
             grasps=(
-                *(grasp.on_body(self.body, self.t_s) for grasp in self.body_grasps),
-                *(obstacle.with_frame_nodes(frame, self.t_s) for obstacle, frame in framed),
+                *(
+                    grasp.on_body(self.body, self.t_s)
+                    for grasp in self.body_grasps
+                ),
+                *(
+                    obstacle.with_frame_nodes(frame, self.t_s)
+                    for obstacle, frame in framed
+                ),
             ),
-            markers=Markers.none(self.t_s) if self.markers is None else self.markers,
+            markers=Markers.none(self.t_s)
+            if self.markers is None
+            else self.markers,
             **{
-                name: tuple(load.on_body(self.body) for load in getattr(self, name))
+                name: tuple(
+                    load.on_body(self.body) for load in getattr(self, name)
+                )
                 for name in loads
             },
         )
         self._check_kind()
         self._check_time()
-        vars(self)["markers"] = self.markers.on_body(self.body, self._undeformed_places)
+        vars(self)["markers"] = self.markers.on_body(
+            self.body, self._undeformed_places
+        )
         self._check_nodes()
         self._check_start()
         self._check_actuators()
@@ -181,14 +206,18 @@ class Experiment:
     @property
     def body_grasps(self) -> tuple[Grasp, ...]:
         """Grasps that hold nodes of the body: all `grasps` but the obstacles."""
-        return tuple(grasp for grasp in self.grasps if not isinstance(grasp, Obstacle))
+        return tuple(
+            grasp for grasp in self.grasps if not isinstance(grasp, Obstacle)
+        )
 
     @property
     def wrenches(self) -> tuple[Wrench, ...]:
         """Measured wrenches of the grasps that have a sensor, obstacles included, in the order of
         `grasps`.
         """
-        return tuple(grasp.wrench for grasp in self.grasps if grasp.wrench is not None)
+        return tuple(
+            grasp.wrench for grasp in self.grasps if grasp.wrench is not None
+        )
 
     @property
     def symmetry(self) -> int:
@@ -201,7 +230,9 @@ class Experiment:
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
         """Rigid obstacles that the body may touch; they come last in `grasps`."""
-        return tuple(grasp for grasp in self.grasps if isinstance(grasp, Obstacle))
+        return tuple(
+            grasp for grasp in self.grasps if isinstance(grasp, Obstacle)
+        )
 
     def with_obstacles(self, obstacles: Iterable[Obstacle]) -> Experiment:
         """Return the experiment with these obstacles in place of its own."""
@@ -215,7 +246,9 @@ class Experiment:
     @property
     def timestep_s(self) -> float:
         """Mean time between samples [s]; 1 s if there is only one sample."""
-        return self.duration_s / (len(self.t_s) - 1) if len(self.t_s) > 1 else 1.0
+        return (
+            self.duration_s / (len(self.t_s) - 1) if len(self.t_s) > 1 else 1.0
+        )
 
     @property
     def duration_s(self) -> float:
@@ -233,9 +266,13 @@ class Experiment:
         """Sorted dofs that are not in `prescribed_dofs`; grasps with a time window may hold some of
         them for a while.
         """
-        return np.setdiff1d(np.arange(self.body.nodes_m.size), self.prescribed_dofs)
+        return np.setdiff1d(
+            np.arange(self.body.nodes_m.size), self.prescribed_dofs
+        )
 
-    def prescribed_displacements(self, t_s: ArrayLike) -> tuple[NDArray[np.bool_], Array]:
+    def prescribed_displacements(
+        self, t_s: ArrayLike
+    ) -> tuple[NDArray[np.bool_], Array]:
         """Return which nodal coordinates are prescribed at the times `t_s` (T,), and their values.
 
         Returns
@@ -251,9 +288,9 @@ class Experiment:
         for grasp in self.grasps:
             holding = np.flatnonzero(grasp.is_active(times))
             moved_m = grasp.positions_at(self.body.nodes_m, times[holding])
-            positions[np.ix_(holding, grasp.nodes, grasp.axis_indices)] = moved_m[
-                ..., grasp.axis_indices
-            ]
+            positions[np.ix_(holding, grasp.nodes, grasp.axis_indices)] = (
+                moved_m[..., grasp.axis_indices]
+            )
         return is_prescribed, positions
 
     def is_prescribed(self, t_s: ArrayLike) -> NDArray[np.bool_]:
@@ -261,10 +298,14 @@ class Experiment:
         bool.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        is_prescribed = np.zeros((len(times), *self.body.nodes_m.shape), dtype=bool)
+        is_prescribed = np.zeros(
+            (len(times), *self.body.nodes_m.shape), dtype=bool
+        )
         for grasp in self.grasps:
             holding = np.flatnonzero(grasp.is_active(times))
-            is_prescribed[np.ix_(holding, grasp.nodes, grasp.axis_indices)] = True
+            is_prescribed[np.ix_(holding, grasp.nodes, grasp.axis_indices)] = (
+                True
+            )
         return is_prescribed
 
     def prescribed_positions(self, t_s: ArrayLike) -> Array:
@@ -287,7 +328,9 @@ class Experiment:
         times = np.atleast_1d(t_s)
         mass = np.broadcast_to(0.0, (len(times), n))
         for point in self.masses:
-            mass = mass + np.outer(self.share(point, times), point.node_mass_kg(n))
+            mass = mass + np.outer(
+                self.share(point, times), point.node_mass_kg(n)
+            )
         return mass
 
     def share(self, load: PointMass | Force, t_s: ArrayLike) -> Array:
@@ -299,11 +342,14 @@ class Experiment:
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         first_share, last_share = (
-            self._share_since(load, change, times) for change in get_args(LoadTime)
+            self._share_since(load, change, times)
+            for change in get_args(LoadTime)
         )
         return first_share - last_share
 
-    def _share_since(self, load: PointMass | Force, change: LoadTime, times: Array) -> Array:
+    def _share_since(
+        self, load: PointMass | Force, change: LoadTime, times: Array
+    ) -> Array:
         """Return the share (T,), from 0 to 1, of a load whose time `change` ("from_s" or "until_s")
         has passed at the given times, see `share`.
         """
@@ -329,15 +375,23 @@ class Experiment:
         times = np.atleast_1d(t_s)
         total = np.broadcast_to(np.zeros(3), (len(times), n, 3))
         for force in self.forces:
-            total = total + self.share(force, times)[:, None, None] * force.node_forces_n(times, n)
+            total = total + self.share(force, times)[
+                :, None, None
+            ] * force.node_forces_n(times, n)
         return total
 
     @property
     def instrumented_grasps(self) -> tuple[int, ...]:
         """Indices of the grasps whose force or torque is measured, by a wrench or custom sensor."""
-        grasps_of_gauges = {gauge.grasp - 1 for gauge in self.readings if gauge.grasp is not None}
+        grasps_of_gauges = {
+            gauge.grasp - 1
+            for gauge in self.readings
+            if gauge.grasp is not None
+        }
         sensed = (
-            k for k, g in enumerate(self.grasps) if g.wrench is not None or k in grasps_of_gauges
+            k
+            for k, g in enumerate(self.grasps)
+            if g.wrench is not None or k in grasps_of_gauges
         )
         return tuple(sensed)
 
@@ -348,11 +402,17 @@ class Experiment:
         """
         if self.instrumented_grasps:
             return True
-        if any(actuator.energy_amplitude_at(self.t_s).any() for actuator in self.actuators):
+        if any(
+            actuator.energy_amplitude_at(self.t_s).any()
+            for actuator in self.actuators
+        ):
             return True
         tied = np.repeat(self.point_mass_at_nodes_kg(self.t_s), 3, axis=1)
         forces = self.declared_node_forces_n(self.t_s).reshape(tied.shape)
-        return bool((tied != 0)[:, self.free_dofs].any() or forces[:, self.free_dofs].any())
+        return bool(
+            (tied != 0)[:, self.free_dofs].any()
+            or forces[:, self.free_dofs].any()
+        )
 
     @property
     def has_air_drag(self) -> bool:
@@ -368,8 +428,13 @@ class Experiment:
     def coupled_graph(self) -> JointPattern:
         """Mesh graph of the body with the couplings of its actuators, obstacles and air drag."""
         couplings = [each.measure.couplings for each in self.actuators]
-        couplings += [each.contact_surface(self.body).points.couplings for each in self.obstacles]
-        couplings += [self.body.unit_air_drag.points.couplings] * self.has_air_drag
+        couplings += [
+            each.contact_surface(self.body).points.couplings
+            for each in self.obstacles
+        ]
+        couplings += [
+            self.body.unit_air_drag.points.couplings
+        ] * self.has_air_drag
         return self.body.joint_pattern_with(couplings)
 
     @property
@@ -385,23 +450,36 @@ class Experiment:
         undeformed place. The frames of obstacles follow their own poses.
         """
         rotations, translations = self.rigid_motion(t_s)
-        places = np.einsum("tij,kj->tki", rotations, self.body.nodes_m) + translations[:, None]
+        places = (
+            np.einsum("tij,kj->tki", rotations, self.body.nodes_m)
+            + translations[:, None]
+        )
         for obstacle in self.obstacles:
-            places[:, obstacle.nodes] = obstacle.positions_at(self.body.nodes_m, np.atleast_1d(t_s))
+            places[:, obstacle.nodes] = obstacle.positions_at(
+                self.body.nodes_m, np.atleast_1d(t_s)
+            )
         return places
 
     @property
     def upward_direction(self) -> Array:
         """Unit vector (3,) against gravity; the z axis if there is no gravity."""
         pull = np.linalg.norm(self.gravity_m_s2)
-        return -self.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0])
+        return (
+            -self.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0])
+        )
 
     def rigid_motion(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """Return rotations (T, 3, 3) and translations (T, 3) [m] of `rigid_positions`."""
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         if not self.body_grasps:
-            return np.tile(np.eye(3), (len(times), 1, 1)), np.zeros((len(times), 3))
-        throughout = [grasp for grasp in self.body_grasps if grasp.is_active(self.t_s).all()]
+            return np.tile(np.eye(3), (len(times), 1, 1)), np.zeros(
+                (len(times), 3)
+            )
+        throughout = [
+            grasp
+            for grasp in self.body_grasps
+            if grasp.is_active(self.t_s).all()
+        ]
         throughout.sort(key=lambda grasp: grasp.axes != "xyz")
         poses = (throughout or self.body_grasps)[0].poses
         if len(poses.t_s) > 1 and not throughout:
@@ -432,7 +510,10 @@ class Experiment:
     def _check_kind(self) -> None:
         if not self.is_static:
             return
-        for name, usual in (("start", "equilibrium"), ("start_rule", "standard")):
+        for name, usual in (
+            ("start", "equilibrium"),
+            ("start_rule", "standard"),
+        ):
             if getattr(self, name) != usual:
                 raise InputError(
                     f"{name} is {getattr(self, name)!r}, but the experiment is static: each sample "
@@ -459,7 +540,9 @@ class Experiment:
                 "and the marker file"
             )
         if not self.is_static:
-            step_s = sample_interval_s(self.t_s, f"t_s of experiment '{self.name}'")
+            step_s = sample_interval_s(
+                self.t_s, f"t_s of experiment '{self.name}'"
+            )
         elif fault := first_unordered_time(self.t_s):
             raise InputError(f"t_s: {fault[1]}", where=f"row {fault[0] + 1}")
         else:
@@ -477,14 +560,23 @@ class Experiment:
             grasp.poses.at(self.t_s[grasp.is_active(self.t_s)])
             if grasp.wrench is not None:
                 is_within_experiment(
-                    grasp.wrench.t_s, self.t_s, "the wrench of a grasp", self.is_static
+                    grasp.wrench.t_s,
+                    self.t_s,
+                    "the wrench of a grasp",
+                    self.is_static,
                 )
         for gauge in self.readings:
             what = f"the reading '{gauge.name}'"
             if [other.name for other in self.readings].count(gauge.name) > 1:
-                raise InputError(f"two readings are called {gauge.name!r}; expected another name")
-            is_within_experiment(gauge.sample_times_s, self.t_s, what, self.is_static)
-            if gauge.grasp is not None and not 1 <= gauge.grasp <= len(self.grasps):
+                raise InputError(
+                    f"two readings are called {gauge.name!r}; expected another name"
+                )
+            is_within_experiment(
+                gauge.sample_times_s, self.t_s, what, self.is_static
+            )
+            if gauge.grasp is not None and not 1 <= gauge.grasp <= len(
+                self.grasps
+            ):
                 raise InputError(
                     f"{what} refers to grasp {gauge.grasp}; expected the number of a grasp, 1 to "
                     f"{len(self.grasps)}"
@@ -493,9 +585,15 @@ class Experiment:
         for depth in self.depths:
             what = f"the depth camera '{depth.name}'"
             if [other.name for other in self.depths].count(depth.name) > 1:
-                raise InputError(f"two depth cameras are called {depth.name!r}; expected another")
-            is_within_experiment(depth.sample_times_s, self.t_s, what, self.is_static)
-            distance_s = np.abs(depth.sample_times_s[:, None] - self.t_s).min(axis=1)
+                raise InputError(
+                    f"two depth cameras are called {depth.name!r}; expected another"
+                )
+            is_within_experiment(
+                depth.sample_times_s, self.t_s, what, self.is_static
+            )
+            distance_s = np.abs(depth.sample_times_s[:, None] - self.t_s).min(
+                axis=1
+            )
             if self.is_static and distance_s.max() > TIME_TOLERANCE_S:
                 raise InputError(
                     f"{what} has an image at {depth.sample_times_s[distance_s.argmax()]:g} s, but "
@@ -508,7 +606,9 @@ class Experiment:
         if not self.markers.names:
             message = "nothing is measured: there are no markers, no wrench and no reading"
             raise InputError(f"{message}; expected at least one of them")
-        raise InputError("there is no marker sample; check the marker file and window_s")
+        raise InputError(
+            "there is no marker sample; check the marker file and window_s"
+        )
 
     def _check_nodes(self) -> None:
         n = len(self.body.nodes_m)
@@ -523,7 +623,9 @@ class Experiment:
         ):
             beyond = [load.nodes[-1] for load in loads if load.nodes[-1] >= n]
             if beyond:
-                raise InputError(f"a {what} node {beyond[0]}, but the body has only {n} nodes")
+                raise InputError(
+                    f"a {what} node {beyond[0]}, but the body has only {n} nodes"
+                )
         placed = self.markers.placement.node_count
         own = len(self.body.nodes.points_m)
         if placed not in (own, n):
@@ -535,7 +637,9 @@ class Experiment:
     def _check_obstacles(self) -> None:
         names = [obstacle.name for obstacle in self.obstacles]
         if twice := [name for k, name in enumerate(names) if name in names[:k]]:
-            raise InputError(f"two obstacles are called {twice[0]!r}; expected different names")
+            raise InputError(
+                f"two obstacles are called {twice[0]!r}; expected different names"
+            )
 
     def _check_actuators(self) -> None:
         names = [actuator.name for actuator in self.actuators]
@@ -550,7 +654,8 @@ class Experiment:
         is_prescribed, places_m = self.prescribed_displacements(self.t_s)
         throughout = np.asarray(is_prescribed.all(axis=0))
         bounded = tuple(
-            pressure.with_fixed_rim(throughout, places_m) for pressure in self.pressures
+            pressure.with_fixed_rim(throughout, places_m)
+            for pressure in self.pressures
         )
         vars(self)["pressures"] = bounded
 
@@ -561,16 +666,21 @@ class Experiment:
                 "time for which a body that starts in equilibrium has been loaded"
             )
         has_initial_state = (
-            self.start_positions_m is not None or self.start_velocities_m_s is not None
+            self.start_positions_m is not None
+            or self.start_velocities_m_s is not None
         )
         if self.start == "given":
             if self.start_positions_m is None:
                 raise InputError("start = 'given' needs start_positions_m")
             if self.start_velocities_m_s is None:
-                vars(self)["start_velocities_m_s"] = np.zeros_like(self.start_positions_m)
+                vars(self)["start_velocities_m_s"] = np.zeros_like(
+                    self.start_positions_m
+                )
             self._append_obstacle_frames(len(self.start_positions_m))
             for name in ("start_positions_m", "start_velocities_m_s"):
-                read_only_floats(getattr(self, name), self.body.nodes_m.shape, name)
+                read_only_floats(
+                    getattr(self, name), self.body.nodes_m.shape, name
+                )
         elif has_initial_state:
             raise InputError(
                 f"start_positions_m or start_velocities_m_s is given, but start is '{self.start}'; "
@@ -594,7 +704,10 @@ class Experiment:
         at_s = self.t_s[0] + np.array([0.0, 1e-3 * self.timestep_s])
         places = self.rigid_positions(at_s)[:, frames]
         rates = np.diff(places, axis=0)[0] / np.diff(at_s)
-        for name, own in (("start_positions_m", places[0]), ("start_velocities_m_s", rates)):
+        for name, own in (
+            ("start_positions_m", places[0]),
+            ("start_velocities_m_s", rates),
+        ):
             vars(self)[name] = np.vstack([getattr(self, name), own])
 
     def _require_unique_equilibrium(self) -> None:

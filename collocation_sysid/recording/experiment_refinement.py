@@ -24,7 +24,9 @@ def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
     markers = experiment.markers
 
     def refined_load(load):
-        return replace(load, nodes=refine_nodes(load.nodes, load.selection, body, finer))
+        return replace(
+            load, nodes=refine_nodes(load.nodes, load.selection, body, finer)
+        )
 
     placement = place_markers(
         markers.predict_positions(body.nodes_m),
@@ -36,13 +38,23 @@ def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
     return replace(
         experiment,
         body=finer,
-        grasps=(*map(refined_load, experiment.body_grasps), *experiment.obstacles),
+        grasps=(
+            *map(refined_load, experiment.body_grasps),
+            *experiment.obstacles,
+        ),
         masses=tuple(map(refined_load, experiment.masses)),
         forces=tuple(map(refined_load, experiment.forces)),
-        pressures=tuple(pressure.on_refined_body(body, finer) for pressure in experiment.pressures),
+        pressures=tuple(
+            pressure.on_refined_body(body, finer)
+            for pressure in experiment.pressures
+        ),
         markers=replace(markers, placement=placement, places_m=None),
-        start_positions_m=_interpolated(experiment.start_positions_m, body, finer),
-        start_velocities_m_s=_interpolated(experiment.start_velocities_m_s, body, finer),
+        start_positions_m=_interpolated(
+            experiment.start_positions_m, body, finer
+        ),
+        start_velocities_m_s=_interpolated(
+            experiment.start_velocities_m_s, body, finer
+        ),
     )
 
 

@@ -17,7 +17,12 @@ from ..errors import InputError
 from ..fem.selection import Selection
 from ..validated_types import Finite, NotNegative
 from .measured_wrench import Wrench
-from .node_selection import Nodes, node_converter, select_on_body, selection_from_section
+from .node_selection import (
+    Nodes,
+    node_converter,
+    select_on_body,
+    selection_from_section,
+)
 from .poses import PoseSequence
 from .sample_times import TIME_TOLERANCE_S
 
@@ -67,8 +72,14 @@ class Grasp:
         Measured force and torque that it exerts on the body.
     """
 
-    nodes: Index = key(Nodes, converter=node_converter("the grasp"), read=selection_from_section)
-    poses: PoseSequence = key(converter=identity)  # matrices stay until there are times
+    nodes: Index = key(
+        Nodes,
+        converter=node_converter("the grasp"),
+        read=selection_from_section,
+    )
+    poses: PoseSequence = key(
+        converter=identity
+    )  # matrices stay until there are times
     from_s: float = key(Finite | None, default=-np.inf)
     until_s: float = key(Finite | None, default=np.inf)
     sigma_m: float | None = key(NotNegative | None, default=None)
@@ -97,8 +108,12 @@ class Grasp:
             )
         if self.zero not in ("", *get_args(Axes)):
             expected = ", ".join(get_args(Axes))
-            raise InputError(f"zero of a grasp is {self.zero!r}; expected one of {expected}")
-        vars(self)["zero"] = "".join(axis for axis in self.zero if axis in self.axes)
+            raise InputError(
+                f"zero of a grasp is {self.zero!r}; expected one of {expected}"
+            )
+        vars(self)["zero"] = "".join(
+            axis for axis in self.zero if axis in self.axes
+        )
         if isinstance(self.nodes, Selection):
             vars(self)["selection"] = self.nodes
 
@@ -164,22 +179,32 @@ def prescribed_dofs(grasps: Sequence[Grasp]) -> Index:
     """
     for (i, first), (j, second) in combinations(enumerate(grasps, start=1), 2):
         shared = np.intersect1d(first.prescribed_dofs, second.prescribed_dofs)
-        if shared.size and max(first.from_s, second.from_s) <= min(first.until_s, second.until_s):
+        if shared.size and max(first.from_s, second.from_s) <= min(
+            first.until_s, second.until_s
+        ):
             node, axis = divmod(int(shared[0]), 3)
-            on_axis = "" if first.axes == second.axes == "xyz" else f" along {'xyz'[axis]}"
+            on_axis = (
+                ""
+                if first.axes == second.axes == "xyz"
+                else f" along {'xyz'[axis]}"
+            )
             raise InputError(
                 f"node {node} is held by the grasps {i} and {j} at the same time{on_axis}; select "
                 "the nodes so that each is held by one grasp"
             )
     return np.unique(
-        np.concatenate([np.zeros(0, dtype=np.int64), *(g.prescribed_dofs for g in grasps)])
+        np.concatenate(
+            [np.zeros(0, dtype=np.int64), *(g.prescribed_dofs for g in grasps)]
+        )
     )
 
 
 # What is left free --------------------------------------------------------------------------------
 
 
-def free_rigid_motions(points_m: Array, is_prescribed: NDArray[np.bool_]) -> list[str]:
+def free_rigid_motions(
+    points_m: Array, is_prescribed: NDArray[np.bool_]
+) -> list[str]:
     """Return the rigid motions that these prescribed coordinates leave free, in words; empty if
     none.
 
@@ -194,11 +219,16 @@ def free_rigid_motions(points_m: Array, is_prescribed: NDArray[np.bool_]) -> lis
         return ["translate and rotate as a rigid body"]
     about = points_m[is_prescribed.any(axis=1)].mean(axis=0)
     arms = points_m - about
-    size_m = float(np.linalg.norm(arms[is_prescribed.any(axis=1)], axis=1).max()) or 1.0
-    turned = np.stack([np.cross(axis, arms / size_m) for axis in np.eye(3)], axis=2)
-    modes = np.concatenate([np.broadcast_to(np.eye(3), turned.shape), turned], axis=2)[
-        is_prescribed
-    ]
+    size_m = (
+        float(np.linalg.norm(arms[is_prescribed.any(axis=1)], axis=1).max())
+        or 1.0
+    )
+    turned = np.stack(
+        [np.cross(axis, arms / size_m) for axis in np.eye(3)], axis=2
+    )
+    modes = np.concatenate(
+        [np.broadcast_to(np.eye(3), turned.shape), turned], axis=2
+    )[is_prescribed]
     _, values, directions = np.linalg.svd(modes)
     rank = int((values > SMALLEST_SINGULAR_VALUE * values[0]).sum())
     free = directions[rank:]
@@ -208,8 +238,14 @@ def free_rigid_motions(points_m: Array, is_prescribed: NDArray[np.bool_]) -> lis
     shifts = _null_space(free[:, 3:].T) @ free[:, :3]
     rotations = free[:, 3:]
     return [
-        *(f"translate along {_direction_text(d)}" for d in _axis_aligned_basis(shifts)),
-        *(f"rotate about {_direction_text(d)}" for d in _axis_aligned_basis(rotations)),
+        *(
+            f"translate along {_direction_text(d)}"
+            for d in _axis_aligned_basis(shifts)
+        ),
+        *(
+            f"rotate about {_direction_text(d)}"
+            for d in _axis_aligned_basis(rotations)
+        ),
     ]
 
 
@@ -223,7 +259,9 @@ def _axis_aligned_basis(vectors: Array) -> Iterator[Array]:
     """Yield the unit vectors (3,) of an orthonormal basis of the span of vectors (k, 3), along
     coordinate axes where possible.
     """
-    _, values, directions = np.linalg.svd(vectors.reshape(-1, 3), full_matrices=False)
+    _, values, directions = np.linalg.svd(
+        vectors.reshape(-1, 3), full_matrices=False
+    )
     space = directions[values > SMALLEST_SINGULAR_VALUE]
     while len(space):
         projected = space.T @ space

@@ -103,7 +103,9 @@ def read_markers(
     t_s = _times_s(raw, rate_hz)
     used_names = [labels.get(label, label) for label in raw.labels]
     coordinates, notes = _mark_missing(raw, used_names)
-    return MarkerTable(t_s, tuple(used_names), coordinates * metres, (*raw.notes, *notes))
+    return MarkerTable(
+        t_s, tuple(used_names), coordinates * metres, (*raw.notes, *notes)
+    )
 
 
 def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
@@ -120,11 +122,17 @@ def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
         return c3d.read(path, content, choose)
     text = decode(content)
     start = text.lstrip().lstrip('"')
-    known = (read for beginning, read in _TEXT_FORMATS.items() if start.startswith(beginning))
+    known = (
+        read
+        for beginning, read in _TEXT_FORMATS.items()
+        if start.startswith(beginning)
+    )
     return next(known, plain_csv.read)(text, choose)
 
 
-def _label_chooser(names: Sequence[str] | None, renamed: Mapping[str, str]) -> LabelChooser:
+def _label_chooser(
+    names: Sequence[str] | None, renamed: Mapping[str, str]
+) -> LabelChooser:
     """Return the function that picks the requested markers from the labels in a file.
 
     It raises an `InputError` if labels or names repeat, if a label of `renamed` or a name is not
@@ -138,7 +146,9 @@ def _label_chooser(names: Sequence[str] | None, renamed: Mapping[str, str]) -> L
         From labels in the file to names.
     """
 
-    def choose(labels: Sequence[str], excluded: Collection[str] = ()) -> list[int]:
+    def choose(
+        labels: Sequence[str], excluded: Collection[str] = ()
+    ) -> list[int]:
         _require_distinct(labels, "two markers are labelled")
         for label in renamed:
             _require_one_of(label, labels, "label")
@@ -146,16 +156,22 @@ def _label_chooser(names: Sequence[str] | None, renamed: Mapping[str, str]) -> L
         _require_distinct(known, "after renaming two markers are named")
         if names is None:
             chosen = [
-                k for k, label in enumerate(labels) if label not in excluded or label in renamed
+                k
+                for k, label in enumerate(labels)
+                if label not in excluded or label in renamed
             ]
             if not labels:
                 raise InputError("holds no markers")
             if not chosen:
-                remedy = f"label them, or rename with labels: {', '.join(labels)}"
+                remedy = (
+                    f"label them, or rename with labels: {', '.join(labels)}"
+                )
                 raise InputError(f"holds unlabelled markers only; {remedy}")
             return chosen
         if not names:
-            raise InputError("no markers are requested; omit the names to use all markers")
+            raise InputError(
+                "no markers are requested; omit the names to use all markers"
+            )
         for name in names:
             _require_one_of(name, known, "marker")
         _require_distinct(names, "requested more than once: marker")
@@ -176,7 +192,9 @@ def _require_one_of(name: str, known: Sequence[str], what: str) -> None:
     """Raise an `InputError` if a name is not among the names in the file."""
     if name not in known:
         hint = hint_at(name, known)
-        raise InputError(f"no {what} '{name}'; the file has {', '.join(known)}{hint}")
+        raise InputError(
+            f"no {what} '{name}'; the file has {', '.join(known)}{hint}"
+        )
 
 
 def _length_unit(raw: RawTracks, length_unit: str | None) -> str:
@@ -242,14 +260,19 @@ def _require_rate(t_s: Array, key: str, rate_hz: float) -> None:
     steps = np.diff(t_s)
     mean_hz = 1 / steps.mean()
     median_hz = 1 / np.median(steps)
-    if min(abs(mean_hz / rate_hz - 1), abs(median_hz / rate_hz - 1)) > _RATE_TOLERANCE:
+    if (
+        min(abs(mean_hz / rate_hz - 1), abs(median_hz / rate_hz - 1))
+        > _RATE_TOLERANCE
+    ):
         raise InputError(
             f"{key} is {rate_hz:g} Hz, but the times are {1 / mean_hz:.6g} s apart, "
             f"{mean_hz:.6g} Hz; expected the same"
         )
 
 
-def _mark_missing(raw: RawTracks, names: Iterable[str]) -> tuple[Array, list[str]]:
+def _mark_missing(
+    raw: RawTracks, names: Iterable[str]
+) -> tuple[Array, list[str]]:
     """Return coordinates (T, M, 3) with NaN for missing samples, and notes on how many are missing.
 
     Markers with the same losses share a note.
@@ -261,7 +284,9 @@ def _mark_missing(raw: RawTracks, names: Iterable[str]) -> tuple[Array, list[str
     for k, name in enumerate(names):
         counts = {"blank": blank[:, k].sum(), "zeros": zero[:, k].sum()}
         if missing := sum(counts.values()):
-            kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+            kinds = ", ".join(
+                f"{count} {kind}" for kind, count in counts.items() if count
+            )
             loss = f"{missing} of {len(x)} samples missing ({kinds})"
             markers_by_loss.setdefault(loss, []).append(name)
     notes = [

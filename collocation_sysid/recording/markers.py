@@ -84,7 +84,9 @@ class Markers:
     on_surface: bool = key(_PLACES, converter=bool, default=False)
     located: NDArray[np.bool_] = key(converter=np.asarray, default=None)
     attach: AttachmentRule = key(AttachmentRule, default="auto")
-    max_distance_m: float | None = key(Positive | None, converter=identity, default=None)
+    max_distance_m: float | None = key(
+        Positive | None, converter=identity, default=None
+    )
 
     def __post_init__(self) -> None:
         shape = len(self.t_s), None, 3
@@ -95,13 +97,23 @@ class Markers:
         if len(self.names) != m:
             message = f"{len(self.names)} marker names for {m} tracks; expected one for each"
             raise InputError(message)
-        if repeated := [name for name, count in Counter(self.names).items() if count > 1]:
-            raise InputError(f"the marker name '{repeated[0]}' is given more than once")
-        each = np.broadcast_to(self.sigma_m, m) if self.sigma_m.ndim == 0 else self.sigma_m
+        if repeated := [
+            name for name, count in Counter(self.names).items() if count > 1
+        ]:
+            raise InputError(
+                f"the marker name '{repeated[0]}' is given more than once"
+            )
+        each = (
+            np.broadcast_to(self.sigma_m, m)
+            if self.sigma_m.ndim == 0
+            else self.sigma_m
+        )
         sigma_m = read_only_floats(each, (m,), "sigma_m")
         for name, sigma in zip(self.names, sigma_m, strict=True):
             if not sigma > 0:
-                raise InputError(f"sigma_m of marker '{name}' is {sigma:g}; expected > 0")
+                raise InputError(
+                    f"sigma_m of marker '{name}' is {sigma:g}; expected > 0"
+                )
         vars(self).update(positions_m=tracks, sigma_m=sigma_m)
         self._check_places(m)
 
@@ -123,16 +135,25 @@ class Markers:
                 "the positions are to be estimated"
             )
         if placement is not None and len(placement.nodes) != m:
-            raise InputError(f"{len(placement.nodes)} positions on the body for {m} markers")
+            raise InputError(
+                f"{len(placement.nodes)} positions on the body for {m} markers"
+            )
         if placement is None:
             places_m = np.full((m, 3), np.nan) if places_m is None else places_m
-            places_m = read_only_floats(places_m, (m, 3), "places_m", finite=False)
+            places_m = read_only_floats(
+                places_m, (m, 3), "places_m", finite=False
+            )
             known = np.isfinite(places_m).all(axis=1)
-        vars(self).update(places_m=places_m, located=np.ones(m, bool) if known is None else known)
+        vars(self).update(
+            places_m=places_m,
+            located=np.ones(m, bool) if known is None else known,
+        )
         if self.places_sigma_m is not None:
             each = self.places_sigma_m
             each = np.broadcast_to(each, m) if each.ndim == 0 else each
-            sigma_m = read_only_floats(each, (m,), "places_sigma_m", finite=False)
+            sigma_m = read_only_floats(
+                each, (m,), "places_sigma_m", finite=False
+            )
             vars(self)["places_sigma_m"] = sigma_m
 
     def __repr__(self) -> str:
@@ -147,7 +168,9 @@ class Markers:
         gaps = f", {missing} missing" if missing else ""
         return f"Markers({', '.join(shown)}: {self.sample_count} samples{gaps})"
 
-    def on_body(self, body: Body, undeformed_places: UndeformedPlaces | None = None) -> Markers:
+    def on_body(
+        self, body: Body, undeformed_places: UndeformedPlaces | None = None
+    ) -> Markers:
         """Return the markers with their placement on a body.
 
         Parameters
@@ -170,7 +193,11 @@ class Markers:
         if not known.all():
             shape = LocatedBody(body.nodes_m, body)
             points_m, times_s = self.first_samples
-            back = points_m if undeformed_places is None else undeformed_places(points_m, times_s)
+            back = (
+                points_m
+                if undeformed_places is None
+                else undeformed_places(points_m, times_s)
+            )
             for m in np.flatnonzero(~known).tolist():
                 if not self.is_present[:, m].any():
                     raise InputError(
@@ -208,7 +235,9 @@ class Markers:
         time (M,) [s].
         """
         rows = self.is_present.argmax(axis=0)
-        return self.positions_m[rows, np.arange(len(self.names))], self.t_s[rows]
+        return self.positions_m[rows, np.arange(len(self.names))], self.t_s[
+            rows
+        ]
 
     @cached_property
     def is_present(self) -> NDArray[np.bool_]:
@@ -229,4 +258,6 @@ class Markers:
         """Return predicted marker positions (..., M, 3) from node positions (..., n, 3)."""
         nodes_m = np.asarray(node_positions_m, dtype=np.float64)
         element_nodes_m = nodes_m[..., self.placement.nodes, :]
-        return np.einsum("mk,...mkd->...md", self.placement.weights, element_nodes_m)
+        return np.einsum(
+            "mk,...mkd->...md", self.placement.weights, element_nodes_m
+        )

@@ -28,7 +28,9 @@ def _with_torques(values: ArrayLike) -> Array:
     """
     rows = np.array(values, dtype=float)
     forces_alone = rows.ndim == 2 and rows.shape[1] == 3
-    return np.hstack([rows, np.full_like(rows, np.nan)]) if forces_alone else rows
+    return (
+        np.hstack([rows, np.full_like(rows, np.nan)]) if forces_alone else rows
+    )
 
 
 @declaration
@@ -67,7 +69,9 @@ class Wrench:
     sigma_nm: float | None = key(Positive | None, default=None)
     frame: Frame = key(Frame, default="world")
     point_m: Array = key(
-        Vector, converter=float_converter((3,), "point_m of the wrench"), default=(0.0,) * 3
+        Vector,
+        converter=float_converter((3,), "point_m of the wrench"),
+        default=(0.0,) * 3,
     )
     symmetry: int = key(AtLeastOne, default=1)
 
@@ -75,7 +79,9 @@ class Wrench:
         if not len(self.t_s):
             raise InputError("a wrench without samples; expected at least one")
         shape = len(self.t_s), 6
-        values = read_only_floats(self.values, shape, "values of the wrench", finite=False)
+        values = read_only_floats(
+            self.values, shape, "values of the wrench", finite=False
+        )
         vars(self)["values"] = values
         if fault := first_unordered_time(self.t_s):
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
@@ -107,7 +113,9 @@ class Wrench:
     @property
     def component_names(self) -> tuple[str, ...]:
         """Names of the measured components, such as "fz"."""
-        return tuple(COMPONENTS[k] for k in np.flatnonzero(self.measured_components))
+        return tuple(
+            COMPONENTS[k] for k in np.flatnonzero(self.measured_components)
+        )
 
     @property
     def sigmas(self) -> Array:

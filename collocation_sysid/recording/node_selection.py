@@ -67,7 +67,9 @@ def selection_from_section(section: NodesSection | str) -> Selection:
     """Return the selection that a table in the problem file states; a text names a point array."""
     if isinstance(section, str):
         return Named(section)
-    ((kind, value),) = ((KINDS[key], value) for key, value in section if value is not None)
+    ((kind, value),) = (
+        (KINDS[key], value) for key, value in section if value is not None
+    )
     return kind(*value) if kind in (Box, Ball) else kind(value)
 
 
@@ -88,9 +90,13 @@ def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:
     def chosen(selection: Any) -> Any:
         if isinstance(selection, Selection):
             return selection
-        nodes = np.unique(read_only_nodes(selection, (None,), f"nodes of {what}"))
+        nodes = np.unique(
+            read_only_nodes(selection, (None,), f"nodes of {what}")
+        )
         if nodes.size == 0:
-            raise InputError(f"{what} needs at least one node; its selection found none")
+            raise InputError(
+                f"{what} needs at least one node; its selection found none"
+            )
         nodes.setflags(write=False)
         return nodes
 

@@ -39,7 +39,16 @@ Component = Literal[
     "depth",
     "gauge",
 ]
-ModelPart = Literal["reading", "clock", "sensor", "gravity", "grasps", "loads", "drives", "depth"]
+ModelPart = Literal[
+    "reading",
+    "clock",
+    "sensor",
+    "gravity",
+    "grasps",
+    "loads",
+    "drives",
+    "depth",
+]
 # Scope of parameters that recordings share, as a pattern and in words for messages.
 SCOPE = r"shared( \S+)?"
 SCOPE_TEXT = '"shared", or "shared" and a word for each of several groups'
@@ -145,7 +154,9 @@ class NuisanceRow:
         """Key of the prior standard deviation in the problem file, with its unit, such as
         "prior_m".
         """
-        unit = {"1": "", "σ": "_sigmas", "1/m²": "_1_m2"}.get(self.unit, f"_{self.unit.lower()}")
+        unit = {"1": "", "σ": "_sigmas", "1/m²": "_1_m2"}.get(
+            self.unit, f"_{self.unit.lower()}"
+        )
         return f"prior{unit}"
 
     @property
@@ -162,7 +173,9 @@ def cayley_rotation(rotation_vector: ca.SX) -> ca.SX:
     Its angle is that of the rotation vector (3,) [rad] up to third order.
     """
     half = ca.skew(rotation_vector / 2)
-    return ca.SX.eye(3) + 2 / (1 + ca.sumsqr(rotation_vector) / 4) * (half + half @ half)
+    return ca.SX.eye(3) + 2 / (1 + ca.sumsqr(rotation_vector) / 4) * (
+        half + half @ half
+    )
 
 
 def in_readable_unit(value: float, unit: str) -> tuple[float, str]:
@@ -240,7 +253,9 @@ def _largest_place_step_m(experiment: Any) -> float:
 
 def _hand_eye_sharing_key(experiment: Any) -> dict[str, Any]:
     """Return what must agree in recordings that share the hand–eye transform."""
-    nodes = {int(node) for grasp in experiment.body_grasps for node in grasp.nodes}
+    nodes = {
+        int(node) for grasp in experiment.body_grasps for node in grasp.nodes
+    }
     return {"body": id(experiment.body), "nodes in its grasps": nodes}
 
 
@@ -317,7 +332,9 @@ CLOCK_RATE = NuisanceRow(
     key="clock_rate",
     considered=1e-4,
     changes=("clock",),
-    applies=lambda experiment: _is_motion(experiment) and _has_markers(experiment),
+    applies=lambda experiment: (
+        _is_motion(experiment) and _has_markers(experiment)
+    ),
     label="rate of the markers' clock",
     sentence="the markers' clock is slow by {signed}",
     description="how much slower than the grasps' clock that of the markers runs",
@@ -441,7 +458,9 @@ OBSTACLE_TILT = NuisanceRow(
     changes=("grasps",),
     by="length",
     considered=0.2 * DEGREE,
-    applies=lambda experiment: any(each.shape.has_tilt for each in experiment.obstacles),
+    applies=lambda experiment: any(
+        each.shape.has_tilt for each in experiment.obstacles
+    ),
     label="tilt of {which}, {axis}",
     sentence="tilt of an obstacle: {size}",
     description="a constant tilt of each obstacle that is a plane or a box, about its point or "
@@ -456,7 +475,9 @@ OBSTACLE_TIME = NuisanceRow(
     changes=("grasps",),
     by="worst",
     considered=1e-3,
-    applies=lambda experiment: any(len(each.poses.t_s) > 1 for each in experiment.obstacles),
+    applies=lambda experiment: any(
+        len(each.poses.t_s) > 1 for each in experiment.obstacles
+    ),
     label="delay of {which}",
     sentence="delay of an obstacle: up to {size}",
     description="delay of each obstacle's motion, to first order",
@@ -681,7 +702,9 @@ DEPTH_TIME = NuisanceRow(
     key="depth_time",
     of="depth",
     changes=("depth",),
-    applies=lambda experiment: _is_motion(experiment) and _has_depth_cameras(experiment),
+    applies=lambda experiment: (
+        _is_motion(experiment) and _has_depth_cameras(experiment)
+    ),
     low=-3.0,
     high=3.0,
     by="worst",
@@ -844,17 +867,25 @@ class Nuisance:
         for row in self.own:
             _check_custom_kind(row)
             if [each.name for each in self.kinds].count(row.name) > 1:
-                raise InputError(f"two nuisance parameters are named {row.name!r}")
+                raise InputError(
+                    f"two nuisance parameters are named {row.name!r}"
+                )
         for row in self.kinds:
             value = self.sigma(row)
             if value is not None and not value > 0:
-                raise InputError(f"{row.name} is {value:g}; expected a standard deviation above 0")
+                raise InputError(
+                    f"{row.name} is {value:g}; expected a standard deviation above 0"
+                )
         names = [row.name for row in self.kinds]
         for name, word in self.scope.items():
             if name not in names:
-                raise InputError(f"found the scope of {name!r}; expected one of {listed(names)}")
+                raise InputError(
+                    f"found the scope of {name!r}; expected one of {listed(names)}"
+                )
             if not re.fullmatch(SCOPE, word):
-                raise InputError(f"the scope of {name} is {word!r}; expected {SCOPE_TEXT}")
+                raise InputError(
+                    f"the scope of {name} is {word!r}; expected {SCOPE_TEXT}"
+                )
 
     @property
     def kinds(self) -> tuple[NuisanceRow, ...]:
@@ -877,8 +908,14 @@ class Nuisance:
 def _check_custom_kind(row: NuisanceRow) -> None:
     """Raise an `InputError` if a custom kind has another component, no prior, or no effect."""
     if row.of not in ("recording", "marker"):
-        raise InputError(f"{row.name} is of a {row.of}; expected of = 'recording' or 'marker'")
+        raise InputError(
+            f"{row.name} is of a {row.of}; expected of = 'recording' or 'marker'"
+        )
     if row.sigma is None:
-        raise InputError(f"{row.name} has no sigma; expected the standard deviation of its prior")
+        raise InputError(
+            f"{row.name} has no sigma; expected the standard deviation of its prior"
+        )
     if (row.reading is None) == (row.clock is None):
-        raise InputError(f"{row.name} has to have a reading or a clock, one of both")
+        raise InputError(
+            f"{row.name} has to have a reading or a clock, one of both"
+        )

@@ -33,14 +33,18 @@ def _require_solid(shape: Any) -> Solid:
     """Return `shape` unchanged; an `InputError` if it is no `Solid`."""
     if not isinstance(shape, Solid):
         kinds = ", ".join(kind.__name__ for kind in KINDS.values())
-        raise InputError(f"shape of an obstacle is {shape!r}; expected one of {kinds}")
+        raise InputError(
+            f"shape of an obstacle is {shape!r}; expected one of {kinds}"
+        )
     return shape
 
 
 def _require_selection(faces: Any) -> Selection:
     """Return `faces` unchanged; an `InputError` if it is no `Selection`."""
     if not isinstance(faces, Selection):
-        raise InputError(f"faces of an obstacle is {faces!r}; expected a selection")
+        raise InputError(
+            f"faces of an obstacle is {faces!r}; expected a selection"
+        )
     return faces
 
 
@@ -90,7 +94,10 @@ class Obstacle(Grasp):
     nodes: Index = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     poses: PoseSequence = field(default_factory=PoseSequence.fixed)
     shape: Solid = key(
-        SolidSection, read=solid_from_section, converter=_require_solid, kw_only=True
+        SolidSection,
+        read=solid_from_section,
+        converter=_require_solid,
+        kw_only=True,
     )
     name: str = key(Text | None, default="obstacle", kw_only=True)
     friction: float | str = key(NotNegative | Text, default=0.0, kw_only=True)
@@ -101,7 +108,9 @@ class Obstacle(Grasp):
         default=None,
         kw_only=True,
     )
-    stiffness_pa_m: float | None = key(Positive | None, default=None, kw_only=True)
+    stiffness_pa_m: float | None = key(
+        Positive | None, default=None, kw_only=True
+    )
     width_m: float | None = key(Positive | None, default=None, kw_only=True)
     slip: float | None = key(Positive | None, default=None, kw_only=True)
     relaxed: float | None = field(default=None, kw_only=True)
@@ -109,13 +118,17 @@ class Obstacle(Grasp):
     def __post_init__(self) -> None:
         self._check_times_and_axes()
         if self.axes != "xyz":
-            raise InputError(f"axes of {self.name} is {self.axes!r}; expected none: it is rigid")
+            raise InputError(
+                f"axes of {self.name} is {self.axes!r}; expected none: it is rigid"
+            )
         least, largest = FRICTION.bounds
         if isinstance(self.friction, float) and self.friction > largest:
             raise InputError(
                 f"friction of {self.name} is {self.friction:g}; expected {least:g} to {largest:g}"
             )
-        if (named := self.friction_constant) and not named.name.endswith(FRICTION.name):
+        if (named := self.friction_constant) and not named.name.endswith(
+            FRICTION.name
+        ):
             raise InputError(
                 f"friction of {self.name} is {named.name!r}; expected a number, or the name of a "
                 f"parameter that ends with {FRICTION.name}, such as table_friction"
@@ -140,7 +153,11 @@ class Obstacle(Grasp):
         uncertain; if there are none, the direction that its shape states.
         """
         uncertain_axes = np.array([float(axis in self.zero) for axis in "xyz"])
-        return uncertain_axes if uncertain_axes.any() else self.shape.offset_direction
+        return (
+            uncertain_axes
+            if uncertain_axes.any()
+            else self.shape.offset_direction
+        )
 
     @property
     def tilt_axes(self) -> Array:
@@ -149,7 +166,9 @@ class Obstacle(Grasp):
         """
         return orthogonal_axes(self.shape.offset_direction)
 
-    def displaced(self, offset_m: float, tilt_rad: Array, delay_s: float) -> Obstacle:
+    def displaced(
+        self, offset_m: float, tilt_rad: Array, delay_s: float
+    ) -> Obstacle:
         """Return a copy of the obstacle, shifted and tilted in its own frame, and delayed.
 
         Parameters
@@ -163,8 +182,12 @@ class Obstacle(Grasp):
         """
         motion = np.eye(4)
         middle = self.shape.tilt_centre_m
-        motion[:3, :3] = Rotation.from_rotvec(tilt_rad @ self.tilt_axes).as_matrix()
-        motion[:3, 3] = middle - motion[:3, :3] @ middle + offset_m * self.offset_direction
+        motion[:3, :3] = Rotation.from_rotvec(
+            tilt_rad @ self.tilt_axes
+        ).as_matrix()
+        motion[:3, 3] = (
+            middle - motion[:3, :3] @ middle + offset_m * self.offset_direction
+        )
         poses = self.poses.after(motion)
         return replace(self, poses=replace(poses, t_s=poses.t_s + delay_s))
 
@@ -176,7 +199,11 @@ class Obstacle(Grasp):
     @cached_property
     def friction_constant(self) -> Constant | None:
         """Parameter that is the coefficient of friction; None if the coefficient is a number."""
-        return constant_named(self.friction) if isinstance(self.friction, str) else None
+        return (
+            constant_named(self.friction)
+            if isinstance(self.friction, str)
+            else None
+        )
 
 
 @lru_cache(maxsize=32)
@@ -185,7 +212,9 @@ def _contact_surface(body: Body, obstacle: Obstacle) -> ContactSurface:
     return ContactSurface.from_body(body, obstacle.nodes, obstacle.faces)
 
 
-def with_obstacle_frames(body: Body, obstacles: Sequence[Obstacle], *, is_static: bool) -> Body:
+def with_obstacle_frames(
+    body: Body, obstacles: Sequence[Obstacle], *, is_static: bool
+) -> Body:
     """Return the body with four nodes for the frame of each obstacle, and the coefficients of
     friction that are parameters among its constants.
 
@@ -193,8 +222,11 @@ def with_obstacle_frames(body: Body, obstacles: Sequence[Obstacle], *, is_static
     are averaged over time steps, which happens in motions without `relaxed` contact.
     """
     named = (each.friction_constant for each in obstacles)
-    frictions = tuple(dict.fromkeys(constant for constant in named if constant is not None))
+    frictions = tuple(
+        dict.fromkeys(constant for constant in named if constant is not None)
+    )
     unsymmetric = any(
-        each.has_friction or (each.relaxed is None and not is_static) for each in obstacles
+        each.has_friction or (each.relaxed is None and not is_static)
+        for each in obstacles
     )
     return body.with_frames(len(obstacles), unsymmetric, frictions)

@@ -84,10 +84,14 @@ class Plane(Solid):
     """
 
     normal: Array = key(
-        Vector, converter=_unit_vector_converter("normal of a plane"), default=(0.0, 0.0, 1.0)
+        Vector,
+        converter=_unit_vector_converter("normal of a plane"),
+        default=(0.0, 0.0, 1.0),
     )
     point_m: Array = key(
-        Vector, converter=float_converter((3,), "point_m of a plane"), default=(0.0,) * 3
+        Vector,
+        converter=float_converter((3,), "point_m of a plane"),
+        default=(0.0,) * 3,
     )
 
     @property
@@ -111,7 +115,10 @@ class Plane(Solid):
         """
         middle = about_m - (about_m - self.point_m) @ self.normal * self.normal
         u, v = orthogonal_axes(self.normal) * size_m / 2
-        corners = [middle + a * u + b * v for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))]
+        corners = [
+            middle + a * u + b * v
+            for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
+        ]
         return [np.array(corners)]
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
@@ -132,11 +139,15 @@ class Sphere(Solid):
     """
 
     radius_m: float = key(Positive)
-    centre_m: Array = key(Vector, converter=float_converter((3,), "centre_m"), default=(0.0,) * 3)
+    centre_m: Array = key(
+        Vector, converter=float_converter((3,), "centre_m"), default=(0.0,) * 3
+    )
 
     def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
         """Return three circles, one across each axis; both arguments are ignored."""
-        return [_circle(self.centre_m, axis, self.radius_m) for axis in np.eye(3)]
+        return [
+            _circle(self.centre_m, axis, self.radius_m) for axis in np.eye(3)
+        ]
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
         """Signed distance of a point (3,) from the sphere [m]; negative inside."""
@@ -153,7 +164,9 @@ def _checked_ends(value: Any) -> Array:
     """
     ends = float_converter((2, 3), "ends_m")(value)
     if (ends[0] == ends[1]).all():
-        raise InputError("the ends of an axis are at the same place; expected two places")
+        raise InputError(
+            "the ends of an axis are at the same place; expected two places"
+        )
     return ends
 
 
@@ -173,7 +186,9 @@ class _AxialSolid(Solid):
         quarters = range(0, len(first) - 1, (len(first) - 1) // 4)
         return [first, last, *(np.array([first[k], last[k]]) for k in quarters)]
 
-    def _cylindrical_coordinates(self, point: ca.SX) -> tuple[ca.SX, ca.SX, float]:
+    def _cylindrical_coordinates(
+        self, point: ca.SX
+    ) -> tuple[ca.SX, ca.SX, float]:
         """Return the cylindrical coordinates of a point (3,) and half of the length of the axis
         [m].
 
@@ -240,12 +255,16 @@ class Cuboid(Solid):
         Radius of the rounded edges [m]; zero for sharp edges.
     """
 
-    corners_m: Array = key(tuple[Vector, Vector], converter=float_converter((2, 3), "corners_m"))
+    corners_m: Array = key(
+        tuple[Vector, Vector], converter=float_converter((2, 3), "corners_m")
+    )
     rounding_m: float = key(NotNegative, default=0.0)
 
     def __post_init__(self) -> None:
         if not (self.corners_m[0] < self.corners_m[1]).all():
-            raise InputError("the corners of a box have to be its lowest, then its highest")
+            raise InputError(
+                "the corners of a box have to be its lowest, then its highest"
+            )
 
     @property
     def has_tilt(self) -> bool:
@@ -261,12 +280,16 @@ class Cuboid(Solid):
         """Return the twelve edges, (2, 3) each; both arguments are ignored."""
         corners = np.array(list(product(*self.corners_m.T)))
         differences = (corners[:, None] != corners).sum(axis=2)
-        return [corners[[i, j]] for i, j in np.argwhere(differences == 1) if i < j]
+        return [
+            corners[[i, j]] for i, j in np.argwhere(differences == 1) if i < j
+        ]
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
         """Signed distance of a point (3,) from the box [m]; negative inside."""
         low, high = self.corners_m
-        beyond = ca.fabs(point - ca.DM((low + high) / 2)) - ca.DM((high - low) / 2)
+        beyond = ca.fabs(point - ca.DM((low + high) / 2)) - ca.DM(
+            (high - low) / 2
+        )
         return _corner_distance(beyond + self.rounding_m) - self.rounding_m
 
 
@@ -278,7 +301,9 @@ def orthogonal_axes(normal: Array) -> Array:
 def _circle(centre_m: Array, axis: Array, radius_m: float) -> Array:
     """Return a closed polyline (33, 3) of the circle about a centre (3,) across an axis (3,)."""
     angle = np.linspace(0, 2 * np.pi, 33)
-    round_m = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ orthogonal_axes(axis)
+    round_m = np.stack(
+        [np.cos(angle), np.sin(angle)], axis=1
+    ) @ orthogonal_axes(axis)
     return centre_m + radius_m * round_m
 
 

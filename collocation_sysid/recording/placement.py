@@ -53,13 +53,19 @@ class Placement:
     node_count: int
 
     def __post_init__(self) -> None:
-        nodes = read_only_nodes(self.nodes, (None, None), "nodes of the placement")
+        nodes = read_only_nodes(
+            self.nodes, (None, None), "nodes of the placement"
+        )
         if nodes.size and nodes.max() >= self.node_count:
             raise InputError(
                 f"the placement refers to node {nodes.max()}, but the body has {self.node_count}"
             )
-        weights = read_only_floats(self.weights, nodes.shape, "weights of the placement")
-        distance = read_only_floats(self.distance_m, (len(nodes),), "distance_m of the placement")
+        weights = read_only_floats(
+            self.weights, nodes.shape, "weights of the placement"
+        )
+        distance = read_only_floats(
+            self.distance_m, (len(nodes),), "distance_m of the placement"
+        )
         vars(self).update(nodes=nodes, weights=weights, distance_m=distance)
 
 
@@ -95,11 +101,17 @@ def place_markers(
     InputError
         If a marker has no position or is too far from the body.
     """
-    points = read_only_floats(points_m, (None, 3), "marker positions", finite=False)
+    points = read_only_floats(
+        points_m, (None, 3), "marker positions", finite=False
+    )
     nodes_m = read_only_floats(node_positions_m, (None, 3), "node positions")
-    labels = [str(k) for k in range(len(points))] if names is None else list(names)
+    labels = (
+        [str(k) for k in range(len(points))] if names is None else list(names)
+    )
     if len(labels) != len(points):
-        raise InputError(f"{len(labels)} marker names for {len(points)} marker positions")
+        raise InputError(
+            f"{len(labels)} marker names for {len(points)} marker positions"
+        )
     if attach not in get_args(AttachmentRule):
         raise InputError(
             f"attach is {attach!r}; expected one of {', '.join(get_args(AttachmentRule))}"
@@ -111,9 +123,11 @@ def place_markers(
             "could be determined; give its reference_m"
         )
     shape = LocatedBody(nodes_m, body)
-    snap_m = {"auto": VERTEX_SNAP_EDGES * shape.mean_edge_m, "vertex": np.inf, "embedded": -1.0}[
-        attach
-    ]
+    snap_m = {
+        "auto": VERTEX_SNAP_EDGES * shape.mean_edge_m,
+        "vertex": np.inf,
+        "embedded": -1.0,
+    }[attach]
     limit_m = shape.mean_edge_m if max_distance_m is None else max_distance_m
 
     nodes = np.empty((len(points), body.cells.shape[1]), dtype=np.int64)
@@ -152,7 +166,9 @@ class LocatedBody:
         self.body = body
         corners = body.cells[:, :4]
         ends = nodes_m[body.mesh.edges]
-        self.mean_edge_m = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
+        self.mean_edge_m = float(
+            np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean()
+        )
         self.origin = nodes_m[corners[:, 0]]
         edges = nodes_m[corners[:, 1:]] - self.origin[:, None]
         self.inverse = np.linalg.inv(edges)  # L1..L3 = (x − origin) @ inverse
@@ -172,7 +188,11 @@ class LocatedBody:
         The distance is 0 inside the body.
         """
         cell, distance = self.nearest_cell(point)
-        return self.body.cells[cell], self._shape_functions_at(point, cell), distance
+        return (
+            self.body.cells[cell],
+            self._shape_functions_at(point, cell),
+            distance,
+        )
 
     def nearest_cell(self, point: Array) -> tuple[int, float]:
         """Return the index of the element that contains a point (3,), or is nearest to it, and its
@@ -187,7 +207,9 @@ class LocatedBody:
         )
         distance = float(to_faces.min())
         # Where an edge or corner is nearest, extrapolate from the element that must the least.
-        nearest = self.body.mesh.surface_cells[to_faces <= distance + 1e-9 * self.mean_edge_m]
+        nearest = self.body.mesh.surface_cells[
+            to_faces <= distance + 1e-9 * self.mean_edge_m
+        ]
         return int(nearest[np.argmax(depth[nearest])]), distance
 
     def weights_at_nearest_point(self, point: Array) -> tuple[Index, Array]:
@@ -197,7 +219,9 @@ class LocatedBody:
         nodes, weights, distance = self.weights_at_point(point)
         if distance == 0.0:
             return nodes, weights
-        nodes, weights, _ = self.weights_at_point(self.nearest_surface_point(point)[0])
+        nodes, weights, _ = self.weights_at_point(
+            self.nearest_surface_point(point)[0]
+        )
         return nodes, weights
 
     def nearest_surface_point(self, point: Array) -> tuple[Array, Array]:
@@ -207,20 +231,26 @@ class LocatedBody:
         nearest = nearest_points_of_triangles(point, self.triangles)
         face = int(np.linalg.norm(point - nearest, axis=1).argmin())
         sides = self.triangles[face, 1:] - self.triangles[face, 0]
-        return nearest[face], np.asarray(np.linalg.qr(sides.T)[0], dtype=np.float64)
+        return nearest[face], np.asarray(
+            np.linalg.qr(sides.T)[0], dtype=np.float64
+        )
 
     def barycentric(self, points: Array, cells: slice | Index) -> Array:
         """Return barycentric coordinates (k, 4) of points (k, 3), or of one (3,), in the cells
         (k,).
         """
-        rest = np.einsum("ei,eij->ej", points - self.origin[cells], self.inverse[cells])
+        rest = np.einsum(
+            "ei,eij->ej", points - self.origin[cells], self.inverse[cells]
+        )
         return np.column_stack([1.0 - rest.sum(axis=1), rest])
 
     def barycentric_gradients(self, cells: Index) -> Array:
         """Return the derivatives (k, 4, 3) of the barycentric coordinates by the point, in the
         cells (k,).
         """
-        rest = np.asarray(np.swapaxes(self.inverse[cells], 1, 2), dtype=np.float64)
+        rest = np.asarray(
+            np.swapaxes(self.inverse[cells], 1, 2), dtype=np.float64
+        )
         return np.concatenate([-rest.sum(axis=1, keepdims=True), rest], axis=1)
 
     def _shape_functions_at(self, point: Array, cell: int) -> Array:
@@ -253,7 +283,9 @@ def nearest_points_of_triangles(point: Array, triangles: Array) -> Array:
     ends = np.roll(triangles, -1, axis=1)
     sides = ends - triangles
     away = point - triangles
-    share = np.einsum("fci,fci->fc", away, sides) / np.einsum("fci,fci->fc", sides, sides)
+    share = np.einsum("fci,fci->fc", away, sides) / np.einsum(
+        "fci,fci->fc", sides, sides
+    )
     on_sides = triangles + np.clip(share, 0.0, 1.0)[:, :, None] * sides
     best = np.linalg.norm(point - on_sides, axis=2).argmin(axis=1)
     ab = sides[:, 0]
@@ -265,4 +297,6 @@ def nearest_points_of_triangles(point: Array, triangles: Array) -> Array:
     in_b = np.einsum("fi,fi->f", np.cross(ap, ac), normal) / squared
     above = (in_b >= 0.0) & (in_c >= 0.0) & (in_b + in_c <= 1.0)
     within = triangles[:, 0] + in_b[:, None] * ab + in_c[:, None] * ac
-    return np.where(above[:, None], within, on_sides[np.arange(len(best)), best])
+    return np.where(
+        above[:, None], within, on_sides[np.arange(len(best)), best]
+    )

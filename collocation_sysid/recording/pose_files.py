@@ -30,14 +30,18 @@ from .poses import PoseSequence, first_matrix_fault, first_pose_fault
 
 POSE_COLUMNS = ("t_s", *POSE)
 
-_MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
+_MATRIX_COLUMNS = tuple(
+    f"m{row}{column}" for row in range(4) for column in range(4)
+)
 _ORDERS = ("xyzw", "wxyz")
 _ZIP = b"PK\x03\x04"
 
 
 @names_file_in_errors
 def read_poses(
-    path: str | Path, quaternion: str | None = None, length_unit: str | None = None
+    path: str | Path,
+    quaternion: str | None = None,
+    length_unit: str | None = None,
 ) -> PoseSequence:
     """Read poses of a grasp, which map undeformed to current positions.
 
@@ -65,7 +69,9 @@ def read_poses(
     """
     require_length_unit(length_unit)
     if quaternion not in (None, *_ORDERS):
-        raise InputError(f"quaternion is {quaternion!r}; expected one of {', '.join(_ORDERS)}")
+        raise InputError(
+            f"quaternion is {quaternion!r}; expected one of {', '.join(_ORDERS)}"
+        )
     content = read_bytes(path)
     if content.startswith(_ZIP):
         t_s, matrices = _read_archive(path)
@@ -79,12 +85,18 @@ def read_poses(
     t_s = times_in_column(grid, *time)
     others = [k for k in range(len(grid.columns)) if k != time[0]]
     if sorted(grid.columns[k] for k in others) == sorted(_MATRIX_COLUMNS):
-        matrices = _read_columns(grid, map(grid.columns.index, _MATRIX_COLUMNS)).reshape(-1, 4, 4)
+        matrices = _read_columns(
+            grid, map(grid.columns.index, _MATRIX_COLUMNS)
+        ).reshape(-1, 4, 4)
         return _from_matrices(t_s, matrices, length_unit, lines)
     axes, metres = _position_columns(grid, length_unit)
-    components = _quaternion_columns(grid, quaternion, [k for k in others if k not in axes])
+    components = _quaternion_columns(
+        grid, quaternion, [k for k in others if k not in axes]
+    )
     positions_m = _read_columns(grid, axes) * metres
-    return _checked_sequence(t_s, positions_m, _read_columns(grid, components), lines)
+    return _checked_sequence(
+        t_s, positions_m, _read_columns(grid, components), lines
+    )
 
 
 def _checked_sequence(
@@ -131,7 +143,9 @@ def _column_error(grid: TextTable) -> InputError:
     )
 
 
-def _position_columns(grid: TextTable, length_unit: str | None) -> tuple[list[int], float]:
+def _position_columns(
+    grid: TextTable, length_unit: str | None
+) -> tuple[list[int], float]:
     """Return the indices of the columns of x, y, z, and the factor from their unit to metres.
 
     Parameters
@@ -147,7 +161,12 @@ def _position_columns(grid: TextTable, length_unit: str | None) -> tuple[list[in
         differently.
     """
     parts = [name_and_unit(column) for column in grid.columns]
-    axes = [k for axis in "xyz" for k, (name, _) in enumerate(parts) if name.lower() == axis]
+    axes = [
+        k
+        for axis in "xyz"
+        for k, (name, _) in enumerate(parts)
+        if name.lower() == axis
+    ]
     units = [parts[k][1] for k in axes]
     metres = [si_factor(unit or length_unit or "m", "length") for unit in units]
     if len(axes) != 3 or None in metres or len(set(metres)) > 1:
@@ -159,7 +178,8 @@ def _position_columns(grid: TextTable, length_unit: str | None) -> tuple[list[in
             f"{', '.join(METRES_PER_UNIT)}, or columns such as x_m, y_m, z_m"
         )
     if length_unit and any(
-        unit and si_factor(unit, "length") != METRES_PER_UNIT[length_unit] for unit in units
+        unit and si_factor(unit, "length") != METRES_PER_UNIT[length_unit]
+        for unit in units
     ):
         raise grid.error_at(
             f"length_unit is '{length_unit}', but the columns are {named}; expected the same "
@@ -168,7 +188,9 @@ def _position_columns(grid: TextTable, length_unit: str | None) -> tuple[list[in
     return axes, float(metres[0] or 1.0)
 
 
-def _quaternion_columns(grid: TextTable, order: str | None, columns: list[int]) -> list[int]:
+def _quaternion_columns(
+    grid: TextTable, order: str | None, columns: list[int]
+) -> list[int]:
     """Return the indices of the columns of the quaternion in the order x, y, z, w.
 
     Parameters
@@ -195,7 +217,10 @@ def _quaternion_columns(grid: TextTable, order: str | None, columns: list[int]) 
             )
         return [place[f"q{axis}"] for axis in "xyzw"]
     numbered = sorted(place)
-    if len(columns) != 4 or numbered not in (["q0", "q1", "q2", "q3"], ["q1", "q2", "q3", "q4"]):
+    if len(columns) != 4 or numbered not in (
+        ["q0", "q1", "q2", "q3"],
+        ["q1", "q2", "q3", "q4"],
+    ):
         raise _column_error(grid)
     if order is None:
         raise grid.error_at(
@@ -222,18 +247,28 @@ def _read_archive(path: str | Path) -> tuple[Array, Array]:
     except InputError:
         raise
     except (*DAMAGE, OSError) as error:
-        raise InputError(f"is not a NumPy archive of numbers: {error}") from error
+        raise InputError(
+            f"is not a NumPy archive of numbers: {error}"
+        ) from error
     shapes = {key: array.shape for key, array in arrays.items()}
     shape = shapes.get("t_s", ())
-    if len(shape) != 1 or shapes.get("matrices") != (*shape, 4, 4) or not shape[0]:
+    if (
+        len(shape) != 1
+        or shapes.get("matrices") != (*shape, 4, 4)
+        or not shape[0]
+    ):
         raise InputError(
             f"holds {', '.join(f'{key} {size}' for key, size in shapes.items()) or 'nothing'}; "
             "expected t_s (T,) and matrices (T, 4, 4)"
         )
     try:
-        return arrays["t_s"].astype(np.float64), arrays["matrices"].astype(np.float64)
+        return arrays["t_s"].astype(np.float64), arrays["matrices"].astype(
+            np.float64
+        )
     except (TypeError, ValueError) as error:
-        raise InputError(f"t_s and matrices must hold numbers: {error}") from error
+        raise InputError(
+            f"t_s and matrices must hold numbers: {error}"
+        ) from error
 
 
 def _from_matrices(
@@ -258,4 +293,6 @@ def _from_matrices(
         raise InputError(fault[1], where=row_names[fault[0]])
     metres = METRES_PER_UNIT[length_unit or "m"]
     quaternions = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
-    return _checked_sequence(t_s, matrices[:, :3, 3] * metres, quaternions, row_names)
+    return _checked_sequence(
+        t_s, matrices[:, :3, 3] * metres, quaternions, row_names
+    )

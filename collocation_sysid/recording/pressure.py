@@ -72,7 +72,9 @@ class Pressure(Actuator[EnclosedVolume]):
         Pressure in the body: factor · stated pressure − loss_pa.
     """
 
-    faces: Selection | Index = key(Nodes, converter=_checked_faces, read=selection_from_section)
+    faces: Selection | Index = key(
+        Nodes, converter=_checked_faces, read=selection_from_section
+    )
     pressure_pa: Array = key(Finite | None, converter=np.asarray)
     t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
     name: str = key(Text | None, default="pressure")
@@ -86,8 +88,14 @@ class Pressure(Actuator[EnclosedVolume]):
     offset_field: ClassVar[str] = "loss_pa"
 
     def __post_init__(self) -> None:
-        pressure = TimeSeries(self.pressure_pa, self.t_s, f"pressure_pa of {self.name}")
-        vars(self).update(pressure_pa=pressure.values, t_s=pressure.t_s, declared_values=pressure)
+        pressure = TimeSeries(
+            self.pressure_pa, self.t_s, f"pressure_pa of {self.name}"
+        )
+        vars(self).update(
+            pressure_pa=pressure.values,
+            t_s=pressure.t_s,
+            declared_values=pressure,
+        )
         if self.lag_s and self.t_s is None:
             raise InputError(
                 f"{self.name} is constant and has a lag_s of {self.lag_s:g} s; expected a table of "
@@ -115,7 +123,10 @@ class Pressure(Actuator[EnclosedVolume]):
         # Seen from the cavity, the outside of the material is the inside.
         wall = body.nodes.nodes_of_faces(mesh.surface[rows][:, ::-1])
         volume = EnclosedVolume(wall, len(body.nodes_m))
-        if not volume.rim.size and volume.evaluate(body.nodes_m.reshape(1, -1))[0] <= 0:
+        if (
+            not volume.rim.size
+            and volume.evaluate(body.nodes_m.reshape(1, -1))[0] <= 0
+        ):
             raise InputError(
                 f"{self.name}: the faces are the outer surface of the body; expected the wall of "
                 "a cavity in it, or an open patch whose rim is held"
@@ -128,16 +139,26 @@ class Pressure(Actuator[EnclosedVolume]):
 
         A selection by position or name stays as it is; faces given by indices are split in four.
         """
-        if isinstance(self.faces, Selection) and not isinstance(self.faces, Indices):
+        if isinstance(self.faces, Selection) and not isinstance(
+            self.faces, Indices
+        ):
             return replace(self, body_measure=None)
         corners = self.on_body(body).measure.faces[:, :3]
-        return replace(self, faces=split_faces_in_four(corners, body.mesh), body_measure=None)
+        return replace(
+            self,
+            faces=split_faces_in_four(corners, body.mesh),
+            body_measure=None,
+        )
 
-    def energy_amplitude(self, declared_value: Any, factor: Any, offset: Any) -> Any:
+    def energy_amplitude(
+        self, declared_value: Any, factor: Any, offset: Any
+    ) -> Any:
         """Return the amplitude of the energy: minus the pressure in the body."""
         return offset - factor * declared_value
 
-    def with_calibration(self, factor: float, offset: float, log_lag_ratio: float) -> Self:
+    def with_calibration(
+        self, factor: float, offset: float, log_lag_ratio: float
+    ) -> Self:
         """Return the pressure with another calibration."""
         lag_s = self.lag_s * float(np.exp(log_lag_ratio))
         return replace(self, factor=factor, loss_pa=offset, lag_s=lag_s)
@@ -152,14 +173,18 @@ class Pressure(Actuator[EnclosedVolume]):
         """Return minus the pressure for a calibration, as an expression of `input_data` (1,)."""
         if not self.lag_s:
             return self.energy_amplitude(data, factor, offset)
-        pressure_pa = self._lagging_pressure(data, self.lag_s * ca.exp(log_lag_ratio))
+        pressure_pa = self._lagging_pressure(
+            data, self.lag_s * ca.exp(log_lag_ratio)
+        )
         return self.energy_amplitude(pressure_pa, factor, offset)
 
     def energy_amplitude_at(self, t_s: Array) -> Array:
         """Return minus the pressure in the body at the times `t_s` (T,), as (T,)."""
         if not self.lag_s:
             return super().energy_amplitude_at(t_s)
-        pressure_pa = self._lagging_pressure(ca.DM(t_s), ca.DM(self.lag_s)).full().ravel()
+        pressure_pa = (
+            self._lagging_pressure(ca.DM(t_s), ca.DM(self.lag_s)).full().ravel()
+        )
         return self.energy_amplitude(pressure_pa, self.factor, self.loss_pa)
 
     def _lagging_pressure(self, t_s: Any, lag_s: Any) -> Any:
@@ -179,7 +204,9 @@ class Pressure(Actuator[EnclosedVolume]):
                 pressure_pa = pressure_pa + change * response
         return pressure_pa
 
-    def with_fixed_rim(self, is_prescribed: NDArray[np.bool_], prescribed_m: Array) -> Pressure:
+    def with_fixed_rim(
+        self, is_prescribed: NDArray[np.bool_], prescribed_m: Array
+    ) -> Pressure:
         """Return the pressure with a volume that does not depend on the motion of a held rim.
 
         The volume of an open patch is that of the cones over its faces from an apex. The pressure
@@ -203,7 +230,9 @@ class Pressure(Actuator[EnclosedVolume]):
         if placed is None or not volume.rim.size:
             return self
         moving_rim = volume.rim[~is_prescribed[volume.rim].all(axis=(1, 2))]
-        is_sliding = np.asarray(np.logical_and.reduce(is_prescribed[moving_rim], axis=1))  # (k, 3)
+        is_sliding = np.asarray(
+            np.logical_and.reduce(is_prescribed[moving_rim], axis=1)
+        )  # (k, 3)
         free = int((~is_sliding.any(axis=1)).sum())
         apex = np.zeros(3)
         size_m = np.nanmax(np.abs(prescribed_m), initial=0.0)
@@ -220,4 +249,6 @@ class Pressure(Actuator[EnclosedVolume]):
                 "is held or slides in a plane perpendicular to an axis: the pressure on other "
                 "patches has no potential energy"
             )
-        return replace(self, body_measure=BodyMeasure(placed.body, volume.with_apex(apex)))
+        return replace(
+            self, body_measure=BodyMeasure(placed.body, volume.with_apex(apex))
+        )

@@ -68,16 +68,22 @@ class RigidFit:
             raise InputError(
                 "no frame contains three markers of the grasp that are not on one line"
             )
-        known = PoseSequence(times[there], self.positions_m[there], self.quaternions_xyzw[there])
+        known = PoseSequence(
+            times[there], self.positions_m[there], self.quaternions_xyzw[there]
+        )
         if len(there) == 1:
             return known
         within = times[there[0] : there[-1] + 1]
         rotations, positions = known.at(within)
-        return PoseSequence(within, positions, Rotation.from_matrix(rotations).as_quat())
+        return PoseSequence(
+            within, positions, Rotation.from_matrix(rotations).as_quat()
+        )
 
 
 def fit_poses(
-    reference_m: ArrayLike, tracks_m: ArrayLike, weights: ArrayLike | None = None
+    reference_m: ArrayLike,
+    tracks_m: ArrayLike,
+    weights: ArrayLike | None = None,
 ) -> RigidFit:
     """Fit the rigid motion of markers at every frame.
 
@@ -116,7 +122,9 @@ def fit_poses(
     repeated = np.broadcast_to(reference, tracks.shape)
     missing = ~_fixes_rotation(repeated, weight)
     rotations, translations = _best_motions(repeated, tracks, weight)
-    fitted = np.einsum("tij,bj->tbi", rotations, reference) + translations[:, None]
+    fitted = (
+        np.einsum("tij,bj->tbi", rotations, reference) + translations[:, None]
+    )
     distance = np.linalg.norm(tracks - fitted, axis=2)
     distance[missing] = np.nan
     total = np.where(missing, np.nan, weight.sum(axis=1))
@@ -155,7 +163,9 @@ class TemplateFit(NamedTuple):
 
 
 def align_to_template(
-    table: MarkerTable, template: Mapping[str, Sequence[float]], window_s: tuple[float, float]
+    table: MarkerTable,
+    template: Mapping[str, Sequence[float]],
+    window_s: tuple[float, float],
 ) -> TemplateFit:
     """Fit the change from the camera's frame to the body's, from mean marker positions in a window.
 
@@ -179,8 +189,14 @@ def align_to_template(
             raise InputError(
                 f"no marker '{name}' for the template; there are {', '.join(table.names)}"
             )
-    slack_s = STEP_TOLERANCE * float(np.median(np.diff(table.t_s))) if len(table.t_s) > 1 else 0.0
-    inside = (table.t_s >= window_s[0] - slack_s) & (table.t_s <= window_s[1] + slack_s)
+    slack_s = (
+        STEP_TOLERANCE * float(np.median(np.diff(table.t_s)))
+        if len(table.t_s) > 1
+        else 0.0
+    )
+    inside = (table.t_s >= window_s[0] - slack_s) & (
+        table.t_s <= window_s[1] + slack_s
+    )
     if not inside.any():
         raise InputError(
             f"the window [{window_s[0]:g}, {window_s[1]:g}] s of the template holds no sample; the "
@@ -191,7 +207,9 @@ def align_to_template(
     samples = table.positions_m[inside][:, chosen]
     count = np.isfinite(samples[:, :, 0]).sum(axis=0)
     means = np.where(
-        count[:, None] > 0, np.nansum(samples, axis=0) / np.maximum(count, 1)[:, None], np.nan
+        count[:, None] > 0,
+        np.nansum(samples, axis=0) / np.maximum(count, 1)[:, None],
+        np.nan,
     )
     weight = (count > 0).astype(np.float64)[None]
     if not _fixes_rotation(places[None], weight)[0]:
@@ -201,7 +219,9 @@ def align_to_template(
         )
     rotations, translations = _best_motions(means[None], places[None], weight)
     moved = means @ rotations[0].T + translations[0]
-    return TemplateFit(rotations[0], translations[0], np.linalg.norm(moved - places, axis=1))
+    return TemplateFit(
+        rotations[0], translations[0], np.linalg.norm(moved - places, axis=1)
+    )
 
 
 def least_rigid_marker(reference_m: Array, positions_m: Array) -> int:
@@ -231,7 +251,9 @@ def _fixes_rotation(points: Array, weight: Array) -> NDArray[np.bool_]:
     used = (weight > 0).astype(np.float64)
     centred = (points - _mean(points, used)[:, None]) * used[:, :, None]
     spread = (
-        np.linalg.svd(centred, compute_uv=False) if points.shape[1] else np.zeros((len(points), 1))
+        np.linalg.svd(centred, compute_uv=False)
+        if points.shape[1]
+        else np.zeros((len(points), 1))
     )
     if spread.shape[1] < 2:
         return np.zeros(len(points), dtype=bool)
@@ -247,7 +269,9 @@ def _mean(points: Array, weight: Array) -> Array:
     return np.einsum("tb,tbi->ti", weight, present) / total[:, None]
 
 
-def _best_motions(source: Array, target: Array, weight: Array) -> tuple[Array, Array]:
+def _best_motions(
+    source: Array, target: Array, weight: Array
+) -> tuple[Array, Array]:
     """Return rotations (T, 3, 3) and translations (T, 3) that map source to target points (T, B, 3)
     with the least squared distances, weighted by `weight` (T, B).
 
@@ -261,4 +285,6 @@ def _best_motions(source: Array, target: Array, weight: Array) -> tuple[Array, A
     u, _, vt = np.linalg.svd(np.einsum("tb,tbi,tbj->tij", weight, b, a))
     u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
     rotations = u @ vt
-    return rotations, target_mean - np.einsum("tij,tj->ti", rotations, source_mean)
+    return rotations, target_mean - np.einsum(
+        "tij,tj->ti", rotations, source_mean
+    )

@@ -21,7 +21,9 @@ SHORTEST_STEP_S = 1e-12
 _PRINTED_DECIMALS = range(10)
 
 
-def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = None) -> float:
+def sample_interval_s(
+    t_s: ArrayLike, what: str, source: str | Path | None = None
+) -> float:
     """Return the time between samples, which must be the same throughout.
 
     Steps may differ by 1 %, and by the rounding of times to the decimals in the file.
@@ -43,12 +45,16 @@ def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = Non
     """
     times = np.asarray(t_s, dtype=np.float64)
     if times.ndim != 1 or len(times) < 2:
-        raise InputError(f"{what}: a sample interval needs at least two samples", source)
+        raise InputError(
+            f"{what}: a sample interval needs at least two samples", source
+        )
     if fault := first_unordered_time(times):
         raise InputError(f"{what}: {fault[1]}", source, f"row {fault[0] + 1}")
     steps = np.diff(times)
     mean_s = float(times[-1] - times[0]) / len(steps)
-    uneven = np.abs(steps - mean_s) > STEP_TOLERANCE * mean_s + printed_rounding_s(times)
+    uneven = np.abs(
+        steps - mean_s
+    ) > STEP_TOLERANCE * mean_s + printed_rounding_s(times)
     if uneven.any():
         # A lost frame also shifts the mean, and with it every other step: name the worst.
         typical_s = float(np.median(steps))
@@ -71,7 +77,10 @@ def first_unordered_time(t_s: Array) -> tuple[int, str] | None:
     if not faulty.size:
         return None
     row = int(faulty[0]) + 1
-    return row, f"t_s = {t_s[row]:.9g} follows {t_s[row - 1]:.9g}; time must increase"
+    return (
+        row,
+        f"t_s = {t_s[row]:.9g} follows {t_s[row - 1]:.9g}; time must increase",
+    )
 
 
 def evenly_spaced_s(t_s: Array) -> Array:

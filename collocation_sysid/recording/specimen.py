@@ -101,17 +101,23 @@ class Specimen:
 
     test: str
     strain: Array = key(converter=float_converter((None,), "strain"))
-    stress_pa: Array = key(converter=float_converter((None,), "stress_pa", finite=False))
+    stress_pa: Array = key(
+        converter=float_converter((None,), "stress_pa", finite=False)
+    )
     sigma_pa: float = key(Positive)
-    t_s: Array | None = key(converter=float_converter((None,), "t_s"), default=None)
+    t_s: Array | None = key(
+        converter=float_converter((None,), "t_s"), default=None
+    )
     second_strain: Array | None = key(
         converter=float_converter((None,), "second_strain"), default=None
     )
     second_stress_pa: Array | None = key(
-        converter=float_converter((None,), "second_stress_pa", finite=False), default=None
+        converter=float_converter((None,), "second_stress_pa", finite=False),
+        default=None,
     )
     lateral_stretch: Array | None = key(
-        converter=float_converter((None,), "lateral_stretch", finite=False), default=None
+        converter=float_converter((None,), "lateral_stretch", finite=False),
+        default=None,
     )
     lateral_sigma: float = key(Positive, default=LATERAL_SIGMA)
     strain_zero: float = key(NotNegative, default=STRAIN_ZERO)
@@ -123,9 +129,13 @@ class Specimen:
     def __post_init__(self) -> None:
         if self.test not in DEFORMATIONS:
             raise InputError(
-                f"found {self.test!r}; expected one of {', '.join(TESTS)}", None, "test"
+                f"found {self.test!r}; expected one of {', '.join(TESTS)}",
+                None,
+                "test",
             )
-        times = np.arange(float(len(self.strain))) if self.t_s is None else self.t_s
+        times = (
+            np.arange(float(len(self.strain))) if self.t_s is None else self.t_s
+        )
         vars(self)["t_s"] = times
         self._require_measurements_of_test()
         if (self.length_m is None) != (self.area_m2 is None):
@@ -135,7 +145,13 @@ class Specimen:
                 None,
                 "length_m",
             )
-        for name in ("stress_pa", "t_s", "second_strain", "second_stress_pa", "lateral_stretch"):
+        for name in (
+            "stress_pa",
+            "t_s",
+            "second_strain",
+            "second_stress_pa",
+            "lateral_stretch",
+        ):
             values = getattr(self, name)
             if values is not None and len(values) != len(self.strain):
                 raise InputError(
@@ -160,13 +176,24 @@ class Specimen:
         """Raise an `InputError` if a measurement is missing, or not one of the test's."""
         of = f"a {self.test} test"
         if (self.second_strain is None) == bool(self.deformation.second):
-            fault = f"{of} needs" if self.second_strain is None else f"{of} does not have"
+            fault = (
+                f"{of} needs"
+                if self.second_strain is None
+                else f"{of} does not have"
+            )
             raise InputError(f"{fault} a second strain", None, "second_strain")
-        if self.second_stress_pa is not None and not self.deformation.second_stress:
-            raise InputError(f"{of} does not have a second stress", None, "second_stress_pa")
+        if (
+            self.second_stress_pa is not None
+            and not self.deformation.second_stress
+        ):
+            raise InputError(
+                f"{of} does not have a second stress", None, "second_stress_pa"
+            )
         if self.lateral_stretch is not None and not self.deformation.lateral:
             raise InputError(
-                f"{of} has no free direction, and no lateral stretch", None, "lateral_stretch"
+                f"{of} has no free direction, and no lateral stretch",
+                None,
+                "lateral_stretch",
             )
 
     @property
@@ -175,7 +202,9 @@ class Specimen:
         deformation = DEFORMATIONS[self.test]
         if self.length_m is None or self.area_m2 is None:
             return deformation
-        return replace(deformation, area_over_length_m=self.area_m2 / self.length_m)
+        return replace(
+            deformation, area_over_length_m=self.area_m2 / self.length_m
+        )
 
     def __repr__(self) -> str:
         return f"Specimen({self.test!r}: {len(self.strain)} samples)"
@@ -227,15 +256,23 @@ class Specimen:
         """Return the prescribed displacements of the nodes of the cell."""
         assert self.t_s is not None
         moving = self.deformation.displaced_nodes()
-        second = np.zeros_like(self.strain) if self.second_strain is None else self.second_strain
+        second = (
+            np.zeros_like(self.strain)
+            if self.second_strain is None
+            else self.second_strain
+        )
         grasps = []
         for node in range(1 + len(AXES)):
             poses = PoseSequence.fixed()
             if node in moving:
                 by_first, by_second = moving[node]
-                shifts_m = np.outer(self.strain, by_first) + np.outer(second, by_second)
+                shifts_m = np.outer(self.strain, by_first) + np.outer(
+                    second, by_second
+                )
                 no_rotation = np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1))
-                poses = PoseSequence(self.t_s, shifts_m, no_rotation, interpolation="linear")
+                poses = PoseSequence(
+                    self.t_s, shifts_m, no_rotation, interpolation="linear"
+                )
             axes = self.deformation.prescribed_axes(node)
             grasps.append(Grasp(np.array([node]), poses, axes=axes))
         return grasps
@@ -246,7 +283,11 @@ class Specimen:
         sensors = []
         for name, component, values in (
             (STRESS_NAME, self.deformation.first_stress, self.stress_pa),
-            (SECOND_STRESS_NAME, self.deformation.second_stress, self.second_stress_pa),
+            (
+                SECOND_STRESS_NAME,
+                self.deformation.second_stress,
+                self.second_stress_pa,
+            ),
         ):
             if values is not None and np.isfinite(values).any():
                 sensors.append(self._stress_sensor(name, component, values))
@@ -271,7 +312,10 @@ class Specimen:
         """Return the sensor of one component of the nominal stress: its direction, then the
         normal.
         """
-        deviations = {"area_error": self.area_error, "stress_zero_pa": self.stress_zero_pa}
+        deviations = {
+            "area_error": self.area_error,
+            "stress_zero_pa": self.stress_zero_pa,
+        }
         direction, normal = (AXES.index(axis) for axis in component)
         assert self.t_s is not None
         return Gauge(
@@ -282,7 +326,9 @@ class Specimen:
             sigma=self.sigma_pa,
             grasp=2 + normal,
             frame="world",
-            unknowns={unknown: sigma for unknown, sigma in deviations.items() if sigma},
+            unknowns={
+                unknown: sigma for unknown, sigma in deviations.items() if sigma
+            },
             unit=STRESS_UNIT,
         )
 
@@ -300,7 +346,10 @@ class NominalStress:
         self.direction = direction
 
     def __call__(
-        self, at: Look, area_error: ca.SX | float = 0.0, stress_zero_pa: ca.SX | float = 0.0
+        self,
+        at: Look,
+        area_error: ca.SX | float = 0.0,
+        stress_zero_pa: ca.SX | float = 0.0,
     ) -> ca.SX:
         """Return the measured stress [Pa] if the area is larger than stated by a share."""
         stress_pa = STRESS_PER_FORCE * at.force_n[self.direction]
@@ -336,5 +385,10 @@ def cell_body(
     """
     mesh = cell_mesh(with_inner_node=DEFORMATIONS[test].needs_inner_node)
     return Body(
-        mesh, material, CELL_DENSITY_KG_M3, damping=damping, prony=prony, rest_shape="stress_free"
+        mesh,
+        material,
+        CELL_DENSITY_KG_M3,
+        damping=damping,
+        prony=prony,
+        rest_shape="stress_free",
     )

@@ -79,7 +79,9 @@ class SpecimenLayout:
     @property
     def quantities(self) -> tuple[Quantity, ...]:
         """Quantities that the table of this kind of test may have."""
-        stresses = (STRESS,) if self.stress == "engineering" else (STRESS, TRUE_STRESS)
+        stresses = (
+            (STRESS,) if self.stress == "engineering" else (STRESS, TRUE_STRESS)
+        )
         if self.test == "volumetric":
             return VOLUME_RATIO, STRETCH, STRAIN, PRESSURE, *stresses
         quantities = [STRAIN, *stresses, DISPLACEMENT, FORCE]
@@ -130,7 +132,10 @@ class SpecimenTable:
             "second_stress_pa": self.second_stress_pa,
             "lateral_stretch": self.lateral_stretch,
         }
-        return {name: None if each is None else each[chosen] for name, each in arrays.items()}
+        return {
+            name: None if each is None else each[chosen]
+            for name, each in arrays.items()
+        }
 
 
 @names_file_in_errors
@@ -144,7 +149,9 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         not increase, or length or area of the specimen are needed; the line is named.
     """
     if layout.test == "simple-shear" and "stretch" in layout.columns:
-        raise InputError("a simple-shear test has a strain and no stretch", where="columns")
+        raise InputError(
+            "a simple-shear test has a strain and no stretch", where="columns"
+        )
     table = read_columns(
         path,
         layout.quantities,
@@ -164,7 +171,9 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         stress_pa = stress_pa * areas[0]
     if second_pa is not None:
         second_pa = layout.stress_sign * second_pa
-        second_pa = second_pa * areas[1] if layout.stress == "true" else second_pa
+        second_pa = (
+            second_pa * areas[1] if layout.stress == "true" else second_pa
+        )
     return SpecimenTable(
         table.t_s,
         strain,
@@ -179,7 +188,9 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
     )
 
 
-def _one_of(table: QuantityTable, quantities: tuple[Quantity, ...], what: str) -> Quantity:
+def _one_of(
+    table: QuantityTable, quantities: tuple[Quantity, ...], what: str
+) -> Quantity:
     """Return the only quantity of several that a table has.
 
     Raises
@@ -187,7 +198,9 @@ def _one_of(table: QuantityTable, quantities: tuple[Quantity, ...], what: str) -
     InputError
         If it has none or more than one.
     """
-    there = [quantity for quantity in quantities if quantity.key in table.values]
+    there = [
+        quantity for quantity in quantities if quantity.key in table.values
+    ]
     if len(there) != 1:
         found = " and ".join(quantity.key for quantity in there) or "no column"
         expected = ", ".join(quantity.column for quantity in quantities)
@@ -203,7 +216,8 @@ def _complete(table: QuantityTable, quantity: Quantity) -> Array:
     values = table.values[quantity.key]
     if (blank := np.isnan(values)).any():
         raise table.grid.error_at(
-            f"the {quantity.key} is blank; expected a number in every row", int(blank.argmax())
+            f"the {quantity.key} is blank; expected a number in every row",
+            int(blank.argmax()),
         )
     return values
 
@@ -211,14 +225,20 @@ def _complete(table: QuantityTable, quantity: Quantity) -> Array:
 def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
     """Return the strain (T,) of the test."""
     known = (STRETCH, STRAIN, DISPLACEMENT, VOLUME_RATIO)
-    possible = tuple(quantity for quantity in known if quantity in layout.quantities)
+    possible = tuple(
+        quantity for quantity in known if quantity in layout.quantities
+    )
     quantity = _one_of(table, possible, "deformation")
     values = _complete(table, quantity)
     if quantity == STRETCH:
         _require_positive(table, quantity, values)
         return values - 1
     if layout.test == "volumetric":
-        ratio = values if quantity == VOLUME_RATIO else 1 + layout.strain_sign * values
+        ratio = (
+            values
+            if quantity == VOLUME_RATIO
+            else 1 + layout.strain_sign * values
+        )
         _require_positive(table, quantity, ratio)
         return np.cbrt(ratio) - 1
     if quantity == DISPLACEMENT:
@@ -234,7 +254,9 @@ def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
     return strain
 
 
-def _require_positive(table: QuantityTable, quantity: Quantity, ratio: Array) -> None:
+def _require_positive(
+    table: QuantityTable, quantity: Quantity, ratio: Array
+) -> None:
     """Raise an `InputError` if a ratio (T,) of deformed to undeformed size is not positive."""
     if (ratio > 0).all():
         return
@@ -251,18 +273,28 @@ def _require_positive(table: QuantityTable, quantity: Quantity, ratio: Array) ->
     )
 
 
-def _second_strain(table: QuantityTable, layout: SpecimenLayout) -> Array | None:
+def _second_strain(
+    table: QuantityTable, layout: SpecimenLayout
+) -> Array | None:
     """Return the strain (T,) along the second axis; None unless the test is biaxial."""
     if layout.test != "biaxial":
         return None
-    quantity = _one_of(table, (SECOND_STRETCH, SECOND_STRAIN), "deformation of the second axis")
+    quantity = _one_of(
+        table, (SECOND_STRETCH, SECOND_STRAIN), "deformation of the second axis"
+    )
     values = _complete(table, quantity)
-    strain = values - 1 if quantity == SECOND_STRETCH else layout.strain_sign * values
+    strain = (
+        values - 1
+        if quantity == SECOND_STRETCH
+        else layout.strain_sign * values
+    )
     _require_positive(table, STRETCH, 1 + strain)
     return strain
 
 
-def _lateral_stretch(table: QuantityTable, layout: SpecimenLayout) -> Array | None:
+def _lateral_stretch(
+    table: QuantityTable, layout: SpecimenLayout
+) -> Array | None:
     """Return the lateral stretch (T,); None if the table has none."""
     if LATERAL_STRETCH.key in table.values:
         return table.values[LATERAL_STRETCH.key]
@@ -274,22 +306,31 @@ def _lateral_stretch(table: QuantityTable, layout: SpecimenLayout) -> Array | No
 def _stress_pa(table: QuantityTable, layout: SpecimenLayout) -> Array:
     """Return the stress (T,) as the table has it, positive in tension [Pa]."""
     known = (STRESS, TRUE_STRESS, FORCE, PRESSURE)
-    possible = tuple(quantity for quantity in known if quantity in layout.quantities)
+    possible = tuple(
+        quantity for quantity in known if quantity in layout.quantities
+    )
     quantity = _one_of(table, possible, "load")
     values = table.values[quantity.key]
     if quantity == PRESSURE:
         return -values
     if quantity == FORCE:
         if layout.stress == "true":
-            raise table.grid.error_at('a force has no area; expected no stress = "true"')
+            raise table.grid.error_at(
+                'a force has no area; expected no stress = "true"'
+            )
         if layout.area_m2 is None:
-            raise table.grid.error_at("a force needs area_m2, the undeformed area it acts on")
+            raise table.grid.error_at(
+                "a force needs area_m2, the undeformed area it acts on"
+            )
         values = values / layout.area_m2
     return layout.stress_sign * values
 
 
 def _area_ratios(
-    layout: SpecimenLayout, strain: Array, second_strain: Array | None, lateral: Array | None
+    layout: SpecimenLayout,
+    strain: Array,
+    second_strain: Array | None,
+    lateral: Array | None,
 ) -> tuple[Array, Array]:
     """Return the deformed over the undeformed area (T,) of the faces of the first and of the
     second stress.

@@ -87,7 +87,9 @@ class Tendon(Actuator[PolylineLength]):
                 f"{name}: tension_n is {tension.values[row]:g} N in row {row + 1}; expected 0 or "
                 "more: a tendon only pulls"
             )
-        vars(self).update(tension_n=tension.values, t_s=tension.t_s, declared_values=tension)
+        vars(self).update(
+            tension_n=tension.values, t_s=tension.t_s, declared_values=tension
+        )
 
     def _measure_on(self, body: Body) -> PolylineLength:
         """Return the length of the polyline in a body.
@@ -99,7 +101,9 @@ class Tendon(Actuator[PolylineLength]):
         """
         shape = LocatedBody(body.nodes_m, body)
         embedded = [shape.weights_at_point(point) for point in self.points_m]
-        nodes, weights, distances = (np.array(part) for part in zip(*embedded, strict=True))
+        nodes, weights, distances = (
+            np.array(part) for part in zip(*embedded, strict=True)
+        )
         worst = int(distances.argmax())
         if distances[worst] > FARTHEST_POINT_EDGES * shape.mean_edge_m:
             raise InputError(
@@ -109,7 +113,9 @@ class Tendon(Actuator[PolylineLength]):
             )
         return PolylineLength(nodes, weights, len(body.nodes_m))
 
-    def energy_amplitude(self, declared_value: Any, factor: Any, offset: Any) -> Any:
+    def energy_amplitude(
+        self, declared_value: Any, factor: Any, offset: Any
+    ) -> Any:
         """Return the tension at the body, max(0, factor · stated − lost) [N]; 0 if the stated
         tension is 0.
 

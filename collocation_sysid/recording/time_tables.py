@@ -59,7 +59,9 @@ def read_forces(path: str | Path) -> tuple[Array, Array]:
         line is named.
     """
     table = read_columns(path, FORCES, requires_all=True)
-    return table.t_s, np.column_stack([table.values[quantity.key] for quantity in FORCES])
+    return table.t_s, np.column_stack(
+        [table.values[quantity.key] for quantity in FORCES]
+    )
 
 
 def read_tension(path: str | Path) -> tuple[Array, Array]:
@@ -89,7 +91,10 @@ def read_pressure(path: str | Path) -> tuple[Array, Array]:
 
 @names_file_in_errors
 def _read_limited(
-    path: str | Path, quantity: Quantity, largest: float, at_least: float = -np.inf
+    path: str | Path,
+    quantity: Quantity,
+    largest: float,
+    at_least: float = -np.inf,
 ) -> tuple[Array, Array]:
     """Return times (T,) and values (T,) of one quantity, with limits on the values.
 
@@ -100,7 +105,9 @@ def _read_limited(
     """
     table = read_columns(path, [quantity])
     values = table.values[quantity.key]
-    for row in (~((values >= at_least) & (abs(values) <= largest))).nonzero()[0]:
+    for row in (~((values >= at_least) & (abs(values) <= largest))).nonzero()[
+        0
+    ]:
         is_so = f"{quantity.column} is {values[row]:g}"
         if abs(values[row]) > largest:
             why = ", which is too large for a soft body; check the unit of the column"
@@ -154,9 +161,13 @@ def read_wrench(
         time does not increase; the line is named.
     """
     quantities = (*FORCES, *TORQUES, FORCE) if area_m2 is None else (STRESS,)
-    table = read_columns(path, quantities, columns, blank_allowed=True, requires_times=timed)
+    table = read_columns(
+        path, quantities, columns, blank_allowed=True, requires_times=timed
+    )
     factor = sign * (area_m2 or 1.0) / symmetry
-    return _without_rounding(table.t_s), factor * _axis_components(table, (*FORCES, *TORQUES), axis)
+    return _without_rounding(table.t_s), factor * _axis_components(
+        table, (*FORCES, *TORQUES), axis
+    )
 
 
 def read_displacement(
@@ -200,9 +211,13 @@ def read_displacement(
     """
     table = _read_displacements(path, columns, length_m, timed)
     shifts_m = (
-        sign * (length_m or 1.0) * np.nan_to_num(_axis_components(table, DISPLACEMENTS, axis))
+        sign
+        * (length_m or 1.0)
+        * np.nan_to_num(_axis_components(table, DISPLACEMENTS, axis))
     )
-    return PoseSequence(table.t_s, shifts_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1)))
+    return PoseSequence(
+        table.t_s, shifts_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1))
+    )
 
 
 def displaced_axes(
@@ -215,14 +230,21 @@ def displaced_axes(
     Arguments and errors are those of `read_displacement`.
     """
     shifts = _axis_components(
-        _read_displacements(path, columns, length_m, timed=False), DISPLACEMENTS, axis
+        _read_displacements(path, columns, length_m, timed=False),
+        DISPLACEMENTS,
+        axis,
     )
     is_present = np.asarray(np.isfinite(shifts).any(axis=0))
-    return "".join(each for each, there in zip("xyz", is_present, strict=True) if there)
+    return "".join(
+        each for each, there in zip("xyz", is_present, strict=True) if there
+    )
 
 
 def _read_displacements(
-    path: str | Path, columns: Mapping[str, str] | None, length_m: float | None, timed: bool
+    path: str | Path,
+    columns: Mapping[str, str] | None,
+    length_m: float | None,
+    timed: bool,
 ) -> QuantityTable:
     """Read the columns of a displacement, or of a strain if the undeformed length `length_m` [m] is
     given.
@@ -241,11 +263,15 @@ def _read_displacements(
     InputError
         As `read_columns`.
     """
-    quantities = (*DISPLACEMENTS, DISPLACEMENT) if length_m is None else (STRAIN,)
+    quantities = (
+        (*DISPLACEMENTS, DISPLACEMENT) if length_m is None else (STRAIN,)
+    )
     return read_columns(path, quantities, columns, requires_times=timed)
 
 
-def _axis_components(table: QuantityTable, quantities: Sequence[Quantity], axis: str) -> Array:
+def _axis_components(
+    table: QuantityTable, quantities: Sequence[Quantity], axis: str
+) -> Array:
     """Return the values (T, n) of n quantities, one for each axis; NaN where missing.
 
     A machine's quantity, whose name contains no axis, becomes the component along `axis` ("x", "y"
@@ -296,12 +322,18 @@ def read_custom_sensor(
     names = list(columns) or [name for name in grid.columns if name != "t_s"]
     for name in ("t_s", *names):
         if (count := grid.columns.count(name)) != 1:
-            there = f"{count} columns are called" if count else "there is no column"
+            there = (
+                f"{count} columns are called" if count else "there is no column"
+            )
             hint = "" if count else hint_at(name, grid.columns)
             among = ", ".join(grid.columns)
-            raise grid.error_at(f"{there} {name!r}; expected one among {among}{hint}")
+            raise grid.error_at(
+                f"{there} {name!r}; expected one among {among}{hint}"
+            )
     t_s = times_in_column(grid, grid.columns.index("t_s"))
-    values = numeric_cells(grid, [grid.columns.index(name) for name in names], blank_allowed=True)
+    values = numeric_cells(
+        grid, [grid.columns.index(name) for name in names], blank_allowed=True
+    )
     return _without_rounding(t_s), np.asarray(values), names
 
 

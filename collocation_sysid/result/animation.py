@@ -22,7 +22,15 @@ from numpy.typing import NDArray
 from ..array_types import Array
 from ..errors import InputError, require_among
 from ..files import replaced_file, safe_name
-from .figure_style import BLACK, BLUE, GREEN, LINE_PT, TEXT_PT, add_legend_above, style_axes
+from .figure_style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    LINE_PT,
+    TEXT_PT,
+    add_legend_above,
+    style_axes,
+)
 from .pictures.over_time import rms_over_markers
 from .pictures.projection import ParallelCamera
 from .pictures.scene import (
@@ -100,17 +108,32 @@ def animate(
     """
     for name, value in (("--fps", fps), ("--slow", slowdown)):
         if not 0 < value < np.inf:
-            raise InputError(f"found {value:g}; expected a number above 0", None, name)
+            raise InputError(
+                f"found {value:g}; expected a number above 0", None, name
+            )
     result, replays = read_run(run)
     replay = experiment_named(replays, experiment, run)
     with damaged_run_refused(Path(run)):
         text = run_headline(result)
-    file = Path(file) if file is not None else Path(run) / f"{safe_name(replay.name)}.gif"
+    file = (
+        Path(file)
+        if file is not None
+        else Path(run) / f"{safe_name(replay.name)}.gif"
+    )
     if file.suffix.lower() not in PIXELS_WIDE:
         raise InputError(
-            f"found '{file.suffix}'; expected {' or '.join(PIXELS_WIDE)}", file, "--to"
+            f"found '{file.suffix}'; expected {' or '.join(PIXELS_WIDE)}",
+            file,
+            "--to",
         )
-    return film(replay, file, fps=fps, slowdown=slowdown, progress=progress, headline=text)
+    return film(
+        replay,
+        file,
+        fps=fps,
+        slowdown=slowdown,
+        progress=progress,
+        headline=text,
+    )
 
 
 def film(
@@ -147,7 +170,10 @@ def film(
     dpi = PIXELS_WIDE[file.suffix.lower()] / (FILM_WIDTH_MM / 25.4)
     with rc_context({"animation.ffmpeg_path": ffmpeg} if ffmpeg else {}):
         writer = _frame_writer(fps, ffmpeg)
-        with replaced_file(file) as draft, writer.saving(picture.figure, str(draft), dpi):
+        with (
+            replaced_file(file) as draft,
+            writer.saving(picture.figure, str(draft), dpi),
+        ):
             for number, t in enumerate(shown):
                 picture.show_sample(int(t))
                 writer.grab_frame()
@@ -157,7 +183,9 @@ def film(
 
 
 def experiment_named(
-    replays: Sequence[MotionRecord], experiment: str | None, run: str | Path | None = None
+    replays: Sequence[MotionRecord],
+    experiment: str | None,
+    run: str | Path | None = None,
 ) -> MotionRecord:
     """Return the experiment called `experiment`, or the first one if that is None.
 
@@ -173,7 +201,9 @@ def experiment_named(
         raise InputError("no experiment of this run has a trajectory", run)
     if experiment is None:
         return next(iter(available.values()))
-    require_among(experiment, available, run, None if run is None else "--experiment")
+    require_among(
+        experiment, available, run, None if run is None else "--experiment"
+    )
     return available[experiment]
 
 
@@ -203,7 +233,9 @@ def film_samples(t_s: Array, fps: float, slowdown: float) -> NDArray[np.int64]:
         )
     times_s = np.arange(count) / (slowdown * fps)
     share = times_s / max(duration, np.finfo(float).tiny)
-    return np.minimum(np.rint(share * (len(t_s) - 1)), len(t_s) - 1).astype(np.int64)
+    return np.minimum(np.rint(share * (len(t_s) - 1)), len(t_s) - 1).astype(
+        np.int64
+    )
 
 
 class FilmFigure:
@@ -217,14 +249,21 @@ class FilmFigure:
     figure: Figure
 
     def __init__(
-        self, replay: MotionRecord, names: tuple[str, str] = TRAJECTORY_NAMES, headline: str = ""
+        self,
+        replay: MotionRecord,
+        names: tuple[str, str] = TRAJECTORY_NAMES,
+        headline: str = "",
     ) -> None:
         self.replay = replay
         trajectories = (
             (names[0], replay.positions_m, replay.markers_m),
             (names[1], replay.rolled_out_positions_m, replay.rolled_out_m),
         )
-        shown = [(n, x, m) for n, x, m in trajectories if x is not None and m is not None]
+        shown = [
+            (n, x, m)
+            for n, x, m in trajectories
+            if x is not None and m is not None
+        ]
         # A forward simulation that goes astray may leave the picture; fit and markers may not.
         surface_m = shown[0][1][:, np.unique(replay.surface)]
         is_finite = np.isfinite(surface_m).all(axis=(1, 2))
@@ -235,26 +274,51 @@ class FilmFigure:
             surface_m, None if outlines_m is None else outlines_m[is_finite]
         )
         depth_points_m = [
-            rows[np.isfinite(rows[:, 4]), 5:] for rows in replay.visible_points.values()
+            rows[np.isfinite(rows[:, 4]), 5:]
+            for rows in replay.visible_points.values()
         ]
         everything = np.vstack(
-            [surroundings_m.reshape(-1, 3), replay.measured_m.reshape(-1, 3), *depth_points_m]
+            [
+                surroundings_m.reshape(-1, 3),
+                replay.measured_m.reshape(-1, 3),
+                *depth_points_m,
+            ]
         )
         compared = [
-            (n, m) for n, _, m in shown if m.size and np.isfinite(m - replay.measured_m).any()
+            (n, m)
+            for n, _, m in shown
+            if m.size and np.isfinite(m - replay.measured_m).any()
         ]
         width = FILM_WIDTH_MM - (ERROR_PANEL_WIDTH_MM if compared else 0.0)
         aspect = aspect_ratio(camera, everything)
-        height = float(np.clip((width - 8) / aspect, MIN_BODY_HEIGHT_MM, MAX_BODY_HEIGHT_MM))
+        height = float(
+            np.clip(
+                (width - 8) / aspect, MIN_BODY_HEIGHT_MM, MAX_BODY_HEIGHT_MM
+            )
+        )
         head = HEAD_HEIGHT_MM + (HEADLINE_HEIGHT_MM if headline else 0.0)
         total = _with_even_pixels(head + height + FOOT_HEIGHT_MM)
         self.figure, axes = sheet(FILM_WIDTH_MM, total)
         self.figure.set_facecolor("white")
-        axes.text(FILM_WIDTH_MM / 2, total - 3, headline, ha="center", va="top", fontsize=TEXT_PT)
+        axes.text(
+            FILM_WIDTH_MM / 2,
+            total - 3,
+            headline,
+            ha="center",
+            va="top",
+            fontsize=TEXT_PT,
+        )
         self.drawings = []
-        view = SheetView.fit_points(camera, everything, (width - 8, height), (4, FOOT_HEIGHT_MM))
+        view = SheetView.fit_points(
+            camera, everything, (width - 8, height), (4, FOOT_HEIGHT_MM)
+        )
         for path_m in np.moveaxis(replay.measured_m, 1, 0):
-            axes.plot(*view.to_sheet_mm(path_m).T, color=MARKER_PATH_COLOUR, lw=0.6, zorder=0.2)
+            axes.plot(
+                *view.to_sheet_mm(path_m).T,
+                color=MARKER_PATH_COLOUR,
+                lw=0.6,
+                zorder=0.2,
+            )
         for k, (name, positions, markers) in enumerate(shown):
             top = total - 3 - (head - HEAD_HEIGHT_MM)
             wire = GREEN if k else None
@@ -272,9 +336,18 @@ class FilmFigure:
             )
             self.drawings.append((name, positions, markers, body, title))
         self._draw_annotations(axes, camera, view.mm_per_m, total)
-        self.cursor = self._draw_errors(compared, width, height, total) if compared else None
+        self.cursor = (
+            self._draw_errors(compared, width, height, total)
+            if compared
+            else None
+        )
         self.time_label = axes.text(
-            FILM_WIDTH_MM - 4, 4.0, "", ha="right", va="center", fontsize=TEXT_PT
+            FILM_WIDTH_MM - 4,
+            4.0,
+            "",
+            ha="right",
+            va="center",
+            fontsize=TEXT_PT,
         )
 
     def _draw_errors(
@@ -309,17 +382,29 @@ class FilmFigure:
                 place[3] / figure_height_mm,
             )
         )
-        for (name, markers), colour in zip(trajectories, (BLUE, GREEN), strict=False):
+        for (name, markers), colour in zip(
+            trajectories, (BLUE, GREEN), strict=False
+        ):
             squares = np.sum((markers - self.replay.measured_m) ** 2, axis=2)
-            style = {"color": colour, "lw": LINE_PT, "ls": "-" if colour == BLUE else (0, (4, 2))}
-            panel.plot(t_s, 1e3 * rms_over_markers(squares), label=name, **style)
+            style = {
+                "color": colour,
+                "lw": LINE_PT,
+                "ls": "-" if colour == BLUE else (0, (4, 2)),
+            }
+            panel.plot(
+                t_s, 1e3 * rms_over_markers(squares), label=name, **style
+            )
         style_axes(panel, "", "time [s]", "marker error, RMS [mm]")
         panel.set_ylim(bottom=0.0)
         add_legend_above(panel, columns=1)
         return panel.axvline(0.0, color=BLACK, lw=0.8)
 
     def _draw_annotations(
-        self, axes: Axes, camera: ParallelCamera, mm_per_m: float, height_mm: float
+        self,
+        axes: Axes,
+        camera: ParallelCamera,
+        mm_per_m: float,
+        height_mm: float,
     ) -> None:
         """Draw the axis directions, the scale bar and the legend around the body."""
         draw_directions(axes, camera, (7.0, 4.0))
@@ -329,7 +414,9 @@ class FilmFigure:
             markers = named[1:] if len(self.replay.marker_names) else []
             named = ["grasped", *markers, "depth image"]
         draw_legend(
-            axes, legend_handles(*named), (FILM_WIDTH_MM * (0.42 if len(named) < 4 else 0.35), 5.5)
+            axes,
+            legend_handles(*named),
+            (FILM_WIDTH_MM * (0.42 if len(named) < 4 else 0.35), 5.5),
         )
 
     def show_sample(self, sample: int) -> None:
@@ -337,7 +424,11 @@ class FilmFigure:
         replay = self.replay
         measured = replay.measured_m[sample]
         for name, positions, markers, drawn, title in self.drawings:
-            outlines_m = None if replay.obstacles_m is None else replay.obstacles_m[sample]
+            outlines_m = (
+                None
+                if replay.obstacles_m is None
+                else replay.obstacles_m[sample]
+            )
             drawn.update(
                 positions[sample],
                 replay.is_prescribed[sample],
@@ -348,8 +439,14 @@ class FilmFigure:
             )
             distances = np.linalg.norm(markers[sample] - measured, axis=1)
             present = distances[np.isfinite(distances)]
-            off = f"{1e3 * np.sqrt(np.mean(present**2)):.2f} mm" if len(present) else "no markers"
-            title.set_text(name if markers is replay.measured_m else f"{name}: {off}")
+            off = (
+                f"{1e3 * np.sqrt(np.mean(present**2)):.2f} mm"
+                if len(present)
+                else "no markers"
+            )
+            title.set_text(
+                name if markers is replay.measured_m else f"{name}: {off}"
+            )
         if self.cursor is not None:
             now_s = replay.t_s[sample] - replay.t_s[0]
             self.cursor.set_xdata([now_s, now_s])
@@ -369,7 +466,11 @@ def _frame_writer(fps: float, ffmpeg: str | None) -> AbstractMovieWriter:
     if ffmpeg is None:
         return PillowWriter(fps=fps)  # type: ignore[arg-type]
     # What every browser plays.
-    return FFMpegWriter(fps=fps, codec="h264", extra_args=["-pix_fmt", "yuv420p", "-crf", "18"])  # type: ignore[arg-type]
+    return FFMpegWriter(
+        fps=fps,  # type: ignore[arg-type]
+        codec="h264",
+        extra_args=["-pix_fmt", "yuv420p", "-crf", "18"],
+    )
 
 
 def _find_ffmpeg(file: Path) -> str:

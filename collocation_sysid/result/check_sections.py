@@ -12,7 +12,13 @@ import numpy as np
 
 from ..display import Line, Shown, Table, duration, labelled
 from ..fem.constants import symbol_of, unit_of
-from ..runs.check import BodyCheck, CheckResult, GraspCheck, QuickCheck, RecordingCheck
+from ..runs.check import (
+    BodyCheck,
+    CheckResult,
+    GraspCheck,
+    QuickCheck,
+    RecordingCheck,
+)
 from ..runs.check.body_check import grasp_sentence
 from .run_sections import remedy_command
 
@@ -24,20 +30,32 @@ SHOWN_RECORDINGS = 4
 
 def quick_check_tables(quick_check: QuickCheck) -> list[Shown]:
     """Return tables of the bodies and of the measurements, which need no simulation."""
-    return [*map(_body_section, quick_check.bodies), _measurements_section(quick_check)]
+    return [
+        *map(_body_section, quick_check.bodies),
+        _measurements_section(quick_check),
+    ]
 
 
 def full_check_tables(findings: CheckResult) -> list[Shown]:
     """Return tables of modes, costs and derivatives, then notes, warnings, remedies and the
     conclusion.
     """
-    messages = {"note": (findings.notes, ""), "warning": (findings.warnings, "check")}
+    messages = {
+        "note": (findings.notes, ""),
+        "warning": (findings.warnings, "check"),
+    }
     return [
         *_motion_section(findings),
         _solve_section(findings),
         "",
         *(
-            Table("", (), tuple((f"{kind}:", each) for each in sentences), texts=1, style=style)
+            Table(
+                "",
+                (),
+                tuple((f"{kind}:", each) for each in sentences),
+                texts=1,
+                style=style,
+            )
             for kind, (sentences, style) in messages.items()
             if sentences
         ),
@@ -50,7 +68,8 @@ def _check_verdict(findings: CheckResult) -> Line:
     """Return the conclusion of a check: valid, wrong derivatives, or a suspect description."""
     if not findings.derivatives_agree:
         return Line(
-            "The derivatives do not agree with finite differences at the guess.", "doubtful"
+            "The derivatives do not agree with finite differences at the guess.",
+            "doubtful",
         )
     if findings.causes:
         likeliest = findings.causes[0].message
@@ -59,17 +78,24 @@ def _check_verdict(findings: CheckResult) -> Line:
             f"{likeliest}"
         )
         return Line(sentence, "doubtful")
-    return Line("The problem is valid and its derivatives agree with finite differences.", "good")
+    return Line(
+        "The problem is valid and its derivatives agree with finite differences.",
+        "good",
+    )
 
 
 def _body_section(body: BodyCheck) -> Table:
     """Return the table of a body: size, mass, mesh, element quality, rest shape and fields."""
     if body.is_homogeneous:
         names = ", ".join(f"'{name}'" for name in body.experiments)
-        return labelled("Specimens", {"homogeneous": f"{names}; exact, without a mesh"})
+        return labelled(
+            "Specimens", {"homogeneous": f"{names}; exact, without a mesh"}
+        )
     size = " × ".join(f"{1e3 * x:.4g}" for x in body.size_m)
     low, mean, high = (1e3 * x for x in body.edges_m)
-    worst = ", ".join(f"{e.element} ({e.quality:.2f})" for e in body.worst_elements)
+    worst = ", ".join(
+        f"{e.element} ({e.quality:.2f})" for e in body.worst_elements
+    )
     return labelled(
         "Body",
         {
@@ -78,7 +104,11 @@ def _body_section(body: BodyCheck) -> Table:
             f"{low:.3g} to {high:.3g} mm (mean {mean:.3g})",
             "quality": f"median {body.median_element_quality:.2f}, worst in elements {worst}",
         }
-        | ({} if body.rest_shape == "stress_free" else {"rest shape": _rest_shape(body)})
+        | (
+            {}
+            if body.rest_shape == "stress_free"
+            else {"rest shape": _rest_shape(body)}
+        )
         | {
             f"field of {symbol_of(name)}": f"{each.modes} shapes with {each.share:.0%} of the "
             f"prior variance, correlation length {1e3 * each.length_m:.3g} mm; resolved details: "
@@ -97,9 +127,7 @@ def _rest_shape(body: BodyCheck) -> str:
     if np.isnan(body.rest_shape_change_m):
         return "the mesh was made under gravity; no stress-free shape was found at the guess"
     change = f"{1e3 * body.rest_shape_change_m:.3g} mm"
-    return (
-        f"the mesh was made under gravity; the stress-free shape differs from it by up to {change}"
-    )
+    return f"the mesh was made under gravity; the stress-free shape differs from it by up to {change}"
 
 
 def _motion_section(findings: CheckResult) -> list[Shown]:
@@ -128,10 +156,19 @@ def _motion_section(findings: CheckResult) -> list[Shown]:
         for mode in motion.modes[:SHOWN_MODES]
     )
     firsts = [
-        f"'{m.experiment}' {m.first_mode.frequency_hz:.3g} Hz" for m in others if m.first_mode
+        f"'{m.experiment}' {m.first_mode.frequency_hz:.3g} Hz"
+        for m in others
+        if m.first_mode
     ]
-    firsts = [*firsts[:SHOWN_RECORDINGS], *["…"] * (len(firsts) > SHOWN_RECORDINGS)]
-    more = [f"  first modes of the other recordings: {', '.join(firsts)}"] if firsts else []
+    firsts = [
+        *firsts[:SHOWN_RECORDINGS],
+        *["…"] * (len(firsts) > SHOWN_RECORDINGS),
+    ]
+    more = (
+        [f"  first modes of the other recordings: {', '.join(firsts)}"]
+        if firsts
+        else []
+    )
     return [Table(title, heads, rows, names=0), *more]
 
 
@@ -146,7 +183,9 @@ def _measurements_section(findings: QuickCheck) -> Table:
             f"{kind_text}: {recording.frames} × {_marker_summary(recording)}{kind}"
         )
     if len(findings.recordings) > SHOWN_RECORDINGS:
-        rows["…"] = f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
+        rows["…"] = (
+            f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
+        )
     densities = {r.air_density_kg_m3 for r in findings.recordings if not r.test}
     if densities:
         rows["air"] = ", ".join(map(_air_description, sorted(densities)))
@@ -159,10 +198,17 @@ def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
     """Return table rows with a sentence on each grasp of an experiment, by label; several grasps
     are numbered from 1.
     """
-    own = [grasp_sentence(grasp) for grasp in holds if grasp.experiment == experiment]
+    own = [
+        grasp_sentence(grasp)
+        for grasp in holds
+        if grasp.experiment == experiment
+    ]
     if len(own) == 1:
         return {f"grasp of '{experiment}'": own[0]}
-    return {f"grasp {k} of '{experiment}'": sentence for k, sentence in enumerate(own, start=1)}
+    return {
+        f"grasp {k} of '{experiment}'": sentence
+        for k, sentence in enumerate(own, start=1)
+    }
 
 
 def _air_description(density_kg_m3: float) -> str:
@@ -199,7 +245,9 @@ def _solve_section(findings: CheckResult) -> Table:
     errors.
     """
     rows = {
-        "guess" if len(findings.bodies) == 1 else f"guess of '{body.experiments[0]}'": ", ".join(
+        "guess"
+        if len(findings.bodies) == 1
+        else f"guess of '{body.experiments[0]}'": ", ".join(
             f"{symbol_of(name)} {value:.4g} {unit_of(name)}".strip()
             for name, value in body.guess.items()
         )
@@ -227,9 +275,13 @@ def _solve_section(findings: CheckResult) -> Table:
     for cost in findings.costs:
         chosen = ", chosen" if cost.method == findings.method else ""
         memory = (
-            f"{cost.memory_mb:.0f} MB" if cost.memory_mb < 1e3 else f"{cost.memory_mb / 1e3:.2g} GB"
+            f"{cost.memory_mb:.0f} MB"
+            if cost.memory_mb < 1e3
+            else f"{cost.memory_mb / 1e3:.2g} GB"
         )
-        rows[cost.method] = f"about {duration(cost.time_s)} and {memory}{chosen}"
+        rows[cost.method] = (
+            f"about {duration(cost.time_s)} and {memory}{chosen}"
+        )
     rows["derivatives"] = (
         f"relative errors of Jacobian and Hessian: {findings.jacobian_error:.0e}, "
         f"{findings.hessian_error:.0e}"

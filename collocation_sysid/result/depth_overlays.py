@@ -52,7 +52,12 @@ class DepthProjection:
 
     @classmethod
     def facing_shape(
-        cls, view: DepthCameraModel, skin: VisibleSurface, phi: Array, shape_m: Array, up: Array
+        cls,
+        view: DepthCameraModel,
+        skin: VisibleSurface,
+        phi: Array,
+        shape_m: Array,
+        up: Array,
     ) -> DepthProjection:
         """Return the projection whose parallel view faces the broad side of the body.
 
@@ -66,7 +71,9 @@ class DepthProjection:
         up : (3,)
             Unit vector against gravity.
         """
-        return cls(view, skin, phi, ParallelCamera.facing_motion(shape_m[None], up))
+        return cls(
+            view, skin, phi, ParallelCamera.facing_motion(shape_m[None], up)
+        )
 
     def image_points(self, camera_m: Array, world_m: Array) -> Array:
         """Return image coordinates u, v [pixels] and depth [m] of points, as (P, 3).
@@ -82,9 +89,13 @@ class DepthProjection:
         """
         camera = self.view.depth.camera
         if camera.matrix is not None:
-            return np.column_stack([camera.undistorted_pixels(camera_m), camera_m[:, 2]])
+            return np.column_stack(
+                [camera.undistorted_pixels(camera_m), camera_m[:, 2]]
+            )
         right_top_mm = 1e3 * self.parallel_camera.project(world_m)
-        return np.column_stack([right_top_mm * [1, -1], -self.parallel_camera.depths_m(world_m)])
+        return np.column_stack(
+            [right_top_mm * [1, -1], -self.parallel_camera.depths_m(world_m)]
+        )
 
     def outlines(self, shape_m: Array, sample: int) -> Array:
         """Return u and v (k, 2) of the faces that are turned to the camera; NaN in the row after
@@ -101,19 +112,28 @@ class DepthProjection:
         if eye_m is None:
             size_m = float(np.linalg.norm(np.ptp(shape_m, axis=0)))
             eye_m = (
-                shape_m.mean(axis=0) + VIEWER_DISTANCE_RATIO * size_m * self.parallel_camera.axes[2]
+                shape_m.mean(axis=0)
+                + VIEWER_DISTANCE_RATIO * size_m * self.parallel_camera.axes[2]
             )
-        corners = shape_m[self.skin.plane_triangles[self.skin.is_facing(shape_m, eye_m)]]
+        corners = shape_m[
+            self.skin.plane_triangles[self.skin.is_facing(shape_m, eye_m)]
+        ]
         closed = corners[:, [0, 1, 2, 0]].reshape(-1, 3)
         own_m = self.view.to_camera_m(self.phi, closed, sample)
         if self.view.depth.camera.matrix is not None:
-            is_in_front = np.repeat((own_m[:, 2].reshape(-1, 4) > 0).all(axis=1), 4)
+            is_in_front = np.repeat(
+                (own_m[:, 2].reshape(-1, 4) > 0).all(axis=1), 4
+            )
             closed = closed[is_in_front]
             own_m = own_m[is_in_front]
         image = self.image_points(own_m, closed)[:, :2].reshape(-1, 4, 2)
-        return np.pad(image, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 2)
+        return np.pad(
+            image, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan
+        ).reshape(-1, 2)
 
-    def point_rows(self, sample: int, points_m: Array, rays: Array, distances_m: Array) -> Array:
+    def point_rows(
+        self, sample: int, points_m: Array, rays: Array, distances_m: Array
+    ) -> Array:
         """Return rows (P, 8) of `MotionRecord.visible_points` for the points of one sample.
 
         Parameters
@@ -127,14 +147,18 @@ class DepthProjection:
         """
         world = self.view.to_world(self.phi, points_m, rays, sample)
         t_s = np.full(len(points_m), self.view.depth.sample_times_s[sample])
-        return np.column_stack([t_s, self.image_points(points_m, world), distances_m, world])
+        return np.column_stack(
+            [t_s, self.image_points(points_m, world), distances_m, world]
+        )
 
     def outline_rows(self, sample: int, shape_m: Array) -> Array:
         """Return rows (k, 8) of `MotionRecord.visible_points` with the outlines of a shape (n, 3).
 
         The last row has the time alone, so that the sample is known also if no face is in view.
         """
-        drawn = np.vstack([self.outlines(shape_m, sample), np.full((1, 2), np.nan)])
+        drawn = np.vstack(
+            [self.outlines(shape_m, sample), np.full((1, 2), np.nan)]
+        )
         rows = np.full((len(drawn), 8), np.nan)
         rows[:, 0] = self.view.depth.sample_times_s[sample]
         rows[:, 1:3] = drawn
@@ -160,16 +184,34 @@ def surface_rows(surface: SurfaceComparison, up: Array) -> Array:
     shapes_m = surface.shapes_m
     phi = surface.phi
     shown = DepthProjection.facing_shape(
-        correspondences.camera, correspondences.surface, phi=phi, shape_m=shapes_m[0], up=up
+        correspondences.camera,
+        correspondences.surface,
+        phi=phi,
+        shape_m=shapes_m[0],
+        up=up,
     )
-    samples = np.flatnonzero(correspondences.is_compared[: len(shapes_m)].any(axis=1)).tolist()
+    samples = np.flatnonzero(
+        correspondences.is_compared[: len(shapes_m)].any(axis=1)
+    ).tolist()
     rows = [np.zeros((0, 8))]
     for k in samples:
         within = correspondences.weights[k].any(axis=1)
-        sights = correspondences.points[k], correspondences.rays[k], surface.signed_distances_m[k]
+        sights = (
+            correspondences.points[k],
+            correspondences.rays[k],
+            surface.signed_distances_m[k],
+        )
         rows.append(shown.point_rows(k, *(each[within] for each in sights)))
-    few = np.unique(np.linspace(0, len(samples) - 1, MAX_OUTLINED_SAMPLES).round().astype(int))
-    rows += [shown.outline_rows(samples[k], shapes_m[samples[k]]) for k in few if samples]
+    few = np.unique(
+        np.linspace(0, len(samples) - 1, MAX_OUTLINED_SAMPLES)
+        .round()
+        .astype(int)
+    )
+    rows += [
+        shown.outline_rows(samples[k], shapes_m[samples[k]])
+        for k in few
+        if samples
+    ]
     return np.vstack(rows)
 
 
@@ -187,7 +229,11 @@ def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
         skin = VisibleSurface.from_body(experiment.body, depth)
         shape_m = skin.initial_positions_m(experiment, depth)
         shown = DepthProjection.facing_shape(
-            view, skin, phi=np.zeros(nuisance.size), shape_m=shape_m, up=experiment.upward_direction
+            view,
+            skin,
+            phi=np.zeros(nuisance.size),
+            shape_m=shape_m,
+            up=experiment.upward_direction,
         )
         points_m = depth.points_m[depth.first_sample_with_points]
         rows = shown.point_rows(
@@ -202,7 +248,9 @@ def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
     return by_camera
 
 
-def save_overlays(experiments: Iterable[Experiment], folder: Path) -> list[Path]:
+def save_overlays(
+    experiments: Iterable[Experiment], folder: Path
+) -> list[Path]:
     """Draw `undeformed_rows` of all experiments into a folder, and return the files."""
     return save_pictures(
         folder,

@@ -63,7 +63,11 @@ class SliderRange:
 
     @classmethod
     def from_estimate(
-        cls, estimate: ReportedEstimate, *, linear: bool, bounds: tuple[float, float]
+        cls,
+        estimate: ReportedEstimate,
+        *,
+        linear: bool,
+        bounds: tuple[float, float],
     ) -> SliderRange:
         """Return a range around an estimate.
 
@@ -80,12 +84,16 @@ class SliderRange:
         value = estimate.value
         interval = estimate.combined95 or (value, value)
         if linear or value <= 0:
-            margin = (1 + WIDENING) * max(value - interval[0], interval[1] - value)
+            margin = (1 + WIDENING) * max(
+                value - interval[0], interval[1] - value
+            )
             margin = max(margin, (LEAST_RATIO - 1) * abs(value)) or 1.0
             low = value - margin
             high = value + margin
         else:
-            ratio = max(interval[1] / value, value / max(interval[0], 1e-12 * value))
+            ratio = max(
+                interval[1] / value, value / max(interval[0], 1e-12 * value)
+            )
             factor = max(ratio ** (1 + WIDENING), LEAST_RATIO)
             low = value / factor
             high = value * factor
@@ -151,11 +159,15 @@ class ParameterSliders:
         self._fitted_markers_m = fitted_markers_m
         self._is_resetting = False
         self.simulation: ForwardSimulation | None = None
-        self.sliders = {name: _slider(widgets, name, each) for name, each in ranges.items()}
+        self.sliders = {
+            name: _slider(widgets, name, each) for name, each in ranges.items()
+        }
         self.picture = widgets.Image(format="png")
         self.message = widgets.Label()
         self.reset_button = widgets.Button(description="estimates")
-        controls = widgets.VBox([*self.sliders.values(), self.reset_button, self.message])
+        controls = widgets.VBox(
+            [*self.sliders.values(), self.reset_button, self.message]
+        )
         self.widget = widgets.HBox([controls, self.picture])
         for slider in self.sliders.values():
             slider.observe(self._on_change, names="value")
@@ -163,7 +175,9 @@ class ParameterSliders:
         self.update()
 
     @classmethod
-    def from_run(cls, run: SolvedProblem, experiment: str | None = None) -> ParameterSliders:
+    def from_run(
+        cls, run: SolvedProblem, experiment: str | None = None
+    ) -> ParameterSliders:
         """Return the sliders of a run, see `Run.interactive`.
 
         Raises
@@ -177,7 +191,9 @@ class ParameterSliders:
         name = next(iter(by_name)) if experiment is None else experiment
         require_among(name, by_name)
         names = [
-            each.name for each in run.start_parameters.free if not is_field_coefficient(each.name)
+            each.name
+            for each in run.start_parameters.free
+            if not is_field_coefficient(each.name)
         ]
         if not names:
             raise InputError(
@@ -192,7 +208,9 @@ class ParameterSliders:
             )
         segment, phi = transcription_and_nuisance(by_name[name], run.solution)
         fitted = zip(run.solution.parts, run.solution.readings_m, strict=True)
-        markers_m = {part.segment.experiment.name: readings for part, readings in fitted}
+        markers_m = {
+            part.segment.experiment.name: readings for part, readings in fitted
+        }
         return cls(
             run.problem,
             by_name[name],
@@ -259,7 +277,10 @@ class ParameterSliders:
             texts.append(f"markers: {rms_mm} mm RMS, at most {max_mm} mm")
         if simulation.wrench_rms[0] is not None:
             texts.append(f"force: {number(simulation.wrench_rms[0], 3)} N RMS")
-        texts += [f"{name}: {number(rms, 3)} RMS" for name, rms in simulation.reading_rms.items()]
+        texts += [
+            f"{name}: {number(rms, 3)} RMS"
+            for name, rms in simulation.reading_rms.items()
+        ]
         texts += [
             f"{name}: {number(1e3 * each.rms_m, 3)} mm RMS"
             for name, each in simulation.depth.items()
@@ -284,15 +305,21 @@ class ParameterSliders:
             )
         if experiment.wrenches:
             sensor = experiment.wrenches[0]
-            columns = _sensor_columns(sensor.t_s, sensor.values, simulation.wrenches[0])
+            columns = _sensor_columns(
+                sensor.t_s, sensor.values, simulation.wrenches[0]
+            )
             columns[:, 1:] *= sensor.symmetry
             return sensor_picture(columns, COMPONENTS, UNITS)
         if experiment.readings:
             gauge = experiment.readings[0]
             predicted = simulation.readings[gauge.name]
-            columns = _sensor_columns(gauge.sample_times_s, gauge.measured_values, predicted)
+            columns = _sensor_columns(
+                gauge.sample_times_s, gauge.measured_values, predicted
+            )
             count = gauge.measured_values.shape[1]
-            return sensor_picture(columns, [f"{gauge.name} {k + 1}" for k in range(count)])
+            return sensor_picture(
+                columns, [f"{gauge.name} {k + 1}" for k in range(count)]
+            )
         return self._shapes_figure(simulation)
 
     def _shapes_figure(self, simulation: ForwardSimulation) -> Figure:
@@ -302,7 +329,9 @@ class ParameterSliders:
 
         trajectory = simulation.trajectory
         simulated = trajectory.positions_m, trajectory.markers_m
-        return shapes_picture(MotionRecord.from_experiment(self._experiment, simulated=simulated))
+        return shapes_picture(
+            MotionRecord.from_experiment(self._experiment, simulated=simulated)
+        )
 
 
 def _slider(widgets: Any, name: str, values: SliderRange) -> Any:
@@ -316,7 +345,12 @@ def _slider(widgets: Any, name: str, values: SliderRange) -> Any:
         low = float(np.log10(values.low))
         high = float(np.log10(values.high))
         return widgets.FloatLogSlider(
-            value=values.value, base=10, min=low, max=high, step=(high - low) / STEPS, **common
+            value=values.value,
+            base=10,
+            min=low,
+            max=high,
+            step=(high - low) / STEPS,
+            **common,
         )
     step = (values.high - values.low) / STEPS
     return widgets.FloatSlider(
@@ -329,7 +363,9 @@ def _sensor_columns(t_s: Array, measured: Array, simulated: Array) -> Array:
 
     `t_s` is (S,), `measured` and `simulated` are (S, m).
     """
-    return np.column_stack([t_s, measured, np.full_like(measured, np.nan), simulated])
+    return np.column_stack(
+        [t_s, measured, np.full_like(measured, np.nan), simulated]
+    )
 
 
 def _png(figure: Figure) -> bytes:

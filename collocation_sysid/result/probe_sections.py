@@ -45,8 +45,15 @@ def probe_section(result: Result) -> TitledParts:
         (
             source_label(p.name) if p.kind == "assumption" else p.name,
             f"{p.chi_squared:.1f}",
-            "" if p.size is None else f"{short(p.size)} ± {short(p.size_error or 0.0)}",
-            *(_change_with_ratios(p.moves.get(name), result.values[name].value) for name in names),
+            ""
+            if p.size is None
+            else f"{short(p.size)} ± {short(p.size_error or 0.0)}",
+            *(
+                _change_with_ratios(
+                    p.moves.get(name), result.values[name].value
+                )
+                for name in names
+            ),
         )
         for p in result.probes
     ]
@@ -56,7 +63,8 @@ def probe_section(result: Result) -> TitledParts:
         "significant assumptions."
     )
     return TitledParts(
-        "Probes", (Table("", heads, tuple(rows), texts=1), read, *_conclusions(result))
+        "Probes",
+        (Table("", heads, tuple(rows), texts=1), read, *_conclusions(result)),
     )
 
 
@@ -65,9 +73,15 @@ def probe_lines(result: Result) -> list[str | Table]:
 
     After routine probes without a significant result the table is left out; empty without probes.
     """
-    if is_routine(result) and not any(probe.sentences for probe in result.probes):
+    if is_routine(result) and not any(
+        probe.sentences for probe in result.probes
+    ):
         return [*_conclusions(result)] if result.probes else []
-    return [each for each in probe_section(result).parts if isinstance(each, (str, Table))]
+    return [
+        each
+        for each in probe_section(result).parts
+        if isinstance(each, (str, Table))
+    ]
 
 
 def _size_and_gain(probe: Probe) -> str:
@@ -101,9 +115,10 @@ def _shown_estimates(result: Result) -> list[str]:
     """Return the names of the estimates that the table has as columns, at most `MAX_ESTIMATES`."""
     known = [n for n, each in result.values.items() if each.statistical95]
     first = [name for name in known if name in STIFFNESS_NAMES[:1]]
-    return [*first, *(n for n in known if n in result.parameters and n not in first)][
-        :MAX_ESTIMATES
-    ]
+    return [
+        *first,
+        *(n for n in known if n in result.parameters and n not in first),
+    ][:MAX_ESTIMATES]
 
 
 def _change_with_ratios(move: EstimateChange | None, value: float) -> str:
@@ -120,14 +135,20 @@ def _change_with_ratios(move: EstimateChange | None, value: float) -> str:
     if move is None:
         return "–"
     shares = ", ".join(
-        f"{x:+.1f}" for x in (move.of_statistical95, move.of_combined95) if x is not None
+        f"{x:+.1f}"
+        for x in (move.of_statistical95, move.of_combined95)
+        if x is not None
     )
     return f"{_change_text(move, value)} ({shares})"
 
 
 def _change_text(move: EstimateChange, value: float) -> str:
     """Return the change of an estimate as text, in percent of `value` unless that is zero."""
-    return f"{100 * move.change / abs(value):+.2f} %" if value else f"{move.change:+.2g}"
+    return (
+        f"{100 * move.change / abs(value):+.2f} %"
+        if value
+        else f"{move.change:+.2g}"
+    )
 
 
 def _conclusions(result: Result) -> Iterator[str]:
@@ -138,7 +159,8 @@ def _conclusions(result: Result) -> Iterator[str]:
     """
     significant = [probe for probe in result.probes if probe.sentences]
     relaxed = sorted(
-        (p for p in significant if p.kind == "assumption"), key=lambda p: -p.chi_squared
+        (p for p in significant if p.kind == "assumption"),
+        key=lambda p: -p.chi_squared,
     )
     for kind in ("window", "recording"):
         disagreeing = [p for p in significant if p.kind == kind]
@@ -151,7 +173,9 @@ def _conclusions(result: Result) -> Iterator[str]:
     if relaxed:
         first = relaxed[0]
         names = _shown_estimates(result)
-        moved = [_named_change(first, result, n) for n in names if n in first.moves][:2]
+        moved = [
+            _named_change(first, result, n) for n in names if n in first.moves
+        ][:2]
         size = short(first.size or 0.0)
         error = short(first.size_error or 0.0)
         yield (
@@ -159,7 +183,9 @@ def _conclusions(result: Result) -> Iterator[str]:
             f"by {first.chi_squared:.3g} and the estimates change by {listed(moved)}; measure it, "
             "or estimate it"
         )
-        if others := [f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in relaxed[1:]]:
+        if others := [
+            f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in relaxed[1:]
+        ]:
             yield f"alternative explanations with similar effects: {listed(others)}"
     elif not significant:
         tested = " or ".join(_size_and_gain(p) for p in result.probes)
@@ -181,12 +207,20 @@ def _most_important_assumption(result: Result) -> Iterator[str]:
     The most important assumption contributes most to the variance of the first stiffness that has a
     budget.
     """
-    significant = {name.partition(" ")[0] for p in result.probes for name in p.sentences}
+    significant = {
+        name.partition(" ")[0] for p in result.probes for name in p.sentences
+    }
     undetermined = {
-        p.name.partition(" ")[0] for p in result.probes if p.kind == "assumption"
+        p.name.partition(" ")[0]
+        for p in result.probes
+        if p.kind == "assumption"
     } - significant
-    for name in (n for n in (*STIFFNESS_NAMES, *result.parameters) if n in result.budget):
-        source = next((s for s in result.budget[name] if s in undetermined), None)
+    for name in (
+        n for n in (*STIFFNESS_NAMES, *result.parameters) if n in result.budget
+    ):
+        source = next(
+            (s for s in result.budget[name] if s in undetermined), None
+        )
         if source is not None:
             share = result.budget[name][source]
             yield (

@@ -34,7 +34,11 @@ REFINEMENT_FILE = "refinement.json"
 
 
 def write_run(
-    solved: SolvedProblem, folder: str | Path, *, frames: bool = True, pictures: bool = True
+    solved: SolvedProblem,
+    folder: str | Path,
+    *,
+    frames: bool = True,
+    pictures: bool = True,
 ) -> Path:
     """Write the folder of a run completely or not at all, then its pictures, and return the folder.
 
@@ -68,7 +72,9 @@ def write_run(
             text = as_json(solved.refinement)
             (place / REFINEMENT_FILE).write_text(text + "\n", encoding="utf-8")
         arrays = _trajectory_arrays(replays(solved))
-        np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **arrays)
+        np.savez_compressed(
+            place / "trajectory.npz", allow_pickle=False, **arrays
+        )
         if frames:
             _write_all_frames(solved, place)
     if pictures:
@@ -77,7 +83,9 @@ def write_run(
 
 
 def draw_run(
-    solved: SolvedProblem, folder: Path, report: Callable[[str], None] | None = None
+    solved: SolvedProblem,
+    folder: Path,
+    report: Callable[[str], None] | None = None,
 ) -> Result:
     """Draw the pictures of a run into its folder, and store in ``result.json`` how long that took.
 
@@ -104,14 +112,18 @@ def draw_run(
     result = build_result(solved)
     file = folder / RESULT_FILE
     _write_pictures(solved, result, folder, report or (lambda _: None))
-    if not file.is_file() or file.read_text(encoding="utf-8") != _result_text(result):
+    if not file.is_file() or file.read_text(encoding="utf-8") != _result_text(
+        result
+    ):
         raise InputError(
             f"{RESULT_FILE} was changed while the pictures were drawn; draw them again with: "
             f"collocation-sysid plot {folder}",
             folder,
         )
     pictures_s = time.perf_counter() - began_s
-    result = replace(result, elapsed_s=replace(result.elapsed_s, pictures=pictures_s))
+    result = replace(
+        result, elapsed_s=replace(result.elapsed_s, pictures=pictures_s)
+    )
     write_text_file(file, _result_text(result))
     return result
 
@@ -122,7 +134,10 @@ def _result_text(result: Result) -> str:
 
 
 def _write_pictures(
-    finished: SolvedProblem, result: Result, folder: Path, say: Callable[[str], None]
+    finished: SolvedProblem,
+    result: Result,
+    folder: Path,
+    say: Callable[[str], None],
 ) -> None:
     """Draw all pictures of a run, including the Jacobian's structure, and write them into its
     folder.
@@ -133,7 +148,11 @@ def _write_pictures(
 
     solution = finished.solution
     jacobian = jacobian_sparsity(solution.collocation, solution.z)
-    save_pictures(folder, all_pictures(replays(finished), result) | {"jacobian": jacobian}, say)
+    save_pictures(
+        folder,
+        all_pictures(replays(finished), result) | {"jacobian": jacobian},
+        say,
+    )
 
 
 def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
@@ -144,7 +163,9 @@ def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
     of its 95 % interval (suffixes ``_lower``, ``_upper``), and its posterior over its prior
     standard deviation (suffix ``_over_prior``).
     """
-    data: dict[str, Any] = {"region": body.part_of_cells} if len(body.parts) > 1 else {}
+    data: dict[str, Any] = (
+        {"region": body.part_of_cells} if len(body.parts) > 1 else {}
+    )
     for name, values in _field_estimates(finished, body).items():
         heads = (name, f"{name}_lower", f"{name}_upper", f"{name}_over_prior")
         data |= dict(zip(heads, values.T, strict=True))
@@ -159,7 +180,11 @@ def _write_all_frames(finished: SolvedProblem, place: Path) -> None:
     for part in finished.solution.parts:
         segment = part.segment
         positions = part.x.reshape(len(part.x), -1, 3)
-        here = place if len(finished.solution.parts) == 1 else place / segment.experiment.name
+        here = (
+            place
+            if len(finished.solution.parts) == 1
+            else place / segment.experiment.name
+        )
         here.mkdir(exist_ok=True)
         body = segment.body
         residual = np.zeros((len(positions), segment.dof_count))
@@ -171,7 +196,9 @@ def _write_all_frames(finished: SolvedProblem, place: Path) -> None:
             cells=body.cells,
             element=body.element,
             undeformed_m=body.nodes_m,
-            point_series={"residual_force_n": residual.reshape(positions.shape)},
+            point_series={
+                "residual_force_n": residual.reshape(positions.shape)
+            },
             fields=ElementFields.from_body(
                 body, body.theta_from_values(finished.solution.parameters)
             ),
@@ -188,18 +215,30 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
     """
     fitted = {}
     collected = []
-    for part, readings in zip(finished.solution.parts, finished.solution.readings_m, strict=True):
+    for part, readings in zip(
+        finished.solution.parts, finished.solution.readings_m, strict=True
+    ):
         x = part.x[part.segment.markers.sample_rows]
-        fitted[part.segment.experiment.name] = x.reshape(len(x), -1, 3), readings
-    for experiment in sorted(finished.problem.experiments, key=lambda each: each.validation):
+        fitted[part.segment.experiment.name] = (
+            x.reshape(len(x), -1, 3),
+            readings,
+        )
+    for experiment in sorted(
+        finished.problem.experiments, key=lambda each: each.validation
+    ):
         rollout = finished.rollouts[experiment.name]
         rolled_out = None
         if isinstance(rollout, ForwardSimulation):
-            rolled_out = rollout.trajectory.positions_m, rollout.trajectory.markers_m
+            rolled_out = (
+                rollout.trajectory.positions_m,
+                rollout.trajectory.markers_m,
+            )
         fit = fitted.get(experiment.name)
         if (shown := fit or rolled_out) is not None:
             motion = finished.modes_by_experiment.get(experiment.name)
-            natural = motion and np.array([mode.frequency_hz for mode in motion.modes])
+            natural = motion and np.array(
+                [mode.frequency_hz for mode in motion.modes]
+            )
             places_m = _marker_places_m(finished, experiment.name)
             replay = MotionRecord.from_experiment(
                 experiment,
@@ -213,11 +252,15 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
             )
             of_cells = _field_estimates(finished, experiment.body)
             of_cameras = _depth_rows(finished, experiment)
-            collected.append(replace(replay, fields=of_cells, visible_points=of_cameras))
+            collected.append(
+                replace(replay, fields=of_cells, visible_points=of_cameras)
+            )
     return collected
 
 
-def _depth_rows(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
+def _depth_rows(
+    finished: SolvedProblem, experiment: Experiment
+) -> dict[str, Array]:
     """Return the points of each depth camera on the fitted surface, or else on the simulated one.
 
     The arrays are as in `MotionRecord.visible_points`, by name of the camera; empty where neither
@@ -272,11 +315,15 @@ def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
     for part in body.parts:
         if part.field is not None:
             estimates[part.field_name] = np.full((len(body.cells), 4), np.nan)
-            estimates[part.field_name][part.cells] = finished.fields[part.field_name].by_element
+            estimates[part.field_name][part.cells] = finished.fields[
+                part.field_name
+            ].by_element
     return estimates
 
 
-def _wrench_columns(finished: SolvedProblem, experiment: Experiment) -> list[Array]:
+def _wrench_columns(
+    finished: SolvedProblem, experiment: Experiment
+) -> list[Array]:
     """Return an array (S, 19) for each force sensor: time, and the wrench measured, fitted and
     simulated.
 
@@ -287,7 +334,11 @@ def _wrench_columns(finished: SolvedProblem, experiment: Experiment) -> list[Arr
     rollout = finished.rollouts[experiment.name]
     fitted = finished.solution.wrenches
     fit = fitted.get(experiment.name, [None] * len(sensors))
-    rolled = rollout.wrenches if isinstance(rollout, ForwardSimulation) else [None] * len(sensors)
+    rolled = (
+        rollout.wrenches
+        if isinstance(rollout, ForwardSimulation)
+        else [None] * len(sensors)
+    )
     both = zip(sensors, fit, rolled, strict=True)
     sensed = []
     for sensor, *models in both:
@@ -297,7 +348,9 @@ def _wrench_columns(finished: SolvedProblem, experiment: Experiment) -> list[Arr
     return sensed
 
 
-def _custom_sensor_columns(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
+def _custom_sensor_columns(
+    finished: SolvedProblem, experiment: Experiment
+) -> dict[str, Array]:
     """Return an array (S, 1 + 3m) for each custom sensor, by name.
 
     The columns are the time [s], and its m numbers as measured, fitted and simulated; NaN where the
@@ -309,19 +362,26 @@ def _custom_sensor_columns(finished: SolvedProblem, experiment: Experiment) -> d
     both = fit.get(experiment.name, {}), rolled
     return {
         gauge.name: _comparison_columns(
-            gauge.sample_times_s, gauge.measured_values, *(each.get(gauge.name) for each in both)
+            gauge.sample_times_s,
+            gauge.measured_values,
+            *(each.get(gauge.name) for each in both),
         )
         for gauge in experiment.readings
     }
 
 
-def _comparison_columns(t_s: Array, measured: Array, *models: Array | None) -> Array:
+def _comparison_columns(
+    t_s: Array, measured: Array, *models: Array | None
+) -> Array:
     """Return the columns time, measured values and the values of each model, as one array.
 
     `t_s` is (S,), `measured` and each of `models` (S, m); the columns of a model that is None are
     NaN.
     """
-    columns = (np.full_like(measured, np.nan) if each is None else each for each in models)
+    columns = (
+        np.full_like(measured, np.nan) if each is None else each
+        for each in models
+    )
     return np.column_stack([t_s, measured, *columns])
 
 
@@ -330,7 +390,9 @@ def _marker_places_m(finished: SolvedProblem, experiment: str) -> Array | None:
     failed.
     """
     if experiment in finished.places:
-        places = [place.position_m for place in finished.places[experiment].values()]
+        places = [
+            place.position_m for place in finished.places[experiment].values()
+        ]
         return np.array(places).reshape(-1, 3)
     rollout = finished.rollouts[experiment]
     if not isinstance(rollout, ForwardSimulation):

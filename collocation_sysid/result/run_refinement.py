@@ -22,7 +22,11 @@ from ..runs.warm_start import WarmStart
 from ..serialisation import as_json, read
 from ..statistics.assessment import NUMERICAL, Assessment, numerical_concerns
 from ..statistics.combined_intervals import combine
-from ..statistics.discretisation_error import DiscretisationError, Refinement, RefinementLevel
+from ..statistics.discretisation_error import (
+    DiscretisationError,
+    Refinement,
+    RefinementLevel,
+)
 from ..statistics.estimates import Estimate
 from ..statistics.uncertainty_budget import NUMERICAL as DISCRETISATION
 from .replay import damaged_run_refused
@@ -74,8 +78,12 @@ def refine_run(
     levels_file = run / REFINEMENT_FILE
     home = before.problem_folder(file, "use collocation_sysid.refine")
     if not before.converged:
-        raise InputError("the run did not converge: there is no result to refine", file)
-    problem = Problem.read(run / "problem.toml", allow_code=allow_code, folder=home)
+        raise InputError(
+            "the run did not converge: there is no result to refine", file
+        )
+    problem = Problem.read(
+        run / "problem.toml", allow_code=allow_code, folder=home
+    )
     problem = replace(problem, substeps=before.problem.substeps)
     estimates = _estimates_at_optimum(before, problem.parameters)
     with damaged_run_refused(run):
@@ -102,7 +110,9 @@ def refine_run(
     return refinement, keep(refinement)
 
 
-def with_refinement(before: Result, refinement: Refinement, parameters: Parameters) -> Result:
+def with_refinement(
+    before: Result, refinement: Refinement, parameters: Parameters
+) -> Result:
     """Return a result with the measured discretisation error in place of the estimated one.
 
     Parameters
@@ -116,7 +126,9 @@ def with_refinement(before: Result, refinement: Refinement, parameters: Paramete
     """
     optimum = _estimates_at_optimum(before, parameters)
 
-    def corrected(values: Mapping[str, ReportedEstimate]) -> dict[str, ReportedEstimate]:
+    def corrected(
+        values: Mapping[str, ReportedEstimate],
+    ) -> dict[str, ReportedEstimate]:
         """Return estimates by name, corrected where the refinement measured their error."""
         return {
             name: _corrected_estimate(
@@ -132,13 +144,17 @@ def with_refinement(before: Result, refinement: Refinement, parameters: Paramete
         }
 
     after = replace(
-        before, parameters=corrected(before.parameters), derived=corrected(before.derived)
+        before,
+        parameters=corrected(before.parameters),
+        derived=corrected(before.derived),
     )
     budget = {
         name: _updated_shares(shares, before.values[name], after.values[name])
         for name, shares in before.budget.items()
     }
-    uncertainties = {name: each.combined_std_error for name, each in after.values.items()}
+    uncertainties = {
+        name: each.combined_std_error for name, each in after.values.items()
+    }
     others = [
         each
         for each in before.trust.concerns
@@ -149,10 +165,14 @@ def with_refinement(before: Result, refinement: Refinement, parameters: Paramete
         *numerical_concerns(optimum, uncertainties, refinement),
         *combined_concerns(parameters, after.values, budget),
     )
-    return replace(after, budget=budget, trust=Assessment.from_concerns(concerns))
+    return replace(
+        after, budget=budget, trust=Assessment.from_concerns(concerns)
+    )
 
 
-def _estimates_at_optimum(result: Result, parameters: Parameters) -> dict[str, Estimate]:
+def _estimates_at_optimum(
+    result: Result, parameters: Parameters
+) -> dict[str, Estimate]:
     """Return the estimates before the correction of the discretisation error, by name."""
     return {
         name: each.at_optimum(name, linear=name in parameters.linear_names)
@@ -193,7 +213,9 @@ def _corrected_estimate(
 
 
 def _updated_shares(
-    shares: Mapping[str, float], before: ReportedEstimate, after: ReportedEstimate
+    shares: Mapping[str, float],
+    before: ReportedEstimate,
+    after: ReportedEstimate,
 ) -> dict[str, float]:
     """Return the contributions to an estimate's variance with the measured discretisation error.
 
@@ -209,7 +231,11 @@ def _updated_shares(
     ratio = (before.combined_std_error / after.combined_std_error) ** 2
     # Standard errors are relative to their values, see `IntervalCoordinate`.
     ratio *= (after.value / before.value) ** 2 if before.value else 1.0
-    others = {name: share * ratio for name, share in shares.items() if name != DISCRETISATION}
+    others = {
+        name: share * ratio
+        for name, share in shares.items()
+        if name != DISCRETISATION
+    }
     total = max(1.0, sum(others.values()))
     corrected = {name: share / total for name, share in others.items()}
     corrected[DISCRETISATION] = 1.0 - sum(corrected.values())
@@ -223,5 +249,10 @@ def _known_levels(file: Path, names: Iterable[str]) -> list[RefinementLevel]:
     if not file.is_file():
         return []
     require_own(file)
-    levels = read(Refinement, json.loads(file.read_text(encoding="utf-8"))).levels
-    return [replace(each, values={name: each.values[name] for name in names}) for each in levels]
+    levels = read(
+        Refinement, json.loads(file.read_text(encoding="utf-8"))
+    ).levels
+    return [
+        replace(each, values={name: each.values[name] for name in names})
+        for each in levels
+    ]

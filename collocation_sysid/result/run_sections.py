@@ -98,7 +98,9 @@ PICTURE_CAPTIONS = {
 LEADING_PICTURES = ("tracks", "wrench", "reading", "depth")
 
 
-def run_summary(result: Result, folder: Path | None = None, budget: bool = False) -> list[Shown]:
+def run_summary(
+    result: Result, folder: Path | None = None, budget: bool = False
+) -> list[Shown]:
     """Return the description of a run that fits on one screen.
 
     Parameters
@@ -109,7 +111,9 @@ def run_summary(result: Result, folder: Path | None = None, budget: bool = False
     budget : bool
         Whether to add the complete table of contributions to each variance.
     """
-    largest = sorted(result.residuals, key=lambda each: -each.rms_m)[:SHOWN_DIAGNOSES]
+    largest = sorted(result.residuals, key=lambda each: -each.rms_m)[
+        :SHOWN_DIAGNOSES
+    ]
     ended = [f"residuals: {each.sentence}" for each in largest]
     sections = (
         _outcome_section(result),
@@ -119,14 +123,23 @@ def run_summary(result: Result, folder: Path | None = None, budget: bool = False
     )
     tables = [budget_table(result)] if budget and result.budget else []
     written = [] if folder is None else [f"written to {folder}"]
-    return [*flattened_parts(sections), *tables, *probe_lines(result), *ended, *written]
+    return [
+        *flattened_parts(sections),
+        *tables,
+        *probe_lines(result),
+        *ended,
+        *written,
+    ]
 
 
 def estimate_sections(result: Result) -> list[Shown]:
     """Return the verdict, the recommended remedies, and the table of parameters with their
     intervals.
     """
-    sections = [verdict_section(result.trust), *remedy_command(result.trust.concerns)]
+    sections = [
+        verdict_section(result.trust),
+        *remedy_command(result.trust.concerns),
+    ]
     sections += [*_deeper_check_advice(result), _parameter_section(result)]
     return [*flattened_parts(sections)]
 
@@ -143,20 +156,24 @@ def run_report(run: str | Path) -> TitledParts:
     result = Result.read(run)
     with damaged_run_refused(run):
         verdict = verdict_section(result.trust, linked=True)
-        took = (
-            f" {result.method}, {result.iterations} iterations; {_elapsed_text(result.elapsed_s)}"
-        )
+        took = f" {result.method}, {result.iterations} iterations; {_elapsed_text(result.elapsed_s)}"
         badge = Span(result.status, f"badge {result.trust.verdict}")
         pictures = _captioned_pictures(run)
         meaning = Line(f"{VERDICT_MEANINGS[result.trust.verdict]}.", "quiet")
         parts: list[Shown] = [
             Line((badge, Span(took)), "quiet"),
-            replace(verdict, parts=(verdict.parts[0], meaning, *verdict.parts[1:])),
+            replace(
+                verdict, parts=(verdict.parts[0], meaning, *verdict.parts[1:])
+            ),
             _cards(result),
             *flattened_parts([_outcome_section(result)]),
             *pictures[:1],
             TitledParts(
-                "What to do", (*_remedy_lines(result.trust.concerns), *_deeper_check_advice(result))
+                "What to do",
+                (
+                    *_remedy_lines(result.trust.concerns),
+                    *_deeper_check_advice(result),
+                ),
             ),
             _parameter_section(result),
             TitledParts("Error bars", tuple(_error_bars(result))),
@@ -167,9 +184,15 @@ def run_report(run: str | Path) -> TitledParts:
             *_nuisance_sections(result),
             TitledParts("Residuals", tuple(_residual_tables(result, run))),
             TitledParts("Pictures", tuple(pictures[1:])),
-            TitledParts("Problem and provenance", tuple(_provenance_parts(result, run))),
+            TitledParts(
+                "Problem and provenance", tuple(_provenance_parts(result, run))
+            ),
         ]
-        shown = (each for each in parts if not isinstance(each, TitledParts) or each.parts)
+        shown = (
+            each
+            for each in parts
+            if not isinstance(each, TitledParts) or each.parts
+        )
         return TitledParts(result.title or "Run", tuple(shown), level=1)
 
 
@@ -211,13 +234,21 @@ def verdict_section(
 
 def _deeper_check_advice(result: Result) -> list[Line]:
     """Return the recommendation of a deeper check where it is worthwhile, else an empty list."""
-    return [Line(DEEPER_CHECK_ADVICE, "quiet")] if is_deeper_check_worthwhile(result) else []
+    return (
+        [Line(DEEPER_CHECK_ADVICE, "quiet")]
+        if is_deeper_check_worthwhile(result)
+        else []
+    )
 
 
 def remedy_command(concerns: Iterable[Concern]) -> list[Line]:
     """Return the command that explains the remedies of some concerns; empty without concerns."""
     pages = dict.fromkeys(topic.page for topic in topics_of(concerns).values())
-    return [Line(f"what to do: {explain_command(*pages)}", "quiet")] if pages else []
+    return (
+        [Line(f"what to do: {explain_command(*pages)}", "quiet")]
+        if pages
+        else []
+    )
 
 
 def _parameter_section(result: Result) -> TitledParts:
@@ -225,10 +256,15 @@ def _parameter_section(result: Result) -> TitledParts:
     on it.
     """
     values = result.values
-    rows = tuple((symbol_with_unit(name), *_estimate_row(result, name)) for name in values)
+    rows = tuple(
+        (symbol_with_unit(name), *_estimate_row(result, name))
+        for name in values
+    )
     heads = ("", "value", "±", "95 % interval", "± stat", "± syst", "guess", "")
     faint = tuple(range(len(result.parameters), len(values)))
-    parts: list[Shown] = [Table("", heads, rows, texts=1, faint=faint, note_column=1)]
+    parts: list[Shown] = [
+        Table("", heads, rows, texts=1, faint=faint, note_column=1)
+    ]
     parts += [field.sentence(name) for name, field in result.fields.items()]
     if any(each.combined95 for each in values.values()):
         parts.append(_coverage_sentence(result))
@@ -241,9 +277,12 @@ def _parameter_section(result: Result) -> TitledParts:
     elif corrected := [
         f"{symbol_of(name)} {100 * (error.extrapolated / optimum - 1):+.2g} %"
         for name, error in result.numerical_errors.items()
-        if (optimum := values[name].optimum) and values[name].statistical95 is not None
+        if (optimum := values[name].optimum)
+        and values[name].statistical95 is not None
     ]:
-        parts.append(f"corrected for the estimated time-step error: {', '.join(corrected)}")
+        parts.append(
+            f"corrected for the estimated time-step error: {', '.join(corrected)}"
+        )
     if known := [
         f"{symbol_of(name)} {100 * each.known_correction / each.value:+.2g} %"
         for name, each in values.items()
@@ -253,7 +292,9 @@ def _parameter_section(result: Result) -> TitledParts:
             f"corrected for the stated grip layer and machine compliance: {', '.join(known)}"
         )
     parts += _undetermined_sentence(result)
-    return TitledParts("Parameters", (*parts, *_largest_contributions(result), *result.basis))
+    return TitledParts(
+        "Parameters", (*parts, *_largest_contributions(result), *result.basis)
+    )
 
 
 def _undetermined_sentence(result: Result) -> list[str]:
@@ -283,11 +324,21 @@ def _coverage_sentence(result: Result) -> str:
     moving = any(not each.static for each in result.fit.experiments.values())
     meshed = any(each.test is None for each in result.fit.experiments.values())
     kinds = ("step", "mesh") if moving else ("mesh",) if meshed else ()
-    covered = [f"the {kind} error" for kind in kinds if kind in result.discretisation_kinds]
-    missing = [f"the {kind} error" for kind in kinds if kind not in result.discretisation_kinds]
+    covered = [
+        f"the {kind} error"
+        for kind in kinds
+        if kind in result.discretisation_kinds
+    ]
+    missing = [
+        f"the {kind} error"
+        for kind in kinds
+        if kind not in result.discretisation_kinds
+    ]
     parts = listed(["noise", *covered, "systematic effects"])
     sentence = f"± (standard uncertainty) and intervals combine {parts}"
-    return sentence + (f", but not {listed(missing)} (measured by refine)" if missing else "")
+    return sentence + (
+        f", but not {listed(missing)} (measured by refine)" if missing else ""
+    )
 
 
 def _largest_contributions(result: Result) -> list[str]:
@@ -299,14 +350,24 @@ def _largest_contributions(result: Result) -> list[str]:
     ratios = {
         name: each.combined_std_error / each.statistical_std_error
         for name, each in result.values.items()
-        if each.combined_std_error and each.statistical_std_error and name in result.budget
+        if each.combined_std_error
+        and each.statistical_std_error
+        and name in result.budget
     }
-    systematic = {name: ratio for name, ratio in ratios.items() if ratio > SYSTEMATIC_RATIO}
+    systematic = {
+        name: ratio
+        for name, ratio in ratios.items()
+        if ratio > SYSTEMATIC_RATIO
+    }
     sentences = []
-    for name in sorted(systematic, key=lambda name: -systematic[name])[:SHOWN_BUDGETS]:
+    for name in sorted(systematic, key=lambda name: -systematic[name])[
+        :SHOWN_BUDGETS
+    ]:
         shares = list(result.budget[name].items())[:SHOWN_SOURCES]
         sources = ", ".join(
-            f"{source_label(s)} {share:.0%}" for s, share in shares if share > SMALLEST_SHOWN_SHARE
+            f"{source_label(s)} {share:.0%}"
+            for s, share in shares
+            if share > SMALLEST_SHOWN_SHARE
         )
         sentences.append(
             f"largest contributions to the combined uncertainty of {symbol_of(name)}: {sources}"
@@ -319,7 +380,10 @@ def budget_table(result: Result) -> Table:
     lines = result.budget
     shown = main_sources(lines, SMALLEST_SHOWN_SHARE)
     rows = [
-        (source_label(s), *(f"{100 * line.get(s, 0):.0f}" for line in lines.values()))
+        (
+            source_label(s),
+            *(f"{100 * line.get(s, 0):.0f}" for line in lines.values()),
+        )
         for s in shown
     ]
     return Table("", ("% of the variance", *map(symbol_of, lines)), tuple(rows))
@@ -335,7 +399,11 @@ def _estimate_row(result: Result, name: str) -> tuple[str, ...]:
     if each.at_bound:
         interval = "at its bound"
     elif each.reason:
-        interval = "not determined" if each.statistical95 is None else "not identifiable"
+        interval = (
+            "not determined"
+            if each.statistical95 is None
+            else "not identifiable"
+        )
     guess = "" if each.guess is None else f"{each.guess:.5g}"
     if each.fixed:
         guess = "tied" if each.tied else "fixed"
@@ -375,7 +443,15 @@ def refinement_table(result: Result) -> Table:
         )
     return Table(
         "",
-        ("", "half the step", "order", "half the edges", "order", "corrected", "95 % interval"),
+        (
+            "",
+            "half the step",
+            "order",
+            "half the edges",
+            "order",
+            "corrected",
+            "95 % interval",
+        ),
         tuple(rows),
     )
 
@@ -406,7 +482,9 @@ def _fit_section(result: Result) -> TitledParts:
         for reading, rms in (each.reading_rms or {}).items():
             unit = _unit_text(each.reading_unit, reading)
             sigma = short((each.reading_sigma or {})[reading])
-            lines.append(f"{reading} of '{name}': {short(rms)}{unit} RMS (sigma {sigma}{unit})")
+            lines.append(
+                f"{reading} of '{name}': {short(rms)}{unit} RMS (sigma {sigma}{unit})"
+            )
         unit = "J in the modelled part" if name in (fit.symmetry or {}) else "J"
         for obstacle, friction in (each.friction or {}).items():
             energy = f"{short(friction.dissipated_j)} {unit}"
@@ -419,22 +497,39 @@ def _fit_section(result: Result) -> TitledParts:
     for name, each in result.rollout.experiments.items():
         lines += _simulation_lines(name, each)
     for parts in sorted({*(fit.symmetry or {}).values()}):
-        names = listed(f"'{name}'" for name, each in (fit.symmetry or {}).items() if each == parts)
+        names = listed(
+            f"'{name}'"
+            for name, each in (fit.symmetry or {}).items()
+            if each == parts
+        )
         lines.append(
             f"loads of {names} are those of the whole specimen, {parts} times those of the "
             "modelled part"
         )
-    lines += [f"time: {_elapsed_text(result.elapsed_s)}", _iterations_text(result)]
+    lines += [
+        f"time: {_elapsed_text(result.elapsed_s)}",
+        _iterations_text(result),
+    ]
     for name, each in experiments.items():
         if each.notes:
-            lines.append(f"nuisance parameters of '{name}': {'; '.join(each.notes)}")
+            lines.append(
+                f"nuisance parameters of '{name}': {'; '.join(each.notes)}"
+            )
     return TitledParts("Fit", tuple(lines))
 
 
 def _elapsed_text(elapsed: Elapsed) -> str:
     """Return how long each part of a run took; pictures that were not drawn are left out."""
-    parts = {"search": elapsed.search, "checks": elapsed.checks, "pictures": elapsed.pictures}
-    known = (f"{part} {time_s:.1f} s" for part, time_s in parts.items() if time_s is not None)
+    parts = {
+        "search": elapsed.search,
+        "checks": elapsed.checks,
+        "pictures": elapsed.pictures,
+    }
+    known = (
+        f"{part} {time_s:.1f} s"
+        for part, time_s in parts.items()
+        if time_s is not None
+    )
     return ", ".join(known)
 
 
@@ -447,7 +542,9 @@ def _iterations_text(result: Result) -> str:
     )
 
 
-def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str]:
+def _simulation_lines(
+    name: str, simulated: SimulatedExperiment
+) -> Iterator[str]:
     """Yield lines on how far a forward simulation is from the measurements.
 
     For a validation experiment, the errors of a blind prediction and of copied measurements follow
@@ -488,7 +585,9 @@ def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str
         yield f"  no copied measurements for comparison: {simulated.not_copied}"
 
 
-def _errors_text(error: PredictionErrors, units: Mapping[str, str] | None) -> str:
+def _errors_text(
+    error: PredictionErrors, units: Mapping[str, str] | None
+) -> str:
     """Return the errors of a prediction in words; "" if nothing is compared.
 
     `units` are the units of custom sensors by name; None if none states a unit.
@@ -505,7 +604,8 @@ def _errors_text(error: PredictionErrors, units: Mapping[str, str] | None) -> st
         for reading, rms in (error.reading_rms or {}).items()
     ]
     texts += [
-        f"depth of {camera} {_depth_text(each)}" for camera, each in (error.depth or {}).items()
+        f"depth of {camera} {_depth_text(each)}"
+        for camera, each in (error.depth or {}).items()
     ]
     return "; ".join(texts)
 
@@ -523,9 +623,7 @@ def _depth_text(error: DepthError) -> str:
     sentence = f"{1e3 * error.rms_m:.3g} mm RMS of {error.points} points"
     if not error.share_beyond_gate:
         return f"{sentence}, all within the gate of {1e3 * error.gate_m:.3g} mm"
-    beyond = (
-        f"{sentence}, {error.share_beyond_gate:.0%} beyond the gate of {1e3 * error.gate_m:.3g} mm"
-    )
+    beyond = f"{sentence}, {error.share_beyond_gate:.0%} beyond the gate of {1e3 * error.gate_m:.3g} mm"
     if error.rms_within_gate_m is None:
         return beyond
     return f"{beyond}, the others {1e3 * error.rms_within_gate_m:.3g} mm RMS"
@@ -555,10 +653,16 @@ def _cards(result: Result) -> Cards:
     values = result.values
     fit = result.fit
     simulated = result.rollout
-    name = next((key for key in STIFFNESS_NAMES if key in values), next(iter(values)))
+    name = next(
+        (key for key in STIFFNESS_NAMES if key in values), next(iter(values))
+    )
     interval = values[name].combined95
     value = f"{number(values[name].value, 4)} {unit_of(name)}"
-    known = "{:.4g} to {:.4g} (95 %)".format(*interval) if interval else "no error bar"
+    known = (
+        "{:.4g} to {:.4g} (95 %)".format(*interval)
+        if interval
+        else "no error bar"
+    )
     alone = f"RMS; expected from noise alone: {millimetres(fit.noise_rms_m)}"
     most = f"RMS; {millimetres(simulated.max_m)} at most"
     return Cards(
@@ -603,12 +707,28 @@ def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
     for experiment, places in result.places.items():
         rows = []
         for marker, place in places.items():
-            errors_m = [None] * 3 if place.std_error_m is None else place.std_error_m
+            errors_m = (
+                [None] * 3 if place.std_error_m is None else place.std_error_m
+            )
             cells = []
             for x, error in zip(place.position_m, errors_m, strict=True):
-                cells += [f"{1e3 * x:.2f}", "–" if error is None else number(1e3 * error, 2)]
-            prior = "exact" if place.prior_m == 0 else _size_text(place.prior_m, "m")
-            rows.append((marker, *cells, prior, "" if place.is_declared else "not given"))
+                cells += [
+                    f"{1e3 * x:.2f}",
+                    "–" if error is None else number(1e3 * error, 2),
+                ]
+            prior = (
+                "exact"
+                if place.prior_m == 0
+                else _size_text(place.prior_m, "m")
+            )
+            rows.append(
+                (
+                    marker,
+                    *cells,
+                    prior,
+                    "" if place.is_declared else "not given",
+                )
+            )
         heads = ("", "x", "±", "y", "±", "z", "±", "prior ±", "")
         if rows:
             table = Table("", heads, tuple(rows), texts=1)
@@ -649,10 +769,17 @@ def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
             )
             for each in result.residuals
         )
-        yield Table("", ("marker", "RMS", "samples", "diagnosis"), rows, texts=1)
+        yield Table(
+            "", ("marker", "RMS", "samples", "diagnosis"), rows, texts=1
+        )
     if worst := _largest_errors(run):
-        rows = tuple((w, f"{number(t_s, 4)} s", millimetres(m)) for m, t_s, w in worst)
-        yield from ("Largest errors:", Table("", ("marker", "time", "error"), rows))
+        rows = tuple(
+            (w, f"{number(t_s, 4)} s", millimetres(m)) for m, t_s, w in worst
+        )
+        yield from (
+            "Largest errors:",
+            Table("", ("marker", "time", "error"), rows),
+        )
 
 
 def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
@@ -668,7 +795,9 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
     """
     arrays = read_arrays(run)
     worst = []
-    for key in (key for key in arrays if key.rpartition("/")[2] == "residuals_m"):
+    for key in (
+        key for key in arrays if key.rpartition("/")[2] == "residuals_m"
+    ):
         prefix = key.removesuffix("residuals_m")
         t_s = arrays[f"{prefix}t_s"]
         markers = arrays[f"{prefix}marker_names"]
@@ -676,14 +805,23 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
         residuals_m = arrays[key]
         largest = float(np.nanmax(np.abs(residuals_m), initial=0.0))
         if residuals_m.shape != shape or largest > LARGEST_NUMBER:
-            raise ValueError(f"the shape of {key} does not match its times and markers")
+            raise ValueError(
+                f"the shape of {key} does not match its times and markers"
+            )
         errors = np.nan_to_num(np.linalg.norm(residuals_m, axis=2))
         for _ in range(SHOWN_ERRORS if errors.size else 0):
             t, m = np.unravel_index(int(errors.argmax()), errors.shape)
             if not errors[t, m] > 0:
                 break
-            worst.append((float(errors[t, m]), float(t_s[t]), f"{prefix}{markers[m]}"))
-            errors[max(0, t - ERROR_SPACING_SAMPLES) : t + ERROR_SPACING_SAMPLES + 1, m] = 0
+            worst.append(
+                (float(errors[t, m]), float(t_s[t]), f"{prefix}{markers[m]}")
+            )
+            errors[
+                max(0, t - ERROR_SPACING_SAMPLES) : t
+                + ERROR_SPACING_SAMPLES
+                + 1,
+                m,
+            ] = 0
     return sorted(worst, key=lambda each: -each[0])[:SHOWN_ERRORS]
 
 
@@ -700,25 +838,45 @@ def _captioned_pictures(run: Path) -> list[Picture]:
         """Return the key of `PICTURE_CAPTIONS` with which a name begins; "" if none."""
         return next(k for k in order if file.stem.startswith(k))
 
-    for file in sorted(own_pictures(run), key=lambda file: (order.index(kind(file)), file.name)):
+    for file in sorted(
+        own_pictures(run), key=lambda file: (order.index(kind(file)), file.name)
+    ):
         about = file.stem.removeprefix(kind(file)).strip("_")
         caption = PICTURE_CAPTIONS.get(kind(file), file.stem)
-        pictures.append(Picture(file, f"{about}: {caption}" if about and kind(file) else caption))
-    compared = (each for each in pictures if kind(each.file) in LEADING_PICTURES)
+        pictures.append(
+            Picture(
+                file, f"{about}: {caption}" if about and kind(file) else caption
+            )
+        )
+    compared = (
+        each for each in pictures if kind(each.file) in LEADING_PICTURES
+    )
     first = next(compared, None)
-    return pictures if first is None else [first, *(p for p in pictures if p is not first)]
+    return (
+        pictures
+        if first is None
+        else [first, *(p for p in pictures if p is not first)]
+    )
 
 
 def _provenance_parts(result: Result, run: Path) -> Iterator[Shown]:
     """Yield a table of the problem and software versions, and the problem file as it was run."""
     rows = content(result.problem) | content(result.provenance)
-    listed_rows = ((key, each if isinstance(each, list) else [each]) for key, each in rows.items())
+    listed_rows = (
+        (key, each if isinstance(each, list) else [each])
+        for key, each in rows.items()
+    )
     yield Table(
-        "", (), tuple((key, ", ".join(map(str, each))) for key, each in listed_rows), texts=1
+        "",
+        (),
+        tuple((key, ", ".join(map(str, each))) for key, each in listed_rows),
+        texts=1,
     )
     file = run / "problem.toml"
     if is_own(run, file):
-        yield Listing("The problem file as run", file.read_text(encoding="utf-8"))
+        yield Listing(
+            "The problem file as run", file.read_text(encoding="utf-8")
+        )
 
 
 def _size_text(value: float | None, unit: str) -> str:

@@ -67,13 +67,16 @@ def write_vtu(
 
     if meshio_type not in VTK_CELL_TYPES:
         raise InputError(
-            f"no cell type {meshio_type!r}; available: {', '.join(VTK_CELL_TYPES)}", path
+            f"no cell type {meshio_type!r}; available: {', '.join(VTK_CELL_TYPES)}",
+            path,
         )
     points = np.asarray(points_m, dtype=float)
     nodes = np.asarray(cells, dtype=np.int64)
     at_points = _checked_arrays("point", point_data or {}, len(points), path)
     in_cells = _checked_arrays("cell", cell_data or {}, len(nodes), path)
-    by_block: dict[str, Any] = {name: [array] for name, array in in_cells.items()}
+    by_block: dict[str, Any] = {
+        name: [array] for name, array in in_cells.items()
+    }
     mesh = meshio.Mesh(points, [(meshio_type, nodes)], {**at_points}, by_block)
     meshio.vtu.write(path, mesh, compression="")
 
@@ -108,10 +111,14 @@ def _checked_arrays(
             )
         if array.dtype.kind == "b":
             arrays[name] = array.astype(np.int8)
-    return {escape(name, {'"': "&quot;"}): array for name, array in arrays.items()}
+    return {
+        escape(name, {'"': "&quot;"}): array for name, array in arrays.items()
+    }
 
 
-def write_pvd(path: str | Path, frames: Sequence[tuple[float, str | Path]]) -> None:
+def write_pvd(
+    path: str | Path, frames: Sequence[tuple[float, str | Path]]
+) -> None:
     """Write the list of frames that ParaView opens as one animation.
 
     Parameters
@@ -125,7 +132,9 @@ def write_pvd(path: str | Path, frames: Sequence[tuple[float, str | Path]]) -> N
     lines = []
     for t_s, file in frames:
         name = Path(os.path.relpath(Path(file).resolve(), folder)).as_posix()
-        lines.append(f'<DataSet timestep="{t_s:.9g}" part="0" file={quoteattr(name)}/>\n')
+        lines.append(
+            f'<DataSet timestep="{t_s:.9g}" part="0" file={quoteattr(name)}/>\n'
+        )
     Path(path).write_text(
         '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n<Collection>\n'
         f"{''.join(lines)}</Collection>\n</VTKFile>\n",
@@ -174,12 +183,21 @@ def write_frames(
     times = np.asarray(t_s, dtype=float)
     positions = np.asarray(positions_m, dtype=float)
     alone = len(times) == 1
-    velocities = np.zeros_like(positions) if alone else np.gradient(positions, times, axis=0)
-    series = {name: np.asarray(values) for name, values in (point_series or {}).items()}
+    velocities = (
+        np.zeros_like(positions)
+        if alone
+        else np.gradient(positions, times, axis=0)
+    )
+    series = {
+        name: np.asarray(values)
+        for name, values in (point_series or {}).items()
+    }
     frames = Path(folder) / "frames"
     frames.mkdir(exist_ok=True)
     written = []
-    for number, k in enumerate(range(0, len(times), -(-len(times) // max_frames))):
+    for number, k in enumerate(
+        range(0, len(times), -(-len(times) // max_frames))
+    ):
         file = frames / f"frame_{number:04d}.vtu"
         data = {
             "displacement_m": positions[k] - undeformed_m,
@@ -189,7 +207,8 @@ def write_frames(
         in_cells = dict(cell_data or {})
         if fields is not None:
             in_cells |= {
-                name: values[0] for name, values in fields.evaluate_at(positions[k]).items()
+                name: values[0]
+                for name, values in fields.evaluate_at(positions[k]).items()
             }
         write_vtu(
             file,
@@ -253,7 +272,11 @@ def replaced_folder(
         raise
     try:
         require_replaceable(target, overwrite, marker_file, content_word)
-        _replace_folder(temporary, target, target.with_name(f".{target.name}.{process_name}.old"))
+        _replace_folder(
+            temporary,
+            target,
+            target.with_name(f".{target.name}.{process_name}.old"),
+        )
     except (InputError, OSError) as error:
         backup = target.with_name(f"{target.name}-{process_name}")
         with suppress(OSError):
@@ -266,7 +289,11 @@ def replaced_folder(
 
 def _resolved_parent(path: Path) -> Path:
     """Return the absolute path with all links resolved, except a link at `path` itself."""
-    return path.resolve() if path.name in ("", "..") else path.parent.resolve() / path.name
+    return (
+        path.resolve()
+        if path.name in ("", "..")
+        else path.parent.resolve() / path.name
+    )
 
 
 def _remove_stale(target: Path) -> None:
@@ -296,7 +323,10 @@ def _is_running(process: int) -> bool:
 
 
 def require_replaceable(
-    target: Path, overwrite: bool = True, marker_file: str = RESULT_FILE, content_word: str = "run"
+    target: Path,
+    overwrite: bool = True,
+    marker_file: str = RESULT_FILE,
+    content_word: str = "run",
 ) -> None:
     """Refuse a place for a run folder that holds anything but an earlier run.
 
@@ -311,9 +341,14 @@ def require_replaceable(
     if not target.exists():
         return
     if not target.is_dir():
-        raise InputError("is a file, expected a folder for the run; choose another", target)
+        raise InputError(
+            "is a file, expected a folder for the run; choose another", target
+        )
     if os.path.ismount(target):
-        raise InputError("is a mount point and cannot be replaced; choose a folder in it", target)
+        raise InputError(
+            "is a mount point and cannot be replaced; choose a folder in it",
+            target,
+        )
     if not any(target.iterdir()):
         return
     if not (target / marker_file).is_file():
@@ -325,7 +360,8 @@ def require_replaceable(
         )
     if not overwrite:
         raise InputError(
-            "the folder holds an earlier run; choose another, or allow it to be overwritten", target
+            "the folder holds an earlier run; choose another, or allow it to be overwritten",
+            target,
         )
     require_only_written(target)
 
@@ -366,7 +402,8 @@ def require_only_written(folder: Path) -> None:
     else:
         why = f"it has no {LIST_FILE}, which lists what this program wrote, but it contains {name}"
     raise InputError(
-        f"{why}, so the folder is left alone; choose another, or move that away", folder
+        f"{why}, so the folder is left alone; choose another, or move that away",
+        folder,
     )
 
 

@@ -64,7 +64,9 @@ class Heartbeat:
         self._tell = show_line
         self._first_s = FIRST_LINE_S if first_s is None else first_s
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=self.NAME, daemon=True)
+        self._thread = threading.Thread(
+            target=self._run, name=self.NAME, daemon=True
+        )
 
     def start(self) -> None:
         """Start the thread and its clock."""
@@ -80,7 +82,9 @@ class Heartbeat:
         """Show lines until `stop` is called; the body of the thread."""
         began = time.monotonic()
         passed_s = 0.0
-        while not self._ended.wait(max(self._first_s, ELAPSED_GROWTH * passed_s)):
+        while not self._ended.wait(
+            max(self._first_s, ELAPSED_GROWTH * passed_s)
+        ):
             passed_s = time.monotonic() - began
             self._tell(f"{self._doing()} ({passed_s:.3g} s so far)")
 
@@ -124,7 +128,11 @@ class SolveProgress(Watched):
         self._share_shown_s = 0.0
         self._contexts = ExitStack()
         silent = not (console.is_terminal or quiet)
-        self._heartbeat = Heartbeat(self._activity_with_iterations, self.line) if silent else None
+        self._heartbeat = (
+            Heartbeat(self._activity_with_iterations, self.line)
+            if silent
+            else None
+        )
 
     def __enter__(self) -> SolveProgress:
         for note in self._notes:
@@ -171,7 +179,9 @@ class SolveProgress(Watched):
         if now_s - self._share_shown_s < SHARE_INTERVAL_S:
             return
         self._share_shown_s = now_s
-        self._remaining = f": {done:.0%}{_remaining_time(now_s - self._phase_began_s, done)}"
+        self._remaining = (
+            f": {done:.0%}{_remaining_time(now_s - self._phase_began_s, done)}"
+        )
         self._redraw()
 
     def _update_activity(self, activity: str, line: str = "") -> None:
@@ -193,7 +203,11 @@ class SolveProgress(Watched):
         if self._remaining:
             return f"{self._doing}{self._remaining}"
         elapsed_s = time.monotonic() - self._activity_began_s
-        elapsed = f" ({elapsed_s:.0f} s so far)" if elapsed_s >= FIRST_ELAPSED_S else ""
+        elapsed = (
+            f" ({elapsed_s:.0f} s so far)"
+            if elapsed_s >= FIRST_ELAPSED_S
+            else ""
+        )
         return f"{self._doing}{elapsed}"
 
     def _activity_with_iterations(self) -> str:
@@ -245,8 +259,19 @@ def _iteration_table(lines: list[Iteration]) -> Shown:
     """Return the table of the last iterations; "" if `lines` is empty."""
     if not lines:
         return ""
-    heads = ("", "RMS mm", "violation N", *map(symbol_of, lines[-1].parameters), "s")
-    return Table("", heads, tuple(map(_iteration_row, lines[-SHOWN_ITERATIONS:])), names=0)
+    heads = (
+        "",
+        "RMS mm",
+        "violation N",
+        *map(symbol_of, lines[-1].parameters),
+        "s",
+    )
+    return Table(
+        "",
+        heads,
+        tuple(map(_iteration_row, lines[-SHOWN_ITERATIONS:])),
+        names=0,
+    )
 
 
 def _iteration_row(line: Iteration) -> tuple[str, ...]:

@@ -38,7 +38,13 @@ from ..recording import (
 from ..recording.recording_writers import write_columns_csv
 from ..recording.specimen_files import SpecimenLayout, specimen_columns
 from ..validated_types import Count, NotNegative, Options, Positive
-from ..written_files import LIST_FILE, hashes_of, is_written_here, list_as_text, listed_hashes
+from ..written_files import (
+    LIST_FILE,
+    hashes_of,
+    is_written_here,
+    list_as_text,
+    listed_hashes,
+)
 from .run_writers import (
     FRAMES_FILE,
     replaced_folder,
@@ -140,13 +146,18 @@ def write_data(
     recipe = recipe or Recipe()
     _require_guesses(problem)
     sections = _experiment_sections(problem)
-    names = [_table_names(each, sections.get(each.name)) for each in problem.experiments]
+    names = [
+        _table_names(each, sections.get(each.name))
+        for each in problem.experiments
+    ]
     _require_separate_files(problem, names)
     files = [place / name for named in names for name in named.values()]
     _refuse_foreign(problem, place, files)
     for experiment in problem.experiments if recipe.frames else ():
         require_replaceable(
-            place / experiment.name, marker_file=FRAMES_FILE, content_word="simulation"
+            place / experiment.name,
+            marker_file=FRAMES_FILE,
+            content_word="simulation",
         )
     rng = np.random.default_rng(recipe.seed)
     simulated = [
@@ -156,7 +167,9 @@ def write_data(
             recipe.integrator,
             timestep_s=recipe.timestep_s,
             # The grid of the problem is that of schemes; Newmark's step is stated in the recipe.
-            substeps="auto" if recipe.integrator == NEWMARK else problem.substeps,
+            substeps="auto"
+            if recipe.integrator == NEWMARK
+            else problem.substeps,
             progress=progress,
         )
         for experiment in problem.experiments
@@ -169,11 +182,18 @@ def write_data(
         ):
             section = sections.get(experiment.name)
             files = [place / n for n in named.values()]
-            drafts = [stack.enter_context(replaced_file(file)) for file in files]
+            drafts = [
+                stack.enter_context(replaced_file(file)) for file in files
+            ]
             drafts_of |= dict(zip(files, drafts, strict=True))
             by_key = dict(zip(named, drafts, strict=True))
             _write_tables(
-                experiment, section, trajectory=trajectory, files=by_key, rng=rng, recipe=recipe
+                experiment,
+                section,
+                trajectory=trajectory,
+                files=by_key,
+                rng=rng,
+                recipe=recipe,
             )
             written += files
             if recipe.frames:
@@ -223,7 +243,9 @@ def _write_tables(
     """
     if experiment.specimen is not None or isinstance(section, SpecimenSection):
         stated = section if isinstance(section, SpecimenSection) else None
-        _write_specimen(experiment, stated, trajectory, files[_SPECIMEN_KEY], rng, recipe)
+        _write_specimen(
+            experiment, stated, trajectory, files[_SPECIMEN_KEY], rng, recipe
+        )
         return
     noise = recipe.noise_m * rng.normal(size=trajectory.markers_m.shape)
     names = experiment.markers.names
@@ -233,29 +255,37 @@ def _write_tables(
     for k, grasp in enumerate(experiment.grasps):
         if (key := _numbered_key("poses", k)) in files:
             write_poses_csv(files[key], grasp.poses)
-    layouts = _wrench_layouts(section) or [WrenchSection.model_construct()] * len(
-        experiment.wrenches
-    )
+    layouts = _wrench_layouts(section) or [
+        WrenchSection.model_construct()
+    ] * len(experiment.wrenches)
     wrenches = []
     for sensor, wrench, layout in zip(
         experiment.wrenches, trajectory.wrenches, layouts, strict=True
     ):
         measured = np.where(sensor.measured_components, wrench, np.nan)
         # The load cell's noise: that of the modelled part is as much smaller as its load.
-        sigmas = np.repeat([recipe.noise_n, recipe.noise_nm], 3) / layout.symmetry
+        sigmas = (
+            np.repeat([recipe.noise_n, recipe.noise_nm], 3) / layout.symmetry
+        )
         wrenches.append(measured + sigmas * rng.normal(size=wrench.shape))
     if section is not None and has_displacement_table(section):
         for name, table in bench_tables(section, experiment, wrenches).items():
             write_columns_csv(files[name], table.columns)
     else:
-        for k, (sensor, layout) in enumerate(zip(experiment.wrenches, layouts, strict=True)):
+        for k, (sensor, layout) in enumerate(
+            zip(experiment.wrenches, layouts, strict=True)
+        ):
             table = BenchTable(sensor.t_s)
             add_wrench(table, layout, sensor.t_s, wrenches[k])
             write_columns_csv(files[_numbered_key("wrench", k)], table.columns)
-    for gauge, read in zip(experiment.readings, trajectory.custom_sensor_values, strict=True):
+    for gauge, read in zip(
+        experiment.readings, trajectory.custom_sensor_values, strict=True
+    ):
         noise = recipe.noise_own * gauge.sigma * rng.normal(size=read.shape)
         key = f"reading_{gauge.name}"
-        write_gauge_csv(files[key], gauge.sample_times_s, gauge.columns, read + noise)
+        write_gauge_csv(
+            files[key], gauge.sample_times_s, gauge.columns, read + noise
+        )
 
 
 def _write_specimen(
@@ -269,7 +299,9 @@ def _write_specimen(
     """Write the table of a specimen with simulated stresses and noise; see `_write_tables`."""
     assert experiment.specimen is not None
     values = {}
-    for gauge, read in zip(experiment.readings, trajectory.custom_sensor_values, strict=True):
+    for gauge, read in zip(
+        experiment.readings, trajectory.custom_sensor_values, strict=True
+    ):
         noise = recipe.noise_own * gauge.sigma * rng.normal(size=read.shape)
         values[gauge.name] = (read + noise)[:, 0]
     layout = SpecimenLayout(test=experiment.specimen.test, columns={})
@@ -295,7 +327,9 @@ def _require_guesses(problem: Problem) -> None:
         )
 
 
-def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> None:
+def _refuse_foreign(
+    problem: Problem, place: Path, files: Iterable[Path]
+) -> None:
     """Refuse to write into a folder with files of others, or over a file that the problem reads.
 
     A file that the problem reads may be a measured recording. The problem's own folder may have
@@ -315,7 +349,11 @@ def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> Non
         Naming the folder or the file.
     """
     require_no_link(place)
-    read = {file.resolve() for file in problem.origin.files} if problem.origin else set()
+    read = (
+        {file.resolve() for file in problem.origin.files}
+        if problem.origin
+        else set()
+    )
     for file in files:
         if file.exists() and file.resolve() in read:
             raise InputError(
@@ -329,12 +367,17 @@ def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> Non
                 "it is not overwritten; choose another folder, or move the file",
                 file,
             )
-    at_home = problem.path is not None and problem.path.resolve().parent == place.resolve()
+    at_home = (
+        problem.path is not None
+        and problem.path.resolve().parent == place.resolve()
+    )
     if place.is_dir() and not at_home:
         require_only_written(place)
 
 
-def _experiment_sections(problem: Problem) -> dict[str, ExperimentSection | SpecimenSection]:
+def _experiment_sections(
+    problem: Problem,
+) -> dict[str, ExperimentSection | SpecimenSection]:
     """Return the table of each experiment in the problem file, by name; empty without a file."""
     if (origin := problem.origin) is None:
         return {}
@@ -356,18 +399,29 @@ def _table_names(
     keys = [_MARKERS_KEY] * bool(experiment.markers.names)
     for k in range(len(experiment.grasps)):
         moved = section and section.moved_sections[k]
-        if moved is None or moved.poses is not None or moved.markers is not None:
+        if (
+            moved is None
+            or moved.poses is not None
+            or moved.markers is not None
+        ):
             keys.append(_numbered_key("poses", k))
     bench: list[str] = []
     if section is not None and has_displacement_table(section):
         tables = [
-            t for each in section.moved_sections for t in (each.displacement, each.wrench) if t
+            t
+            for each in section.moved_sections
+            for t in (each.displacement, each.wrench)
+            if t
         ]
         bench = [table_name(section, table) for table in tables]
     else:
-        keys += [_numbered_key("wrench", k) for k in range(len(experiment.wrenches))]
+        keys += [
+            _numbered_key("wrench", k) for k in range(len(experiment.wrenches))
+        ]
     keys += [f"reading_{gauge.name}" for gauge in experiment.readings]
-    return {key: f"{experiment.name}_{key}.csv" for key in keys} | {name: name for name in bench}
+    return {key: f"{experiment.name}_{key}.csv" for key in keys} | {
+        name: name for name in bench
+    }
 
 
 def _numbered_key(kind: str, index: int) -> str:
@@ -375,7 +429,9 @@ def _numbered_key(kind: str, index: int) -> str:
     return f"{kind}_{index + 1}" if index else kind
 
 
-def _require_separate_files(problem: Problem, names: Sequence[Mapping[str, str]]) -> None:
+def _require_separate_files(
+    problem: Problem, names: Sequence[Mapping[str, str]]
+) -> None:
     """Refuse experiments that read the same file, because a simulation writes one for each.
 
     `names` are the results of `_table_names`, one for each experiment of the problem.

@@ -90,7 +90,9 @@ class ForwardSimulation:
     wrench_rms: tuple[float | None, float | None] = (None, None)
     readings: Mapping[str, Array] = field(default_factory=dict)
     reading_rms: Mapping[str, float] = field(default_factory=dict)
-    depth_surfaces: Mapping[str, SurfaceComparison] = field(default_factory=dict)
+    depth_surfaces: Mapping[str, SurfaceComparison] = field(
+        default_factory=dict
+    )
     misfits: tuple[InstrumentMisfit, ...] = ()
     blind_error: PredictionErrors | None = None
     copy_error: CopyError | str = ""
@@ -98,7 +100,9 @@ class ForwardSimulation:
     @property
     def depth(self) -> dict[str, DepthError]:
         """Distances of depth cameras' points from the simulated surface, by camera."""
-        return {name: surface.error for name, surface in self.depth_surfaces.items()}
+        return {
+            name: surface.error for name, surface in self.depth_surfaces.items()
+        }
 
 
 def simulate_experiments(
@@ -121,8 +125,13 @@ def simulate_experiments(
         return simulate_experiment(problem, experiment, solution, report)
 
     with counted_phase(StepUnit.SIMULATION, len(problem.experiments)):
-        rollouts = map_experiments(simulate_counted, problem.experiments, threads)
-    return {e.name: each for e, each in zip(problem.experiments, rollouts, strict=True)}
+        rollouts = map_experiments(
+            simulate_counted, problem.experiments, threads
+        )
+    return {
+        e.name: each
+        for e, each in zip(problem.experiments, rollouts, strict=True)
+    }
 
 
 def simulate_experiment(
@@ -158,7 +167,9 @@ def simulate_experiment(
     fitted = [part.segment.experiment for part in solution.parts]
     return replace(
         rollout,
-        nuisance=dict(zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True)),
+        nuisance=dict(
+            zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True)
+        ),
         places_m=dict(zip(experiment.markers.names, places_m, strict=True)),
         blind_error=_blind_error(problem, segment, solution),
         copy_error=nearest_recording_error(experiment, fitted),
@@ -201,7 +212,9 @@ def simulate_with_parameters(
     InputError, SimulationError
         Where the simulation fails.
     """
-    trajectory = _simulate(problem, segment, phi=phi, parameters=parameters, report=report)
+    trajectory = _simulate(
+        problem, segment, phi=phi, parameters=parameters, report=report
+    )
     predicted, surfaces = _predict_instruments(segment, trajectory, phi)
     error = prediction_error(experiment, predicted)
     return ForwardSimulation(
@@ -235,7 +248,9 @@ def _simulate(
     InputError, SimulationError
         Where that fails.
     """
-    integrator = problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
+    integrator = (
+        problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
+    )
     return simulate(
         with_contact_energy(segment.corrected_experiment(phi)),
         segment.body.theta_from_values(parameters),
@@ -267,7 +282,9 @@ def _predict_instruments(
     positions_m = trajectory.positions_m
     x = positions_m.reshape(len(positions_m), -1)
     gauged = zip(
-        segment.custom_sensors, _predict_sensors(segment, x, trajectory.reactions, phi), strict=True
+        segment.custom_sensors,
+        _predict_sensors(segment, x, trajectory.reactions, phi),
+        strict=True,
     )
     surfaces = {
         reading.correspondences.camera.depth.name: SurfaceComparison.from_motion(
@@ -278,9 +295,13 @@ def _predict_instruments(
     predicted = InstrumentPrediction(
         markers_m=segment.markers.predict_samples(positions_m, phi),
         wrenches=[
-            sensor.on_grid(grid).predict_reactions(forced, phi) for sensor in segment.sensors
+            sensor.on_grid(grid).predict_reactions(forced, phi)
+            for sensor in segment.sensors
         ],
-        readings={gauge.sensor.name: gauge.without_padding(each) for gauge, each in gauged},
+        readings={
+            gauge.sensor.name: gauge.without_padding(each)
+            for gauge, each in gauged
+        },
         depth={name: surface.error for name, surface in surfaces.items()},
     )
     return predicted, surfaces
@@ -329,7 +350,9 @@ def transcription_and_nuisance(
     # All that is left to estimate is φ.
     if not alone.nphi:
         return segment, np.zeros(0)
-    return segment, alone.parameters_from(ReducedSpace()(alone).unless_interrupted().z)
+    return segment, alone.parameters_from(
+        ReducedSpace()(alone).unless_interrupted().z
+    )
 
 
 def step_error(
@@ -361,7 +384,11 @@ def step_error(
     """
     differences: list[Array] = []
     collocation = solution.collocation
-    moving = [s.experiment for s in collocation.transcriptions if not s.experiment.is_static]
+    moving = [
+        s.experiment
+        for s in collocation.transcriptions
+        if not s.experiment.is_static
+    ]
     if not moving or any(experiment.obstacles for experiment in moving):
         return None
     for part, readings in zip(solution.parts, solution.readings_m, strict=True):
@@ -372,9 +399,13 @@ def step_error(
         if not isinstance(rollout, ForwardSimulation) or share is None:
             return None
         way = share * (rollout.trajectory.markers_m - readings)
-        differences.append(np.nan_to_num(way / experiment.markers.sigma_m[:, None]))
+        differences.append(
+            np.nan_to_num(way / experiment.markers.sigma_m[:, None])
+        )
         fitted = solution.wrenches.get(experiment.name, [])
-        for sensor, read, rolled in zip(segment.sensors, fitted, rollout.wrenches, strict=True):
+        for sensor, read, rolled in zip(
+            segment.sensors, fitted, rollout.wrenches, strict=True
+        ):
             way = share * np.nan_to_num((rolled - read) / sensor.wrench.sigmas)
             differences.append(way.reshape(-1, 2, 3))
         differences += _sensor_differences(part, rollout.trajectory, share)
@@ -406,10 +437,17 @@ def _sensor_differences(
         part.x[segment.markers.sample_rows],
         (ReactionGrid.from_dynamics(segment.dynamics), part.motion.reactions),
     )
-    rolled = trajectory.positions_m.reshape(len(fitted[0]), -1), trajectory.reactions
-    here, there = (_predict_sensors(segment, *each, part.phi) for each in (fitted, rolled))
+    rolled = (
+        trajectory.positions_m.reshape(len(fitted[0]), -1),
+        trajectory.reactions,
+    )
+    here, there = (
+        _predict_sensors(segment, *each, part.phi) for each in (fitted, rolled)
+    )
     return [
-        share * np.nan_to_num(simulated_values - fitted_values) / gauge.sigmas[:, None]
+        share
+        * np.nan_to_num(simulated_values - fitted_values)
+        / gauge.sigmas[:, None]
         for gauge, fitted_values, simulated_values in zip(
             segment.custom_sensors, here, there, strict=True
         )
@@ -428,18 +466,25 @@ def _depth_differences(
     rows_s = part.segment.dynamics.t_s
     fitted = part.x[part.segment.markers.sample_rows]
     way_m = share * (trajectory.positions_m.reshape(len(fitted), -1) - fitted)
-    way_rows_m = np.array([np.interp(rows_s, known_s, each) for each in way_m.T])
+    way_rows_m = np.array(
+        [np.interp(rows_s, known_s, each) for each in way_m.T]
+    )
     displacements_m = way_rows_m.T.reshape(len(rows_s), -1, 3, 1)
     return [
         reading.residual_changes(
-            observation, displacements_m[:, reading.correspondences.surface.nodes], part.phi
+            observation,
+            displacements_m[:, reading.correspondences.surface.nodes],
+            part.phi,
         )[..., 0]
         for reading, observation in sights
     ]
 
 
 def _predict_sensors(
-    segment: Transcription, x: Array, reactions: tuple[ReactionGrid, ReactionForces], phi: Array
+    segment: Transcription,
+    x: Array,
+    reactions: tuple[ReactionGrid, ReactionForces],
+    phi: Array,
 ) -> list[Array]:
     """Return the predictions of custom sensors, for each (S, G, 3) at S samples of G points or
     wrenches.

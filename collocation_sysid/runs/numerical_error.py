@@ -13,7 +13,11 @@ from ..methods.solution import Solution
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..recording import experiment_refinement
-from ..statistics.discretisation_error import Refinement, RefinementLevel, discretisation_errors
+from ..statistics.discretisation_error import (
+    Refinement,
+    RefinementLevel,
+    discretisation_errors,
+)
 from ..statistics.estimates import Estimate
 from .solved_problem import SolvedProblem
 from .solving import solve
@@ -35,8 +39,13 @@ def finer_mesh(problem: Problem) -> Problem:
     """Return the problem with every tetrahedron of its bodies split into eight, and experiments,
     grasps included, that refer to the new meshes; the cells of specimens are exact and stay.
     """
-    meshed = [each.body for each in problem.experiments if each.specimen is None]
-    bodies = {id(body): refine_body(body) for body in {id(b): b for b in meshed}.values()}
+    meshed = [
+        each.body for each in problem.experiments if each.specimen is None
+    ]
+    bodies = {
+        id(body): refine_body(body)
+        for body in {id(b): b for b in meshed}.values()
+    }
     experiments = [
         e
         if e.specimen is not None
@@ -49,7 +58,11 @@ def finer_mesh(problem: Problem) -> Problem:
 REFINEMENTS = {"step": finer_step, "mesh": finer_mesh}
 
 
-def refine(run: A, levels: int = 2, report_progress: Callable[[str], None] | None = None) -> A:
+def refine(
+    run: A,
+    levels: int = 2,
+    report_progress: Callable[[str], None] | None = None,
+) -> A:
     """Return a converged run with its numerical error, see `solve_refined`."""
     answer = WarmStart.of(run.solution)
     problem = replace(run.problem, substeps=run.solution.collocation.substeps)
@@ -57,7 +70,11 @@ def refine(run: A, levels: int = 2, report_progress: Callable[[str], None] | Non
     return replace(
         run,
         refinement=solve_refined(
-            problem, answer, estimates=estimates, levels=levels, report_progress=report_progress
+            problem,
+            answer,
+            estimates=estimates,
+            levels=levels,
+            report_progress=report_progress,
         ),
     )
 
@@ -102,7 +119,11 @@ def solve_refined(
     """
     if not 2 <= levels <= MOST_LEVELS:
         raise InputError(f"levels = {levels}; expected 2 or {MOST_LEVELS}")
-    fitted = [experiment for experiment in problem.experiments if not experiment.validation]
+    fitted = [
+        experiment
+        for experiment in problem.experiments
+        if not experiment.validation
+    ]
     if all(experiment.specimen is not None for experiment in fitted):
         raise InputError(
             "the deformation of specimens is homogeneous and exact, without a mesh and time steps; "
@@ -115,15 +136,21 @@ def solve_refined(
     for kind, finer in REFINEMENTS.items():
         at = coarse
         start = solution
-        for level in range(1, levels if moving or kind == "mesh" else 1):  # equilibria have no step
+        for level in range(
+            1, levels if moving or kind == "mesh" else 1
+        ):  # equilibria have no step
             at = finer(at)
             if (kind, level) in solved:
                 reached.append(solved[kind, level])
-                start = replace(solution, values={**solution.values, **reached[-1].values})
+                start = replace(
+                    solution, values={**solution.values, **reached[-1].values}
+                )
                 continue
             if report_progress is not None:
                 report_progress(f"solving again: {kind} halved {level}×")
-            refined = _solve_refined_problem(at, start, f"{kind} halved {level}×")
+            refined = _solve_refined_problem(
+                at, start, f"{kind} halved {level}×"
+            )
             start = WarmStart.of(refined)
             reached.append(_level_summary(kind, level, refined))
             if save_progress is not None:
@@ -132,13 +159,16 @@ def solve_refined(
 
 
 def _errors_from_levels(
-    levels: Sequence[RefinementLevel], problem: Problem, estimates: Mapping[str, Estimate]
+    levels: Sequence[RefinementLevel],
+    problem: Problem,
+    estimates: Mapping[str, Estimate],
 ) -> Refinement:
     """Return the numerical errors of the estimates from the levels solved so far, with these
     levels.
     """
     by_step, by_mesh = (
-        [each.values for each in levels if each.refined == kind] for kind in REFINEMENTS
+        [each.values for each in levels if each.refined == kind]
+        for kind in REFINEMENTS
     )
     order = as_scheme(problem.scheme).order
     errors = discretisation_errors(
@@ -151,7 +181,9 @@ def _errors_from_levels(
     return Refinement(errors, tuple(levels))
 
 
-def _solve_refined_problem(problem: Problem, start: WarmStart, what: str) -> Solution:
+def _solve_refined_problem(
+    problem: Problem, start: WarmStart, what: str
+) -> Solution:
     """Solve a finer problem in reduced space from an earlier answer.
 
     Raises
@@ -161,7 +193,9 @@ def _solve_refined_problem(problem: Problem, start: WarmStart, what: str) -> Sol
     KeyboardInterrupt
         If the solve is interrupted.
     """
-    solution = solve(problem, ReducedSpace(ladder=(1.0,), tolerance=TOLERANCE), start=start)
+    solution = solve(
+        problem, ReducedSpace(ladder=(1.0,), tolerance=TOLERANCE), start=start
+    )
     if not solution.unless_interrupted().status.converged:
         raise InputError(
             f"the problem with the {what} was not solved ({solution.status.value}: "
@@ -170,7 +204,9 @@ def _solve_refined_problem(problem: Problem, start: WarmStart, what: str) -> Sol
     return solution
 
 
-def _level_summary(kind: str, level: int, solution: Solution) -> RefinementLevel:
+def _level_summary(
+    kind: str, level: int, solution: Solution
+) -> RefinementLevel:
     """Return size, cost and estimates of a solved level.
 
     Parameters

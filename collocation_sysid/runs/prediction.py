@@ -107,14 +107,20 @@ class InstrumentPrediction:
     depth: Mapping[str, DepthError] = field(default_factory=dict)
 
 
-def prediction_error(experiment: Experiment, predicted: InstrumentPrediction) -> PredictionErrors:
+def prediction_error(
+    experiment: Experiment, predicted: InstrumentPrediction
+) -> PredictionErrors:
     """Return RMS and maximum differences between a prediction and the measurements of its
     recording, for each kind of instrument.
 
     Values that are not measured, or not predicted, are left out; a kind without values has None.
     """
-    distance_m = np.linalg.norm(predicted.markers_m - experiment.markers.positions_m, axis=2)
-    present_m = distance_m[experiment.markers.is_present & np.isfinite(distance_m)]
+    distance_m = np.linalg.norm(
+        predicted.markers_m - experiment.markers.positions_m, axis=2
+    )
+    present_m = distance_m[
+        experiment.markers.is_present & np.isfinite(distance_m)
+    ]
     force_n, torque_nm = wrench_rms(experiment, predicted.wrenches)
     return PredictionErrors(
         rms_m=root_mean(present_m**2) if present_m.size else None,
@@ -136,16 +142,28 @@ def instrument_misfits(
     results = []
     markers = experiment.markers
     if markers.is_present.any():
-        difference_m = (predicted.markers_m - markers.positions_m)[markers.is_present]
-        sigma_m = np.broadcast_to(markers.sigma_m, markers.is_present.shape)[markers.is_present]
+        difference_m = (predicted.markers_m - markers.positions_m)[
+            markers.is_present
+        ]
+        sigma_m = np.broadcast_to(markers.sigma_m, markers.is_present.shape)[
+            markers.is_present
+        ]
         rms_m = root_mean(np.sum(difference_m**2, axis=1))
         ratio = difference_m / sigma_m[:, None]
-        results.append(_misfit("the markers", "sigma_m", ratio, f"{1e3 * rms_m:.3g} mm RMS"))
-    for read, sensor in zip(predicted.wrenches, experiment.wrenches, strict=True):
+        results.append(
+            _misfit(
+                "the markers", "sigma_m", ratio, f"{1e3 * rms_m:.3g} mm RMS"
+            )
+        )
+    for read, sensor in zip(
+        predicted.wrenches, experiment.wrenches, strict=True
+    ):
         ratio = (read - sensor.values) / sensor.sigmas
         results.append(_misfit("the wrench", "sigma_n", ratio))
     for gauge in experiment.readings:
-        ratio = (predicted.readings[gauge.name] - gauge.measured_values) / gauge.sigma
+        ratio = (
+            predicted.readings[gauge.name] - gauge.measured_values
+        ) / gauge.sigma
         results.append(_misfit(gauge.name, "its sigma", ratio))
     for name, error in predicted.depth.items():
         if error.rms_m is not None:
@@ -164,7 +182,9 @@ def instrument_misfits(
     return results
 
 
-def _misfit(what: str, declared_size: str, ratio: Array, size: str = "") -> InstrumentMisfit:
+def _misfit(
+    what: str, declared_size: str, ratio: Array, size: str = ""
+) -> InstrumentMisfit:
     """Return the misfit of one instrument.
 
     Parameters
@@ -181,14 +201,21 @@ def _misfit(what: str, declared_size: str, ratio: Array, size: str = "") -> Inst
     known = ratio[np.isfinite(ratio)]
     sigmas = root_mean(known**2)
     return InstrumentMisfit(
-        what, declared_size, sigmas=sigmas, robust_sigmas=sigmas, count=known.size, size=size
+        what,
+        declared_size,
+        sigmas=sigmas,
+        robust_sigmas=sigmas,
+        count=known.size,
+        size=size,
     )
 
 
 # Blind predictions --------------------------------------------------------------------------------
 
 
-def nuisance_of_fitted_recordings(segment: Transcription, solution: Solution) -> Array:
+def nuisance_of_fitted_recordings(
+    segment: Transcription, solution: Solution
+) -> Array:
     """Return the nuisance parameters (k,) of a recording by those of the fitted recordings.
 
     Each is the mean over the fitted recordings that have one of the same label, such as the place
@@ -222,7 +249,10 @@ def nuisance_of_fitted_recordings(segment: Transcription, solution: Solution) ->
             if name in part.segment.experiment.markers.names
         ]
         if places_m:
-            directions_m = segment.association.sigma_m[number] * segment.association.axes[number]
+            directions_m = (
+                segment.association.sigma_m[number]
+                * segment.association.axes[number]
+            )
             way_m = np.mean(places_m, axis=0) - start_m[number]
             phi[places[number]] = np.linalg.pinv(directions_m) @ way_m
     return phi
@@ -250,18 +280,31 @@ def nearest_recording_error(
         if reason:
             reasons[other.name] = reason
             continue
-        order = [other.markers.names.index(name) for name in experiment.markers.names]
-        known_m = np.where(other.markers.is_present[..., None], other.markers.positions_m, np.nan)
+        order = [
+            other.markers.names.index(name) for name in experiment.markers.names
+        ]
+        known_m = np.where(
+            other.markers.is_present[..., None],
+            other.markers.positions_m,
+            np.nan,
+        )
         copy = InstrumentPrediction(
             markers_m=known_m[:, order],
             wrenches=[each.values for each in other.wrenches],
-            readings={gauge.name: gauge.measured_values for gauge in other.readings},
+            readings={
+                gauge.name: gauge.measured_values for gauge in other.readings
+            },
         )
         copies.append(CopyError(other.name, prediction_error(experiment, copy)))
     if not copies:
-        explanation = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
+        explanation = "; ".join(
+            f"{name}: {reason}" for name, reason in reasons.items()
+        )
         return f"no fitted recording can be copied ({explanation})"
-    return min(copies, key=lambda each: each.error.rms_m or each.error.wrench_rms_n or np.inf)
+    return min(
+        copies,
+        key=lambda each: each.error.rms_m or each.error.wrench_rms_n or np.inf,
+    )
 
 
 def _reason_against_copy(experiment: Experiment, other: Experiment) -> str:
@@ -276,10 +319,15 @@ def _reason_against_copy(experiment: Experiment, other: Experiment) -> str:
         return "other markers"
     if len(experiment.wrenches) != len(other.wrenches):
         return "other wrenches"
-    if [g.name for g in experiment.readings] != [g.name for g in other.readings]:
+    if [g.name for g in experiment.readings] != [
+        g.name for g in other.readings
+    ]:
         return "other readings"
     times = [(experiment.t_s, other.t_s)] if own.sample_count else []
-    times += [(a.t_s, b.t_s) for a, b in zip(experiment.wrenches, other.wrenches, strict=True)]
+    times += [
+        (a.t_s, b.t_s)
+        for a, b in zip(experiment.wrenches, other.wrenches, strict=True)
+    ]
     times += [
         (a.sample_times_s, b.sample_times_s)
         for a, b in zip(experiment.readings, other.readings, strict=True)
@@ -288,6 +336,9 @@ def _reason_against_copy(experiment: Experiment, other: Experiment) -> str:
     for here_s, there_s in times:
         if len(here_s) != len(there_s):
             return f"{len(there_s)} samples instead of {len(here_s)}"
-        if np.abs((here_s - starts_s[0]) - (there_s - starts_s[1])).max() > TIME_TOLERANCE_S:
+        if (
+            np.abs((here_s - starts_s[0]) - (there_s - starts_s[1])).max()
+            > TIME_TOLERANCE_S
+        ):
             return "other times"
     return ""

@@ -64,16 +64,23 @@ def build_result(answer: SolvedProblem) -> Result:
         trust=answer.trust,
         method=solution.method,
         title=problem.title,
-        parameters={item.name: values[item.name] for item in answer.start_parameters.items},
+        parameters={
+            item.name: values[item.name]
+            for item in answer.start_parameters.items
+        },
         derived={name: values[name] for name in answer.derived},
         basis=tuple(_reference_sentences(problem)),
         budget={name: line.shares for name, line in answer.budget.items()},
         probes=answer.probes,
         places=answer.places,
         nuisance=_nuisance(answer),
-        fields={name: _field_result(field) for name, field in answer.fields.items()},
+        fields={
+            name: _field_result(field) for name, field in answer.fields.items()
+        },
         uncertainty=_uncertainty_result(answer),
-        scan=None if solution.scan is None else copy_fields(ScanResult, solution.scan),
+        scan=None
+        if solution.scan is None
+        else copy_fields(ScanResult, solution.scan),
         fit=_fit_result(answer),
         residuals=answer.diagnoses,
         dynamics=DynamicsResult(
@@ -90,12 +97,16 @@ def build_result(answer: SolvedProblem) -> Result:
             sum(len(body.nodes_m) for body in problem.bodies),
             sum(len(body.cells) for body in problem.bodies),
             substeps=collocation.substeps,
-            timesteps=sum(segment.grid_times for segment in collocation.transcriptions),
+            timesteps=sum(
+                segment.grid_times for segment in collocation.transcriptions
+            ),
             variables=collocation.variable_count,
             constraints=collocation.constraint_count,
             scheme=as_scheme(collocation.scheme).name,
         ),
-        notes=tuple(dict.fromkeys([*problem.notes, *solution.notes, *answer.all_notes])),
+        notes=tuple(
+            dict.fromkeys([*problem.notes, *solution.notes, *answer.all_notes])
+        ),
         history=tuple(solution.history),
         provenance=_provenance(problem),
     )
@@ -112,7 +123,9 @@ def _provenance(problem: Problem) -> Provenance:
         python=platform.python_version(),
         platform=platform.platform(),
         problem_file=None if origin is None else str(origin.path),
-        problem_sha256=None if text is None else hashlib.sha256(text).hexdigest(),
+        problem_sha256=None
+        if text is None
+        else hashlib.sha256(text).hexdigest(),
         mesh_sha256=tuple(body.mesh.sha256 for body in problem.bodies),
     )
 
@@ -122,13 +135,18 @@ def _reference_sentences(problem: Problem) -> Iterator[str]:
     force.
     """
     parts = [part for body in problem.bodies for part in body.parts]
-    laws = dict.fromkeys(part.damping.name for part in parts if GAMMA_R in part.damping.constants)
+    laws = dict.fromkeys(
+        part.damping.name for part in parts if GAMMA_R in part.damping.constants
+    )
     law_names = [
-        law + (", which also damps rigid rotation" if law == "rayleigh" else "") for law in laws
+        law + (", which also damps rigid rotation" if law == "rayleigh" else "")
+        for law in laws
     ]
     if law_names:
         yield f"{GAMMA_R.symbol} refers to the damping law {' and '.join(law_names)}"
-    if (relative := relative_scale_note(problem.experiments, problem.parameters)) is not None:
+    if (
+        relative := relative_scale_note(problem.experiments, problem.parameters)
+    ) is not None:
         yield relative
 
 
@@ -140,7 +158,11 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
     known = answer.uncertainty
     if known is None:
         return None
-    reported = [k for k, name in enumerate(known.names) if not is_field_coefficient(name)]
+    reported = [
+        k
+        for k, name in enumerate(known.names)
+        if not is_field_coefficient(name)
+    ]
     return copy_fields(
         UncertaintyResult,
         known,
@@ -183,7 +205,10 @@ def _field_result(estimate: FieldEstimate) -> FieldResult:
             phases=estimate.phases,
         )
     share = float(volumes_m3[is_determined].sum() / volumes_m3.sum())
-    likelier = {f"{each:g}": estimate.log_evidence_ratio(each) for each in modes.field.lengths_m}
+    likelier = {
+        f"{each:g}": estimate.log_evidence_ratio(each)
+        for each in modes.field.lengths_m
+    }
     return FieldResult(
         modes.resolution,
         ends,
@@ -194,11 +219,16 @@ def _field_result(estimate: FieldEstimate) -> FieldResult:
     )
 
 
-def _recordings_agreement(answer: SolvedProblem) -> dict[str, RecordingsAgreement] | None:
+def _recordings_agreement(
+    answer: SolvedProblem,
+) -> dict[str, RecordingsAgreement] | None:
     """Return the estimates from single recordings, to first order, and their agreement, by
     parameter, without coefficients of fields; None if this was not evaluated.
     """
-    if answer.uncertainty is None or (scatter := answer.uncertainty.scatter) is None:
+    if (
+        answer.uncertainty is None
+        or (scatter := answer.uncertainty.scatter) is None
+    ):
         return None
     q = answer.solution.q
     agreements = {}
@@ -206,7 +236,10 @@ def _recordings_agreement(answer: SolvedProblem) -> dict[str, RecordingsAgreemen
         if is_field_coefficient(item.name):
             continue
         away = q[k] + scatter.differences[:, k]
-        values = [item.from_coordinate(float(x)) if np.isfinite(x) else np.nan for x in away]
+        values = [
+            item.from_coordinate(float(x)) if np.isfinite(x) else np.nan
+            for x in away
+        ]
         deviations = scatter.deviations[:, k].tolist()
         agreements[item.name] = RecordingsAgreement(
             dict(zip(scatter.recordings, values, strict=True)),
@@ -244,14 +277,23 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
             markers.sample_count,
             int(markers.missing_counts.sum()),
             experiment.is_static,
-            (*_place_sentences(answer.places[name]), *_nuisance_sentences(part, answer)),
+            (
+                *_place_sentences(answer.places[name]),
+                *_nuisance_sentences(part, answer),
+            ),
             *solution.wrench_rms.get(name, (None, None)),
             custom_sensor_rms(experiment, solution.readings[name]) or None,
             *(root_mean(each[np.isfinite(each)]) or None for each in both),
-            reading_sigma={gauge.name: gauge.sigma for gauge in experiment.readings} or None,
+            reading_sigma={
+                gauge.name: gauge.sigma for gauge in experiment.readings
+            }
+            or None,
             reading_unit=_sensor_units(experiment),
             depth=depths.get(name),
-            friction=friction_summaries(experiment, part.equations.dynamics, part.x) or None,
+            friction=friction_summaries(
+                experiment, part.equations.dynamics, part.x
+            )
+            or None,
             air_density_kg_m3=experiment.air_density_kg_m3,
             test=experiment.specimen and experiment.specimen.test,
         )
@@ -262,7 +304,13 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
         if experiment.symmetry > 1
     }
     symmetry = parts or None
-    return FitResult(solution.rms_m, answer.noise_rms_m, experiments, *pooled, symmetry=symmetry)
+    return FitResult(
+        solution.rms_m,
+        answer.noise_rms_m,
+        experiments,
+        *pooled,
+        symmetry=symmetry,
+    )
 
 
 def _forward_results(answer: SolvedProblem) -> ForwardResult:
@@ -273,22 +321,37 @@ def _forward_results(answer: SolvedProblem) -> ForwardResult:
     squares = []
     largest = []
     for experiment in answer.problem.experiments:
-        experiments[experiment.name] = compared = _forward_result(answer, experiment)
-        if compared.fitted and compared.rms_m is not None and compared.max_m is not None:
-            squares.append(experiment.markers.sample_count * np.array([compared.rms_m**2, 1.0]))
+        experiments[experiment.name] = compared = _forward_result(
+            answer, experiment
+        )
+        if (
+            compared.fitted
+            and compared.rms_m is not None
+            and compared.max_m is not None
+        ):
+            squares.append(
+                experiment.markers.sample_count
+                * np.array([compared.rms_m**2, 1.0])
+            )
             largest.append(compared.max_m)
     if not largest:
         return ForwardResult(None, None, experiments)
     total, count = np.sum(squares, axis=0)
-    return ForwardResult(float(np.sqrt(total / max(1, count))), max(largest), experiments)
+    return ForwardResult(
+        float(np.sqrt(total / max(1, count))), max(largest), experiments
+    )
 
 
 def _sensor_units(experiment: Experiment) -> dict[str, str] | None:
     """Return the units of the custom sensors that state one, by name; None if none does."""
-    return {gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit} or None
+    return {
+        gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit
+    } or None
 
 
-def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedExperiment:
+def _forward_result(
+    answer: SolvedProblem, experiment: Experiment
+) -> SimulatedExperiment:
     """Return the errors of the forward simulation of an experiment, or the reason why it failed."""
     fitted = experiment.name in answer.solution.rms_by_experiment_m
     simulated = answer.rollouts[experiment.name]
@@ -306,8 +369,12 @@ def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedE
         reading_unit=_sensor_units(experiment),
         depth=simulated.depth or None,
         blind=simulated.blind_error,
-        copied=simulated.copy_error if isinstance(simulated.copy_error, CopyError) else None,
-        not_copied=simulated.copy_error if isinstance(simulated.copy_error, str) else None,
+        copied=simulated.copy_error
+        if isinstance(simulated.copy_error, CopyError)
+        else None,
+        not_copied=simulated.copy_error
+        if isinstance(simulated.copy_error, str)
+        else None,
     )
 
 
@@ -316,11 +383,17 @@ def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedE
 
 def _nuisance(answer: SolvedProblem) -> dict[str, dict[str, NuisanceResult]]:
     """Return the nuisance parameters, without the places of markers, by experiment and label."""
-    deviations = answer.uncertainty.nuisance if answer.uncertainty is not None else {}
+    deviations = (
+        answer.uncertainty.nuisance if answer.uncertainty is not None else {}
+    )
     named: dict[str, dict[str, NuisanceResult]] = {}
     for part in answer.solution.parts:
-        for entry, name, value in part.segment.nuisance.iterate_values(part.phi):
-            error = deviations[name] * entry.sigma if name in deviations else None
+        for entry, name, value in part.segment.nuisance.iterate_values(
+            part.phi
+        ):
+            error = (
+                deviations[name] * entry.sigma if name in deviations else None
+            )
             here = named.setdefault(part.segment.experiment.name, {})
             here[entry.label] = NuisanceResult(value, entry.sigma, error)
     return named
@@ -344,14 +417,22 @@ def _place_sentences(places: Mapping[str, MarkerPlace]) -> Iterator[str]:
         )
     if unknown := [place for place in places.values() if not place.is_declared]:
         count = f"{len(unknown)} marker" + ("s" if len(unknown) > 1 else "")
-        errors = [float(p.std_error_m.max()) for p in unknown if p.std_error_m is not None]
+        errors = [
+            float(p.std_error_m.max())
+            for p in unknown
+            if p.std_error_m is not None
+        ]
         known = (
-            f", estimated to ±{short(1e3 * max(errors))} mm" if len(errors) == len(unknown) else ""
+            f", estimated to ±{short(1e3 * max(errors))} mm"
+            if len(errors) == len(unknown)
+            else ""
         )
         yield f"positions of {count}{known} (prior ±{short(1e3 * unknown[0].prior_m)} mm)"
 
 
-def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Iterator[str]:
+def _nuisance_sentences(
+    part: ExperimentIterate, answer: SolvedProblem
+) -> Iterator[str]:
     """Yield a sentence on each kind of nuisance parameter but the places, with the estimate and its
     prior.
     """
@@ -363,12 +444,17 @@ def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Itera
             continue
         groups = [[k] for k in here]
         if row.by == "length":
-            entry_numbers = dict.fromkeys(nuisance.entries[k].number for k in here)
+            entry_numbers = dict.fromkeys(
+                nuisance.entries[k].number for k in here
+            )
             vectors = [
-                nuisance.indices_of_rows(row, component=number).tolist() for number in entry_numbers
+                nuisance.indices_of_rows(row, component=number).tolist()
+                for number in entry_numbers
             ]
             # Several markers have one each: the longest counts.
-            groups = [max(vectors, key=lambda own: float(np.linalg.norm(values[own])))]
+            groups = [
+                max(vectors, key=lambda own: float(np.linalg.norm(values[own])))
+            ]
         elif row.by == "worst":
             groups = [[max(here, key=lambda k: abs(part.phi[k]))]]
         for own in groups:
@@ -376,7 +462,10 @@ def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Itera
 
 
 def _nuisance_sentence(
-    part: ExperimentIterate, components: Sequence[int], values: Array, answer: SolvedProblem
+    part: ExperimentIterate,
+    components: Sequence[int],
+    values: Array,
+    answer: SolvedProblem,
 ) -> str:
     """Return a sentence with the size of a nuisance parameter, or of a vector of them, its standard
     error if known, and its prior.
@@ -396,7 +485,10 @@ def _nuisance_sentence(
     entry = nuisance.entries[k]
     name = nuisance.names[k]
     known = answer.uncertainty.nuisance if answer.uncertainty else {}
-    low, high = (limit[k] for limit in nuisance.bounds(part.segment.association.clock_samples))
+    low, high = (
+        limit[k]
+        for limit in nuisance.bounds(part.segment.association.clock_samples)
+    )
     factor, unit = in_readable_unit(1.0, entry.unit)
     if entry.row == TARE:  # of the sensor, on which the whole specimen acts
         factor *= part.segment.experiment.symmetry

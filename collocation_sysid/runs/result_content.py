@@ -77,14 +77,21 @@ class ReportedEstimate(Estimate):
         linear : bool
             Whether the parameter is its own coordinate, see `IntervalCoordinate`.
         """
-        if self.optimum is None or self.statistical95 is None or self.optimum == self.value:
+        if (
+            self.optimum is None
+            or self.statistical95 is None
+            or self.optimum == self.value
+        ):
             optimum = self.value if self.optimum is None else self.optimum
             return replace(self._statistical, value=optimum)
         at = IntervalCoordinate.for_estimate(
             name, (self.value, self.optimum, *self.statistical95), linear
         )
         correction = at.from_value(self.value) - at.from_value(self.optimum)
-        low, high = (at.to_value(at.from_value(end) - correction) for end in self.statistical95)
+        low, high = (
+            at.to_value(at.from_value(end) - correction)
+            for end in self.statistical95
+        )
         spread = self.statistical_std_error
         if spread is not None:
             spread *= at.derivative(self.value) / at.derivative(self.optimum)
@@ -118,7 +125,10 @@ class ReportedEstimate(Estimate):
     @property
     def systematic_std_error(self) -> float | None:
         """Part of the combined standard uncertainty that is not statistical; None if unknown."""
-        if self.combined_std_error is None or self.statistical_std_error is None:
+        if (
+            self.combined_std_error is None
+            or self.statistical_std_error is None
+        ):
             return None
         difference = self.combined_std_error**2 - self.statistical_std_error**2
         return max(0.0, difference) ** 0.5
@@ -185,11 +195,18 @@ class FieldResult:
                 f"{1e6 * most_m3:.3g}); the phase is determined in {self.determined_share:.0%} of "
                 "the volume"
             )
-        shapes = f"{self.identified} of the {self.shapes.modes} shapes of its field"
+        shapes = (
+            f"{self.identified} of the {self.shapes.modes} shapes of its field"
+        )
         share = f"halve the prior uncertainty in {self.determined_share:.0%} of the volume"
-        details = [f"resolved details: above {short(1e3 * self.shapes.detail_m)} mm"]
+        details = [
+            f"resolved details: above {short(1e3 * self.shapes.detail_m)} mm"
+        ]
         if len(self.likelier) > 1:
-            each = ", ".join(f"{length} m {gain:+.1f}" for length, gain in self.likelier.items())
+            each = ", ".join(
+                f"{length} m {gain:+.1f}"
+                for length, gain in self.likelier.items()
+            )
             details.append(
                 f"correlation length {self.shapes.length_m:g} m; relative log evidence of the "
                 f"lengths: {each}"
@@ -541,7 +558,11 @@ class Result:
     def values(self) -> dict[str, ReportedEstimate]:
         """Parameters, then derived moduli, by name, without the coefficients of fields."""
         both = {**self.parameters, **self.derived}
-        return {name: each for name, each in both.items() if not is_field_coefficient(name)}
+        return {
+            name: each
+            for name, each in both.items()
+            if not is_field_coefficient(name)
+        }
 
     @property
     def discretisation_kinds(self) -> tuple[str, ...]:
@@ -551,7 +572,9 @@ class Result:
     @property
     def numerical_errors(self) -> dict[str, DiscretisationError]:
         """Known discretisation errors, by name of the estimate."""
-        errors = ((name, each.numerical_error) for name, each in self.values.items())
+        errors = (
+            (name, each.numerical_error) for name, each in self.values.items()
+        )
         return {name: error for name, error in errors if error is not None}
 
     def problem_folder(self, run: str | Path, purpose: str) -> Path:

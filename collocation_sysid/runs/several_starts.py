@@ -64,11 +64,19 @@ def robust_loss(solution: Solution) -> float:
         for part in solution.parts
         for reading, _ in part.depth_residuals
     )
-    return sum(part.loss for part in solution.parts) + float(prior @ prior) + loss_of_distant_points
+    return (
+        sum(part.loss for part in solution.parts)
+        + float(prior @ prior)
+        + loss_of_distant_points
+    )
 
 
 def follow_starts(
-    solver: Method, collocation: Collocation, scan: Scan, watch: Watch | None, solve: Solve
+    solver: Method,
+    collocation: Collocation,
+    scan: Scan,
+    watch: Watch | None,
+    solve: Solve,
 ) -> CompletedStart:
     """Follow the starts of a scan to convergence and return the one with the lowest loss.
 
@@ -92,12 +100,16 @@ def follow_starts(
     first = CompletedStart(collocation, scan, solution=None, note="")
     if not scan.others or not has_local_minima(collocation):
         return first
-    own = getattr(solver, "name", getattr(getattr(solver, "func", None), "name", ""))
+    own = getattr(
+        solver, "name", getattr(getattr(solver, "func", None), "name", "")
+    )
     is_own = own == ReducedSpace.name
     method: Method = solver if is_own else ReducedSpace()
     candidates: list[tuple[float, int, Solution]] = []
     for number in (scan.best, *scan.others):
-        started = associated_at_guess(replace(collocation, parameters=scan.starts[number]))
+        started = associated_at_guess(
+            replace(collocation, parameters=scan.starts[number])
+        )
         solution = solve(method, started)
         if solution.status is Status.INTERRUPTED:
             return first if not is_own else replace(first, solution=solution)
@@ -107,7 +119,8 @@ def follow_starts(
         return first
     loss, best, solution = min(candidates, key=lambda each: each[0])
     losses = ", ".join(
-        f"{each:.4g} from E = {scan.young_pa[number]:.3g} Pa" for each, number, _ in candidates
+        f"{each:.4g} from E = {scan.young_pa[number]:.3g} Pa"
+        for each, number, _ in candidates
     )
     note = (
         f"{len(candidates)} initial values of the scan were solved to the end, with the losses "

@@ -15,7 +15,12 @@ from ..fem.constants import is_field_coefficient, unit_of
 from ..methods.solution import Solution
 from ..model.parameters import Parameters
 from ..problem import Problem
-from ..statistics.assessment import Assessment, cause_concerns, numerical_concerns, probe_concerns
+from ..statistics.assessment import (
+    Assessment,
+    cause_concerns,
+    numerical_concerns,
+    probe_concerns,
+)
 from ..statistics.combined_intervals import combine
 from ..statistics.concerns import Concern
 from ..statistics.discretisation_error import DiscretisationError, Refinement
@@ -32,7 +37,12 @@ from ..statistics.uncertainty_budget import BudgetLine, VarianceSources, budget
 from .check.modes_check import ModesCheck
 from .forward_simulation import ForwardSimulation
 from .result_content import Elapsed, ReportedEstimate
-from .verdict import combined_concerns, expected_rms_m, modes_by_experiment, solution_concerns
+from .verdict import (
+    combined_concerns,
+    expected_rms_m,
+    modes_by_experiment,
+    solution_concerns,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,15 +96,22 @@ class SolvedProblem:
     def __repr__(self) -> str:
         solution = self.solution
         free = [item.name for item in self.problem.parameters.free]
-        values = ", ".join(f"{name} = {_estimate_text(self.estimates[name])}" for name in free)
+        values = ", ".join(
+            f"{name} = {_estimate_text(self.estimates[name])}" for name in free
+        )
         rms = f"{1e3 * solution.rms_m:.3g} mm RMS"
-        summary = f"{solution.method}, {solution.status.value}, {self.trust.verdict}"
+        summary = (
+            f"{solution.method}, {solution.status.value}, {self.trust.verdict}"
+        )
         return f"Run({summary}: {values}; {rms})"
 
     @property
     def parameters(self) -> dict[str, float]:
         """Every parameter by name, corrected for the known discretisation error."""
-        return {name: self.estimates[name].value for name in self.solution.parameters}
+        return {
+            name: self.estimates[name].value
+            for name in self.solution.parameters
+        }
 
     @property
     def start_parameters(self) -> Parameters:
@@ -104,21 +121,38 @@ class SolvedProblem:
     @cached_property
     def derived(self) -> dict[str, float]:
         """Moduli that follow from the parameters at the optimum, by name."""
-        constants = (segment.constants for segment in self.solution.collocation.transcriptions)
-        return dict(DerivedModuli.from_bodies(constants, self.solution.q).values)
+        constants = (
+            segment.constants
+            for segment in self.solution.collocation.transcriptions
+        )
+        return dict(
+            DerivedModuli.from_bodies(constants, self.solution.q).values
+        )
 
     @cached_property
     def estimates(self) -> dict[str, ReportedEstimate]:
         """Parameters and derived moduli with their combined and statistical intervals, by name."""
-        return {name: self._report_estimate(name, each) for name, each in self.optimum.items()}
+        return {
+            name: self._report_estimate(name, each)
+            for name, each in self.optimum.items()
+        }
 
-    def _report_estimate(self, name: str, optimum: Estimate) -> ReportedEstimate:
+    def _report_estimate(
+        self, name: str, optimum: Estimate
+    ) -> ReportedEstimate:
         """Return the estimate to report: corrected for the known discretisation error and known
         effects, with combined and statistical uncertainties.
         """
-        item = next((each for each in self.start_parameters.items if each.name == name), None)
+        item = next(
+            (each for each in self.start_parameters.items if each.name == name),
+            None,
+        )
         line = self.budget.get(name)
-        error = None if is_field_coefficient(name) else self.discretisation_errors.get(name)
+        error = (
+            None
+            if is_field_coefficient(name)
+            else self.discretisation_errors.get(name)
+        )
         linear, bounds = self.start_parameters.scale_and_bounds(name)
         systematic = None if line is None else line.systematic
         known_effect = 0.0 if line is None else line.known_effect
@@ -171,15 +205,22 @@ class SolvedProblem:
         bars = self.uncertainty
         known = {} if bars is None else {**bars.estimates, **bars.derived}
         values = self.solution.parameters | self.derived
-        return {name: known.get(name, Estimate(value)) for name, value in values.items()}
+        return {
+            name: known.get(name, Estimate(value))
+            for name, value in values.items()
+        }
 
     @cached_property
     def places(self) -> dict[str, dict[str, MarkerPlace]]:
         """Estimated places of the markers on the undeformed body, by fitted experiment and by
         marker.
         """
-        named = ((part.segment.experiment.name, part) for part in self.solution.parts)
-        return {name: marker_places(part, self.uncertainty) for name, part in named}
+        named = (
+            (part.segment.experiment.name, part) for part in self.solution.parts
+        )
+        return {
+            name: marker_places(part, self.uncertainty) for name, part in named
+        }
 
     @cached_property
     def trust(self) -> Assessment:
@@ -191,18 +232,31 @@ class SolvedProblem:
             uncertainty=self.uncertainty,
             diagnoses=self.diagnoses,
         )
-        uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}
-        numerical = numerical_concerns(self.optimum, uncertainties, self.refinement)
+        uncertainties = {
+            name: each.combined_std_error
+            for name, each in self.estimates.items()
+        }
+        numerical = numerical_concerns(
+            self.optimum, uncertainties, self.refinement
+        )
         shares = {name: line.shares for name, line in self.budget.items()}
         vague = combined_concerns(self.start_parameters, self.estimates, shares)
-        of_fields = [concern for field in self.fields.values() for concern in field.concerns]
+        of_fields = [
+            concern
+            for field in self.fields.values()
+            for concern in field.concerns
+        ]
         if not self.omitted_checks:
-            probed = probe_concerns(self.probes, self._discretisation_corrections)
+            probed = probe_concerns(
+                self.probes, self._discretisation_corrections
+            )
             causes = cause_concerns(self.causes)
             return Assessment.from_concerns(
                 (*causes, *of_fit, *of_fields, *probed, *numerical, *vague)
             )
-        interrupted = Concern("solve/interrupted", "doubtful", {"left_out": self.omitted_checks})
+        interrupted = Concern(
+            "solve/interrupted", "doubtful", {"left_out": self.omitted_checks}
+        )
         return Assessment.from_concerns(
             (interrupted, *(of_fit if self.uncertainty is not None else ()))
         )
@@ -213,7 +267,8 @@ class SolvedProblem:
         return {
             item.name: each.value / each.optimum if each.optimum else 1.0
             for item in self.start_parameters.free
-            if not is_field_coefficient(item.name) and (each := self.estimates[item.name])
+            if not is_field_coefficient(item.name)
+            and (each := self.estimates[item.name])
         }
 
     @cached_property
@@ -228,8 +283,13 @@ class SolvedProblem:
         """Estimated fields (spatially varying constants), by name."""
         collocation = self.solution.collocation
         q = self.solution.q
-        bodies = dict.fromkeys(segment.body for segment in collocation.transcriptions)
-        known = (field_estimates(b, collocation.parameters, q, self.uncertainty) for b in bodies)
+        bodies = dict.fromkeys(
+            segment.body for segment in collocation.transcriptions
+        )
+        known = (
+            field_estimates(b, collocation.parameters, q, self.uncertainty)
+            for b in bodies
+        )
         return {field.name: field for each in known for field in each}
 
     @property
@@ -288,7 +348,9 @@ class SolvedProblem:
         try:
             pandas = import_module("pandas")
         except ImportError as error:
-            raise InputError("a data frame needs pandas: pip install pandas") from error
+            raise InputError(
+                "a data frame needs pandas: pip install pandas"
+            ) from error
         rows = {name: self._row(name) for name in self.estimates}
         return pandas.DataFrame.from_dict(rows, orient="index")
 
@@ -314,7 +376,9 @@ class SolvedProblem:
         """Return an estimate by name; an `InputError` for an unknown name."""
         if name not in self.estimates:
             known = list(self.estimates)
-            expected = f"expected one of {', '.join(known)}{hint_at(name, known)}"
+            expected = (
+                f"expected one of {', '.join(known)}{hint_at(name, known)}"
+            )
             raise InputError(f"no parameter {name!r}; {expected}")
         return self.estimates[name]
 
@@ -325,8 +389,15 @@ class SolvedProblem:
         """
         if self.uncertainty is None:
             return self.notes
-        notes = (*self.notes, *self.uncertainty.notes, *identifiability_sentences(self.uncertainty))
-        return (*dict.fromkeys(notes), *(profile.message for profile in self.profiles))
+        notes = (
+            *self.notes,
+            *self.uncertainty.notes,
+            *identifiability_sentences(self.uncertainty),
+        )
+        return (
+            *dict.fromkeys(notes),
+            *(profile.message for profile in self.profiles),
+        )
 
 
 def _or_nan(value: float | None) -> float:
@@ -338,8 +409,14 @@ def _estimate_text(estimate: ReportedEstimate) -> str:
     """Return an estimate as text: the value, " ± " and the standard uncertainty, and the combined
     interval in brackets, each only if it is known.
     """
-    error = "" if estimate.combined_std_error is None else f" ± {estimate.combined_std_error:.2g}"
+    error = (
+        ""
+        if estimate.combined_std_error is None
+        else f" ± {estimate.combined_std_error:.2g}"
+    )
     interval = (
-        "" if estimate.combined95 is None else " [{:.5g}, {:.5g}]".format(*estimate.combined95)
+        ""
+        if estimate.combined95 is None
+        else " [{:.5g}, {:.5g}]".format(*estimate.combined95)
     )
     return f"{estimate.value:.5g}{error}{interval}"

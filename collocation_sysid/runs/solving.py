@@ -87,7 +87,9 @@ def solve(
         )
     with connect_executor(scheduler) as workers:
         return _solve_with_likeliest_lengths(
-            problem, start, partial(_solve_once, solver=solver, watch=watch, workers=workers)
+            problem,
+            start,
+            partial(_solve_once, solver=solver, watch=watch, workers=workers),
         )
 
 
@@ -120,7 +122,12 @@ def _solve_with_likeliest_lengths(
         return solve_two_phases(problem, start, solve_once)
     solution = solve_once(problem, start)
     tried = [problem.lengths_m]
-    fields = {part.field for body in problem.bodies for part in body.parts if part.field}
+    fields = {
+        part.field
+        for body in problem.bodies
+        for part in body.parts
+        if part.field
+    }
     if all(len(field.field.lengths_m) == 1 for field in fields):
         return solution
     while solution.status.converged:
@@ -147,8 +154,12 @@ def _solve_once(
     """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier
     solution.
     """
-    warm_start = WarmStart.read(start) if isinstance(start, (str, Path)) else start
-    problem = problem if warm_start is None else warm_start.apply_to_problem(problem)
+    warm_start = (
+        WarmStart.read(start) if isinstance(start, (str, Path)) else start
+    )
+    problem = (
+        problem if warm_start is None else warm_start.apply_to_problem(problem)
+    )
     try:
         needs_complete_start = getattr(solver, "needs_complete_start", False)
         collocation = problem.collocation()
@@ -176,14 +187,18 @@ def _solve_once(
                 collocation,
                 scan=scan,
                 watch=watch,
-                solve=lambda by, of: solve_with_renewed_correspondences(by, of, watch),
+                solve=lambda by, of: solve_with_renewed_correspondences(
+                    by, of, watch
+                ),
             )
             collocation = associated_at_guess(scanned.collocation)
             scan = scanned.scan
             solution = scanned.solution
             started_from = [scanned.note] if scanned.note else []
         if solution is None:
-            solution = solve_with_renewed_correspondences(solver, collocation, watch, variables)
+            solution = solve_with_renewed_correspondences(
+                solver, collocation, watch, variables
+            )
         if scan is None and solution.status in FAILED_STATUSES:
             scan, solution = _solve_from_scan(solver, solution, watch)
         if (
@@ -196,9 +211,16 @@ def _solve_once(
         raise error.located(problem.path) from error
     if solution.status is Status.REFUSED:
         reasons = "; ".join(solution.notes)
-        raise InputError(f"{solution.message} {reasons}".strip(), problem.path, "solver")
+        raise InputError(
+            f"{solution.message} {reasons}".strip(), problem.path, "solver"
+        )
     scan_notes = [] if scan is None else [scan.sentence]
-    notes = (*scan_notes, *started_from, *solution.notes, *_depth_notes(solution))
+    notes = (
+        *scan_notes,
+        *started_from,
+        *solution.notes,
+        *_depth_notes(solution),
+    )
     return replace(solution, scan=scan or solution.scan, notes=notes)
 
 
@@ -211,7 +233,9 @@ def _depth_notes(solution: Solution) -> Iterator[str]:
             distance_m = reading.signed_distances_m(observation, part.phi)
             sighting = reading.correspondences
             excluded = ", ".join(
-                f"{count} {why}" for why, count in sighting.excluded_counts.items() if count
+                f"{count} {why}"
+                for why, count in sighting.excluded_counts.items()
+                if count
             )
             distances = "are compared, because none is near enough to the body"
             if sighting.is_compared.any():
@@ -268,13 +292,17 @@ def _solve_from_scan(
     scan = rescue(failed.collocation, reason, needs_complete_start)
     if scan is None:
         return None, failed
-    again = associated_at_guess(replace(failed.collocation, parameters=scan.parameters))
+    again = associated_at_guess(
+        replace(failed.collocation, parameters=scan.parameters)
+    )
     solution = solve_with_renewed_correspondences(solver, again, watch)
     ended = solution.status.converged or solution.status is Status.INTERRUPTED
     return (scan, solution) if ended else (None, failed)
 
 
-def _best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -> Solution:
+def _best_of_second_start(
+    solver: Method, first: Solution, watch: Watch | None
+) -> Solution:
     """Return the better of a solution and of the solution from its `second_start_parameters`, with
     a note if that is the second one.
 
@@ -299,7 +327,10 @@ def _best_of_second_start(solver: Method, first: Solution, watch: Watch | None) 
 
 
 def solve_with_renewed_correspondences(
-    solver: Method, collocation: Collocation, watch: Watch | None, start: Array | None = None
+    solver: Method,
+    collocation: Collocation,
+    watch: Watch | None,
+    start: Array | None = None,
 ) -> Solution:
     """Solve, and repeat while estimates change the correspondences of the measurements.
 
@@ -324,7 +355,9 @@ def solve_with_renewed_correspondences(
         collocation, moved = solution.collocation.follow_estimates(p, positions)
         if collocation is solution.collocation:
             break
-        solution = solver(collocation, watch, collocation.pack(moved, positions))
+        solution = solver(
+            collocation, watch, collocation.pack(moved, positions)
+        )
     return solution
 
 
@@ -354,10 +387,16 @@ def second_start_parameters(solution: Solution) -> Parameters | None:
             own = [region + each for each in LAME if region + each in free]
             if len(own) == 2 or own == [name]:
                 young_pa = values[region + "young_pa"]
-                changed |= {each: _usual_modulus(each, young_pa) for each in own}
-    if not changed or any(not free[n].lower < v < free[n].upper for n, v in changed.items()):
+                changed |= {
+                    each: _usual_modulus(each, young_pa) for each in own
+                }
+    if not changed or any(
+        not free[n].lower < v < free[n].upper for n, v in changed.items()
+    ):
         return None
-    return collocation.parameters.with_guess({name: values[name] for name in free} | changed)
+    return collocation.parameters.with_guess(
+        {name: values[name] for name in free} | changed
+    )
 
 
 def _usual_modulus(name: str, young_pa: float) -> float:

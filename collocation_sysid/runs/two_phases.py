@@ -21,14 +21,23 @@ from ..array_types import Array, Index
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.constants import CONTRAST, field_coefficient
-from ..fem.two_phase import ElementLogarithms, PhaseSamples, TwoPhaseModes, is_inclusion
+from ..fem.two_phase import (
+    ElementLogarithms,
+    PhaseSamples,
+    TwoPhaseModes,
+    is_inclusion,
+)
 from ..methods.solution import Solution
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..program.marker_association import MarkerAssociation
 from ..recording.experiment import Experiment
 from ..statistics.field_estimates import mean_logarithm
-from ..statistics.linearised import LinearisedFit, factorise_information, linearise_fit
+from ..statistics.linearised import (
+    LinearisedFit,
+    factorise_information,
+    linearise_fit,
+)
 from ..statistics.phase_sampling import (
     USUAL,
     ElementInformation,
@@ -97,7 +106,9 @@ class _SmoothFitQuality:
         """Return the temperature T of `statistics.phase_sampling` for an answer with this χ²: its
         excess over the smooth fit per determined parameter, at least one.
         """
-        return max(1.0, (chi_squared - self.chi_squared) / max(1.0, self.determined))
+        return max(
+            1.0, (chi_squared - self.chi_squared) / max(1.0, self.determined)
+        )
 
 
 def _smooth_fit(fit: LinearisedFit) -> _SmoothFitQuality:
@@ -110,7 +121,9 @@ def _smooth_fit(fit: LinearisedFit) -> _SmoothFitQuality:
 
 
 def solve_two_phases(
-    problem: Problem, start: str | Path | WarmStart | None, solve_once: SolveOnce
+    problem: Problem,
+    start: str | Path | WarmStart | None,
+    solve_once: SolveOnce,
 ) -> Solution:
     """Solve a problem with a two-phase field; the body of the solution has the phases and their
     samples.
@@ -130,13 +143,17 @@ def solve_two_phases(
         For several two-phase fields, or too many elements.
     """
     search = _two_phase_search(problem)
-    solution = solve_once(problem.with_fields({search.name: search.modes.smooth_field}), start)
+    solution = solve_once(
+        problem.with_fields({search.name: search.modes.smooth_field}), start
+    )
     if not solution.status.converged:
         return solution
     smooth = _smooth_fit(linearise_fit(solution.collocation, solution.z))
     at_smooth = _linearise_in_elements(problem, search, solution)
     phase = initial_phases(
-        at_smooth.normal_equations(1.0), at_smooth.faces, search.modes.volumes_m3
+        at_smooth.normal_equations(1.0),
+        at_smooth.faces,
+        search.modes.volumes_m3,
     )
     best: Solution | None = None
     at_best = at_smooth
@@ -155,14 +172,21 @@ def solve_two_phases(
         if not candidate.status.converged:
             break
         at_candidate = _linearise_in_elements(problem, search, candidate)
-        if best is not None and at_candidate.fit.chi_squared >= at_best.fit.chi_squared:
+        if (
+            best is not None
+            and at_candidate.fit.chi_squared >= at_best.fit.chi_squared
+        ):
             break
         best = candidate
         at_best = at_candidate
-        draws = sample_phases(at_best.normal_equations(1.0), at_best.faces, phase)
+        draws = sample_phases(
+            at_best.normal_equations(1.0), at_best.faces, phase
+        )
         next_phase = _likelier_phases(draws.probability)
         volumes_m3 = search.modes.volumes_m3
-        if volumes_m3 @ np.abs(next_phase - phase) < SETTLED_VOLUME_SHARE * (volumes_m3 @ phase):
+        if volumes_m3 @ np.abs(next_phase - phase) < SETTLED_VOLUME_SHARE * (
+            volumes_m3 @ phase
+        ):
             break
         phase = next_phase
     assert best is not None
@@ -171,7 +195,9 @@ def solve_two_phases(
     # The whole posterior is tempered, its prior too: with the data alone tempered the prior would
     # shrink inclusions.
     settings = replace(USUAL, face_nats=USUAL.face_nats / temperature)
-    draws = sample_phases(at_best.normal_equations(temperature), at_best.faces, final, settings)
+    draws = sample_phases(
+        at_best.normal_equations(temperature), at_best.faces, final, settings
+    )
     samples = _samples(draws, at_best.fit, search, best)
     best = _with_samples(best, replace(samples, smooth_misfit=smooth.misfit))
     note = (
@@ -193,7 +219,9 @@ def _phases_of_solution(solution: Solution, search: _PhaseSearch) -> Array:
 def _two_phase_body(solution: Solution, search: _PhaseSearch) -> Body:
     """Return the body, among those of a solution, that has the two-phase field of `search`."""
     segments = solution.collocation.transcriptions
-    return next(s.body for s in segments if search.name in s.body.field_lengths_m)
+    return next(
+        s.body for s in segments if search.name in s.body.field_lengths_m
+    )
 
 
 def _solve_with_phases(
@@ -228,12 +256,21 @@ def _two_phase_search(problem: Problem) -> _PhaseSearch:
             f"the two-phase field of {name} has {len(modes.phase)} elements; expected at most "
             f"{MOST_ELEMENTS}: take a coarser mesh, or a region around the inclusion"
         )
-    parts = next(body.parts for body in problem.bodies if name in body.field_lengths_m)
+    parts = next(
+        body.parts for body in problem.bodies if name in body.field_lengths_m
+    )
     number = next(k for k, part in enumerate(parts) if part.field_name == name)
     part = parts[number]
-    elements = tuple(part.full_name(field_coefficient(k).name) for k in range(len(modes.phase)))
+    elements = tuple(
+        part.full_name(field_coefficient(k).name)
+        for k in range(len(modes.phase))
+    )
     return _PhaseSearch(
-        name, part.full_name(CONTRAST.name), modes=modes, number=number, elements=elements
+        name,
+        part.full_name(CONTRAST.name),
+        modes=modes,
+        number=number,
+        elements=elements,
     )
 
 
@@ -297,7 +334,9 @@ def _linearise_in_elements(
     theta = body.theta_from_values(solution.parameters)
     base = part.field.logarithms(theta[body.field_slices[search.number]])
     elements = ElementLogarithms.relative_to(search.modes, base)
-    fit = _fit_with_elements(problem.with_fields({search.name: elements}), solution, search)
+    fit = _fit_with_elements(
+        problem.with_fields({search.name: elements}), solution, search
+    )
     return _LinearisedMeasurements(
         fit=fit,
         columns=_columns(fit, search),
@@ -314,7 +353,10 @@ def _columns(fit: LinearisedFit, search: _PhaseSearch) -> Index:
 
 
 def _samples(
-    draws: PosteriorDraws, fit: LinearisedFit, search: _PhaseSearch, solution: Solution
+    draws: PosteriorDraws,
+    fit: LinearisedFit,
+    search: _PhaseSearch,
+    solution: Solution,
 ) -> PhaseSamples:
     """Return draws of the phases as samples of the logarithms in the elements.
 
@@ -345,7 +387,9 @@ def _samples(
     by_parameters = draws.changes[:, : len(shared)] @ slopes
     means = np.column_stack([draws.means[:, : len(shared)], draws.means[:, -1]])
     return PhaseSamples(
-        logarithms=mean + by_parameters[:, None] + draws.contrasts[:, None] * draws.phases,
+        logarithms=mean
+        + by_parameters[:, None]
+        + draws.contrasts[:, None] * draws.phases,
         contrasts=draws.contrasts,
         volumes_m3=draws.phases @ search.modes.volumes_m3,
         names=(*names, search.contrast),
@@ -355,7 +399,9 @@ def _samples(
     )
 
 
-def _fit_with_elements(problem: Problem, solution: Solution, search: _PhaseSearch) -> LinearisedFit:
+def _fit_with_elements(
+    problem: Problem, solution: Solution, search: _PhaseSearch
+) -> LinearisedFit:
     """Return the linearised fit at a solution, with the elements' logarithms as further parameters.
 
     The values of these parameters are zero.
@@ -370,9 +416,12 @@ def _fit_with_elements(problem: Problem, solution: Solution, search: _PhaseSearc
         has_lifted_variables=False,
     )
     p, positions = solved.unpack(solution.z)
-    values = dict(zip((item.name for item in solved.parameters.free), p, strict=False))
+    values = dict(
+        zip((item.name for item in solved.parameters.free), p, strict=False)
+    )
     q = [
-        0.0 if item.name in elements else values[item.name] for item in collocation.parameters.free
+        0.0 if item.name in elements else values[item.name]
+        for item in collocation.parameters.free
     ]
     both = np.concatenate([q, p[solved.nq :]])
     return linearise_fit(collocation, collocation.pack(both, positions))
@@ -384,7 +433,12 @@ def _chi_squared_per_measurement(fit: LinearisedFit) -> float:
 
 
 def _normal_equations(
-    fit: LinearisedFit, of_z: Index, *, base: Array, deviation: float, temperature: float
+    fit: LinearisedFit,
+    of_z: Index,
+    *,
+    base: Array,
+    deviation: float,
+    temperature: float,
 ) -> ElementInformation:
     """Return the blocks of the normal equations of a linearised fit, for the logarithms of the
     elements and for all other parameters.
@@ -431,7 +485,9 @@ def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
     """Return the solution with a body whose two-phase fields have these samples."""
     collocation = solution.collocation
     bodies: dict[int, Body] = {}
-    for body in dict.fromkeys(segment.body for segment in collocation.transcriptions):
+    for body in dict.fromkeys(
+        segment.body for segment in collocation.transcriptions
+    ):
         fields = {
             part.field_name: replace(part.field, samples=samples)
             for part in body.parts
@@ -439,11 +495,15 @@ def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
         }
         bodies[id(body)] = body.with_fields(fields)
     experiments = [
-        replace(each, body=bodies.get(id(each.body), each.body)) for each in collocation.experiments
+        replace(each, body=bodies.get(id(each.body), each.body))
+        for each in collocation.experiments
     ]
     charts = _marker_associations(collocation, experiments)
     return replace(
-        solution, collocation=replace(collocation, experiments=experiments, associations=charts)
+        solution,
+        collocation=replace(
+            collocation, experiments=experiments, associations=charts
+        ),
     )
 
 
@@ -455,6 +515,8 @@ def _marker_associations(
     """
     bodies = {experiment.name: experiment.body for experiment in experiments}
     return {
-        segment.experiment.name: replace(segment.association, body=bodies[segment.experiment.name])
+        segment.experiment.name: replace(
+            segment.association, body=bodies[segment.experiment.name]
+        )
         for segment in collocation.transcriptions
     }

@@ -34,7 +34,10 @@ from ..statistics.assessment import (
     stability_concerns,
 )
 from ..statistics.concerns import Concern
-from ..statistics.plausibility import material_hypothesis, size_and_density_hypotheses
+from ..statistics.plausibility import (
+    material_hypothesis,
+    size_and_density_hypotheses,
+)
 from ..statistics.remedies import remedy_for
 from ..statistics.residual_diagnostics import MarkerDiagnosis
 from ..statistics.scale_identifiability import scale_concerns
@@ -91,34 +94,44 @@ def solution_concerns(
         low = np.where(low == 0, -np.inf, low)
         yield from nuisance_concerns(nuisance.names, part.phi, low, high)
         for camera in range(len(part.segment.experiment.depths)):
-            pose = nuisance.indices_of_rows(DEPTH_TURN, DEPTH_SHIFT, component=camera)
+            pose = nuisance.indices_of_rows(
+                DEPTH_TURN, DEPTH_SHIFT, component=camera
+            )
             yield from camera_pose_concerns(
                 [nuisance.names[k] for k in pose], part.phi[pose].tolist()
             )
         for reading, distance_px in part.outline_distances_px:
-            camera = (
-                f"'{reading.correspondences.camera.depth.name}' of '{part.segment.experiment.name}'"
-            )
+            camera = f"'{reading.correspondences.camera.depth.name}' of '{part.segment.experiment.name}'"
             yield from outline_concerns(camera, distance_px)
         for k in nuisance.indices_of_rows(TIME):
             scale = float(nuisance.scales[k])
             name = part.segment.experiment.name
             yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
-    yield from stability_concerns(find_instabilities(solution.collocation, solution.z))
+    yield from stability_concerns(
+        find_instabilities(solution.collocation, solution.z)
+    )
     yield from strain_stability_concerns(solution.parts)
     yield from contact_concerns(contact_summaries_of_parts(solution.parts))
     if not solution.collocation.nq:
         yield from _prediction_concerns(rollouts)
     for name, rollout in rollouts.items():
         yield from _unseen_depth_concerns(name, rollout)
-        yield from _forward_concerns(name, rollout, solution, expected_rms_m(solution, uncertainty))
+        yield from _forward_concerns(
+            name, rollout, solution, expected_rms_m(solution, uncertainty)
+        )
     collocation = solution.collocation
     for segment in collocation.transcriptions:
         yield from rotation_step_concerns(
-            segment.experiment, collocation.substeps, DOUBTFUL_ANGLE_RAD, "scheme/turn"
+            segment.experiment,
+            collocation.substeps,
+            DOUBTFUL_ANGLE_RAD,
+            "scheme/turn",
         )
     for motion in motions:
-        if motion.first_mode is not None and motion.first_mode.damping_ratio < 1:
+        if (
+            motion.first_mode is not None
+            and motion.first_mode.damping_ratio < 1
+        ):
             yield from scheme_concerns(
                 motion.experiment,
                 motion.first_mode.damping_ratio,
@@ -145,7 +158,9 @@ def combined_concerns(
         Shares of the variance in the budget, largest first.
     """
     return [
-        _undetermined_concern(item.name, estimates[item.name], shares[item.name])
+        _undetermined_concern(
+            item.name, estimates[item.name], shares[item.name]
+        )
         for item in parameters.free
         if item.name in shares and not estimates[item.name].is_determined
     ]
@@ -157,21 +172,39 @@ def _undetermined_concern(
     """Return the concern about an undetermined estimate, with the largest share of its budget."""
     source, share = next(iter(shares.items()))
     low, high = estimate.combined95 or (np.nan, np.nan)
-    data = {"name": name, "low": low, "high": high, "source": source_label(source), "share": share}
-    return Concern("information/combined", "check", {**data, "remedy": remedy_for(source)})
+    data = {
+        "name": name,
+        "low": low,
+        "high": high,
+        "source": source_label(source),
+        "share": share,
+    }
+    return Concern(
+        "information/combined", "check", {**data, "remedy": remedy_for(source)}
+    )
 
 
 def body_concerns(solution: Solution) -> Iterator[Concern]:
     """Yield concerns about implausible sizes and densities, implausible stiffness, and unknown
     scale.
     """
-    for body in dict.fromkeys(segment.body for segment in solution.collocation.transcriptions):
+    for body in dict.fromkeys(
+        segment.body for segment in solution.collocation.transcriptions
+    ):
         odd = size_and_density_hypotheses(body) or [
-            material_hypothesis(body, body.theta_from_values(solution.parameters))
+            material_hypothesis(
+                body, body.theta_from_values(solution.parameters)
+            )
         ]
-        yield from (each.concern("doubtful") for each in odd if each is not None)
-    experiments = [segment.experiment for segment in solution.collocation.transcriptions]
-    yield from scale_concerns(experiments, solution.collocation.parameters, "doubtful")
+        yield from (
+            each.concern("doubtful") for each in odd if each is not None
+        )
+    experiments = [
+        segment.experiment for segment in solution.collocation.transcriptions
+    ]
+    yield from scale_concerns(
+        experiments, solution.collocation.parameters, "doubtful"
+    )
 
 
 def allowance_concerns(solution: Solution) -> Iterator[Concern]:
@@ -180,36 +213,56 @@ def allowance_concerns(solution: Solution) -> Iterator[Concern]:
 
     In motions the autocorrelation of the residuals shows this; static experiments have none.
     """
-    for experiment in (segment.experiment for segment in solution.collocation.transcriptions):
+    for experiment in (
+        segment.experiment for segment in solution.collocation.transcriptions
+    ):
         if not experiment.is_static or not experiment.markers.sample_count:
             continue
         sigma_m = float(np.max(experiment.markers.sigma_m))
         share = sigma_m / float(np.ptp(experiment.body.nodes_m, axis=0).max())
         if share > LARGEST_CAMERA_NOISE:
-            yield Concern("noise/allowance", data={"sigma_mm": 1e3 * sigma_m, "share": share})
+            yield Concern(
+                "noise/allowance",
+                data={"sigma_mm": 1e3 * sigma_m, "share": share},
+            )
 
 
-def _prediction_concerns(rollouts: Mapping[str, ForwardSimulation | str]) -> Iterator[Concern]:
+def _prediction_concerns(
+    rollouts: Mapping[str, ForwardSimulation | str],
+) -> Iterator[Concern]:
     """Yield concerns about forward simulations that differ from the measurements by more than the
     noise; failed simulations, given by their reason, are ignored.
     """
     for name, rollout in rollouts.items():
-        for misfit in rollout.misfits if isinstance(rollout, ForwardSimulation) else ():
+        for misfit in (
+            rollout.misfits if isinstance(rollout, ForwardSimulation) else ()
+        ):
             yield from prediction_concerns(name, **vars(misfit))
 
 
-def _unseen_depth_concerns(name: str, rollout: ForwardSimulation | str) -> Iterator[Concern]:
+def _unseen_depth_concerns(
+    name: str, rollout: ForwardSimulation | str
+) -> Iterator[Concern]:
     """Yield a concern for each depth camera without a point within its gate of the simulated
     surface; none if the simulation failed.
     """
-    for camera, error in rollout.depth.items() if isinstance(rollout, ForwardSimulation) else ():
+    for camera, error in (
+        rollout.depth.items() if isinstance(rollout, ForwardSimulation) else ()
+    ):
         if not error.points:
-            data = {"experiment": name, "camera": camera, "seen": error.compared_points}
+            data = {
+                "experiment": name,
+                "camera": camera,
+                "seen": error.compared_points,
+            }
             yield Concern("prediction/unseen", "doubtful", data)
 
 
 def _forward_concerns(
-    name: str, rollout: ForwardSimulation | str, solution: Solution, noise_m: float
+    name: str,
+    rollout: ForwardSimulation | str,
+    solution: Solution,
+    noise_m: float,
 ) -> list[Concern]:
     """Return concerns about the forward simulation of an experiment: that it failed, or that its
     errors are larger than the noise and the residuals of the fit.
@@ -225,11 +278,21 @@ def _forward_concerns(
     """
     fit_rms_m = solution.rms_by_experiment_m
     if not isinstance(rollout, ForwardSimulation):
-        return [Concern("roll-out/failed", "doubtful", {"experiment": name, "why": rollout})]
+        return [
+            Concern(
+                "roll-out/failed",
+                "doubtful",
+                {"experiment": name, "why": rollout},
+            )
+        ]
     fitted = name in fit_rms_m
     fit_m = fit_rms_m.get(name, solution.rms_m)
     of_markers = forward_simulation_concerns(
-        name, rollout.rms_m, fit_rms_m=fit_m, noise_rms_m=noise_m, is_fitted=fitted
+        name,
+        rollout.rms_m,
+        fit_rms_m=fit_m,
+        noise_rms_m=noise_m,
+        is_fitted=fitted,
     )
     predicted_n = rollout.wrench_rms[0]
     fit_n = pooled_wrench_rms(solution)[0]
@@ -237,12 +300,18 @@ def _forward_concerns(
         return of_markers
     if predicted_n is not None and fit_n is not None:
         of_markers = forward_simulation_concerns(
-            f"{name}/force", predicted_n, fit_rms_m=fit_n, noise_rms_m=0.0, is_fitted=fitted
+            f"{name}/force",
+            predicted_n,
+            fit_rms_m=fit_n,
+            noise_rms_m=0.0,
+            is_fitted=fitted,
         )
     return [*of_markers, *_depth_concerns(name, rollout, solution)]
 
 
-def _depth_concerns(name: str, rollout: ForwardSimulation, solution: Solution) -> Iterator[Concern]:
+def _depth_concerns(
+    name: str, rollout: ForwardSimulation, solution: Solution
+) -> Iterator[Concern]:
     """Yield concerns about predicted depth, against the larger of the fitted residuals and the
     noise.
     """
@@ -263,27 +332,45 @@ def depth_errors(solution: Solution) -> dict[tuple[str, str], DepthError]:
     camera).
     """
     return {
-        (part.segment.experiment.name, reading.correspondences.camera.depth.name): (
-            SurfaceComparison.from_fit(reading, part.x, observation, part.phi).error
+        (
+            part.segment.experiment.name,
+            reading.correspondences.camera.depth.name,
+        ): (
+            SurfaceComparison.from_fit(
+                reading, part.x, observation, part.phi
+            ).error
         )
         for part in solution.parts
         for reading, observation in part.depth_residuals
     }
 
 
-def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float:
+def expected_rms_m(
+    solution: Solution, uncertainty: Uncertainty | None
+) -> float:
     """Return the RMS distance [m] of the fitted markers that is expected from noise with the stated
     σ, less what the fitted parameters absorb; without `uncertainty` they absorb nothing.
     """
-    markers = [segment.experiment.markers for segment in solution.collocation.transcriptions]
-    samples = np.concatenate([each.is_present.sum(axis=0) for each in markers]).astype(float)
+    markers = [
+        segment.experiment.markers
+        for segment in solution.collocation.transcriptions
+    ]
+    samples = np.concatenate(
+        [each.is_present.sum(axis=0) for each in markers]
+    ).astype(float)
     sigma_m = np.concatenate([each.sigma_m for each in markers])
     measured = solution.collocation.measurement_count
-    fitted = 0.0 if uncertainty is None else measured - uncertainty.degrees_of_freedom
+    fitted = (
+        0.0
+        if uncertainty is None
+        else measured - uncertainty.degrees_of_freedom
+    )
     return rms_expected_from_noise_m(sigma_m, samples, float(fitted))
 
 
-def modes_by_experiment(problem: Problem, solution: Solution) -> dict[str, ModesCheck]:
+def modes_by_experiment(
+    problem: Problem, solution: Solution
+) -> dict[str, ModesCheck]:
     """Return the natural modes of each body at the estimates, by experiment; empty if the search
     failed.
 
@@ -292,7 +379,11 @@ def modes_by_experiment(problem: Problem, solution: Solution) -> dict[str, Modes
     motions = {}
     substeps = solution.collocation.substeps
     scheme = as_scheme(solution.collocation.scheme)
-    moving = [experiment for experiment in problem.experiments if not experiment.is_static]
+    moving = [
+        experiment
+        for experiment in problem.experiments
+        if not experiment.is_static
+    ]
     for experiment in moving if solution.status.converged else ():
         theta = experiment.body.theta_from_values(solution.parameters)
         try:

@@ -53,7 +53,9 @@ class WarmStart:
         InputError
             If the folder is no run folder, or damaged.
         """
-        return cls.from_result(Result.read(folder, "the folder of an earlier run"), Path(folder))
+        return cls.from_result(
+            Result.read(folder, "the folder of an earlier run"), Path(folder)
+        )
 
     @classmethod
     def from_result(cls, result: Result, folder: Path) -> WarmStart:
@@ -76,13 +78,21 @@ class WarmStart:
             for name, each in named.items()
         }
         places_m = {
-            experiment: {name: place.position_m for name, place in named.items()}
+            experiment: {
+                name: place.position_m for name, place in named.items()
+            }
             for experiment, named in result.places.items()
         }
-        points = np.array([place for named in places_m.values() for place in named.values()])
+        points = np.array(
+            [place for named in places_m.values() for place in named.values()]
+        )
         with damage_refused(folder, RESULT_FILE, "solve that problem again"):
             all_values = np.array(
-                [*values.values(), *nuisance.values(), *points.reshape(-1, 3).flat]
+                [
+                    *values.values(),
+                    *nuisance.values(),
+                    *points.reshape(-1, 3).flat,
+                ]
             )
             if not np.isfinite(all_values).all():
                 raise ValueError("a value that is not finite")
@@ -98,11 +108,14 @@ class WarmStart:
             segment = part.segment
             name = segment.experiment.name
             nuisance |= {
-                f"{name}: {e.label}": v for e, _, v in segment.nuisance.iterate_values(part.phi)
+                f"{name}: {e.label}": v
+                for e, _, v in segment.nuisance.iterate_values(part.phi)
             }
             markers = segment.experiment.markers.names
             places = segment.marker_places_m(part.phi)
-            places_m[segment.experiment.name] = dict(zip(markers, places, strict=True))
+            places_m[segment.experiment.name] = dict(
+                zip(markers, places, strict=True)
+            )
         values = parameter_values(collocation, solution.q)
         return cls(Path(), values, nuisance, places_m, collocation.substeps)
 
@@ -122,8 +135,13 @@ class WarmStart:
                 f"estimated, {', '.join(item.name for item in free)}",
                 self.folder / RESULT_FILE,
             )
-        guesses = {i.name: float(np.clip(value, i.lower, i.upper)) for i, value in known.items()}
-        return replace(problem, parameters=problem.parameters.with_guess(guesses))
+        guesses = {
+            i.name: float(np.clip(value, i.lower, i.upper))
+            for i, value in known.items()
+        }
+        return replace(
+            problem, parameters=problem.parameters.with_guess(guesses)
+        )
 
     def apply_to_places(self, collocation: Collocation) -> Collocation:
         """Return the discretised problem with estimated markers starting at the earlier places."""
@@ -142,7 +160,9 @@ class WarmStart:
         places_m = self.places_m.get(segment.experiment.name, {})
         names = segment.experiment.markers.names
         estimated = segment.association.estimated.tolist()
-        return {m: places_m[names[m]] for m in estimated if names[m] in places_m}
+        return {
+            m: places_m[names[m]] for m in estimated if names[m] in places_m
+        }
 
     def apply_to_nuisance(self, collocation: Collocation) -> tuple[Array, int]:
         """Return p at the guess with the earlier nuisance parameters, and the number of these.
@@ -153,7 +173,9 @@ class WarmStart:
         matches = 0
         for segment in collocation.transcriptions:
             for place, entry in zip(
-                segment.nuisance_indices.indices, segment.nuisance.entries, strict=True
+                segment.nuisance_indices.indices,
+                segment.nuisance.entries,
+                strict=True,
             ):
                 name = f"{segment.experiment.name}: {entry.label}"
                 if name in self.nuisance:
@@ -168,7 +190,10 @@ class WarmStart:
         markers are those of the discretised problem.
         """
         p, matches = self.apply_to_nuisance(collocation)
-        matches += sum(len(self._known_places(segment)) for segment in collocation.transcriptions)
+        matches += sum(
+            len(self._known_places(segment))
+            for segment in collocation.transcriptions
+        )
         if not matches:
             return None
         p = np.clip(p, *collocation.parameter_bounds)

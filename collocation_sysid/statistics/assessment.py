@@ -115,8 +115,13 @@ class Assessment:
     @classmethod
     def from_concerns(cls, concerns: Iterable[Concern]) -> Assessment:
         """Build from concerns; duplicates are removed and the gravest come first."""
-        by_message = {concern.message: concern for concern in reversed([*concerns])}
-        gravest = sorted(reversed(by_message.values()), key=lambda each: each.grade == "check")
+        by_message = {
+            concern.message: concern for concern in reversed([*concerns])
+        }
+        gravest = sorted(
+            reversed(by_message.values()),
+            key=lambda each: each.grade == "check",
+        )
         return cls(tuple(gravest))
 
     @property
@@ -135,7 +140,9 @@ class Assessment:
 
     def combined_with(self, other: Assessment) -> Assessment:
         """Return the graver of two verdicts, with the reasons of both."""
-        light, grave = sorted((other, self), key=lambda t: get_args(Verdict).index(t.verdict))
+        light, grave = sorted(
+            (other, self), key=lambda t: get_args(Verdict).index(t.verdict)
+        )
         return Assessment.from_concerns((*grave.concerns, *light.concerns))
 
 
@@ -164,9 +171,16 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     is_used = uncertainty.errors == "autocorrelated" and (persistent or shared)
     larger = factor > MISFIT and level.larger_p < RARE
     # Of single samples nothing tells that it is noise.
-    no_noise = persistent or shared or not np.isfinite(dependence.lag1_deviation)
+    no_noise = (
+        persistent or shared or not np.isfinite(dependence.lag1_deviation)
+    )
     # Residuals of exactly zero are those of no measurement at all.
-    smaller = not larger and 0 < factor < 1 / MISFIT and level.smaller_p < RARE and not is_used
+    smaller = (
+        not larger
+        and 0 < factor < 1 / MISFIT
+        and level.smaller_p < RARE
+        and not is_used
+    )
     sigma_key = level.sigma_key
     return [
         *(outlier.concern for outlier in uncertainty.outliers),
@@ -184,7 +198,13 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
             factor=factor,
             stated=sigma_key,
         ),
-        *concern_if(smaller, False, "noise/smaller", factor=1 / (factor or 1.0), stated=sigma_key),
+        *concern_if(
+            smaller,
+            False,
+            "noise/smaller",
+            factor=1 / (factor or 1.0),
+            stated=sigma_key,
+        ),
         *_noisy_marker_concerns(level),
         *_disagreement_concerns(uncertainty),
     ]
@@ -193,7 +213,11 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
 def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:
     """Return a concern if recordings disagree on shared parameters."""
     scatter = uncertainty.scatter
-    disagreeing = [] if scatter is None else np.flatnonzero(scatter.is_disagreeing).tolist()
+    disagreeing = (
+        []
+        if scatter is None
+        else np.flatnonzero(scatter.is_disagreeing).tolist()
+    )
     names = [display_name(uncertainty.names[k]) for k in disagreeing]
     return concern_if(bool(names), False, "residuals/recordings", names=names)
 
@@ -203,12 +227,20 @@ def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
     if not level.unequal_p < RARE:
         return []
     usual = float(np.median([*level.factors.values()]))
-    noisy = [n for n, f in level.factors.items() if f > MARKER_MISFIT * max(1.0, usual)]
+    noisy = [
+        n
+        for n, f in level.factors.items()
+        if f > MARKER_MISFIT * max(1.0, usual)
+    ]
     if not noisy:
         return []
     worst = max(noisy, key=level.factors.__getitem__)
     code = "noise/marker" if len(noisy) == 1 else "noise/markers"
-    data = {"marker": worst, "factor": level.factors[worst], "count": len(noisy)}
+    data = {
+        "marker": worst,
+        "factor": level.factors[worst],
+        "count": len(noisy),
+    }
     return [Concern(code, data=data)]
 
 
@@ -217,8 +249,12 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     not determine.
     """
     known = uncertainty.estimates
-    estimates = {name: known[name] for name in uncertainty.names if name in known}
-    bounded = [name for name, estimate in estimates.items() if estimate.at_bound]
+    estimates = {
+        name: known[name] for name in uncertainty.names if name in known
+    }
+    bounded = [
+        name for name, estimate in estimates.items() if estimate.at_bound
+    ]
     undetermined = [
         name
         for name, estimate in estimates.items()
@@ -262,7 +298,11 @@ def numerical_concerns(
     value = optimum[worst].value
     percent = 100 * (refinement.errors[worst].extrapolated - value) / abs(value)
     code = NUMERICAL[1] if refinement.levels else NUMERICAL[0]
-    return [Concern(code, data={"name": worst, "percent": percent, "errors": largest})]
+    return [
+        Concern(
+            code, data={"name": worst, "percent": percent, "errors": largest}
+        )
+    ]
 
 
 # What is assumed, by the name of the relaxed assumption, for messages.
@@ -273,7 +313,9 @@ RELAXED = {
 }
 
 
-def probe_concerns(probes: Iterable[Probe], corrections: Mapping[str, float]) -> list[Concern]:
+def probe_concerns(
+    probes: Iterable[Probe], corrections: Mapping[str, float]
+) -> list[Concern]:
     """Return a concern about the assumption that the data contradict most, with the estimates
     without it.
 
@@ -288,19 +330,29 @@ def probe_concerns(probes: Iterable[Probe], corrections: Mapping[str, float]) ->
         The estimated parameters in the order in which they are reported, each with the factor that
         corrects its optimum for the known discretisation error.
     """
-    alarming = sorted(filter(is_alarming, probes), key=lambda each: -each.chi_squared)
+    alarming = sorted(
+        filter(is_alarming, probes), key=lambda each: -each.chi_squared
+    )
     if not alarming:
         return []
     worst, *others = alarming
-    instead = listed(f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in others)
+    instead = listed(
+        f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in others
+    )
     data = {
-        "assumption": RELAXED.get(worst.name, f"{source_label(worst.name)} is as stated"),
+        "assumption": RELAXED.get(
+            worst.name, f"{source_label(worst.name)} is as stated"
+        ),
         "name": source_label(worst.name),
         "size": short(worst.size or 0.0),
         "size_error": short(worst.size_error or 0.0),
         "chi_squared": worst.chi_squared,
-        "estimates": [_relaxed_estimate(worst, *each) for each in corrections.items()],
-        "instead": f"; alternatives that decrease χ² less: {instead}" if others else "",
+        "estimates": [
+            _relaxed_estimate(worst, *each) for each in corrections.items()
+        ],
+        "instead": f"; alternatives that decrease χ² less: {instead}"
+        if others
+        else "",
     }
     return [Concern("assumption/contradicted", data=data)]
 
@@ -316,17 +368,26 @@ def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
     return f"{symbol_of(name)} = {value:.4g} ± {move.std_error:.2g} {unit_of(name)}".strip()
 
 
-def outlier_share_concerns(diagnoses: Iterable[MarkerDiagnosis]) -> list[Concern]:
+def outlier_share_concerns(
+    diagnoses: Iterable[MarkerDiagnosis],
+) -> list[Concern]:
     """Return a concern if too many samples of all markers are beyond Huber's threshold, as a list;
     else empty.
     """
     diagnoses_list = tuple(diagnoses)
-    share = sum(d.wild for d in diagnoses_list) / max(1, sum(d.samples for d in diagnoses_list))
-    return concern_if(share > WILD, share > HARDLY_TAME, "residuals/wild", percent=100 * share)
+    share = sum(d.wild for d in diagnoses_list) / max(
+        1, sum(d.samples for d in diagnoses_list)
+    )
+    return concern_if(
+        share > WILD, share > HARDLY_TAME, "residuals/wild", percent=100 * share
+    )
 
 
 def nuisance_concerns(
-    names: Iterable[str], deviations: Iterable[float], low: Iterable[float], high: Iterable[float]
+    names: Iterable[str],
+    deviations: Iterable[float],
+    low: Iterable[float],
+    high: Iterable[float],
 ) -> list[Concern]:
     """Return concerns about nuisance parameters far from their priors or at their limits.
 
@@ -360,7 +421,9 @@ def nuisance_concerns(
     return concerns
 
 
-def camera_pose_concerns(names: Sequence[str], deviations: Sequence[float]) -> list[Concern]:
+def camera_pose_concerns(
+    names: Sequence[str], deviations: Sequence[float]
+) -> list[Concern]:
     """Return a concern if a depth camera is farther from its stated pose than expected.
 
     A wrong shape of the body often fits with a camera that is rotated and translated to match.
@@ -433,7 +496,11 @@ def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
 
 
 def forward_simulation_concerns(
-    name: str, rms_m: float, fit_rms_m: float, noise_rms_m: float, is_fitted: bool
+    name: str,
+    rms_m: float,
+    fit_rms_m: float,
+    noise_rms_m: float,
+    is_fitted: bool,
 ) -> list[Concern]:
     """Return a concern if the forward simulation of an experiment is much worse than the fit.
 
@@ -457,7 +524,11 @@ def forward_simulation_concerns(
         times = rms_m / yardstick_m
         gross = times > GROSS_PREDICTION
         return concern_if(
-            times > PREDICTION, gross, "roll-out/predicted", experiment=name, times=times
+            times > PREDICTION,
+            gross,
+            "roll-out/predicted",
+            experiment=name,
+            times=times,
         )
     missed = float(np.sqrt(max(0.0, rms_m**2 - fit_rms_m**2))) / yardstick_m
     return concern_if(
@@ -522,7 +593,9 @@ def stability_concerns(instabilities: Iterable[Instability]) -> list[Concern]:
     return concerns
 
 
-def contact_concerns(summaries: Iterable[ContactSummary], guess: str = "") -> list[Concern]:
+def contact_concerns(
+    summaries: Iterable[ContactSummary], guess: str = ""
+) -> list[Concern]:
     """Return concerns about obstacles that are never touched, or by too few faces to resolve the
     contact.
 
@@ -538,16 +611,27 @@ def contact_concerns(summaries: Iterable[ContactSummary], guess: str = "") -> li
     """
     concerns: dict[tuple[str, str], list[Concern]] = {}
     for each in sorted(summaries, key=lambda touch: touch.face_count):
-        data = {"experiment": each.experiment, "obstacle": each.obstacle, "guess": guess}
+        data = {
+            "experiment": each.experiment,
+            "obstacle": each.obstacle,
+            "guess": guess,
+        }
         coarse = 0 < each.face_count < FEWEST_FACES
         sizes = {"faces": each.face_count, "face_mm": each.face_mm}
         for one in (
             *concern_if(
-                not each.face_count, not guess, "contact/never", mm=1e3 * each.gap_m, **data
+                not each.face_count,
+                not guess,
+                "contact/never",
+                mm=1e3 * each.gap_m,
+                **data,
             ),
             *concern_if(coarse, False, "contact/coarse", **sizes, **data),
             *concern_if(
-                bool(guess) and each.is_initially_in_contact, False, "contact/pressed", **data
+                bool(guess) and each.is_initially_in_contact,
+                False,
+                "contact/pressed",
+                **data,
             ),
             *concern_if(
                 bool(guess and each.separation_s),
@@ -559,7 +643,13 @@ def contact_concerns(summaries: Iterable[ContactSummary], guess: str = "") -> li
         ):
             concerns.setdefault((one.code, each.obstacle), []).append(one)
     return [
-        replace(first, data={**first.data, "more": f" and {len(others)} more" if others else ""})
+        replace(
+            first,
+            data={
+                **first.data,
+                "more": f" and {len(others)} more" if others else "",
+            },
+        )
         for first, *others in concerns.values()
     ]
 
@@ -575,7 +665,9 @@ def rotation_step_concerns(
     """
     turn = fastest_rotation(experiment, substeps)
     sizes = {"step_ms": 1e3 * turn.step_s, "rate_rad_s": turn.rate_rad_s}
-    return concern_if(turn.angle_rad > limit_rad, False, code, **vars(turn), **sizes)
+    return concern_if(
+        turn.angle_rad > limit_rad, False, code, **vars(turn), **sizes
+    )
 
 
 def scheme_concerns(
@@ -613,7 +705,9 @@ def scheme_concerns(
     ]
 
 
-def rms_expected_from_noise_m(sigma_m: Array, samples: Array, parameter_count: float) -> float:
+def rms_expected_from_noise_m(
+    sigma_m: Array, samples: Array, parameter_count: float
+) -> float:
     """Return the RMS distance of markers that noise alone would leave, √(3 (1 − p/N)) σ, pooled
     [m].
 

@@ -83,7 +83,10 @@ class LaggedProducts:
         return self.split(solution.astype(np.float64))
 
     def long_lag_products(
-        self, fit: LinearisedFit, information: Information, tails: Sequence[Array]
+        self,
+        fit: LinearisedFit,
+        information: Information,
+        tails: Sequence[Array],
     ) -> Array:
         """Return the contribution (K,) of autocovariances at longer lags to the products.
 
@@ -103,9 +106,15 @@ class LaggedProducts:
         overlap = []
         total = np.zeros(self.shifted.shape[1:])
         for block, slope, last, tail in zip(
-            fit.blocks, information.scaled_jacobians, self.lags, tails, strict=True
+            fit.blocks,
+            information.scaled_jacobians,
+            self.lags,
+            tails,
+            strict=True,
         ):
-            smoothed = toeplitz_product(tail, slope) * block.channels[2][:, :, None]
+            smoothed = (
+                toeplitz_product(tail, slope) * block.channels[2][:, :, None]
+            )
             total += np.einsum("tcr,tcs->rs", slope, smoothed, optimize=True)
             overlap += [
                 np.vdot(slope[k:], smoothed[: len(slope) - k])
@@ -113,7 +122,9 @@ class LaggedProducts:
                 for k in range(last + 1)
             ]
             overlap[-last - 1] /= 2  # one diagonal, not two
-        return np.einsum("krs,rs->k", self.shifted, total) - 2 * np.array(overlap)
+        return np.einsum("krs,rs->k", self.shifted, total) - 2 * np.array(
+            overlap
+        )
 
 
 def lagged_products(
@@ -134,14 +145,21 @@ def lagged_products(
     shifted = []
     diagonal_counts = []
     overlaps = []
-    for block, slope, last in zip(fit.blocks, information.scaled_jacobians, lags, strict=True):
+    for block, slope, last in zip(
+        fit.blocks, information.scaled_jacobians, lags, strict=True
+    ):
         residual, _, present = block.channels
         width = slope.shape[2]
         within = np.zeros((last + 1, width, width))
         overlap = np.zeros((last + 1, last + 1))
-        for channel in range(residual.shape[1]):  # one at a time: all lags at once are large
+        for channel in range(
+            residual.shape[1]
+        ):  # one at a time: all lags at once are large
             is_present = present[:, channel]
-            lagged = [_lagged(slope[:, channel], is_present, k) for k in range(last + 1)]
+            lagged = [
+                _lagged(slope[:, channel], is_present, k)
+                for k in range(last + 1)
+            ]
             stacked = np.stack([each.ravel() for each in lagged])
             overlap += stacked @ stacked.T
             for k, each in enumerate(lagged):
@@ -150,8 +168,12 @@ def lagged_products(
             twice = 1 if k == 0 else 2
             lagged_rows = slice(k, None)
             behind = slice(None, len(residual) - k)
-            products.append(twice * np.sum(residual[lagged_rows] * residual[behind]))
-            diagonal_counts.append(twice * np.sum(present[lagged_rows] & present[behind]))
+            products.append(
+                twice * np.sum(residual[lagged_rows] * residual[behind])
+            )
+            diagonal_counts.append(
+                twice * np.sum(present[lagged_rows] & present[behind])
+            )
         shifted.append(within)
         overlaps.append(overlap)
     shifted = np.concatenate(shifted)
@@ -167,7 +189,9 @@ def lagged_products(
 def toeplitz_product(autocorrelation: Array, values: Array) -> Array:
     """Return the product of the Toeplitz matrix of an autocorrelation (T,) with values (T, …)."""
     columns = values.reshape(len(values), -1)
-    product = np.asarray(matmul_toeplitz(autocorrelation, columns), dtype=np.float64)
+    product = np.asarray(
+        matmul_toeplitz(autocorrelation, columns), dtype=np.float64
+    )
     return product.reshape(values.shape)
 
 
@@ -204,11 +228,19 @@ def fit_autoregression(autocovariance: Array, samples: float) -> Array:
     best = coefficients
     least = samples * np.log(innovation)
     for order in range(1, len(autocovariance)):
-        remainder = autocovariance[order] - coefficients @ autocovariance[1:order][::-1]
-        partial = np.clip(remainder / innovation, -LARGEST_PARTIAL, LARGEST_PARTIAL)
-        coefficients = np.append(coefficients - partial * coefficients[::-1], partial)
+        remainder = (
+            autocovariance[order] - coefficients @ autocovariance[1:order][::-1]
+        )
+        partial = np.clip(
+            remainder / innovation, -LARGEST_PARTIAL, LARGEST_PARTIAL
+        )
+        coefficients = np.append(
+            coefficients - partial * coefficients[::-1], partial
+        )
         innovation *= 1 - partial**2
-        criterion = samples * np.log(innovation) + order * np.log(max(samples, 2.0))
+        criterion = samples * np.log(innovation) + order * np.log(
+            max(samples, 2.0)
+        )
         if criterion < least:
             best = coefficients
             least = criterion
@@ -321,7 +353,9 @@ class ErrorProcess:
     degrees_of_freedom: float
 
 
-def analyse_dependence(fit: LinearisedFit, information: Information) -> Dependence:
+def analyse_dependence(
+    fit: LinearisedFit, information: Information
+) -> Dependence:
     """Test the residuals of a fit for correlation in time, among channels and in space.
 
     Residuals at the level of rounding count as uncorrelated. Blocks with a floor of noise are not
@@ -331,8 +365,15 @@ def analyse_dependence(fit: LinearisedFit, information: Information) -> Dependen
         return Dependence(0.0, np.inf, shared_p=1.0)
     pairs = zip(fit.blocks, information.scaled_jacobians, strict=True)
     tested = (each for each in pairs if not each[0].has_noise_floor)
-    over_space = [moments for each in tested if (moments := estimate_spatial_correlation(*each))]
-    space_p = min((len(over_space) * moments.p_value for moments in over_space), default=1.0)
+    over_space = [
+        moments
+        for each in tested
+        if (moments := estimate_spatial_correlation(*each))
+    ]
+    space_p = min(
+        (len(over_space) * moments.p_value for moments in over_space),
+        default=1.0,
+    )
     moments = lagged_products(fit, information, [1] * len(fit.blocks))
     # Rows and columns: variance and lag one, pooled over the experiments.
     pool = np.tile(np.eye(2), len(fit.blocks))
@@ -343,7 +384,9 @@ def analyse_dependence(fit: LinearisedFit, information: Information) -> Dependen
     variance = products[0] / expected[0, 0]
     lag1_variance = (products[1] - variance * expected[1, 0]) / expected[1, 1]
     return Dependence(
-        lag1=float(np.clip(lag1_variance / variance, -1.0, 1.0)),  # corrected, it may be beyond
+        lag1=float(
+            np.clip(lag1_variance / variance, -1.0, 1.0)
+        ),  # corrected, it may be beyond
         lag1_deviation=float(np.sqrt(2 / expected[1, 1])),
         shared_p=_channel_correlation_p(fit),
         space_p=space_p,
@@ -359,7 +402,9 @@ def _channel_correlation_p(fit: LinearisedFit) -> float:
     for block in fit.blocks:
         residual, _, present = block.channels
         counts = present.T.astype(float) @ present
-        of_channel = np.sqrt(np.sum(residual**2, axis=0) / np.maximum(np.diag(counts), 1))
+        of_channel = np.sqrt(
+            np.sum(residual**2, axis=0) / np.maximum(np.diag(counts), 1)
+        )
         scaled = residual / np.where(of_channel > 0, of_channel, np.inf)
         used = np.triu(counts > 2, 1)
         correlation = (scaled.T @ scaled)[used] / counts[used]
@@ -368,38 +413,60 @@ def _channel_correlation_p(fit: LinearisedFit) -> float:
     return float(chi2_sf(statistic, pairs)) if pairs else 1.0
 
 
-def error_processes(fit: LinearisedFit, information: Information) -> tuple[ErrorProcess, ...]:
+def error_processes(
+    fit: LinearisedFit, information: Information
+) -> tuple[ErrorProcess, ...]:
     """Estimate the error process of each experiment."""
-    orders = [min(MAX_ORDER, len(block.t_s) // SAMPLES_PER_ORDER) for block in fit.blocks]
-    moments = lagged_products(fit, information, [max(1, order) for order in orders])
+    orders = [
+        min(MAX_ORDER, len(block.t_s) // SAMPLES_PER_ORDER)
+        for block in fit.blocks
+    ]
+    moments = lagged_products(
+        fit, information, [max(1, order) for order in orders]
+    )
     autocovariances = moments.autocovariances()
     for _ in range(ROUNDS):
         tails = [
             _long_lag_autocovariances(block, gamma, order)
-            for block, gamma, order in zip(fit.blocks, autocovariances, orders, strict=True)
+            for block, gamma, order in zip(
+                fit.blocks, autocovariances, orders, strict=True
+            )
         ]
         before, autocovariances = (
             autocovariances,
-            moments.autocovariances(moments.long_lag_products(fit, information, tails)),
+            moments.autocovariances(
+                moments.long_lag_products(fit, information, tails)
+            ),
         )
         if np.allclose(
-            np.concatenate(autocovariances), np.concatenate(before), rtol=SETTLED, atol=0
+            np.concatenate(autocovariances),
+            np.concatenate(before),
+            rtol=SETTLED,
+            atol=0,
         ):
             break
     return tuple(
         _error_process(block, slope, gamma[: order + 1])
         for block, slope, gamma, order in zip(
-            fit.blocks, information.scaled_jacobians, autocovariances, orders, strict=True
+            fit.blocks,
+            information.scaled_jacobians,
+            autocovariances,
+            orders,
+            strict=True,
         )
     )
 
 
-def _long_lag_autocovariances(block: ResidualBlock, autocovariance: Array, order: int) -> Array:
+def _long_lag_autocovariances(
+    block: ResidualBlock, autocovariance: Array, order: int
+) -> Array:
     """Return the autocovariances (T,) of a block's errors by an autoregression of an order, at lags
     beyond those given (K,); zero at the given ones.
     """
     coefficients = _autoregression_of(block, autocovariance[: order + 1])
-    tail = max(0.0, autocovariance[0]) * process_autocorrelation(coefficients, len(block.t_s))
+    tail = max(0.0, autocovariance[0]) * process_autocorrelation(
+        coefficients, len(block.t_s)
+    )
     tail[: len(autocovariance)] = 0.0
     return tail
 
@@ -410,7 +477,9 @@ def _autoregression_of(block: ResidualBlock, autocovariance: Array) -> Array:
     """
     residual, _, present = block.channels
     channels = _effective_channels(_channel_covariance(residual, present))
-    return fit_autoregression(autocovariance, _mean_sample_count(present) * channels)
+    return fit_autoregression(
+        autocovariance, _mean_sample_count(present) * channels
+    )
 
 
 def _mean_sample_count(present: NDArray[np.bool_]) -> float:
@@ -418,7 +487,9 @@ def _mean_sample_count(present: NDArray[np.bool_]) -> float:
     return float(present.sum() / max(1, present.any(axis=0).sum()))
 
 
-def _error_process(block: ResidualBlock, slope: Array, autocovariance: Array) -> ErrorProcess:
+def _error_process(
+    block: ResidualBlock, slope: Array, autocovariance: Array
+) -> ErrorProcess:
     """Return the error process of one block, from autocovariances (K,) of its errors and
     derivatives `slope` (T, 3M, r) of its residuals.
     """
@@ -495,7 +566,9 @@ def score_covariance(
     directions = information.fit.root[:shared].T
     total = information.prior.copy()
     variance_of_variance = np.zeros(directions.shape[1])
-    for slope, process in zip(information.scaled_jacobians, processes, strict=True):
+    for slope, process in zip(
+        information.scaled_jacobians, processes, strict=True
+    ):
         shape = slope.shape[0] * slope.shape[1], slope.shape[2]
         smoothed = toeplitz_product(process.autocorrelation, slope)
         mixed = np.einsum("cd,tdr->tcr", process.channel_covariance, smoothed)
@@ -510,10 +583,16 @@ def score_covariance(
             spread = np.sum(share * share.T)
             if spread > 0:
                 freedom = process.samples * variance**2 / spread
-                variance_of_variance[k] += variance**2 / min(freedom, process.degrees_of_freedom)
+                variance_of_variance[k] += variance**2 / min(
+                    freedom, process.degrees_of_freedom
+                )
     variances = np.sum((directions.T @ total) * directions.T, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        freedom = np.where(variance_of_variance > 0, variances**2 / variance_of_variance, np.inf)
+        freedom = np.where(
+            variance_of_variance > 0,
+            variances**2 / variance_of_variance,
+            np.inf,
+        )
     return total, np.maximum(freedom, 1.0)
 
 

@@ -443,12 +443,19 @@ def message_of(code: str, data: Mapping[str, Any]) -> str:
     factor by which the misfit decreases is appended.
     """
     topic, _, rest = code.partition("/")
-    shown = {k: listed(v) if isinstance(v, (list, tuple)) else v for k, v in data.items()}
+    shown = {
+        k: listed(v) if isinstance(v, (list, tuple)) else v
+        for k, v in data.items()
+    }
     message = TOPICS[topic].messages[rest].format(**shown)
     distance_text = (
-        f" (the misfit becomes {data['nearer']:.2g} times smaller)" if "nearer" in data else ""
+        f" (the misfit becomes {data['nearer']:.2g} times smaller)"
+        if "nearer" in data
+        else ""
     )
-    return f"{data['of']}: {message}{distance_text}" if data.get("of") else message
+    return (
+        f"{data['of']}: {message}{distance_text}" if data.get("of") else message
+    )
 
 
 @dataclass(frozen=True)
@@ -480,11 +487,17 @@ class Concern:
         return message_of(self.code, self.data)
 
 
-def concern_if(is_present: bool, is_gross: bool, code: str, **data: Any) -> list[Concern]:
+def concern_if(
+    is_present: bool, is_gross: bool, code: str, **data: Any
+) -> list[Concern]:
     """Return a list with the concern of a code and its data, graded "doubtful" if `is_gross` and
     else "check"; an empty list unless `is_present`.
     """
-    return [Concern(code, "doubtful" if is_gross else "check", data)] if is_present else []
+    return (
+        [Concern(code, "doubtful" if is_gross else "check", data)]
+        if is_present
+        else []
+    )
 
 
 def topics_of(concerns: Iterable[Concern]) -> dict[str, Topic]:

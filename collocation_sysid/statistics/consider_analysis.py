@@ -21,12 +21,23 @@ from ..program.lapack import one_blas_thread
 from ..program.measurement_residual import MeasurementResidual
 from ..program.observables import ObservedMotion, ReactionForces
 from ..program.reaction_forces import GraspForces
-from ..program.sweep import ForwardSubstitution, PrescribedColumns, Sweep, SweepColumns
+from ..program.sweep import (
+    ForwardSubstitution,
+    PrescribedColumns,
+    Sweep,
+    SweepColumns,
+)
 from ..recording.experiment import Experiment
 from ..recording.nuisance import KINDS
 from .linearised import linearise_fit
 from .shape_error import CORRELATION
-from .systematic_effects import ASSUMPTIONS, CORRELATION_KEY, Assumption, Effect, ExperimentAtAnswer
+from .systematic_effects import (
+    ASSUMPTIONS,
+    CORRELATION_KEY,
+    Assumption,
+    Effect,
+    ExperimentAtAnswer,
+)
 
 # A threshold of Huber's loss that no residual reaches.
 UNWEIGHTED = 1e9
@@ -79,10 +90,14 @@ class ResidualChanges(NamedTuple):
         """
         excluded = set(assumptions)
         remaining = [
-            k for k, name in enumerate(self.names) if name.partition(" ")[0] not in excluded
+            k
+            for k, name in enumerate(self.names)
+            if name.partition(" ")[0] not in excluded
         ]
         names = tuple(self.names[k] for k in remaining)
-        return ResidualChanges(names, [block[..., remaining] for block in self.blocks])
+        return ResidualChanges(
+            names, [block[..., remaining] for block in self.blocks]
+        )
 
 
 def changes_of_assumptions(
@@ -104,7 +119,9 @@ def changes_of_assumptions(
     rows = [(row, deviations.get(row.name, row.sigma)) for row in ASSUMPTIONS]
     assumptions = [(row, s) for row, s in rows if s is not None]
     correlation = deviations.get(CORRELATION_KEY) or CORRELATION
-    of_bodies = changed_residuals(collocation, z, assumptions, surface_correlation=correlation)
+    of_bodies = changed_residuals(
+        collocation, z, assumptions, surface_correlation=correlation
+    )
     of_nuisances = changes_of_nuisances(collocation, z, deviations)
     both = zip(of_bodies.blocks, of_nuisances.blocks, strict=True)
     blocks = [np.concatenate(each, axis=3) for each in both]
@@ -129,23 +146,48 @@ def changes_of_nuisances(
 
     def with_added_nuisances(experiment: Experiment) -> Experiment:
         nuisance = experiment.nuisance
-        sigmas = {row: deviations.get(row.name, row.considered) for row in KINDS}
-        more = {r.name: s for r, s in sigmas.items() if s and nuisance.sigma(r) is None}
+        sigmas = {
+            row: deviations.get(row.name, row.considered) for row in KINDS
+        }
+        more = {
+            r.name: s
+            for r, s in sigmas.items()
+            if s and nuisance.sigma(r) is None
+        }
         return replace(experiment, nuisance=replace(nuisance, **more))
 
-    wider = [with_added_nuisances(experiment) for experiment in collocation.experiments]
-    wide = replace(collocation, experiments=wider, huber=UNWEIGHTED)  # whatever their weights
+    wider = [
+        with_added_nuisances(experiment)
+        for experiment in collocation.experiments
+    ]
+    wide = replace(
+        collocation, experiments=wider, huber=UNWEIGHTED
+    )  # whatever their weights
     p, positions = collocation.unpack(z)
     values = dict(zip(collocation.parameter_names, p.tolist(), strict=True))
-    at = wide.pack(np.array([values.get(name, 0.0) for name in wide.parameter_names]), positions)
+    at = wide.pack(
+        np.array([values.get(name, 0.0) for name in wide.parameter_names]),
+        positions,
+    )
     new = np.array(
-        [k for k, name in enumerate(wide.parameter_names) if name not in values], dtype=np.int64
+        [
+            k
+            for k, name in enumerate(wide.parameter_names)
+            if name not in values
+        ],
+        dtype=np.int64,
     )
     names: dict[int, str] = {}
     for segment in wide.transcriptions:
-        own = zip(segment.parameter_indices[wide.nq :], segment.nuisance.entries, strict=True)
+        own = zip(
+            segment.parameter_indices[wide.nq :],
+            segment.nuisance.entries,
+            strict=True,
+        )
         names |= {int(place): entry.row.name for place, entry in own}
-    blocks = [block.jacobian[..., new] for block in linearise_fit(wide, at).blocks]
+    blocks = [
+        block.jacobian[..., new] for block in linearise_fit(wide, at).blocks
+    ]
     return ResidualChanges(tuple(names[k] for k in new.tolist()), blocks)
 
 
@@ -173,10 +215,17 @@ def changed_residuals(
     names = tuple(name for row, _ in assumptions for name in row.components)
     changes: list[Array] = []
     for part in collocation.iterates(z):
-        at = ExperimentAtAnswer(part, collocation.parameters, surface_correlation)
+        at = ExperimentAtAnswer(
+            part, collocation.parameters, surface_correlation
+        )
         is_specimen = part.segment.experiment.specimen is not None
         effects = [
-            (None if is_specimen and not row.of_specimens else row.effect(at, axis), sigma)
+            (
+                None
+                if is_specimen and not row.of_specimens
+                else row.effect(at, axis),
+                sigma,
+            )
             for row, sigma in assumptions
             for axis in range(len(row.components))
         ]
@@ -212,18 +261,24 @@ def _changes_by_effects(
             rows[..., k] -= sigma * effect.mass_kg * fitted.acceleration
         if effect.time_stretch:
             mass = fitted.dynamics.mass.inertia_kg
-            rows[..., k] += 2 * sigma * effect.time_stretch * mass * fitted.acceleration
+            rows[..., k] += (
+                2 * sigma * effect.time_stretch * mass * fitted.acceleration
+            )
         if effect.displacement_m is not None:
             displacements_m[..., k] = sigma * np.where(
                 np.isnan(prescribed.positions_m), 0.0, effect.displacement_m
             )
-    forces[: fitted.dynamics.first_row] = rows[: fitted.dynamics.first_row] = 0.0
+    forces[: fitted.dynamics.first_row] = rows[: fitted.dynamics.first_row] = (
+        0.0
+    )
     solver = Sweep(segment)
     columns = _EffectColumns(
         part.equations,
         count,
         has_parameters=False,
-        prescribed=PrescribedColumns.from_columns(solver, prescribed.dofs, displacements_m),
+        prescribed=PrescribedColumns.from_columns(
+            solver, prescribed.dofs, displacements_m
+        ),
         forces_n=forces,
         rows_n=rows,
     )
@@ -234,7 +289,10 @@ def _changes_by_effects(
 
 
 def propagate_columns(
-    iterate: ExperimentIterate, solver: Sweep, columns: SweepColumns, inertia_n: Array | float = 0.0
+    iterate: ExperimentIterate,
+    solver: Sweep,
+    columns: SweepColumns,
+    inertia_n: Array | float = 0.0,
 ) -> Iterator[tuple[MeasurementResidual, ObservedMotion, Array, Array]]:
     """Propagate columns of a forward substitution to the observables.
 
@@ -258,18 +316,27 @@ def propagate_columns(
     phi = iterate.phi
     sensed = GraspForces.zeros(len(x), len(segment.sensed_dofs), columns.count)
     response = iterate.observation.response_of_rows(
-        ForwardSubstitution(solver, columns, grasp_forces=sensed).iterate_rows(x), sensed
+        ForwardSubstitution(solver, columns, grasp_forces=sensed).iterate_rows(
+            x
+        ),
+        sensed,
     )
     columns_numbered = np.arange(columns.count)
     size = columns.count + len(phi)
-    motions = iterate.observation.linearised_motions(x, response, is_by_parameters=False)
+    motions = iterate.observation.linearised_motions(
+        x, response, is_by_parameters=False
+    )
     for reading, motion in zip(segment.residuals, motions, strict=True):
         motion = _without_row_changes(motion, inertia_n)
-        values, slopes = reading.observable.linearise(motion, phi, columns_numbered, size)
+        values, slopes = reading.observable.linearise(
+            motion, phi, columns_numbered, size
+        )
         yield reading, motion, values, slopes.by_common[..., : columns.count]
 
 
-def _without_row_changes(motion: ObservedMotion, inertia_n: Array | float) -> ObservedMotion:
+def _without_row_changes(
+    motion: ObservedMotion, inertia_n: Array | float
+) -> ObservedMotion:
     """Return the motion with `inertia_n` subtracted from the changes of its reaction forces."""
 
     def forced() -> ReactionForces:

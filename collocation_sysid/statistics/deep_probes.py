@@ -35,7 +35,13 @@ from .relaxed_assumptions import (
     relaxed_probe,
     with_relaxed_assumption,
 )
-from .routine_probes import ROUTINE, WIDENING, is_alarming, routine_probes, significance_limit
+from .routine_probes import (
+    ROUTINE,
+    WIDENING,
+    is_alarming,
+    routine_probes,
+    significance_limit,
+)
 from .systematic_effects import CORRELATION_KEY
 
 # Into so many windows of time the data are cut.
@@ -61,7 +67,10 @@ def routine_probes_with_steps(fit: SolvedFit) -> tuple[Probe, ...]:
     if not alarming:
         return probes
     worst = max(alarming, key=lambda probe: probe.chi_squared)
-    with_steps = replace(_iterate_probe(fit, worst, significance_limit(fit.changes)), routine=True)
+    with_steps = replace(
+        _iterate_probe(fit, worst, significance_limit(fit.changes)),
+        routine=True,
+    )
     return tuple(with_steps if probe is worst else probe for probe in probes)
 
 
@@ -77,7 +86,10 @@ def deep_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
     limits = dict.fromkeys(ROUTINE, significance_limit(solved_fit.changes))
     return (
         *(_with_significant_moves(each, limit) for each in parts),
-        *(_iterate_probe(solved_fit, probe, limits.get(probe.name, limit)) for probe in relaxed),
+        *(
+            _iterate_probe(solved_fit, probe, limits.get(probe.name, limit))
+            for probe in relaxed
+        ),
     )
 
 
@@ -85,23 +97,34 @@ def _window_probes(at: SolvedFit) -> Iterator[Probe]:
     """Yield the refits of a third of every recording's time."""
     for k, name in enumerate(WINDOWS):
         cuts = [_third(block, k) for block in at.fit.blocks]
-        blocks = [_restrict(block, cut) for block, cut in zip(at.fit.blocks, cuts, strict=True)]
+        blocks = [
+            _restrict(block, cut)
+            for block, cut in zip(at.fit.blocks, cuts, strict=True)
+        ]
         alone = fit_part(at.fit, blocks, np.arange(len(at.fit.names)))
         yield from _part_probe(at, "window", name, *alone)
 
 
 def _third(block: ResidualBlock, k: int) -> slice:
     """Return the slice of the samples in third k (an index) of a block's samples."""
-    ends = np.round(np.linspace(0, len(block.t_s), len(WINDOWS) + 1)).astype(int)
+    ends = np.round(np.linspace(0, len(block.t_s), len(WINDOWS) + 1)).astype(
+        int
+    )
     return slice(int(ends[k]), int(ends[k + 1]))
 
 
 def _restrict(block: ResidualBlock, cut: slice) -> ResidualBlock:
     """Return the block with the samples in the slice `cut` only."""
     own = ("t_s", "is_present", "residual", "jacobian", "misfit", "components")
-    there = {name: each[cut] for name in own if (each := getattr(block, name)) is not None}
+    there = {
+        name: each[cut]
+        for name in own
+        if (each := getattr(block, name)) is not None
+    }
     shaken = block.disturbances
-    return replace(block, **there, disturbances=None if shaken is None else shaken[:, cut])
+    return replace(
+        block, **there, disturbances=None if shaken is None else shaken[:, cut]
+    )
 
 
 def _recording_probes(at: SolvedFit) -> Iterator[Probe]:
@@ -109,7 +132,9 @@ def _recording_probes(at: SolvedFit) -> Iterator[Probe]:
     if len(blocks_by_recording(at.fit)) < 2:
         return
     for alone, step in single_fits(at.fit):
-        yield from _part_probe(at, "recording", name=alone.blocks[0].name, alone=alone, step=step)
+        yield from _part_probe(
+            at, "recording", name=alone.blocks[0].name, alone=alone, step=step
+        )
 
 
 def _part_probe(
@@ -147,7 +172,9 @@ def _with_significant_moves(probe: Probe, limit: float) -> Probe:
     A part of the data differs from all data with less than its own error bar (Hausman 1978).
     """
     significant = (
-        n for n, move in probe.moves.items() if abs(move.change) > limit * move.std_error
+        n
+        for n, move in probe.moves.items()
+        if abs(move.change) > limit * move.std_error
     )
     return replace(probe, sentences=tuple(significant))
 
@@ -158,8 +185,13 @@ def _with_significant_moves(probe: Probe, limit: float) -> Probe:
 def _relaxed_probes(at: SolvedFit) -> Iterator[Probe]:
     """Relax each assumption that changes anything, by one linear step."""
     for name in dict.fromkeys(at.changes.names):
-        wide = with_relaxed_assumption(at.fit, at.changes, name, _widening(name))
-        if any(block.jacobian[..., len(at.fit.names) :].any() for block in wide.blocks):
+        wide = with_relaxed_assumption(
+            at.fit, at.changes, name, _widening(name)
+        )
+        if any(
+            block.jacobian[..., len(at.fit.names) :].any()
+            for block in wide.blocks
+        ):
             yield relaxed_probe(at, name, wide, at.parameters)
 
 
@@ -181,14 +213,21 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
     first = len(at.fit.names)
     collocation = at.collocation
     accepted_names = assumption_name(probe.name), CORRELATION_KEY
-    alone = {name: size if name in accepted_names else None for name, size in at.deviations.items()}
-    wide = with_relaxed_assumption(at.fit, at.changes, probe.name, _widening(probe.name))
+    alone = {
+        name: size if name in accepted_names else None
+        for name, size in at.deviations.items()
+    }
+    wide = with_relaxed_assumption(
+        at.fit, at.changes, probe.name, _widening(probe.name)
+    )
     p = at.parameters
     _, positions = collocation.unpack(at.z)
     for _ in range(STEPS):
         step = gauss_newton_step(wide)[:first]
         p = p + step
-        positions, failure = simulate_trajectories(collocation, p, guess=positions)
+        positions, failure = simulate_trajectories(
+            collocation, p, guess=positions
+        )
         if failure is not None:
             break
         z = collocation.pack(p, positions)
@@ -196,11 +235,15 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
         there = linearise_fit(collocation, z).with_disturbances(
             b.disturbances for b in at.fit.blocks
         )
-        wide = with_relaxed_assumption(there, changes, probe.name, _widening(probe.name))
+        wide = with_relaxed_assumption(
+            there, changes, probe.name, _widening(probe.name)
+        )
         probe = relaxed_probe(at, probe.name, wide, p)
         if np.abs(step[: wide.shared_count]).max(initial=0.0) < SETTLED:
             break
-    return replace(probe, sentences=(probe.name,) if probe.is_beyond(limit) else ())
+    return replace(
+        probe, sentences=(probe.name,) if probe.is_beyond(limit) else ()
+    )
 
 
 def _widening(name: str) -> float:

@@ -151,16 +151,23 @@ class Refinement:
             Estimates without one are left out.
         """
         if std_errors is None:
-            std_errors = {name: each.statistical_std_error for name, each in estimates.items()}
+            std_errors = {
+                name: each.statistical_std_error
+                for name, each in estimates.items()
+            }
         moves = {
             name: abs(estimates[name].value - error.extrapolated) / spread
             for name, error in self.errors.items()
             if (spread := std_errors.get(name))
         }
         # Moduli that move alike differ by rounding: the first is the parameter itself.
-        return max(moves.items(), key=lambda each: round(each[1], 6), default=("", 0.0))
+        return max(
+            moves.items(), key=lambda each: round(each[1], 6), default=("", 0.0)
+        )
 
-    def suggested_substeps(self, estimates: Mapping[str, Estimate], order: float) -> int:
+    def suggested_substeps(
+        self, estimates: Mapping[str, Estimate], order: float
+    ) -> int:
         """Return the number of steps per sample, from 1 to `MOST_SUBSTEPS`, that makes every
         correction small if the present errors are those of one step per sample.
 
@@ -196,7 +203,9 @@ class _Extrapolation:
     order: float | None = None
 
     @classmethod
-    def from_values(cls, x: Sequence[float], order: float, least: float) -> _Extrapolation:
+    def from_values(
+        cls, x: Sequence[float], order: float, least: float
+    ) -> _Extrapolation:
         """Extrapolate values at steps or edge lengths halved repeatedly; a single value has no
         change.
 
@@ -226,7 +235,12 @@ class _Extrapolation:
         observed_order = float(np.log2(ratio))
         remaining = last / (2 ** min(observed_order, order) - 1)
         uncertainty = OBSERVED * abs(remaining)
-        return cls(float(changes.sum()) + remaining, uncertainty, uncertainty, observed_order)
+        return cls(
+            float(changes.sum()) + remaining,
+            uncertainty,
+            uncertainty,
+            observed_order,
+        )
 
 
 def discretisation_error(
@@ -252,11 +266,20 @@ def discretisation_error(
     linear : bool
         Whether the parameter is its own coordinate.
     """
-    known = (estimate.value, *(estimate.statistical95 or ()), *by_step, *by_mesh)
+    known = (
+        estimate.value,
+        *(estimate.statistical95 or ()),
+        *by_step,
+        *by_mesh,
+    )
     at = IntervalCoordinate.for_estimate(name, known, linear)
     x = at.from_value(estimate.value)
-    step = _Extrapolation.from_values([x, *map(at.from_value, by_step)], step_order, step_order / 2)
-    mesh = _Extrapolation.from_values([x, *map(at.from_value, by_mesh)], MESH_ORDER, LEAST_ORDER)
+    step = _Extrapolation.from_values(
+        [x, *map(at.from_value, by_step)], step_order, step_order / 2
+    )
+    mesh = _Extrapolation.from_values(
+        [x, *map(at.from_value, by_mesh)], MESH_ORDER, LEAST_ORDER
+    )
     limit = x + step.change + mesh.change
     interval = None
     if estimate.statistical95 is not None:
@@ -297,7 +320,9 @@ def discretisation_errors(
     """
     errors = {}
     for name, estimate in estimates.items():
-        steps, meshes = ([values[name] for values in level] for level in (by_step, by_mesh))
+        steps, meshes = (
+            [values[name] for values in level] for level in (by_step, by_mesh)
+        )
         if any(value != estimate.value for value in (*steps, *meshes)):
             errors[name] = discretisation_error(
                 name,
@@ -310,7 +335,9 @@ def discretisation_errors(
     return errors
 
 
-def change_in_observations(fit: LinearisedFit, residual_changes: Sequence[Array]) -> Array:
+def change_in_observations(
+    fit: LinearisedFit, residual_changes: Sequence[Array]
+) -> Array:
     """Return the change (p,) of the parameters, to first order, if the residuals change.
 
     Parameters
@@ -320,7 +347,9 @@ def change_in_observations(fit: LinearisedFit, residual_changes: Sequence[Array]
     residual_changes : sequence of (T, M, 3) arrays
         Changes of the residuals of each block, in units of σ.
     """
-    return estimate_changes(fit, [each[..., None] for each in residual_changes])[:, 0]
+    return estimate_changes(
+        fit, [each[..., None] for each in residual_changes]
+    )[:, 0]
 
 
 def estimate_changes(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
@@ -347,7 +376,9 @@ def estimate_changes(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
         slope = block.jacobian[..., free]
         slope = slope.reshape(int(np.prod(slope.shape[:-1])), len(free))
         problem = problem.with_rows(np.zeros(len(slope)), slope)
-        weighted_change = change * block.root_weight[..., None] * block.is_measured[..., None]
+        weighted_change = (
+            change * block.root_weight[..., None] * block.is_measured[..., None]
+        )
         score += slope.T @ weighted_change.reshape(len(slope), count)
     estimates = np.zeros((len(fit.names), count))
     estimates[free] = -problem.root @ (problem.root.T @ score)

@@ -82,7 +82,9 @@ class IntervalCoordinate:
     is_linear: bool
 
     @classmethod
-    def for_estimate(cls, name: str, values: Iterable[float], linear: bool) -> IntervalCoordinate:
+    def for_estimate(
+        cls, name: str, values: Iterable[float], linear: bool
+    ) -> IntervalCoordinate:
         """Return the coordinate for an estimate.
 
         Parameters
@@ -95,7 +97,10 @@ class IntervalCoordinate:
             Whether the parameter is its own coordinate.
         """
         lowest = min(values)
-        return cls(without_region(name) == "poisson" and lowest > 0, linear or lowest <= 0)
+        return cls(
+            without_region(name) == "poisson" and lowest > 0,
+            linear or lowest <= 0,
+        )
 
     def derivative(self, value: float) -> float:
         """Return the derivative of the coordinate by the value."""
@@ -125,7 +130,11 @@ def correlation_from_covariance(covariance: Array) -> Array:
 
 
 def user_estimates(
-    parameters: Parameters, q: Array, covariance_q: Array, at_bound: Mask, quantiles: Array
+    parameters: Parameters,
+    q: Array,
+    covariance_q: Array,
+    at_bound: Mask,
+    quantiles: Array,
 ) -> dict[str, Estimate]:
     """Return the estimates of the user's parameters by name, except the mode coefficients of
     fields.
@@ -144,10 +153,16 @@ def user_estimates(
         Half widths of the 95 % intervals in standard deviations.
     """
     values = parameters.values(q).items()
-    estimates = {name: Estimate(value) for name, value in values if not is_field_coefficient(name)}
+    estimates = {
+        name: Estimate(value)
+        for name, value in values
+        if not is_field_coefficient(name)
+    }
     partners = np.abs(np.nan_to_num(correlation_from_covariance(covariance_q)))
     np.fill_diagonal(partners, 0.0)
-    partners[:, [is_field_coefficient(item.name) for item in parameters.free]] = 0.0
+    partners[
+        :, [is_field_coefficient(item.name) for item in parameters.free]
+    ] = 0.0
     for k, item in enumerate(parameters.free):
         if item.name not in estimates:
             continue
@@ -156,24 +171,44 @@ def user_estimates(
             estimates[item.name] = _estimate_at_bound(value)
             continue
         deviation = float(np.sqrt(covariance_q[k, k]))
-        estimate = _parameter_estimate(item, value, deviation, float(quantiles[k]))
+        estimate = _parameter_estimate(
+            item, value, deviation, float(quantiles[k])
+        )
         other = int(np.argmax(partners[k]))
-        relative = deviation * item.value_derivative(value) / max(abs(value), 1e-300)
-        if estimate.statistical_std_error is None or estimate.statistical95 is None:
+        relative = (
+            deviation * item.value_derivative(value) / max(abs(value), 1e-300)
+        )
+        if (
+            estimate.statistical_std_error is None
+            or estimate.statistical95 is None
+        ):
             pass
-        elif estimate.statistical95[0] <= item.lower and estimate.statistical95[1] >= item.upper:
-            reason = "its 95 % interval covers the whole range between its bounds"
-            estimate = Estimate(value, None, estimate.statistical95, reason=reason)
-        elif partners[k, other] > CONFOUNDED and relative > CONFOUNDED_DEVIATION:
+        elif (
+            estimate.statistical95[0] <= item.lower
+            and estimate.statistical95[1] >= item.upper
+        ):
+            reason = (
+                "its 95 % interval covers the whole range between its bounds"
+            )
+            estimate = Estimate(
+                value, None, estimate.statistical95, reason=reason
+            )
+        elif (
+            partners[k, other] > CONFOUNDED and relative > CONFOUNDED_DEVIATION
+        ):
             reason = (
                 f"confounded with {parameters.free[other].name} "
                 f"(correlation {correlation_from_covariance(covariance_q)[k, other]:.3f})"
             )
-            estimate = Estimate(value, None, estimate.statistical95, reason=reason)
+            estimate = Estimate(
+                value, None, estimate.statistical95, reason=reason
+            )
         estimates[item.name] = estimate
     for item in parameters.items:
         if item.tied is not None:
-            estimates[item.name] = _scaled_estimate(estimates[item.tied.to], item.tied.ratio)
+            estimates[item.name] = _scaled_estimate(
+                estimates[item.tied.to], item.tied.ratio
+            )
     return estimates
 
 
@@ -184,13 +219,18 @@ def relative_derivatives(parameters: Parameters, q: Array) -> Array:
     slopes = []
     for item, coordinate in zip(parameters.free, q, strict=True):
         value = item.from_coordinate(float(coordinate))
-        size = 1.0 if is_field_coefficient(item.name) else max(abs(value), 1e-300)
+        size = (
+            1.0 if is_field_coefficient(item.name) else max(abs(value), 1e-300)
+        )
         slopes.append(item.value_derivative(value) / size)
     return np.array(slopes)
 
 
 def derived_estimates(
-    derived: DerivedModuli, covariance_q: Array, at_bound: Mask, quantiles: Array
+    derived: DerivedModuli,
+    covariance_q: Array,
+    at_bound: Mask,
+    quantiles: Array,
 ) -> dict[str, Estimate]:
     """Return the estimates of the moduli that follow from the parameters, by the delta method.
 
@@ -213,7 +253,11 @@ def derived_estimates(
         elif not len(used) or not value > 0:
             estimates[name] = Estimate(value)
         else:
-            variance = gradient[used] @ covariance_q[np.ix_(used, used)] @ gradient[used]
+            variance = (
+                gradient[used]
+                @ covariance_q[np.ix_(used, used)]
+                @ gradient[used]
+            )
             deviation = float(np.sqrt(variance)) / value
             estimates[name] = _logarithmic_estimate(
                 name, value, deviation, float(quantiles[used].max())
@@ -239,13 +283,17 @@ def _parameter_estimate(
     if item.scale == "log":
         return _logarithmic_estimate(item.name, value, deviation, quantile)
     if without_region(item.name) == "poisson" and value > 0:
-        return _logarithmic_estimate(item.name, value, deviation * item.unit / value, quantile)
+        return _logarithmic_estimate(
+            item.name, value, deviation * item.unit / value, quantile
+        )
     if not deviation <= UNDETERMINED:
         return Estimate(value, reason="the data do not determine it")
     spread = deviation * item.unit
     least = constant_named(item.name).at_least
     return Estimate(
-        value, spread, (max(least, value - quantile * spread), value + quantile * spread)
+        value,
+        spread,
+        (max(least, value - quantile * spread), value + quantile * spread),
     )
 
 
@@ -270,11 +318,15 @@ def _scaled_estimate(estimate: Estimate, ratio: float) -> Estimate:
 def _estimate_at_bound(value: float) -> Estimate:
     """Return the estimate of a value at a bound, without error bars."""
     return Estimate(
-        value, at_bound=True, reason="it ended at a bound, or follows from a parameter that did"
+        value,
+        at_bound=True,
+        reason="it ended at a bound, or follows from a parameter that did",
     )
 
 
-def _logarithmic_estimate(name: str, value: float, deviation: float, quantile: float) -> Estimate:
+def _logarithmic_estimate(
+    name: str, value: float, deviation: float, quantile: float
+) -> Estimate:
     """Return the estimate of a value whose logarithm has the standard deviation `deviation`, NaN or
     a large one if it is not determined; `quantile` is the half width of the interval in standard
     deviations.
@@ -282,8 +334,12 @@ def _logarithmic_estimate(name: str, value: float, deviation: float, quantile: f
     if not deviation <= UNDETERMINED:  # or NaN
         return Estimate(value, reason="the data do not determine it")
     at = IntervalCoordinate.for_estimate(name, [value], linear=False)
-    reach = min(quantile * deviation * value * at.derivative(value), UNDETERMINED)
-    low, high = (at.to_value(at.from_value(value) + way * reach) for way in (-1, 1))
+    reach = min(
+        quantile * deviation * value * at.derivative(value), UNDETERMINED
+    )
+    low, high = (
+        at.to_value(at.from_value(value) + way * reach) for way in (-1, 1)
+    )
     reason = f"its 95 % interval spans more than a factor of {WIDE_FACTOR:g}"
     if at.is_odds:
         reason = "its 95 % interval covers nearly all of (0, 0.5)"
@@ -298,7 +354,9 @@ LONG = 1.0
 NOTEWORTHY = 1.1
 
 
-def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -> list[str]:
+def parameter_notes(
+    parameters: Parameters, estimates: Mapping[str, Estimate]
+) -> list[str]:
     """Return notes on parameters at a bound, not determined, or not identifiable."""
     notes = []
     reasons = {}
@@ -307,7 +365,8 @@ def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -
         estimate = estimates[item.name]
         if estimate.at_bound:
             nearest = min(
-                ("lower", "upper"), key=lambda side: abs(getattr(item, side) - estimate.value)
+                ("lower", "upper"),
+                key=lambda side: abs(getattr(item, side) - estimate.value),
             )
             notes.append(
                 f"{name} ended at its {nearest} bound {getattr(item, nearest):g}: it has no "
@@ -316,7 +375,11 @@ def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -
             )
         elif estimate.statistical95 is None:
             damping = is_damping(name)
-            by = ": no information on damping in these data" if damping else " by these data"
+            by = (
+                ": no information on damping in these data"
+                if damping
+                else " by these data"
+            )
             notes.append(
                 f"{name} is not determined{by}; fix it, give it a prior, or record a "
                 f"motion{'' if damping else ' differently'}"
@@ -350,7 +413,9 @@ def _unidentifiable_notes(reasons: Mapping[str, str]) -> list[str]:
     return notes
 
 
-def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[str]:
+def memory_notes(
+    estimates: Mapping[str, Estimate], longest_s: float
+) -> list[str]:
     """Return notes on memory branches whose share ended at zero, may be zero, or whose relaxation
     is slower than the longest recording [s].
     """
@@ -370,7 +435,11 @@ def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[st
                 f"the data do not determine whether there is memory: the share of {branch} "
                 f"may be 0, and is at most {share.statistical95[1]:.2g} (95 %)"
             )
-        elif (share.at_bound or share.statistical95) and tau and tau.value > LONG * longest_s:
+        elif (
+            (share.at_bound or share.statistical95)
+            and tau
+            and tau.value > LONG * longest_s
+        ):
             notes.append(
                 f"{branch} relaxes within {tau.value:.2g} s, slower than the longest "
                 f"recording of {longest_s:.2g} s: its share and the long-term moduli are "
@@ -379,7 +448,9 @@ def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[st
     return notes
 
 
-def noise_notes(requested: str, kind: Noise, level: NoiseLevel, errors: str) -> list[str]:
+def noise_notes(
+    requested: str, kind: Noise, level: NoiseLevel, errors: str
+) -> list[str]:
     """Return notes on residuals larger or smaller than the stated σ, and how the error bars account
     for that.
 
@@ -398,8 +469,14 @@ def noise_notes(requested: str, kind: Noise, level: NoiseLevel, errors: str) -> 
         return []
     factor = float(np.sqrt(level.pooled))
     sigma_key = level.sigma_key
-    low, high = (pick(level.factors, key=level.factors.__getitem__) for pick in (min, max))
-    if level.is_unequal and level.factors[high] > NOTEWORTHY**2 * level.factors[low]:
+    low, high = (
+        pick(level.factors, key=level.factors.__getitem__)
+        for pick in (min, max)
+    )
+    if (
+        level.is_unequal
+        and level.factors[high] > NOTEWORTHY**2 * level.factors[low]
+    ):
         least = f"{level.factors[low]:.2g} ({low})"
         most = f"{level.factors[high]:.2g} ({high})"
         size = f"between {least} and {most} times as large as expected from {sigma_key}"
@@ -425,7 +502,9 @@ def noise_notes(requested: str, kind: Noise, level: NoiseLevel, errors: str) -> 
     return [f"the residuals are {size}; {so}"]
 
 
-def correlation_notes(requested: str, errors: str, dependence: Dependence) -> list[str]:
+def correlation_notes(
+    requested: str, errors: str, dependence: Dependence
+) -> list[str]:
     """Return notes on correlated residuals and how the error bars account for that.
 
     Empty if they are not correlated, or if their correlation is explained, so that independent
@@ -439,15 +518,15 @@ def correlation_notes(requested: str, errors: str, dependence: Dependence) -> li
         Errors that were used.
     dependence : Dependence
     """
-    if not dependence.is_correlated or (errors != "autocorrelated" and requested != "independent"):
+    if not dependence.is_correlated or (
+        errors != "autocorrelated" and requested != "independent"
+    ):
         return []
     pattern = "are correlated between markers or axes"
     if dependence.is_correlated_in_space:
         pattern = "are correlated between neighbouring points of the surface"
     if dependence.is_correlated_in_time:
-        pattern = (
-            f"are correlated between consecutive samples (autocorrelation {dependence.lag1:.2f})"
-        )
+        pattern = f"are correlated between consecutive samples (autocorrelation {dependence.lag1:.2f})"
     if errors == "autocorrelated":
         return [
             f"the residuals {pattern}, unlike the noise of most sensors, so the model or the "
@@ -460,7 +539,9 @@ def correlation_notes(requested: str, errors: str, dependence: Dependence) -> li
     ]
 
 
-def disagreement_notes(fit: LinearisedFit, scatter: RecordingComparison | None) -> list[str]:
+def disagreement_notes(
+    fit: LinearisedFit, scatter: RecordingComparison | None
+) -> list[str]:
     """Return notes on parameters on which the recordings disagree; empty without a comparison
     (None).
     """
@@ -478,4 +559,8 @@ def display_name(name: str) -> str:
     """Return the name of an estimated parameter for messages; a mode coefficient is
     described by its field.
     """
-    return f"the {MODE.name} (share {name})" if is_field_coefficient(name) else name
+    return (
+        f"the {MODE.name} (share {name})"
+        if is_field_coefficient(name)
+        else name
+    )

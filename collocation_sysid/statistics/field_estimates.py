@@ -71,10 +71,18 @@ def phase_concerns(phases: PhaseSummary, name: str) -> list[Concern]:
         ends = {"name": name, "lower": lower, "median": median, "upper": upper}
         concerns.append(Concern("field/one-phase", data=ends))
     if phases.elements < FEWEST_ELEMENTS:
-        few = {"name": name, "elements": phases.elements, "fewest": FEWEST_ELEMENTS}
+        few = {
+            "name": name,
+            "elements": phases.elements,
+            "fewest": FEWEST_ELEMENTS,
+        }
         concerns.append(Concern("field/few", data=few))
     if phases.misfit > WORSE * max(1.0, phases.smooth_misfit):
-        both = {"name": name, "misfit": phases.misfit, "smooth": phases.smooth_misfit}
+        both = {
+            "name": name,
+            "misfit": phases.misfit,
+            "smooth": phases.smooth_misfit,
+        }
         concerns.append(Concern("field/phases", data=both))
     return concerns
 
@@ -128,7 +136,9 @@ class FieldEstimate:
         if self.sampled_intervals is not None:
             return self.sampled_intervals
         if self.declared_density_kg_m3 is not None:
-            half_width = self.quantile * self.deviation * self.declared_density_kg_m3
+            half_width = (
+                self.quantile * self.deviation * self.declared_density_kg_m3
+            )
             return self.value - half_width, self.value + half_width
         factor = np.exp(self.quantile * self.deviation)
         return self.value / factor, self.value * factor
@@ -136,7 +146,11 @@ class FieldEstimate:
     @property
     def deviation_over_prior(self) -> Array:
         """Standard deviation (k,) over that of the prior about the mean."""
-        prior = self.modes.field.deviation if self.phases is None else self.phases.deviation
+        prior = (
+            self.modes.field.deviation
+            if self.phases is None
+            else self.phases.deviation
+        )
         return self.deviation / prior
 
     @property
@@ -157,12 +171,16 @@ class FieldEstimate:
         """Table (k, 4): value, ends of its interval, and its standard deviation over that
         of the prior.
         """
-        return np.column_stack([self.value, *self.statistical95, self.deviation_over_prior])
+        return np.column_stack(
+            [self.value, *self.statistical95, self.deviation_over_prior]
+        )
 
     @cached_property
     def _data_information(self) -> tuple[Array, Array]:
         """Information H of the data alone, and the score b, see the module's documentation."""
-        values, vectors = np.linalg.eigh((self.covariance + self.covariance.T) / 2)
+        values, vectors = np.linalg.eigh(
+            (self.covariance + self.covariance.T) / 2
+        )
         # Rounding, or error bars that are wider than the fit's: no less than nothing.
         values = np.clip(values, 1e-12, 1.0)
         alone = vectors * (1 / values - 1) @ vectors.T
@@ -174,9 +192,14 @@ class FieldEstimate:
         noise; then there is no valid evidence.
         """
         known = self.covariance
-        return not np.isfinite(known).all() or np.linalg.eigvalsh(known)[-1] > WIDER
+        return (
+            not np.isfinite(known).all()
+            or np.linalg.eigvalsh(known)[-1] > WIDER
+        )
 
-    def log_evidence_ratio(self, length_m: float | None = None, factor: float = 1.0) -> float:
+    def log_evidence_ratio(
+        self, length_m: float | None = None, factor: float = 1.0
+    ) -> float:
         """Return ln Z(D) − ln Z(I) for another correlation length [m], or for the amplitude times a
         factor.
 
@@ -195,7 +218,9 @@ class FieldEstimate:
         prior = factor**2 * np.eye(size)
         if length_m is not None and length_m != self.modes.length_m:
             other = np.linalg.lstsq(
-                self.modes.shapes, self.modes.with_length(length_m).shapes, rcond=None
+                self.modes.shapes,
+                self.modes.with_length(length_m).shapes,
+                rcond=None,
             )
             prior = factor**2 * other[0] @ other[0].T
         return self._log_evidence(prior) - self._log_evidence(np.eye(size))
@@ -206,7 +231,13 @@ class FieldEstimate:
         """
         alone, score = self._data_information
         both = np.eye(len(alone)) + alone @ prior
-        return float(score @ prior @ np.linalg.solve(both, score) - np.linalg.slogdet(both)[1]) / 2
+        return (
+            float(
+                score @ prior @ np.linalg.solve(both, score)
+                - np.linalg.slogdet(both)[1]
+            )
+            / 2
+        )
 
     @property
     def concerns(self) -> list[Concern]:
@@ -215,9 +246,15 @@ class FieldEstimate:
             return phase_concerns(self.phases, self.name)
         amplitude = self.modes.field.deviation
         contradicted = dict[str, dict[str, float]]()
-        best = max(AMPLITUDES, key=lambda factor: self.log_evidence_ratio(factor=factor))
+        best = max(
+            AMPLITUDES,
+            key=lambda factor: self.log_evidence_ratio(factor=factor),
+        )
         if best > 1 and self.log_evidence_ratio(factor=best) > LIKELIER:
-            contradicted["amplitude"] = {"stated": amplitude, "likely": best * amplitude}
+            contradicted["amplitude"] = {
+                "stated": amplitude,
+                "likely": best * amplitude,
+            }
         if self.log_evidence_ratio(self.modes.length_m / 2) > LIKELIER:
             contradicted["length"] = {
                 "stated": self.modes.length_m,
@@ -228,14 +265,23 @@ class FieldEstimate:
             for what, v in contradicted.items()
         ]
         if below := int((self.value <= 0).sum()):
-            counts = {"name": self.name, "below": below, "elements": len(self.value)}
+            counts = {
+                "name": self.name,
+                "below": below,
+                "elements": len(self.value),
+            }
             least = {"least": float(self.value.min()), "stated": amplitude}
-            determined.insert(0, Concern("field/negative", "doubtful", counts | least))
+            determined.insert(
+                0, Concern("field/negative", "doubtful", counts | least)
+            )
         return determined
 
 
 def field_estimates(
-    body: Body, parameters: Parameters, q: Array, uncertainty: Uncertainty | Array | None
+    body: Body,
+    parameters: Parameters,
+    q: Array,
+    uncertainty: Uncertainty | Array | None,
 ) -> list[FieldEstimate]:
     """Return the estimates of all fields of a body.
 
@@ -269,25 +315,39 @@ def field_estimates(
         if (modes := part.field) is None:
             continue
         coefficients = body.field_slices[number]
-        mean, slopes = _mean_logarithm(constants, number, modes).evaluate_with_jacobian(q, NOTHING)
+        mean, slopes = _mean_logarithm(
+            constants, number, modes
+        ).evaluate_with_jacobian(q, NOTHING)
         local = mean[0] + modes.logarithms(theta[coefficients])
         declared = None
         if part.stress_field is None:
             declared = part.density_kg_m3
-        gradient = slopes + modes.jacobian(theta[coefficients]) @ by_q[coefficients]
+        gradient = (
+            slopes + modes.jacobian(theta[coefficients]) @ by_q[coefficients]
+        )
         # What is at a bound has no variance: it is taken for known.
-        used = np.flatnonzero(gradient.any(axis=0) & ~np.isnan(np.diag(covariance)))
+        used = np.flatnonzero(
+            gradient.any(axis=0) & ~np.isnan(np.diag(covariance))
+        )
         own = gradient[:, used]
-        variance = np.einsum("ei,ij,ej->e", own, covariance[np.ix_(used, used)], own)
+        variance = np.einsum(
+            "ei,ij,ej->e", own, covariance[np.ix_(used, used)], own
+        )
         deviation = np.sqrt(variance + modes.omitted_deviation**2)
-        free = [names.index(name) for name in [*body.constants][coefficients] if name in names]
+        free = [
+            names.index(name)
+            for name in [*body.constants][coefficients]
+            if name in names
+        ]
         values = np.exp(local) if declared is None else declared * local
         estimate = FieldEstimate(
             name=part.field_name,
             modes=modes,
             cells=part.cells,
             value=values,
-            deviation=deviation if uncertainty is not None else np.full_like(deviation, np.nan),
+            deviation=deviation
+            if uncertainty is not None
+            else np.full_like(deviation, np.nan),
             quantile=quantile,
             coefficients=theta[coefficients],
             covariance=covariance[np.ix_(free, free)],
@@ -300,7 +360,9 @@ def field_estimates(
     return estimates
 
 
-def _with_phases(estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float) -> FieldEstimate:
+def _with_phases(
+    estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float
+) -> FieldEstimate:
     """Return the estimate of a two-phase field with intervals from its samples.
 
     Intervals are quantiles of the samples, so that an element at the boundary has an interval from
@@ -333,7 +395,10 @@ def _with_phases(estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float)
     return replace(
         estimate,
         deviation=samples.logarithms.std(axis=0),
-        sampled_intervals=(np.minimum(lower, estimate.value), np.maximum(upper, estimate.value)),
+        sampled_intervals=(
+            np.minimum(lower, estimate.value),
+            np.maximum(upper, estimate.value),
+        ),
         phases=finding,
     )
 
@@ -344,22 +409,35 @@ def _quantiles(values: Array) -> tuple[float, float, float]:
     return float(lower), float(median), float(upper)
 
 
-def field_estimates_at(collocation: Collocation, z: Array) -> dict[str, FieldEstimate]:
+def field_estimates_at(
+    collocation: Collocation, z: Array
+) -> dict[str, FieldEstimate]:
     """Return the field estimates at a solution by name, with the covariance for independent
     errors of the stated σ.
     """
-    covariance = factorise_information(linearise_fit(collocation, z)).fit.covariance()
+    covariance = factorise_information(
+        linearise_fit(collocation, z)
+    ).fit.covariance()
     nq = collocation.nq
     estimates = dict[str, FieldEstimate]()
-    for body in dict.fromkeys(segment.body for segment in collocation.transcriptions):
+    for body in dict.fromkeys(
+        segment.body for segment in collocation.transcriptions
+    ):
         known = covariance[:nq, :nq]
-        for field in field_estimates(body, collocation.parameters, z[:nq], known):
+        for field in field_estimates(
+            body, collocation.parameters, z[:nq], known
+        ):
             estimates.setdefault(field.name, field)
     return estimates
 
 
 def mean_logarithm(
-    body: Body, parameters: Parameters, q: Array, *, part_index: int, names: Sequence[str]
+    body: Body,
+    parameters: Parameters,
+    q: Array,
+    *,
+    part_index: int,
+    names: Sequence[str],
 ) -> tuple[float, Array]:
     """Return the logarithm of the mean of a part's field, and its derivatives by some parameters;
     for a density the ratio to the stated density in place of the logarithm.
@@ -382,10 +460,14 @@ def mean_logarithm(
         ThetaMap(parameters, body), part_index, modes
     ).evaluate_with_jacobian(q, NOTHING)
     free = [item.name for item in parameters.free]
-    return float(mean[0]), slopes.reshape(-1)[[free.index(name) for name in names]]
+    return float(mean[0]), slopes.reshape(-1)[
+        [free.index(name) for name in names]
+    ]
 
 
-def _mean_logarithm(constants: ThetaMap, part_index: int, modes: FieldModes) -> GeneratedFunction:
+def _mean_logarithm(
+    constants: ThetaMap, part_index: int, modes: FieldModes
+) -> GeneratedFunction:
     """Return the generated logarithm of the mean of a part's field as a function of q; for a
     density, the generated ratio to the stated density.
 
@@ -412,4 +494,6 @@ def _mean_logarithm(constants: ThetaMap, part_index: int, modes: FieldModes) -> 
         lame = part.material.lame(own[: len(part.material.constants)])
         return ca.log(engineering_constants(lame[0], lame[1])[0])
 
-    return GeneratedFunction(logarithm, len(constants.parameters.free), data_size=0)
+    return GeneratedFunction(
+        logarithm, len(constants.parameters.free), data_size=0
+    )

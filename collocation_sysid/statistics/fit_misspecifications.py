@@ -25,7 +25,12 @@ from ..program.modal_prediction import DeclaredMotion
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp
 from ..recording.poses import PoseSequence
-from .misspecification_hypothesis import Hypothesis, HypothesisTest, clock_hypothesis, rank
+from .misspecification_hypothesis import (
+    Hypothesis,
+    HypothesisTest,
+    clock_hypothesis,
+    rank,
+)
 from .modal_misspecifications import (
     ModalComparison,
     find_misspecifications_by_modes,
@@ -63,7 +68,9 @@ SAME_LAG_S = 5e-4
 SHORTEST = 4
 
 
-def find_misspecifications(solution: Solution, budget: int | None = None) -> tuple[Hypothesis, ...]:
+def find_misspecifications(
+    solution: Solution, budget: int | None = None
+) -> tuple[Hypothesis, ...]:
     """Return hypotheses of what is described wrongly, likeliest first; empty where the residuals
     are noise.
 
@@ -80,8 +87,13 @@ def find_misspecifications(solution: Solution, budget: int | None = None) -> tup
     tuple of Hypothesis
         `strength` is the factor by which the misfit decreases without the mistake.
     """
-    fitted = [segment.experiment for segment in solution.collocation.transcriptions]
-    misfits = [_misfit(e, read) for e, read in zip(fitted, solution.readings_m, strict=True)]
+    fitted = [
+        segment.experiment for segment in solution.collocation.transcriptions
+    ]
+    misfits = [
+        _misfit(e, read)
+        for e, read in zip(fitted, solution.readings_m, strict=True)
+    ]
     hypotheses = [
         *wrench_causes(solution),
         *(cause for e in fitted for cause in load_sign_hypotheses(e)),
@@ -125,9 +137,13 @@ def _refit_hypotheses(
         noise_level=NOISE,
     )
     of = f"'{experiment.name}'"
-    lags = [] if first.is_static else _clock_hypotheses(alone, first, fitted_m, of)
+    lags = (
+        [] if first.is_static else _clock_hypotheses(alone, first, fitted_m, of)
+    )
     comparison = ModalComparison.from_experiment(first, solution.parameters)
-    turned = [] if comparison is None else _gravity_hypotheses(first, comparison)
+    turned = (
+        [] if comparison is None else _gravity_hypotheses(first, comparison)
+    )
     return [
         *trial.accepted(
             [
@@ -140,16 +156,26 @@ def _refit_hypotheses(
     ]
 
 
-def _gravity_hypotheses(declared: Experiment, comparison: ModalComparison) -> Iterator[Hypothesis]:
+def _gravity_hypotheses(
+    declared: Experiment, comparison: ModalComparison
+) -> Iterator[Hypothesis]:
     """Yield the direction of gravity that suits the natural modes best, as a hypothesis."""
     others = gravity_hypotheses(comparison.declared)
-    nearest = min(others, key=lambda each: comparison.misfit_m(each.corrected), default=None)
+    nearest = min(
+        others,
+        key=lambda each: comparison.misfit_m(each.corrected),
+        default=None,
+    )
     if nearest is not None:
         gravity_m_s2 = nearest.corrected.gravity_m_s2
-        yield replace(nearest, corrected=replace(declared, gravity_m_s2=gravity_m_s2))
+        yield replace(
+            nearest, corrected=replace(declared, gravity_m_s2=gravity_m_s2)
+        )
 
 
-def _grasp_layer_hypotheses(declared: Experiment, of: str) -> Iterator[Hypothesis]:
+def _grasp_layer_hypotheses(
+    declared: Experiment, of: str
+) -> Iterator[Hypothesis]:
     """Yield hypotheses, about the subject `of`, of grasps one layer of elements deeper or less
     deep, where that is possible.
     """
@@ -158,7 +184,9 @@ def _grasp_layer_hypotheses(declared: Experiment, of: str) -> Iterator[Hypothesi
             yield Hypothesis("grasp-layer", of, {"deep": deep}, layered)
 
 
-def _slip_hypotheses(declared: Experiment, fitted_m: Array, of: str) -> Iterator[Hypothesis]:
+def _slip_hypotheses(
+    declared: Experiment, fitted_m: Array, of: str
+) -> Iterator[Hypothesis]:
     """Yield the hypothesis, about the subject `of`, that the marker whose residuals change most
     abruptly slipped; `corrected` is the experiment without it. None if no change is abrupt, or too
     few markers remain.
@@ -166,15 +194,22 @@ def _slip_hypotheses(declared: Experiment, fitted_m: Array, of: str) -> Iterator
     residual = _residual(declared, fitted_m)
     described = DeclaredMotion.from_experiment(declared)
     if described is not None:
-        residual = np.einsum("tji,tmj->tmi", described.rotations, residual[: len(described.t_s)])
+        residual = np.einsum(
+            "tji,tmj->tmi", described.rotations, residual[: len(described.t_s)]
+        )
     clearest = [_largest_step(residual[:, m]) for m in range(residual.shape[1])]
     m = int(np.argmax([ratio for ratio, _ in clearest]))
     if clearest[m][0] < SLIP or residual.shape[1] < 2:
         return
     tracks = np.array(declared.markers.positions_m)
     tracks[:, m] = np.nan
-    data = {"marker": declared.markers.names[m], "t_s": declared.t_s[clearest[m][1]]}
-    without = replace(declared, markers=replace(declared.markers, positions_m=tracks))
+    data = {
+        "marker": declared.markers.names[m],
+        "t_s": declared.t_s[clearest[m][1]],
+    }
+    without = replace(
+        declared, markers=replace(declared.markers, positions_m=tracks)
+    )
     yield Hypothesis("marker-slip", of, data, without)
 
 
@@ -202,9 +237,13 @@ class _Refitter:
     sweeps.
     """
 
-    def __init__(self, solution: Solution, declared: Experiment, sweeps: int | None) -> None:
+    def __init__(
+        self, solution: Solution, declared: Experiment, sweeps: int | None
+    ) -> None:
         self.collocation = solution.collocation
-        fitted = [segment.experiment for segment in self.collocation.transcriptions]
+        fitted = [
+            segment.experiment for segment in self.collocation.transcriptions
+        ]
         rows = sum(len(experiment.t_s) for experiment in fitted)
         self.each = min(MOST_SWEEPS, max(FEWEST_SWEEPS, solution.iterations))
         work = EFFORT * self.each * rows // len(declared.t_s)
@@ -230,14 +269,21 @@ class _Refitter:
         """
         if self.sweeps <= 0:
             return None
-        method = ReducedSpace(max_iterations=min(self.each, self.sweeps), tolerance=TOLERANCE)
+        method = ReducedSpace(
+            max_iterations=min(self.each, self.sweeps), tolerance=TOLERANCE
+        )
         try:
-            solution = method(replace(self.collocation, experiments=(experiment,)))
+            solution = method(
+                replace(self.collocation, experiments=(experiment,))
+            )
         except (InputError, SimulationError):
             return None
         self.sweeps -= solution.iterations
         solution.unless_interrupted()
-        ended = solution.status.converged or solution.status is Status.ITERATION_LIMIT
+        ended = (
+            solution.status.converged
+            or solution.status is Status.ITERATION_LIMIT
+        )
         return solution.readings_m[0] if ended else None
 
 
@@ -291,9 +337,14 @@ def with_pose_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
         return replace(
             experiment,
             t_s=t_s[is_covered],
-            grasps=[replace(g, poses=_delayed_poses(g, t_s, lag_s)) for g in experiment.grasps],
+            grasps=[
+                replace(g, poses=_delayed_poses(g, t_s, lag_s))
+                for g in experiment.grasps
+            ],
             markers=replace(
-                markers, t_s=t_s[is_covered], positions_m=markers.positions_m[is_covered]
+                markers,
+                t_s=t_s[is_covered],
+                positions_m=markers.positions_m[is_covered],
             ),
         )
     except InputError:
@@ -313,8 +364,12 @@ def _delayed_poses(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
     return replace(
         poses,
         t_s=np.r_[min(t_s[0], poses.t_s[0]), times],
-        positions_m=np.concatenate([poses.positions_m[first], poses.positions_m]),
-        quaternions_xyzw=np.concatenate([poses.quaternions_xyzw[first], poses.quaternions_xyzw]),
+        positions_m=np.concatenate(
+            [poses.positions_m[first], poses.positions_m]
+        ),
+        quaternions_xyzw=np.concatenate(
+            [poses.quaternions_xyzw[first], poses.quaternions_xyzw]
+        ),
     )
 
 
@@ -325,13 +380,17 @@ def _marker_lag_s(experiment: Experiment, predicted_m: Array) -> float:
     """
     v = np.gradient(predicted_m, experiment.timestep_s, axis=0)
     residual = np.where(
-        np.isfinite(experiment.markers.positions_m), _residual(experiment, predicted_m), 0.0
+        np.isfinite(experiment.markers.positions_m),
+        _residual(experiment, predicted_m),
+        0.0,
     )
     moving = np.where(experiment.markers.is_present[..., None], v, 0.0)
     return float(np.sum(residual * moving) / max(np.sum(moving**2), 1e-300))
 
 
-def _with_shifted_grasps(experiment: Experiment, deeper: bool) -> Experiment | None:
+def _with_shifted_grasps(
+    experiment: Experiment, deeper: bool
+) -> Experiment | None:
     """Return the experiment with every grasp one layer of elements deeper or less deep;
     None if that is impossible.
     """
@@ -367,5 +426,7 @@ def _misfit(experiment: Experiment, predicted_m: Array) -> float:
     """Return the root mean square of the residuals of predicted markers (T, M, 3) [m] in standard
     deviations; missing samples are ignored.
     """
-    scaled = _residual(experiment, predicted_m) / experiment.markers.sigma_m[:, None]
+    scaled = (
+        _residual(experiment, predicted_m) / experiment.markers.sigma_m[:, None]
+    )
     return root_mean(scaled[experiment.markers.is_present] ** 2)

@@ -33,10 +33,21 @@ def identifiability_sentences(uncertainty: Uncertainty) -> tuple[str, ...]:
 
     Sentences on parameters at a bound or not identifiable are the same as in the notes.
     """
-    open_ends = [note for note in uncertainty.notes if note.split()[0] in uncertainty.names]
+    open_ends = [
+        note
+        for note in uncertainty.notes
+        if note.split()[0] in uncertainty.names
+    ]
     combined = _combination_sentences(uncertainty)
-    in_other_terms = _other_convention(uncertainty) if open_ends or combined else []
-    return (*_single_sentences(uncertainty), *combined, *in_other_terms, *open_ends)
+    in_other_terms = (
+        _other_convention(uncertainty) if open_ends or combined else []
+    )
+    return (
+        *_single_sentences(uncertainty),
+        *combined,
+        *in_other_terms,
+        *open_ends,
+    )
 
 
 def _single_sentences(uncertainty: Uncertainty) -> list[str]:
@@ -45,14 +56,25 @@ def _single_sentences(uncertainty: Uncertainty) -> list[str]:
         name: factor
         for name in uncertainty.names
         if name in uncertainty.estimates
-        and (factor := _interval_factor(uncertainty.estimates[name])) is not None
+        and (factor := _interval_factor(uncertainty.estimates[name]))
+        is not None
     }
-    well = [f"{name} to {_precision_text(f)}" for name, f in factors.items() if f <= WELL_FIXED]
+    well = [
+        f"{name} to {_precision_text(f)}"
+        for name, f in factors.items()
+        if f <= WELL_FIXED
+    ]
     badly = [
-        f"{name} only to {_precision_text(f)}" for name, f in factors.items() if f > WELL_FIXED
+        f"{name} only to {_precision_text(f)}"
+        for name, f in factors.items()
+        if f > WELL_FIXED
     ]
     parts = [listed(part) for part in (well, badly) if part]
-    return [f"the data determine {'; '.join(parts)} (95 %, statistical)"] if parts else []
+    return (
+        [f"the data determine {'; '.join(parts)} (95 %, statistical)"]
+        if parts
+        else []
+    )
 
 
 def _combination_sentences(uncertainty: Uncertainty) -> list[str]:
@@ -60,7 +82,9 @@ def _combination_sentences(uncertainty: Uncertainty) -> list[str]:
     eigenvalue.
     """
     deviations = np.sqrt(np.diag(uncertainty.covariance))
-    modes = np.array([is_field_coefficient(name) for name in uncertainty.names], dtype=bool)
+    modes = np.array(
+        [is_field_coefficient(name) for name in uncertainty.names], dtype=bool
+    )
     known = np.flatnonzero(np.isfinite(deviations) & (deviations > 0) & ~modes)
     if len(known) < 2:
         return []
@@ -73,15 +97,25 @@ def _combination_sentences(uncertainty: Uncertainty) -> list[str]:
         members = np.flatnonzero(np.abs(vector) > MEMBER * np.abs(vector).max())
         # Three or more that are well known each need no word about their company.
         widths = (uncertainty.quantiles * deviations)[known[members]]
-        if len(members) == 2 or (len(members) > 2 and widths.max() > np.log(WELL_FIXED)):
+        if len(members) == 2 or (
+            len(members) > 2 and widths.max() > np.log(WELL_FIXED)
+        ):
             sentences.append(
-                _combination_sentence(uncertainty, known[members], max(value, 0.0), vector[members])
+                _combination_sentence(
+                    uncertainty,
+                    known[members],
+                    max(value, 0.0),
+                    vector[members],
+                )
             )
     return sentences
 
 
 def _combination_sentence(
-    uncertainty: Uncertainty, members: NDArray[np.intp], eigenvalue: float, vector: Array
+    uncertainty: Uncertainty,
+    members: NDArray[np.intp],
+    eigenvalue: float,
+    vector: Array,
 ) -> str:
     """Return the sentence about one combination of confounded parameters.
 
@@ -98,11 +132,15 @@ def _combination_sentence(
     quantiles = uncertainty.quantiles[members]
     weights = vector / deviations
     largest = int(np.argmax(np.abs(weights)))
-    fixed = np.exp(quantiles.max() * np.sqrt(eigenvalue) / abs(weights[largest]))
+    fixed = np.exp(
+        quantiles.max() * np.sqrt(eigenvalue) / abs(weights[largest])
+    )
     how = ""
     if len(members) == 2:
         how = f" (correlation {uncertainty.correlation[members[0], members[1]]:.3f})"
-    if any(uncertainty.estimates[name].value <= 0 for name in names):  # no powers of these
+    if any(
+        uncertainty.estimates[name].value <= 0 for name in names
+    ):  # no powers of these
         return (
             f"{listed(names)} are confounded{how}: these data determine only one combination "
             "of them"
@@ -128,7 +166,9 @@ def _other_convention(uncertainty: Uncertainty) -> list[str]:
                 f"{name} {'only ' if factor > WELL_FIXED else ''}to {_precision_text(factor)}"
             )
     return (
-        [f"expressed as other elastic constants, the data determine {listed(parts)} (95 %)"]
+        [
+            f"expressed as other elastic constants, the data determine {listed(parts)} (95 %)"
+        ]
         if parts
         else []
     )
@@ -140,7 +180,9 @@ def _interval_factor(estimate: Estimate) -> float | None:
     """
     if estimate.statistical95 is None or not estimate.statistical95[0] > 0:
         return None
-    factor = float(np.sqrt(estimate.statistical95[1] / estimate.statistical95[0]))
+    factor = float(
+        np.sqrt(estimate.statistical95[1] / estimate.statistical95[0])
+    )
     return factor if factor < HOPELESS else None
 
 
@@ -148,7 +190,11 @@ def _precision_text(factor: float) -> str:
     """Return an interval's half width, given as a factor, as text."""
     if factor < 1.5:
         return f"±{100 * (factor - 1):.2g} %"
-    return f"within a factor of {factor:.2g}" if factor < HOPELESS else "no useful range"
+    return (
+        f"within a factor of {factor:.2g}"
+        if factor < HOPELESS
+        else "no useful range"
+    )
 
 
 def _product_text(names: Sequence[str], powers: Array) -> str:

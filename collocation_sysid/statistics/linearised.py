@@ -45,13 +45,17 @@ def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
         If the equations of a step are singular.
     """
     return [
-        np.stack(list(Sweep(part.segment).sensitivities(part.x, part.equations)))
+        np.stack(
+            list(Sweep(part.segment).sensitivities(part.x, part.equations))
+        )
         for part in collocation.iterates(z)
     ]
 
 
 @one_blas_thread()
-def observable_responses(collocation: Collocation, z: Array) -> list[ObservableResponse]:
+def observable_responses(
+    collocation: Collocation, z: Array
+) -> list[ObservableResponse]:
     """Return the changes of the observables of each experiment with its parameters, computed in
     parallel.
 
@@ -64,9 +68,13 @@ def observable_responses(collocation: Collocation, z: Array) -> list[ObservableR
     def of(iterate: ExperimentIterate) -> ObservableResponse:
         segment = iterate.segment
         grasp_forces = GraspForces.zeros(
-            len(iterate.x), len(segment.sensed_dofs), len(segment.dynamic_parameters)
+            len(iterate.x),
+            len(segment.sensed_dofs),
+            len(segment.dynamic_parameters),
         )
-        rows = Sweep(segment).sensitivities(iterate.x, iterate.equations, grasp_forces)
+        rows = Sweep(segment).sensitivities(
+            iterate.x, iterate.equations, grasp_forces
+        )
         return iterate.observation.response_of_rows(rows, grasp_forces)
 
     return map_experiments(of, collocation.iterates(z), collocation.threads)
@@ -76,7 +84,10 @@ def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
     """Return the derivatives d(markers)/dp of each experiment at its samples, (T, 3M, m),
     see `ObservableResponse`.
     """
-    return [response.observed_changes[0] for response in observable_responses(collocation, z)]
+    return [
+        response.observed_changes[0]
+        for response in observable_responses(collocation, z)
+    ]
 
 
 Mask = NDArray[np.bool_]
@@ -160,7 +171,10 @@ class ResidualBlock:
         """
         if self.misfit is None:
             return np.zeros(self.is_present.shape, dtype=bool)
-        return np.linalg.norm(self.misfit, axis=2) > np.linalg.norm(self.residual, axis=2) + 1e-9
+        return (
+            np.linalg.norm(self.misfit, axis=2)
+            > np.linalg.norm(self.residual, axis=2) + 1e-9
+        )
 
     @property
     def root_weight(self) -> Array:
@@ -169,7 +183,9 @@ class ResidualBlock:
         """
         if self.misfit is None:
             return np.ones((*self.is_present.shape, 1))
-        long, short = (np.linalg.norm(r, axis=2) for r in (self.misfit, self.residual))
+        long, short = (
+            np.linalg.norm(r, axis=2) for r in (self.misfit, self.residual)
+        )
         share = np.divide(short, long, out=np.ones_like(long), where=long > 0)
         return np.sqrt(share)[..., None]
 
@@ -184,7 +200,9 @@ class ResidualBlock:
         samples, markers = self.is_present.shape
         return (
             self.residual.reshape(samples, 3 * markers),
-            self.jacobian.reshape(samples, 3 * markers, self.jacobian.shape[-1]),
+            self.jacobian.reshape(
+                samples, 3 * markers, self.jacobian.shape[-1]
+            ),
             self.is_measured.reshape(samples, 3 * markers),
         )
 
@@ -205,13 +223,17 @@ class DerivedModuli:
     derivatives: Mapping[str, Array]
 
     @classmethod
-    def from_bodies(cls, constants: Iterable[ThetaMap], q: Array) -> DerivedModuli:
+    def from_bodies(
+        cls, constants: Iterable[ThetaMap], q: Array
+    ) -> DerivedModuli:
         """Compute the moduli of several bodies at q."""
         values: dict[str, float] = {}
         by_q: dict[str, Array] = {}
         for each in constants:
             moduli, slopes = each.derived_moduli(q)
-            values |= dict(zip(each.derived_names, moduli.tolist(), strict=True))
+            values |= dict(
+                zip(each.derived_names, moduli.tolist(), strict=True)
+            )
             by_q |= dict(zip(each.derived_names, slopes, strict=True))
         return cls(values, by_q)
 
@@ -219,7 +241,10 @@ class DerivedModuli:
 def parameter_values(collocation: Collocation, q: Array) -> dict[str, float]:
     """Return derived moduli and parameters by name, in SI units, at q (nq,)."""
     constants = (segment.constants for segment in collocation.transcriptions)
-    return {**DerivedModuli.from_bodies(constants, q).values, **collocation.parameters.values(q)}
+    return {
+        **DerivedModuli.from_bodies(constants, q).values,
+        **collocation.parameters.values(q),
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +276,9 @@ class LinearisedFit:
     prior_residual: Array
     prior_jacobian: Array
     at_bound: Mask
-    derived: DerivedModuli = field(default_factory=lambda: DerivedModuli({}, {}))
+    derived: DerivedModuli = field(
+        default_factory=lambda: DerivedModuli({}, {})
+    )
     phase_covariance: Array | None = None
 
     @property
@@ -259,18 +286,26 @@ class LinearisedFit:
         """Number of scalar measurements that are present."""
         return sum(block.measurement_count for block in self.blocks)
 
-    def with_disturbances(self, samples: Iterable[Array | None]) -> LinearisedFit:
+    def with_disturbances(
+        self, samples: Iterable[Array | None]
+    ) -> LinearisedFit:
         """Return the fit with samples (K, T, M, 3) of known errors of the residuals for each block;
         None for a block without them.
         """
         pairs = zip(self.blocks, samples, strict=True)
-        return replace(self, blocks=tuple(replace(b, disturbances=each) for b, each in pairs))
+        return replace(
+            self,
+            blocks=tuple(replace(b, disturbances=each) for b, each in pairs),
+        )
 
     def after_step(self, step: Array) -> LinearisedFit:
         """Return the fit after a step (p,) of all parameters, to first order: with changed
         residuals and the same derivatives.
         """
-        blocks_after = (replace(b, residual=b.residual + b.jacobian @ step) for b in self.blocks)
+        blocks_after = (
+            replace(b, residual=b.residual + b.jacobian @ step)
+            for b in self.blocks
+        )
         at_best = self.prior_residual + self.prior_jacobian * step
         return replace(self, blocks=tuple(blocks_after), prior_residual=at_best)
 
@@ -301,15 +336,23 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
     p = collocation.parameters_from(z)
     blocks = []
     for part, response in zip(
-        collocation.iterates(z), observable_responses(collocation, z), strict=True
+        collocation.iterates(z),
+        observable_responses(collocation, z),
+        strict=True,
     ):
         segment = part.segment
         experiment = part.segment.experiment
-        relaxed = segment.body.has_memory and bool(np.isinf(experiment.loaded_since_s))
+        relaxed = segment.body.has_memory and bool(
+            np.isinf(experiment.loaded_since_s)
+        )
         linearised = part.observation.linearise(part.x, response)
-        for reading, (misfit, by_own) in zip(segment.residuals, linearised, strict=True):
+        for reading, (misfit, by_own) in zip(
+            segment.residuals, linearised, strict=True
+        ):
             residual, by_own = huber_as_weights(misfit, by_own, reading.huber)
-            residual, misfit, by_own = map(reading.pool_values, (residual, misfit, by_own))
+            residual, misfit, by_own = map(
+                reading.pool_values, (residual, misfit, by_own)
+            )
             slope = np.zeros((*residual.shape, len(p)))
             slope[..., segment.parameter_indices] = by_own
             blocks.append(
@@ -317,7 +360,9 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
                     name=experiment.name,
                     t_s=reading.t_s,
                     marker_names=reading.pooled_groups.names,
-                    is_present=np.asarray(reading.pooled_groups.is_compared.any(axis=2)),
+                    is_present=np.asarray(
+                        reading.pooled_groups.is_compared.any(axis=2)
+                    ),
                     residual=residual,
                     jacobian=slope,
                     sigma_m=reading.pooled_groups.sigmas,
@@ -340,7 +385,8 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
         prior_jacobian=prior_slope,
         at_bound=(p - lower < AT_BOUND) | (upper - p < AT_BOUND),
         derived=DerivedModuli.from_bodies(
-            (s.constants for s in collocation.transcriptions), p[: collocation.nq]
+            (s.constants for s in collocation.transcriptions),
+            p[: collocation.nq],
         ),
         phase_covariance=_covariance_by_phases(collocation),
     )
@@ -352,12 +398,22 @@ def _covariance_by_phases(collocation: Collocation) -> Array | None:
     """
     names = [item.name for item in collocation.parameters.free]
     covariance: Array | None = None
-    for body in dict.fromkeys(segment.body for segment in collocation.transcriptions):
+    for body in dict.fromkeys(
+        segment.body for segment in collocation.transcriptions
+    ):
         for samples in body.phase_samples:
-            places = [k for k, name in enumerate(samples.names) if name in names]
+            places = [
+                k for k, name in enumerate(samples.names) if name in names
+            ]
             own = [names.index(samples.names[k]) for k in places]
-            covariance = np.zeros((len(names), len(names))) if covariance is None else covariance
-            covariance[np.ix_(own, own)] += samples.deviations[np.ix_(places, places)]
+            covariance = (
+                np.zeros((len(names), len(names)))
+                if covariance is None
+                else covariance
+            )
+            covariance[np.ix_(own, own)] += samples.deviations[
+                np.ix_(places, places)
+            ]
     return covariance
 
 
@@ -405,12 +461,16 @@ def least_squares_of_fit(fit: LinearisedFit) -> SquareRootInformation:
     return of_all.with_rows(fit.prior_residual, np.diag(fit.prior_jacobian))
 
 
-def least_squares_of_blocks(fit: LinearisedFit, indices: Iterable[int]) -> SquareRootInformation:
+def least_squares_of_blocks(
+    fit: LinearisedFit, indices: Iterable[int]
+) -> SquareRootInformation:
     """Return the residuals of some blocks (indices) as a least-squares problem, without priors."""
     problem = SquareRootInformation.empty(len(fit.names))
     for k in indices:
         residual, slope, _ = fit.blocks[k].channels
-        problem = problem.with_rows(residual.ravel(), slope.reshape(residual.size, slope.shape[2]))
+        problem = problem.with_rows(
+            residual.ravel(), slope.reshape(residual.size, slope.shape[2])
+        )
     return problem
 
 

@@ -58,11 +58,17 @@ class Hypothesis:
         """Return the hypothesis as a concern of a given grade."""
         tried = {} if self.corrected is None else {"nearer": self.strength}
         of = {"of": self.subject} if self.subject else {}
-        return Concern(f"description/{self.code}", grade, {**of, **self.data, **tried})
+        return Concern(
+            f"description/{self.code}", grade, {**of, **self.data, **tried}
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return cause, message and strength for JSON and tables."""
-        return {"cause": self.cause, "sentence": self.message, "strength": self.strength}
+        return {
+            "cause": self.cause,
+            "sentence": self.message,
+            "strength": self.strength,
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +95,9 @@ class HypothesisTest:
     smallest_misfit: float = 0.0
     noise_level: float = 0.0
 
-    def accepted(self, hypotheses: Iterable[Hypothesis]) -> Iterator[Hypothesis]:
+    def accepted(
+        self, hypotheses: Iterable[Hypothesis]
+    ) -> Iterator[Hypothesis]:
         """Yield those hypotheses, with their strength, whose correction decreases the misfit by the
         required factor, or from above the noise to below it.
 
@@ -99,8 +107,13 @@ class HypothesisTest:
         for each in hypotheses:
             if (misfit := self.misfit_of(each.corrected)) is None:
                 continue
-            strength = self.misfit / max(self.smallest_misfit, misfit) / each.handicap
-            if strength > self.required_factor or misfit < self.noise_level < self.misfit:
+            strength = (
+                self.misfit / max(self.smallest_misfit, misfit) / each.handicap
+            )
+            if (
+                strength > self.required_factor
+                or misfit < self.noise_level < self.misfit
+            ):
                 yield replace(each, strength=strength)
 
 
@@ -122,7 +135,9 @@ def clock_hypothesis(
     """
     when, do = ("late", "add") if lag_s > 0 else ("early", "subtract")
     data = {"when": when, "by_ms": 1e3 * abs(lag_s), "do": do}
-    return Hypothesis("clock", subject, data=data, corrected=corrected, handicap=handicap)
+    return Hypothesis(
+        "clock", subject, data=data, corrected=corrected, handicap=handicap
+    )
 
 
 def rank(hypotheses: Iterable[Hypothesis]) -> tuple[Hypothesis, ...]:

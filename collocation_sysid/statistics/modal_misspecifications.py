@@ -17,10 +17,19 @@ from scipy.spatial.transform import Rotation
 
 from ..array_types import Array, Index
 from ..errors import SimulationError
-from ..program.modal_prediction import DeclaredMotion, ModalResponse, delayed_tracks
+from ..program.modal_prediction import (
+    DeclaredMotion,
+    ModalResponse,
+    delayed_tracks,
+)
 from ..recording.experiment import Experiment
 from .axes import OTHER_AXES
-from .misspecification_hypothesis import Hypothesis, HypothesisTest, clock_hypothesis, rank
+from .misspecification_hypothesis import (
+    Hypothesis,
+    HypothesisTest,
+    clock_hypothesis,
+    rank,
+)
 from .plausibility import (
     load_sign_hypotheses,
     name_exchange_hypotheses,
@@ -51,7 +60,9 @@ LARGEST_MISFIT = 0.3
 
 
 def find_misspecifications_by_modes(
-    experiment: Experiment, constants: Mapping[str, float], huber: float | None = None
+    experiment: Experiment,
+    constants: Mapping[str, float],
+    huber: float | None = None,
 ) -> tuple[Hypothesis, ...]:
     """Return hypotheses about a recording's description, likeliest first; mostly empty.
 
@@ -67,9 +78,15 @@ def find_misspecifications_by_modes(
     if not experiment.markers.names:
         return rank(load_sign_hypotheses(experiment))
     if experiment.is_static:
-        return rank([*load_sign_hypotheses(experiment), *_rigid_axes(experiment)])
+        return rank(
+            [*load_sign_hypotheses(experiment), *_rigid_axes(experiment)]
+        )
     comparison = ModalComparison.from_experiment(experiment, constants)
-    tried = _rigid_axes(experiment) if comparison is None else comparison.hypotheses()
+    tried = (
+        _rigid_axes(experiment)
+        if comparison is None
+        else comparison.hypotheses()
+    )
     hypotheses = [
         *tried,
         *name_exchange_hypotheses(experiment, huber),
@@ -87,7 +104,9 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
     """
     markers = experiment.markers
     body = experiment.body
-    places_m = markers.predict_positions(experiment.rigid_positions(experiment.t_s))
+    places_m = markers.predict_positions(
+        experiment.rigid_positions(experiment.t_s)
+    )
     size_m = float(np.linalg.norm(np.ptp(body.mesh.bounds_m, axis=0)))
 
     def remaining_misfit(tracks_m: Array) -> float:
@@ -96,9 +115,13 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
 
     if markers.sample_count:
         trial = HypothesisTest(
-            remaining_misfit(markers.positions_m), remaining_misfit, LEAST_IMPROVEMENT
+            remaining_misfit(markers.positions_m),
+            remaining_misfit,
+            LEAST_IMPROVEMENT,
         )
-        yield from trial.accepted(_axes(f"'{experiment.name}'", markers.positions_m))
+        yield from trial.accepted(
+            _axes(f"'{experiment.name}'", markers.positions_m)
+        )
 
 
 def _axes(name: str, tracks_m: Array) -> Iterator[Hypothesis]:
@@ -108,7 +131,11 @@ def _axes(name: str, tracks_m: Array) -> Iterator[Hypothesis]:
     for axes, (order, signs) in OTHER_AXES.items():
         turned = np.array(signs) * tracks_m[..., list(order)]
         yield Hypothesis(
-            "markers-axes", name, data={"axes": axes}, corrected=turned, handicap=ONE_OF_MANY
+            "markers-axes",
+            name,
+            data={"axes": axes},
+            corrected=turned,
+            handicap=ONE_OF_MANY,
         )
 
 
@@ -142,7 +169,11 @@ class ModalComparison:
         None if the body has no modes, no single grasp carries it, there are too few tracks, or
         tendons or pressures drive it.
         """
-        declared = None if experiment.actuators else DeclaredMotion.from_experiment(experiment)
+        declared = (
+            None
+            if experiment.actuators
+            else DeclaredMotion.from_experiment(experiment)
+        )
         if declared is None or np.isfinite(declared.tracks_m[..., 0]).sum() < 3:
             return None
         try:
@@ -152,12 +183,17 @@ class ModalComparison:
         markers = experiment.markers
         noise_m = np.sqrt(3) * np.median(markers.sigma_m)
         return cls(
-            declared, markers.names, response, float(np.hypot(noise_m, ROUGHLY * response.size_m))
+            declared,
+            markers.names,
+            response,
+            float(np.hypot(noise_m, ROUGHLY * response.size_m)),
         )
 
     def misfit_m(self, declared: DeclaredMotion) -> float:
         """Return the misfit of the best stiffness [m]."""
-        return float(self._misfits_m(declared, self.response.predict(declared)).min())
+        return float(
+            self._misfits_m(declared, self.response.predict(declared)).min()
+        )
 
     def best_prediction(self, declared: DeclaredMotion) -> Array:
         """Return the markers (T, M, 3) [m] as predicted from a description with the stiffness and
@@ -168,7 +204,9 @@ class ModalComparison:
 
     def hypotheses(self) -> Iterator[Hypothesis]:
         """Iterate over the hypotheses that fit far better than the description as stated."""
-        trial = HypothesisTest(self.misfit_m(self.declared), self.misfit_m, LEAST_IMPROVEMENT)
+        trial = HypothesisTest(
+            self.misfit_m(self.declared), self.misfit_m, LEAST_IMPROVEMENT
+        )
         yield from trial.accepted(
             [
                 *simple_hypotheses(self.declared),
@@ -188,7 +226,9 @@ class ModalComparison:
         strength = misfit_m / (LARGEST_MISFIT * size_m)
         if strength > 1:
             data = {"by_mm": 1e3 * misfit_m, "size_mm": 1e3 * size_m}
-            yield Hypothesis("unlike", self.declared.name, data, strength=strength)
+            yield Hypothesis(
+                "unlike", self.declared.name, data, strength=strength
+            )
 
     def _other_axes(self) -> Iterator[Hypothesis]:
         """Yield hypotheses of other axes of the tracks, tested by the modes."""
@@ -207,8 +247,12 @@ class ModalComparison:
         """Return the misfit (S,) [m] of each prediction (S, T, M, 3): the root of the mean squared
         distance of the nearest 90 % of the samples plus the squared floor.
         """
-        present = np.isfinite(declared.tracks_m[..., 0]) & np.isfinite(predicted[0, ..., 0])
-        distance = np.linalg.norm(predicted - declared.tracks_m, axis=3)[:, present]
+        present = np.isfinite(declared.tracks_m[..., 0]) & np.isfinite(
+            predicted[0, ..., 0]
+        )
+        distance = np.linalg.norm(predicted - declared.tracks_m, axis=3)[
+            :, present
+        ]
         squares = np.sort(distance**2, axis=1)
         used = max(1, int(np.ceil(USED * squares.shape[1])))
         return np.sqrt(squares[:, :used].mean(axis=1) + self.floor_m**2)
@@ -229,14 +273,28 @@ class ModalComparison:
                 else np.broadcast_to(places_m, declared.tracks_m.shape)
             )
             moved_poses = moved_poses.with_prior_motion(
-                *_fit_rigid_motion(best, moved_poses.to_grasp_frame(moved_poses.tracks_m))
+                *_fit_rigid_motion(
+                    best, moved_poses.to_grasp_frame(moved_poses.tracks_m)
+                )
             )
             turn, shift_m = _fit_rigid_motion(
                 moved_tracks.tracks_m, self.best_prediction(moved_tracks)
             )
-            moved_tracks = replace(moved_tracks, tracks_m=moved_tracks.tracks_m @ turn.T + shift_m)
-        yield Hypothesis("gripper-frame", declared.name, corrected=moved_poses, handicap=FITTED)
-        yield Hypothesis("camera-frame", declared.name, corrected=moved_tracks, handicap=FITTED)
+            moved_tracks = replace(
+                moved_tracks, tracks_m=moved_tracks.tracks_m @ turn.T + shift_m
+            )
+        yield Hypothesis(
+            "gripper-frame",
+            declared.name,
+            corrected=moved_poses,
+            handicap=FITTED,
+        )
+        yield Hypothesis(
+            "camera-frame",
+            declared.name,
+            corrected=moved_tracks,
+            handicap=FITTED,
+        )
 
     def _clock_hypotheses(self) -> Iterator[Hypothesis]:
         """Yield the hypothesis of the clock lag that fits best, unless the allowed lags are
@@ -244,12 +302,18 @@ class ModalComparison:
         """
         declared = self.declared
         predicted = self.response.predict(declared)
-        allowed = LAGS_S[np.abs(LAGS_S) < LONGEST_LAG * np.ptp(declared.t_s)].tolist()
-        delayed = (delayed_tracks(predicted, declared.t_s, lag_s) for lag_s in allowed)
+        allowed = LAGS_S[
+            np.abs(LAGS_S) < LONGEST_LAG * np.ptp(declared.t_s)
+        ].tolist()
+        delayed = (
+            delayed_tracks(predicted, declared.t_s, lag_s) for lag_s in allowed
+        )
         misfits = [self._misfits_m(declared, each).min() for each in delayed]
         if misfits:
             lag_s = allowed[int(np.argmin(misfits))]
-            yield clock_hypothesis(declared.name, lag_s, replace(declared, lag_s=lag_s), FITTED)
+            yield clock_hypothesis(
+                declared.name, lag_s, replace(declared, lag_s=lag_s), FITTED
+            )
 
     def _name_hypotheses(self) -> Iterator[Hypothesis]:
         """Yield the hypothesis that markers have each other's names, tested on these markers; none
@@ -257,7 +321,12 @@ class ModalComparison:
         """
         declared = self.declared
         squares = np.sum(
-            (declared.tracks_m[:, :, None] - self.best_prediction(declared)[:, None]) ** 2, axis=3
+            (
+                declared.tracks_m[:, :, None]
+                - self.best_prediction(declared)[:, None]
+            )
+            ** 2,
+            axis=3,
         )
         is_complete = np.isfinite(squares).any(axis=0).all()
         if not is_complete or len(self.names) < 2:
@@ -270,14 +339,20 @@ class ModalComparison:
             _with_markers(declared, declared.tracks_m[:, order], exchanged)
             for order in (np.arange(len(chosen)), np.argsort(chosen))
         )
-        listed = ", ".join(f"{self.names[k]} is {self.names[chosen[k]]}" for k in exchanged)
-        hypothesis = Hypothesis("markers-exchanged", declared.name, {"names": listed}, renamed)
-        yield from HypothesisTest(self.misfit_m(few), self.misfit_m, LEAST_IMPROVEMENT).accepted(
-            [hypothesis]
+        listed = ", ".join(
+            f"{self.names[k]} is {self.names[chosen[k]]}" for k in exchanged
         )
+        hypothesis = Hypothesis(
+            "markers-exchanged", declared.name, {"names": listed}, renamed
+        )
+        yield from HypothesisTest(
+            self.misfit_m(few), self.misfit_m, LEAST_IMPROVEMENT
+        ).accepted([hypothesis])
 
 
-def _with_markers(declared: DeclaredMotion, tracks_m: Array, markers: Index) -> DeclaredMotion:
+def _with_markers(
+    declared: DeclaredMotion, tracks_m: Array, markers: Index
+) -> DeclaredMotion:
     """Return the description with the tracks `tracks_m` (T, M, 3) [m] of some markers (indices)
     only; the others are missing (NaN).
     """
@@ -293,7 +368,9 @@ def _fit_rigid_motion(from_m: Array, to_m: Array) -> tuple[Array, Array]:
     both = np.isfinite(from_m[..., 0]) & np.isfinite(to_m[..., 0])
     a = from_m[both]
     b = to_m[both]
-    rotation = Rotation.align_vectors(b - b.mean(axis=0), a - a.mean(axis=0))[0].as_matrix()
+    rotation = Rotation.align_vectors(b - b.mean(axis=0), a - a.mean(axis=0))[
+        0
+    ].as_matrix()
     return rotation, b.mean(axis=0) - rotation @ a.mean(axis=0)
 
 
@@ -314,15 +391,20 @@ SAME_DIRECTION = 0.94
 def simple_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
     """Iterate over the hypotheses without fitted numbers, each with the mistake corrected."""
     moving = (
-        np.ptp(declared.rotations, axis=0).any() or np.ptp(declared.translations_m, axis=0).any()
+        np.ptp(declared.rotations, axis=0).any()
+        or np.ptp(declared.translations_m, axis=0).any()
     )
     if moving or np.abs(declared.translations_m).any():
         yield from _pose_hypotheses(declared)
         yield from _unit_hypotheses(
             declared, "translations_m", "the poses would fit if they", "grasp"
         )
-    yield from _unit_hypotheses(declared, "tracks_m", "the markers would fit if they", "markers")
-    yield from _unit_hypotheses(declared, "mesh_scale", "the mesh would fit if it", "object")
+    yield from _unit_hypotheses(
+        declared, "tracks_m", "the markers would fit if they", "markers"
+    )
+    yield from _unit_hypotheses(
+        declared, "mesh_scale", "the mesh would fit if it", "object"
+    )
     yield from gravity_hypotheses(declared)
 
 
@@ -333,16 +415,22 @@ def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
     inverted = replace(declared, rotations=inverse, translations_m=shift)
     yield Hypothesis("poses-inverted", declared.name, corrected=inverted)
     yield Hypothesis(
-        "rotation-inverted", declared.name, corrected=replace(declared, rotations=inverse)
+        "rotation-inverted",
+        declared.name,
+        corrected=replace(declared, rotations=inverse),
     )
     quaternions = Rotation.from_matrix(declared.rotations).as_quat()
     # Signs are free; neighbours of one sign keep the reordered ones continuous.
     flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
     quaternions *= np.cumprod(np.r_[1.0, np.where(flips, -1.0, 1.0)])[:, None]
     for order, turn in (("wxyz", -1), ("xyzw", 1)):
-        reordered = Rotation.from_quat(np.roll(quaternions, turn, axis=1)).as_matrix()
+        reordered = Rotation.from_quat(
+            np.roll(quaternions, turn, axis=1)
+        ).as_matrix()
         without = replace(declared, rotations=reordered)
-        yield Hypothesis("quaternion-order", declared.name, {"order": order}, without)
+        yield Hypothesis(
+            "quaternion-order", declared.name, {"order": order}, without
+        )
 
 
 def _unit_hypotheses(
@@ -375,7 +463,13 @@ def gravity_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
     for axis, name in enumerate("xyz"):
         for sign, plus in ((1.0, "+"), (-1.0, "−")):
             other: Array = np.where(np.arange(3) == axis, sign * size, 0.0)
-            if size and other @ declared.gravity_m_s2 <= SAME_DIRECTION * size**2:
-                data = {"axis": plus + name, "vector": ", ".join(f"{x:g}" for x in other)}
+            if (
+                size
+                and other @ declared.gravity_m_s2 <= SAME_DIRECTION * size**2
+            ):
+                data = {
+                    "axis": plus + name,
+                    "vector": ", ".join(f"{x:g}" for x in other),
+                }
                 without = replace(declared, gravity_m_s2=other)
                 yield Hypothesis("gravity", declared.name, data, without)

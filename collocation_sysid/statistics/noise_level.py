@@ -93,12 +93,18 @@ class NoiseLevel:
         """Source of the variance that the residuals suggest."""
         if self.is_unequal:
             return "by-marker"
-        return "estimated" if self.larger_p < LARGER or self.is_smaller else "given"
+        return (
+            "estimated"
+            if self.larger_p < LARGER or self.is_smaller
+            else "given"
+        )
 
     @cached_property
     def factors(self) -> dict[str, float]:
         """Standard deviation of the errors of each marker over σ, by the marker's name."""
-        return dict(zip(self.names, np.sqrt(self.variances).tolist(), strict=True))
+        return dict(
+            zip(self.names, np.sqrt(self.variances).tolist(), strict=True)
+        )
 
     @property
     def unevenness(self) -> float:
@@ -139,17 +145,26 @@ class NoiseLevel:
             return exact + of_data, np.full(shared, max(1.0, self.freedom))
         total = exact + np.tensordot(self.variances, self.shares, 1)
         directions = information.fit.root[:shared]
-        parts = np.einsum("kr,grs,ks->kg", directions, self.shares, directions) * self.variances
-        variance_of_variance = np.sum(parts**2 / np.maximum(self.freedoms, 1.0), axis=1)
+        parts = (
+            np.einsum("kr,grs,ks->kg", directions, self.shares, directions)
+            * self.variances
+        )
+        variance_of_variance = np.sum(
+            parts**2 / np.maximum(self.freedoms, 1.0), axis=1
+        )
         variances = np.einsum("kr,rs,ks->k", directions, total, directions)
         with np.errstate(divide="ignore", invalid="ignore"):
             freedom = np.where(
-                variance_of_variance > 0, variances**2 / variance_of_variance, np.inf
+                variance_of_variance > 0,
+                variances**2 / variance_of_variance,
+                np.inf,
             )
         return total, np.maximum(freedom, 1.0)
 
 
-def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseLevel:
+def estimate_noise_level(
+    fit: LinearisedFit, information: Information
+) -> NoiseLevel:
     """Return the size of the errors of each marker compared with the stated σ, with tests, from the
     residuals of a fit.
 
@@ -167,7 +182,9 @@ def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseL
     counts = []
     shares = []
     prior_score = np.zeros_like(information.prior)
-    for block, slope in zip(fit.blocks, information.scaled_jacobians, strict=True):
+    for block, slope in zip(
+        fit.blocks, information.scaled_jacobians, strict=True
+    ):
         if block.has_noise_floor:
             prior_score += _prior_score_covariance(block, slope)
             continue
@@ -175,7 +192,10 @@ def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseL
         for m in np.flatnonzero(block.is_present.any(axis=0)).tolist():
             rows = by_marker[:, m].reshape(3 * len(block.t_s), slope.shape[2])
             names.append(f"{block.name}/{block.marker_names[m]}")
-            squares.append(float(np.sum(block.residual[:, m] ** 2)) / shortened_power(block))
+            squares.append(
+                float(np.sum(block.residual[:, m] ** 2))
+                / shortened_power(block)
+            )
             counts.append(int(block.is_measured[:, m].sum()))
             shares.append(rows.T @ rows)
     of_score, besides = _known_error_moments(fit, information)
@@ -188,9 +208,16 @@ def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseL
         prior=information.prior + prior_score,
         of_score=of_score + prior_score,
     )
-    sigma_keys = [b.sigma_key for b in fit.blocks if b.is_present.any() and not b.has_noise_floor]
+    sigma_keys = [
+        b.sigma_key
+        for b in fit.blocks
+        if b.is_present.any() and not b.has_noise_floor
+    ]
     # That of places stands for all.
-    return replace(level, sigma_key=min(sigma_keys, key="sigma_m".__ne__, default="sigma_m"))
+    return replace(
+        level,
+        sigma_key=min(sigma_keys, key="sigma_m".__ne__, default="sigma_m"),
+    )
 
 
 def _prior_score_covariance(block: ResidualBlock, slope: Array) -> Array:
@@ -207,9 +234,14 @@ def _prior_score_covariance(block: ResidualBlock, slope: Array) -> Array:
     """
     rows = slope.reshape(slope.shape[0] * slope.shape[1], slope.shape[2])
     share = rows.T @ rows
-    degrees_of_freedom = max(1.0, block.measurement_count - float(np.trace(share)))
+    degrees_of_freedom = max(
+        1.0, block.measurement_count - float(np.trace(share))
+    )
     factor = max(
-        1.0, float(np.sum(block.residual**2)) / shortened_power(block) / degrees_of_freedom
+        1.0,
+        float(np.sum(block.residual**2))
+        / shortened_power(block)
+        / degrees_of_freedom,
     )
     return factor * share
 
@@ -222,12 +254,16 @@ def disturbance_samples(fit: LinearisedFit) -> list[Array]:
     count = next((len(each) for each in of_blocks if each is not None), 0)
     samples_of_blocks = []
     for block, each in zip(fit.blocks, of_blocks, strict=True):
-        samples = np.zeros((count, *block.residual.shape)) if each is None else each
+        samples = (
+            np.zeros((count, *block.residual.shape)) if each is None else each
+        )
         samples_of_blocks.append(samples[:count] * block.is_measured)
     return samples_of_blocks
 
 
-def project_errors(information: Information, errors: Sequence[Array]) -> tuple[Array, list[Array]]:
+def project_errors(
+    information: Information, errors: Sequence[Array]
+) -> tuple[Array, list[Array]]:
     """Return the effect of samples of errors on the fit.
 
     Parameters
@@ -244,21 +280,32 @@ def project_errors(information: Information, errors: Sequence[Array]) -> tuple[A
     """
     error_rows = [each.reshape(len(each), each.shape[1], -1) for each in errors]
     pairs = [*zip(error_rows, information.scaled_jacobians, strict=True)]
-    scores = np.sum([np.einsum("ktc,tcr->kr", e, slope) for e, slope in pairs], axis=0)
-    remaining = [e - np.einsum("tcr,kr->ktc", slope, scores) for e, slope in pairs]
+    scores = np.sum(
+        [np.einsum("ktc,tcr->kr", e, slope) for e, slope in pairs], axis=0
+    )
+    remaining = [
+        e - np.einsum("tcr,kr->ktc", slope, scores) for e, slope in pairs
+    ]
     return scores, [
         each.reshape(errors_of_block.shape)
         for each, errors_of_block in zip(remaining, errors, strict=True)
     ]
 
 
-def _known_error_moments(fit: LinearisedFit, information: Information) -> tuple[Array, Array]:
+def _known_error_moments(
+    fit: LinearisedFit, information: Information
+) -> tuple[Array, Array]:
     """Return the covariance (r, r) of the score, and the sums of squares (G, K) of each of G
     markers in each of K samples, due to known errors; zeros with K = 1 if there are none.
     """
-    is_used = [block.is_present.any(axis=0) & (not block.has_noise_floor) for block in fit.blocks]
+    is_used = [
+        block.is_present.any(axis=0) & (not block.has_noise_floor)
+        for block in fit.blocks
+    ]
     if not len((samples := disturbance_samples(fit))[0]):
-        return np.zeros_like(information.prior), np.zeros((int(np.concatenate(is_used).sum()), 1))
+        return np.zeros_like(information.prior), np.zeros(
+            (int(np.concatenate(is_used).sum()), 1)
+        )
     scores, remaining = project_errors(information, samples)
     present = [block.is_measured for block in fit.blocks]
     sums = [
@@ -304,7 +351,11 @@ def _solve_noise_level(
     means = own_freedoms + known_means
     spreads = own_freedoms + 2 * known_means + besides.var(axis=1) / 2
     freedoms = means**2 / np.maximum(spreads, 1e-300)
-    spread = own_freedoms.sum() + 2 * known_means.sum() + besides.sum(axis=0).var() / 2
+    spread = (
+        own_freedoms.sum()
+        + 2 * known_means.sum()
+        + besides.sum(axis=0).var() / 2
+    )
     freedom = float(means.sum() ** 2 / max(spread, 1e-300))
     of_prior = np.einsum("grs,sr->g", shares, prior)
     overlap = np.einsum("grs,hsr->gh", shares, shares)
@@ -313,7 +364,10 @@ def _solve_noise_level(
     raw = np.maximum(squares - known_means, 0.0)
     least = np.maximum(LEAST_SHARE * raw / np.maximum(counts, 1.0), ROUNDING**2)
     by_marker = np.maximum(np.linalg.lstsq(expected, own)[0], least)
-    pooled = max(own.sum() / max(1.0, expected.sum()), counts @ least / max(1.0, counts.sum()))
+    pooled = max(
+        own.sum() / max(1.0, expected.sum()),
+        counts @ least / max(1.0, counts.sum()),
+    )
     exact = squares.sum() <= ROUNDING**2 * counts.sum()
     tested = not exact and own_freedoms.sum() >= 1
     statistic = float(squares.sum()) * freedom / max(float(means.sum()), 1e-300)
@@ -325,7 +379,9 @@ def _solve_noise_level(
         freedom=freedom,
         larger_p=float(chi2_sf(statistic, freedom)) if tested else 1.0,
         smaller_p=float(chi2_cdf(statistic, freedom)) if tested else 1.0,
-        unequal_p=_bartlett(squares * freedoms / np.maximum(means, 1e-300), freedoms)
+        unequal_p=_bartlett(
+            squares * freedoms / np.maximum(means, 1e-300), freedoms
+        )
         if tested
         else 1.0,
         shares=shares,
@@ -344,7 +400,9 @@ def _bartlett(squares: Array, freedoms: Array) -> float:
         return 1.0
     total = each.sum()
     pooled = squares[used].sum() / total
-    statistic = total * np.log(pooled) - np.sum(each * np.log(squares[used] / each))
+    statistic = total * np.log(pooled) - np.sum(
+        each * np.log(squares[used] / each)
+    )
     correction = 1 + (np.sum(1 / each) - 1 / total) / (3 * (count - 1))
     return float(chi2_sf(statistic / correction, count - 1))
 

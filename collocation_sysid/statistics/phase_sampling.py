@@ -97,7 +97,9 @@ class InternalFaces:
     def from_mesh(cls, mesh: TetMesh, cells: Index) -> InternalFaces:
         """Find the faces between some elements of a mesh, numbered in the order of `cells`."""
         corners = mesh.tetrahedra[cells]
-        triples = np.sort(corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]], axis=2)
+        triples = np.sort(
+            corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]], axis=2
+        )
         cell_of_face = np.repeat(np.arange(len(cells)), 4)
         all_triples = triples.reshape(-1, 3)
         order = np.lexsort(all_triples.T)
@@ -117,7 +119,9 @@ class InternalFaces:
         """Sparse matrix (E, E) of the weights of the faces between elements."""
         i, j = self.pairs.T
         both = (np.r_[self.weights, self.weights], (np.r_[i, j], np.r_[j, i]))
-        return sp.csr_array(both, shape=(self.element_count, self.element_count))
+        return sp.csr_array(
+            both, shape=(self.element_count, self.element_count)
+        )
 
     @property
     def jump_operator(self) -> sp.csr_array:
@@ -125,7 +129,9 @@ class InternalFaces:
         faces = np.arange(len(self.pairs))
         ends = np.r_[faces, faces], self.pairs.T.ravel()
         signs = np.repeat([1.0, -1.0], len(faces))
-        return sp.csr_array((signs, ends), shape=(len(faces), self.element_count))
+        return sp.csr_array(
+            (signs, ends), shape=(len(faces), self.element_count)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,10 +225,14 @@ def initial_phases(
         weights = settings.total_variation * faces.weights / smoothed
         prior = (jumps.T @ sp.diags_array(weights) @ jumps).toarray()
         # No measurement tells the mean of z, which p has too.
-        prior[np.diag_indices_from(prior)] += 1e-9 * np.trace(prior) / len(prior)
+        prior[np.diag_indices_from(prior)] += (
+            1e-9 * np.trace(prior) / len(prior)
+        )
         z = np.linalg.solve(normal + prior, normal @ data.base - score)
     above = z >= _class_threshold(z, volumes_m3)
-    return (above if volumes_m3[above].sum() <= volumes_m3.sum() / 2 else ~above).astype(float)
+    return (
+        above if volumes_m3[above].sum() <= volumes_m3.sum() / 2 else ~above
+    ).astype(float)
 
 
 def _class_threshold(values: Array, weights: Array) -> float:
@@ -239,7 +249,10 @@ def _class_threshold(values: Array, weights: Array) -> float:
 
 
 def sample_phases(
-    data: ElementInformation, faces: InternalFaces, start: Array, settings: SamplerSettings = USUAL
+    data: ElementInformation,
+    faces: InternalFaces,
+    start: Array,
+    settings: SamplerSettings = USUAL,
 ) -> PosteriorDraws:
     """Draw phases, contrast and parameters from their posterior, by several chains.
 
@@ -313,7 +326,9 @@ def _run_chain(
         """
         coupling = data.mixed.T @ phase
         own = phase @ of_z_phase + 1 / data.deviation**2
-        information = np.block([[data.of_p, coupling[:, None]], [coupling, np.array([[own]])]])
+        information = np.block(
+            [[data.of_p, coupling[:, None]], [coupling, np.array([[own]])]]
+        )
         information[np.diag_indices_from(information)] *= 1 + 1e-12
         factor = np.linalg.cholesky(information)
         right = -np.r_[of_p, phase @ constant]
@@ -342,7 +357,9 @@ def _run_chain(
             mean, both = drawn()
             energy = change(1 - 2 * phase)
         weights = np.cumsum(np.exp(np.clip(-energy / 2, -limit, limit)))
-        chosen = min(int(np.searchsorted(weights, rng.random() * weights[-1])), count - 1)
+        chosen = min(
+            int(np.searchsorted(weights, rng.random() * weights[-1])), count - 1
+        )
         sign = 1 - 2 * phase[chosen]
         before = of_z_phase, neighbour_sums, energy
         row = slice(neighbours.indptr[chosen], neighbours.indptr[chosen + 1])

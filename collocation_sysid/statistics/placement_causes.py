@@ -39,7 +39,10 @@ def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
     cells = experiment.body.cells
     count = len(experiment.body.nodes_m)
     first = np.repeat(cells[:, 0], cells.shape[1] - 1)
-    edges = coo_array((np.ones(len(first)), (first, cells[:, 1:].ravel())), shape=(count, count))
+    edges = coo_array(
+        (np.ones(len(first)), (first, cells[:, 1:].ravel())),
+        shape=(count, count),
+    )
     _, labels = connected_components(edges, directed=False)
     parts, sizes = np.unique(labels[np.unique(cells)], return_counts=True)
     grasped_labels = [labels[grasp.nodes] for grasp in experiment.body_grasps]
@@ -49,11 +52,19 @@ def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
         else np.zeros(len(parts), dtype=bool)
     )
     if loose.any() and not experiment.tendons:
-        data = {"parts": len(parts), "loose": int(loose.sum()), "nodes": int(sizes[loose].max())}
-        yield Hypothesis("mesh-parts", f"'{experiment.name}'", data, strength=float(count))
+        data = {
+            "parts": len(parts),
+            "loose": int(loose.sum()),
+            "nodes": int(sizes[loose].max()),
+        }
+        yield Hypothesis(
+            "mesh-parts", f"'{experiment.name}'", data, strength=float(count)
+        )
 
 
-def _containing(experiment: Experiment, obstacle: Obstacle) -> Iterator[Hypothesis]:
+def _containing(
+    experiment: Experiment, obstacle: Obstacle
+) -> Iterator[Hypothesis]:
     """Yield the hypothesis that an obstacle contains most of the undeformed body at the
     first time.
     """
@@ -66,7 +77,9 @@ def _containing(experiment: Experiment, obstacle: Obstacle) -> Iterator[Hypothes
     share = float((gaps_m < -deep_m).mean())
     if share <= MOST_INSIDE:
         return
-    reversible = isinstance(obstacle.shape, Plane) and not (gaps_m > deep_m).any()
+    reversible = (
+        isinstance(obstacle.shape, Plane) and not (gaps_m > deep_m).any()
+    )
     code = "obstacle-normal" if reversible else "obstacle-place"
     data = {"obstacle": obstacle.name, "percent": 100 * share}
     yield Hypothesis(code, f"'{experiment.name}'", data, strength=100 * share)
@@ -78,4 +91,6 @@ def _gaps_m(obstacle: Obstacle, points_m: Array) -> Array:
     """
     point = ca.SX.sym("point", 3)
     gap = ca.Function("gap", [point], [obstacle.shape.signed_distance(point)])
-    return np.asarray(gap.map(len(points_m))(points_m.T), dtype=np.float64).ravel()
+    return np.asarray(
+        gap.map(len(points_m))(points_m.T), dtype=np.float64
+    ).ravel()

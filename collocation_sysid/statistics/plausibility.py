@@ -70,9 +70,15 @@ def size_and_density_hypotheses(body: Body) -> tuple[Hypothesis, ...]:
         else f"probably {density_kg_m3 / 1e3:.4g} kg/m³, if the mass is in g",
     }
     tried = (
-        Hypothesis("length-unit/size", data=size, strength=_excess_factor(size_m, SIZES_M)),
         Hypothesis(
-            "density", data=density, strength=_excess_factor(density_kg_m3, DENSITIES_KG_M3)
+            "length-unit/size",
+            data=size,
+            strength=_excess_factor(size_m, SIZES_M),
+        ),
+        Hypothesis(
+            "density",
+            data=density,
+            strength=_excess_factor(density_kg_m3, DENSITIES_KG_M3),
         ),
     )
     for each in tried:
@@ -95,11 +101,19 @@ def material_hypothesis(body: Body, theta: Array) -> Hypothesis | None:
 
     Motion determines the stiffness over the density only, so a wrong density leaves no other trace.
     """
-    density_kg_m3 = float(body.mass_of_dofs(theta).sum()) / 3 / body.mesh.volume_m3
-    young_pa = max(float(engineering_constants(*lame)[0]) for lame in body.lame(theta).values())
+    density_kg_m3 = (
+        float(body.mass_of_dofs(theta).sum()) / 3 / body.mesh.volume_m3
+    )
+    young_pa = max(
+        float(engineering_constants(*lame)[0])
+        for lame in body.lame(theta).values()
+    )
     if density_kg_m3 < METAL_KG_M3 or young_pa > SOFTEST_METAL_PA:
         return None
-    return Hypothesis("density/metal", data={"density_kg_m3": density_kg_m3, "young_pa": young_pa})
+    return Hypothesis(
+        "density/metal",
+        data={"density_kg_m3": density_kg_m3, "young_pa": young_pa},
+    )
 
 
 def _excess_factor(value: float, limits: tuple[float, float]) -> float:
@@ -122,7 +136,9 @@ def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
 
     Dynamic experiments are not tested, because of inertia.
     """
-    for k, grasp in enumerate(experiment.grasps if experiment.is_static else (), start=1):
+    for k, grasp in enumerate(
+        experiment.grasps if experiment.is_static else (), start=1
+    ):
         if grasp.wrench is None:
             continue
         shifts_m = grasp.poses.at(grasp.wrench.t_s)[1]
@@ -133,16 +149,25 @@ def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
             is_measured = np.isfinite(load_n)
             if isinstance(grasp, Obstacle):
                 # Before contact the load is noise.
-                is_measured &= np.abs(load_n) > TOUCHING * np.nanmax(np.abs(load_n), initial=0.0)
+                is_measured &= np.abs(load_n) > TOUCHING * np.nanmax(
+                    np.abs(load_n), initial=0.0
+                )
             if is_measured.sum() < FEWEST_SAMPLES or not (
-                np.ptp(displacement_m[is_measured]) and np.ptp(load_n[is_measured])
+                np.ptp(displacement_m[is_measured])
+                and np.ptp(load_n[is_measured])
             ):
                 continue
-            correlation = float(np.corrcoef(displacement_m[is_measured], load_n[is_measured])[0, 1])
+            correlation = float(
+                np.corrcoef(displacement_m[is_measured], load_n[is_measured])[
+                    0, 1
+                ]
+            )
             if correlation < AGAINST:
                 data = {"axis": axis, "grasp": k, "correlation": correlation}
                 strength = 1 / (1 + correlation + 1e-3)
-                yield Hypothesis("sign", f"'{experiment.name}'", data, strength=strength)
+                yield Hypothesis(
+                    "sign", f"'{experiment.name}'", data, strength=strength
+                )
 
 
 def _pushing_axis(grasp: Grasp, shifts_m: Array) -> str:
@@ -170,13 +195,17 @@ def step_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     if len(experiment.markers.positions_m) < FEWEST:
         return
     if (grasp := carrying_grasp(experiment)) is not None:
-        moved_m = grasp.poses.moved_positions(_marker_box_m(experiment), experiment.t_s)
+        moved_m = grasp.poses.moved_positions(
+            _marker_box_m(experiment), experiment.t_s
+        )
         yield from _pose_jump_hypotheses(experiment, moved_m)
         yield from _common_jump(experiment, moved_m)
     yield from _slip_hypotheses(experiment)
 
 
-def _common_jump(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]:
+def _common_jump(
+    experiment: Experiment, moved_m: Array
+) -> Iterator[Hypothesis]:
     """Yield the hypothesis of the largest step of all markers together that the poses do not have;
     only samples with all markers are used.
 
@@ -196,9 +225,15 @@ def _common_jump(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]
     sizes = step_sizes(tracks_m[rows]).min(axis=1)
     k = int(sizes.argmax())
     grasp_step_m = step_sizes(moved_m[rows]).max(axis=1)[k]
-    usual_m = max(_usual_change(sizes), float(grasp_step_m), 2 * float(np.median(sigma_m)))
+    usual_m = max(
+        _usual_change(sizes), float(grasp_step_m), 2 * float(np.median(sigma_m))
+    )
     yield from _step_hypothesis(
-        "markers-jump", experiment, k=int(rows[k]), size_m=float(sizes[k]), usual_m=usual_m
+        "markers-jump",
+        experiment,
+        k=int(rows[k]),
+        size_m=float(sizes[k]),
+        usual_m=usual_m,
     )
 
 
@@ -214,13 +249,20 @@ def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
     """
     t_s = experiment.t_s
     grasps = experiment.grasps
-    if experiment.start != "equilibrium" or experiment.actuators or experiment.obstacles:
+    if (
+        experiment.start != "equilibrium"
+        or experiment.actuators
+        or experiment.obstacles
+    ):
         return
     is_grasped_throughout = (
         grasp.from_s <= t_s[0] and grasp.until_s >= t_s[-1] for grasp in grasps
     )
     motions = [part for grasp in grasps for part in grasp.poses.at(t_s)]
-    loads = [experiment.declared_node_forces_n(t_s), experiment.point_mass_at_nodes_kg(t_s)]
+    loads = [
+        experiment.declared_node_forces_n(t_s),
+        experiment.point_mass_at_nodes_kg(t_s),
+    ]
     if (
         not grasps
         or not all(is_grasped_throughout)
@@ -234,11 +276,15 @@ def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
         return
     tracks_m = markers.positions_m[:, is_measured]
     motion_m = np.sqrt(np.nanmean(np.nanvar(tracks_m, axis=0).sum(axis=1)))
-    still_m = STILL_OF_SIZE * size_m + STILL_SIGMAS * float(np.median(markers.sigma_m))
+    still_m = STILL_OF_SIZE * size_m + STILL_SIGMAS * float(
+        np.median(markers.sigma_m)
+    )
     if motion_m > still_m:
         data = {"by_mm": 1e3 * motion_m}
         of = f"'{experiment.name}'"
-        yield Hypothesis("poses-constant", of, data, strength=float(motion_m / still_m))
+        yield Hypothesis(
+            "poses-constant", of, data, strength=float(motion_m / still_m)
+        )
 
 
 def _changes(values: Array) -> bool:
@@ -263,7 +309,9 @@ def step_sizes(x: Array) -> Array:
     return np.sqrt(np.maximum(opposite, 0.0))
 
 
-def _pose_jump_hypotheses(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]:
+def _pose_jump_hypotheses(
+    experiment: Experiment, moved_m: Array
+) -> Iterator[Hypothesis]:
     """Yield the hypothesis of the largest jump of points `moved_m` (T, m, 3) [m] carried by the
     poses, if the markers do not follow it.
     """
@@ -273,9 +321,15 @@ def _pose_jump_hypotheses(experiment: Experiment, moved_m: Array) -> Iterator[Hy
     moved = np.linalg.norm(np.diff(moved_m, 2, axis=0), axis=2).max(axis=1)
     sigma_m = float(np.median(experiment.markers.sigma_m))
     if np.isfinite(markers).any():
-        usual_m = max(_usual_change(moved), float(np.nanmedian(markers)), 2 * sigma_m)
+        usual_m = max(
+            _usual_change(moved), float(np.nanmedian(markers)), 2 * sigma_m
+        )
         yield from _step_hypothesis(
-            "pose-jump", experiment, k=k, size_m=float(sizes[k]), usual_m=usual_m
+            "pose-jump",
+            experiment,
+            k=k,
+            size_m=float(sizes[k]),
+            usual_m=usual_m,
         )
 
 
@@ -290,15 +344,27 @@ def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
         others = np.delete(sizes[k], m)
         size_m = float(sizes[k, m])
         most_m = float(others[np.isfinite(others)].max(initial=0.0))
-        usual_m = max(_usual_change(sizes[:, m]), most_m, 2 * float(markers.sigma_m[m]))
+        usual_m = max(
+            _usual_change(sizes[:, m]), most_m, 2 * float(markers.sigma_m[m])
+        )
         if _is_lasting(markers.positions_m, m, k + 2, size_m):
             yield from _step_hypothesis(
-                "marker-slip/alone", experiment, k=k, size_m=size_m, usual_m=usual_m, marker=name
+                "marker-slip/alone",
+                experiment,
+                k=k,
+                size_m=size_m,
+                usual_m=usual_m,
+                marker=name,
             )
 
 
 def _step_hypothesis(
-    code: str, experiment: Experiment, k: int, size_m: float, usual_m: float, marker: str = ""
+    code: str,
+    experiment: Experiment,
+    k: int,
+    size_m: float,
+    usual_m: float,
+    marker: str = "",
 ) -> Iterator[Hypothesis]:
     """Yield the hypothesis of a step between samples k + 1 and k + 2, if it is far larger than
     usual.
@@ -315,9 +381,15 @@ def _step_hypothesis(
     marker : str
         Name of the marker; empty for all.
     """
-    data = {"marker": marker, "by_mm": 1e3 * size_m, "t_s": experiment.t_s[k + 2]}
+    data = {
+        "marker": marker,
+        "by_mm": 1e3 * size_m,
+        "t_s": experiment.t_s[k + 2],
+    }
     if size_m >= SUDDEN * usual_m:
-        yield Hypothesis(code, f"'{experiment.name}'", data, strength=size_m / usual_m)
+        yield Hypothesis(
+            code, f"'{experiment.name}'", data, strength=size_m / usual_m
+        )
 
 
 def _is_lasting(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
@@ -331,7 +403,9 @@ def _is_lasting(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
     before = others[:sample]
     after = others[sample:]
     both = np.isfinite(before).any(axis=0) & np.isfinite(after).any(axis=0)
-    change = np.nanmedian(after[:, both], axis=0) - np.nanmedian(before[:, both], axis=0)
+    change = np.nanmedian(after[:, both], axis=0) - np.nanmedian(
+        before[:, both], axis=0
+    )
     return bool(np.abs(change).max(initial=0.0) > 0.3 * step_m)
 
 
@@ -363,7 +437,9 @@ def name_exchange_hypotheses(
     """
     order, strength = _marker_identities(experiment)
     kinds, counts = np.unique(order, axis=0, return_counts=True)
-    right = kinds[int(np.argmax(np.where((kinds == order[0]).all(axis=1), 2, 1) * counts))]
+    right = kinds[
+        int(np.argmax(np.where((kinds == order[0]).all(axis=1), 2, 1) * counts))
+    ]
     wrong = order != right
     share = float(wrong.mean(axis=0).max(initial=0.0))
     if not share or (huber is not None and share < TAMED):
@@ -378,10 +454,19 @@ def name_exchange_hypotheses(
         "on" if end == len(t_s) else f"to {t_s[end - 1]:.4g} s"
     )
     real = np.argsort(right)[order[first]]
-    listed = ", ".join(f"{names[k]} is {names[real[k]]}" for k in np.flatnonzero(wrong[first]))
+    listed = ", ".join(
+        f"{names[k]} is {names[real[k]]}" for k in np.flatnonzero(wrong[first])
+    )
     also = ", and at other times" if affected[-1] >= end else ""
     data = {"when": f"{when}{also}", "names": listed}
-    return (Hypothesis("markers-exchanged/later", f"'{experiment.name}'", data, strength=strength),)
+    return (
+        Hypothesis(
+            "markers-exchanged/later",
+            f"'{experiment.name}'",
+            data,
+            strength=strength,
+        ),
+    )
 
 
 def _marker_identities(experiment: Experiment) -> tuple[Index, float]:
@@ -393,14 +478,18 @@ def _marker_identities(experiment: Experiment) -> tuple[Index, float]:
     in_grasp_m = np.array(markers.positions_m)
     if grasp is not None:
         rotations, translations_m = grasp.poses.at(experiment.t_s)
-        in_grasp_m = np.einsum("tji,tmj->tmi", rotations, in_grasp_m - translations_m[:, None])
+        in_grasp_m = np.einsum(
+            "tji,tmj->tmi", rotations, in_grasp_m - translations_m[:, None]
+        )
     order = np.tile(np.arange(len(markers.names)), (len(in_grasp_m), 1))
     strength = 0.0
     last_m = np.full(in_grasp_m.shape[1:], np.nan)
     for k, now_m in enumerate(in_grasp_m):
         is_present = np.isfinite(now_m[:, 0])
         known = np.flatnonzero(is_present & np.isfinite(last_m[:, 0]))
-        chosen, clearly = _best_assignment(last_m[known], now_m[known], markers.sigma_m[known])
+        chosen, clearly = _best_assignment(
+            last_m[known], now_m[known], markers.sigma_m[known]
+        )
         if clearly > CLEARLY:
             order[k:, known] = order[k, known[chosen]]
             strength = max(strength, clearly)
@@ -408,7 +497,9 @@ def _marker_identities(experiment: Experiment) -> tuple[Index, float]:
     return order, strength
 
 
-def _best_assignment(before_m: Array, now_m: Array, sigma_m: Array) -> tuple[Index, float]:
+def _best_assignment(
+    before_m: Array, now_m: Array, sigma_m: Array
+) -> tuple[Index, float]:
     """Return the assignment (M,) of markers to those of the sample before, and the factor by which
     it is nearer than no exchange.
 
@@ -422,12 +513,16 @@ def _best_assignment(before_m: Array, now_m: Array, sigma_m: Array) -> tuple[Ind
     same = np.arange(len(now_m))
     if len(now_m) < 2:
         return same, 1.0
-    differences_m = (now_m - now_m.mean(axis=0))[:, None] - (before_m - before_m.mean(axis=0))
+    differences_m = (now_m - now_m.mean(axis=0))[:, None] - (
+        before_m - before_m.mean(axis=0)
+    )
     cost = np.sum(differences_m**2, axis=2)
     if (cost.argmin(axis=1) == same).all():
         return same, 1.0
     _, chosen = linear_sum_assignment(cost)
     exchanged = np.flatnonzero(chosen != same)
     noise = 6 * float(np.sum(sigma_m[exchanged] ** 2))
-    remaining = max(float(cost[exchanged, chosen[exchanged]].sum()), noise, 1e-300)
+    remaining = max(
+        float(cost[exchanged, chosen[exchanged]].sum()), noise, 1e-300
+    )
     return chosen, float(np.sqrt(cost[exchanged, exchanged].sum() / remaining))

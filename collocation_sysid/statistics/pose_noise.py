@@ -65,7 +65,11 @@ class PoseNoise:
     @property
     def message(self) -> str:
         """Message for the user about the assumed pose noise."""
-        how = "estimated from their roughness" if self.is_estimated else "as stated"
+        how = (
+            "estimated from their roughness"
+            if self.is_estimated
+            else "as stated"
+        )
         return (
             f"the error bars of '{self.experiment}' include noise of the poses of "
             f"{1e3 * self.sigma_m:.2g} mm and {np.degrees(self.sigma_rad):.2g}°, {how}"
@@ -81,7 +85,10 @@ def estimate_pose_noise(poses: PoseSequence) -> tuple[float, float]:
     if len(poses.t_s) < 4 * ORDER:
         return 0.0, 0.0
     rotations = poses.rotation_steps
-    sizes = [np.diff(poses.positions_m, ORDER, axis=0), np.diff(rotations, ORDER - 1, axis=0)]
+    sizes = [
+        np.diff(poses.positions_m, ORDER, axis=0),
+        np.diff(rotations, ORDER - 1, axis=0),
+    ]
     scale = np.sqrt(binom(2 * ORDER, ORDER))
     # The median of squares, so that a jump or a stroke does not count as noise.
     sigmas = [float(np.median(np.abs(size)) / 0.6745 / scale) for size in sizes]
@@ -117,16 +124,23 @@ def with_pose_noise(
     noises: list[PoseNoise] = []
     for part in collocation.iterates(z):
         noise_of_grasps = [
-            _grasp_noise(part.segment.experiment.name, g) for g in part.segment.experiment.grasps
+            _grasp_noise(part.segment.experiment.name, g)
+            for g in part.segment.experiment.grasps
         ]
         disturbances: list[Array | None] = [None] * len(part.segment.residuals)
         if any(noise.sigma_m or noise.sigma_rad for noise in noise_of_grasps):
-            drawn = _residual_samples(part, noise_of_grasps, np.random.default_rng(seed))
+            drawn = _residual_samples(
+                part, noise_of_grasps, np.random.default_rng(seed)
+            )
             if any(np.sqrt(np.mean(each**2)) >= NEGLIGIBLE for each in drawn):
                 disturbances = [*drawn]
         draws += disturbances
         if disturbances[0] is not None:
-            noises += [noise for noise in noise_of_grasps if noise.sigma_m or noise.sigma_rad]
+            noises += [
+                noise
+                for noise in noise_of_grasps
+                if noise.sigma_m or noise.sigma_rad
+            ]
     return fit.with_disturbances(draws), tuple(noises)
 
 
@@ -141,7 +155,9 @@ def _grasp_noise(name: str, grasp: Grasp) -> PoseNoise:
 
 
 def _residual_samples(
-    iterate: ExperimentIterate, noises: Sequence[PoseNoise], rng: np.random.Generator
+    iterate: ExperimentIterate,
+    noises: Sequence[PoseNoise],
+    rng: np.random.Generator,
 ) -> list[Array]:
     """Return K samples (K, T, M, 3) of the changes of each measurement's residuals by noise of the
     poses of each grasp.
@@ -153,25 +169,41 @@ def _residual_samples(
     displacements_m = np.zeros((*prescribed.positions_m.shape, count))
     pose_errors = []
     for grasp, noise in zip(segment.experiment.grasps, noises, strict=True):
-        shifts, rotations = _pose_samples(iterate, grasp, noise=noise, rng=rng, count=count)
+        shifts, rotations = _pose_samples(
+            iterate, grasp, noise=noise, rng=rng, count=count
+        )
         _add_displacements(
-            displacements_m, iterate, grasp=grasp, shifts=shifts, rotations=rotations
+            displacements_m,
+            iterate,
+            grasp=grasp,
+            shifts=shifts,
+            rotations=rotations,
         )
         pose_errors.append((grasp, shifts, rotations))
     solver = Sweep(segment)
     changes = []
-    columns = SweepColumns.from_prescribed(solver, iterate.equations, displacements_m)
-    for reading, motion, values, by in propagate_columns(iterate, solver, columns):
+    columns = SweepColumns.from_prescribed(
+        solver, iterate.equations, displacements_m
+    )
+    for reading, motion, values, by in propagate_columns(
+        iterate, solver, columns
+    ):
         for grasp, shifts, rotations in pose_errors:
             by = by + reading.observable.frame_changes(
                 grasp, motion, iterate.phi, shifts, rotations
             )
-        changes.append(np.moveaxis(reading.residual_changes(values, by, iterate.phi), 3, 0))
+        changes.append(
+            np.moveaxis(reading.residual_changes(values, by, iterate.phi), 3, 0)
+        )
     return changes
 
 
 def _pose_samples(
-    iterate: ExperimentIterate, grasp: Grasp, noise: PoseNoise, rng: np.random.Generator, count: int
+    iterate: ExperimentIterate,
+    grasp: Grasp,
+    noise: PoseNoise,
+    rng: np.random.Generator,
+    count: int,
 ) -> tuple[Array, Array]:
     """Return `count` samples of translation [m] and rotation [rad] errors of the poses of a grasp
     at the N grid times, (N, count, 3) each; zero while the grasp does not hold, and for a single
@@ -216,7 +248,9 @@ def _add_displacements(
     dofs = np.searchsorted(prescribed.dofs, grasp.prescribed_dofs)
     arms = grasp.poses.at(t_s[rows])[0] @ segment.body.nodes_m[grasp.nodes].T
     arms = np.moveaxis(arms, 1, 2)
-    change = shifts[rows, None] + np.cross(rotations[rows, None], arms[:, :, None])
+    change = shifts[rows, None] + np.cross(
+        rotations[rows, None], arms[:, :, None]
+    )
     change = change[..., grasp.axis_indices]  # (rows, nodes, c, axes)
     displacements_m[np.ix_(rows, dofs)] += np.moveaxis(change, 3, 2).reshape(
         len(rows), len(dofs), count

@@ -114,14 +114,24 @@ def compute_profile(
             except SimulationError:
                 losses_by_value[trial] = np.inf
         above = (
-            float(np.sqrt(np.clip((losses_by_value[trial] - loss) / threshold, 0.0, HIGHEST))) - 1.0
+            float(
+                np.sqrt(
+                    np.clip(
+                        (losses_by_value[trial] - loss) / threshold,
+                        0.0,
+                        HIGHEST,
+                    )
+                )
+            )
+            - 1.0
         )
         return above if abs(above) > PRECISION / 2 else 0.0
 
     step = 2 * deviation if np.isfinite(deviation) and deviation > 0 else 0.1
     lower, upper = (
         None
-        if (way := _find_end(rise, side * step, float(np.log(bound / value)))) is None
+        if (way := _find_end(rise, side * step, float(np.log(bound / value))))
+        is None
         else float(value * np.exp(way))
         for side, bound in zip((-1, 1), bounds, strict=True)
     )
@@ -144,7 +154,9 @@ def compute_profile(
     )
 
 
-def _find_end(rise: Callable[[float], float], step: float, bound: float) -> float | None:
+def _find_end(
+    rise: Callable[[float], float], step: float, bound: float
+) -> float | None:
     """Return the change of the logarithm of the parameter at which the loss has risen enough, on
     the side to which `step` points; None if it has not at the bound.
 
@@ -165,7 +177,9 @@ def _find_end(rise: Callable[[float], float], step: float, bound: float) -> floa
         outside = closest(inside + step, bound)
         if rise(outside) >= 0:
             within = PRECISION * abs(outside)
-            return root_scalar(rise, bracket=(inside, outside), xtol=within).root
+            return root_scalar(
+                rise, bracket=(inside, outside), xtol=within
+            ).root
         inside = outside
         step = 2 * step
     return None
@@ -241,28 +255,39 @@ def profile_of_solution(
 
 def _loss_of(solution: Solution) -> float:
     """Return the loss of a solution, with priors."""
-    return solution.collocation.objective(solution.z) / solution.collocation.loss_scale
+    return (
+        solution.collocation.objective(solution.z)
+        / solution.collocation.loss_scale
+    )
 
 
-def _loss_with_fixed(solution: Solution, item: Parameter, value: float) -> float:
+def _loss_with_fixed(
+    solution: Solution, item: Parameter, value: float
+) -> float:
     """Return the smallest loss, with priors, with one parameter fixed at a value, searched from the
     answer; infinite if the solve does not converge.
     """
     before = solution.collocation
     started = before.parameters.with_guess(solution.parameters)
     fixed = started.with_fixed({item.name: value})
-    refit = ReducedSpace()(replace(before, parameters=fixed)).unless_interrupted()
+    refit = ReducedSpace()(
+        replace(before, parameters=fixed)
+    ).unless_interrupted()
     if not refit.status.converged:
         return float("inf")
     prior = 0.0
     if item.prior is not None:
         mean, deviation = item.prior
-        deviation_from_prior = np.log(value / mean) if item.scale == "log" else value - mean
+        deviation_from_prior = (
+            np.log(value / mean) if item.scale == "log" else value - mean
+        )
         prior = (deviation_from_prior / deviation) ** 2
     return _loss_of(refit) + float(prior)
 
 
-def _noise_scale(solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, k: int) -> float:
+def _noise_scale(
+    solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, k: int
+) -> float:
     """Return the variance of the parameter with index k over its variance for independent errors of
     the stated σ; 1 if that ratio is not finite.
     """

@@ -81,8 +81,12 @@ class RecordingComparison:
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             weight = np.nan_to_num(1 / self.deviations**2)
-            mean = np.nansum(weight * self.differences, axis=0) / weight.sum(axis=0)
-        return np.nansum(weight * np.nan_to_num(self.differences - mean) ** 2, axis=0)
+            mean = np.nansum(weight * self.differences, axis=0) / weight.sum(
+                axis=0
+            )
+        return np.nansum(
+            weight * np.nan_to_num(self.differences - mean) ** 2, axis=0
+        )
 
     @property
     def degrees_of_freedom(self) -> NDArray[np.int64]:
@@ -103,7 +107,9 @@ class RecordingComparison:
         ratio = self.chi_squared / np.maximum(self.degrees_of_freedom, 1)
         with np.errstate(invalid="ignore", divide="ignore"):
             of_all = 1 / np.nansum(1 / self.deviations**2, axis=0)
-            enough = np.maximum(variances, ratio * np.minimum(variances, of_all))
+            enough = np.maximum(
+                variances, ratio * np.minimum(variances, of_all)
+            )
         return np.where(self.is_disagreeing, enough, variances)
 
 
@@ -122,9 +128,12 @@ def single_fits(fit: LinearisedFit) -> Iterator[tuple[LinearisedFit, Array]]:
     for name, block_numbers in blocks_by_recording(fit).items():
         # What recordings share they have to find alone, too.
         mine = [
-            other.startswith((f"{name}: ", "shared")) for other in fit.names[fit.shared_count :]
+            other.startswith((f"{name}: ", "shared"))
+            for other in fit.names[fit.shared_count :]
         ]
-        columns = np.r_[np.arange(fit.shared_count), fit.shared_count + np.flatnonzero(mine)]
+        columns = np.r_[
+            np.arange(fit.shared_count), fit.shared_count + np.flatnonzero(mine)
+        ]
         yield fit_part(fit, [fit.blocks[k] for k in block_numbers], columns)
 
 
@@ -151,7 +160,10 @@ def fit_part(
     )
     alone = replace(
         fit,
-        blocks=tuple(replace(each, jacobian=each.jacobian[..., columns]) for each in blocks),
+        blocks=tuple(
+            replace(each, jacobian=each.jacobian[..., columns])
+            for each in blocks
+        ),
         names=tuple(fit.names[k] for k in columns),
         prior_residual=prior_residual,
         prior_jacobian=prior_slope,
@@ -175,7 +187,9 @@ def compare_recordings(
         For each recording: step from the joint answer, variances of q, and variances of q for
         independent errors of the stated σ.
     """
-    steps, variances, independent = (np.array(each) for each in zip(*alone.values(), strict=True))
+    steps, variances, independent = (
+        np.array(each) for each in zip(*alone.values(), strict=True)
+    )
     deviations = np.sqrt(variances)
     is_determined = deviations < TELLING
     with np.errstate(invalid="ignore"):
@@ -184,15 +198,22 @@ def compare_recordings(
         tuple(alone),
         np.where(is_determined, steps, np.nan),
         np.where(is_determined, deviations, np.nan),
-        _sensitivities_to_differences(fit, [*alone], np.where(np.isfinite(excess), excess, 1.0)),
+        _sensitivities_to_differences(
+            fit, [*alone], np.where(np.isfinite(excess), excess, 1.0)
+        ),
     )
 
 
-def _sensitivities_to_differences(fit: LinearisedFit, names: Sequence[str], excess: Array) -> Array:
+def _sensitivities_to_differences(
+    fit: LinearisedFit, names: Sequence[str], excess: Array
+) -> Array:
     """Return `RecordingComparison.sensitivities` (p, nq n) for n recordings, by name; zero for
     parameters at a bound.
     """
-    own = [least_squares_of_blocks(fit, blocks_by_recording(fit)[name]) for name in names]
+    own = [
+        least_squares_of_blocks(fit, blocks_by_recording(fit)[name])
+        for name in names
+    ]
     each = np.array([o.information for o in own])
     scores = np.array([o.score for o in own])
     together = least_squares_of_fit(fit)
@@ -209,16 +230,27 @@ def _sensitivities_to_differences(fit: LinearisedFit, names: Sequence[str], exce
             information[np.ix_(others, others)], hermitian=True
         )
         own_s = scores[:, k] - cross @ score[others]
-        by_own = [np.diag(each[:, k, l]) - cross @ each[:, others, l].T for l in shared]
+        by_own = [
+            np.diag(each[:, k, l]) - cross @ each[:, others, l].T
+            for l in shared
+        ]
         remaining = by_own[row]
         if not remaining.sum() > SILENT * information[k, k]:
             continue
-        projection = np.linalg.pinv(remaining, rcond=SILENT, hermitian=True) - 1 / remaining.sum()
+        projection = (
+            np.linalg.pinv(remaining, rcond=SILENT, hermitian=True)
+            - 1 / remaining.sum()
+        )
         noise = remaining * np.sqrt(np.outer(excess[:, k], excess[:, k]))
-        excess_scatter[row] = own_s @ projection @ own_s - np.trace(projection @ noise)
+        excess_scatter[row] = own_s @ projection @ own_s - np.trace(
+            projection @ noise
+        )
         by_each[row] = [np.trace(m.T @ projection @ m) for m in by_own]
     sizes = np.where(np.diag(by_each) > 0, np.diag(by_each), 1.0)
-    variances = nnls(by_each / np.sqrt(np.outer(sizes, sizes)), excess_scatter / np.sqrt(sizes))[0]
+    variances = nnls(
+        by_each / np.sqrt(np.outer(sizes, sizes)),
+        excess_scatter / np.sqrt(sizes),
+    )[0]
     sensitivities = np.zeros((len(fit.names), fit.shared_count, len(names)))
     for k, tau in zip(shared, np.sqrt(variances / np.sqrt(sizes)), strict=True):
         sensitivities[free, k] = -tau * inverse @ each[:, free, k].T

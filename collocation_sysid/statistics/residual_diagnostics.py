@@ -21,7 +21,12 @@ from numpy.typing import NDArray
 from ..array_types import Array
 from .concerns import Concern
 from .distributions import beta_sf, chi2_isf, normal_isf
-from .linearised import LinearisedFit, Mask, ResidualBlock, factorise_information
+from .linearised import (
+    LinearisedFit,
+    Mask,
+    ResidualBlock,
+    factorise_information,
+)
 from .noise_level import NoiseLevel, estimate_noise_level
 
 # Level of the tests for patterns.
@@ -96,7 +101,9 @@ class MarkerDiagnosis:
 def diagnose_markers(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
     """Diagnose every marker that was measured, experiment by experiment."""
     level = estimate_noise_level(fit, factorise_information(fit))
-    alone = {outlier.series: outlier for outlier in reversed(remove_outliers(fit)[1])}
+    alone = {
+        outlier.series: outlier for outlier in reversed(remove_outliers(fit)[1])
+    }
     return tuple(
         _diagnose_marker(
             block,
@@ -112,12 +119,19 @@ def diagnose_markers(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
     )
 
 
-def _estimated_kinds(fit: LinearisedFit, block: ResidualBlock) -> tuple[bool, bool]:
+def _estimated_kinds(
+    fit: LinearisedFit, block: ResidualBlock
+) -> tuple[bool, bool]:
     """Return whether marker offsets, and a time shift, of the block's experiment are among the
     parameters of the fit.
     """
-    kinds = [name.removeprefix(f"{block.name}: ") for name in fit.names[fit.shared_count :]]
-    return any(k.startswith("offset") for k in kinds), any(k.startswith("time") for k in kinds)
+    kinds = [
+        name.removeprefix(f"{block.name}: ")
+        for name in fit.names[fit.shared_count :]
+    ]
+    return any(k.startswith("offset") for k in kinds), any(
+        k.startswith("time") for k in kinds
+    )
 
 
 def _diagnose_marker(
@@ -156,7 +170,9 @@ def _diagnose_marker(
     early = np.zeros(len(residual), dtype=bool)
     if not block.is_static:
         frequency, peak = _largest_peak(varying, block.t_s)
-        early = block.t_s <= block.t_s[0] + EARLY_TIME * (block.t_s[-1] - block.t_s[0])
+        early = block.t_s <= block.t_s[0] + EARLY_TIME * (
+            block.t_s[-1] - block.t_s[0]
+        )
     diagnosis = MarkerDiagnosis(
         experiment=block.name,
         marker=block.marker_names[marker],
@@ -174,10 +190,15 @@ def _diagnose_marker(
     )
     if name in outliers:
         message = outliers[name].concern.message.removeprefix(f"{name}: ")
-        return replace(diagnosis, sentence=f"{name}: {1e3 * diagnosis.rms_m:.2g} mm RMS; {message}")
+        return replace(
+            diagnosis,
+            sentence=f"{name}: {1e3 * diagnosis.rms_m:.2g} mm RMS; {message}",
+        )
     pairs = int(np.sum(present[1:] & present[:-1]))
     motion = block.jacobian[:, marker, :, :shared].reshape(len(residual), -1)
-    message = _message(diagnosis, pairs, block=block, motion=motion, estimated=estimated_kinds)
+    message = _message(
+        diagnosis, pairs, block=block, motion=motion, estimated=estimated_kinds
+    )
     if diagnosis.wild > MOST_WILD * samples:
         message += (
             f"; {diagnosis.wild} samples are outliers, beyond the threshold of the Huber "
@@ -255,10 +276,12 @@ def _message(
     size = f"{1e3 * diagnosis.rms_m:.2g} mm RMS"
     if diagnosis.rms_m < ROUNDING_M:
         return f"{name}: residuals are at the level of rounding errors"
-    persistent = pairs > 0 and abs(diagnosis.lag1) > normal_isf(SIGNIFICANCE / 2) / np.sqrt(
-        3 * pairs
+    persistent = pairs > 0 and abs(diagnosis.lag1) > normal_isf(
+        SIGNIFICANCE / 2
+    ) / np.sqrt(3 * pairs)
+    shifted = diagnosis.constant_share > chi2_isf(SIGNIFICANCE, 3) / (
+        3 * diagnosis.samples
     )
-    shifted = diagnosis.constant_share > chi2_isf(SIGNIFICANCE, 3) / (3 * diagnosis.samples)
     if not persistent and not shifted:
         return f"{name}: {size}, {_white_noise_message(diagnosis)}"
     if diagnosis.constant_share > DOMINANT:
@@ -278,9 +301,7 @@ def _message(
     elif diagnosis.oscillating_share > DOMINANT:
         cause = _oscillation_message(diagnosis, t_s, motion)
     elif persistent and diagnosis.lag1 > DOMINANT:
-        cause = (
-            "the residuals drift slowly: the model lacks creep of the material or slip in the grasp"
-        )
+        cause = "the residuals drift slowly: the model lacks creep of the material or slip in the grasp"
         if block.is_static:
             cause = (
                 "the residuals change with the load: the material law or the boundary "
@@ -304,16 +325,18 @@ def _white_noise_message(diagnosis: MarkerDiagnosis) -> str:
     return "uncorrelated, consistent with noise"
 
 
-def _oscillation_message(diagnosis: MarkerDiagnosis, t_s: Array, motion: Array) -> str:
+def _oscillation_message(
+    diagnosis: MarkerDiagnosis, t_s: Array, motion: Array
+) -> str:
     """Return the description of oscillating residuals at times (T,) [s], compared with the
     frequency of the motion, which derivatives `motion` (T, k) of the residuals show.
     """
-    share = f"{100 * diagnosis.oscillating_share:.0f} % of the squared residuals"
+    share = (
+        f"{100 * diagnosis.oscillating_share:.0f} % of the squared residuals"
+    )
     record_s = (t_s[1] - t_s[0]) * len(t_s)
     if diagnosis.frequency_hz * record_s < FEWEST_PERIODS:
-        return (
-            f"{share} is a slow drift: the model lacks creep of the material or slip in the grasp"
-        )
+        return f"{share} is a slow drift: the model lacks creep of the material or slip in the grasp"
     message = f"{share} oscillates at {diagnosis.frequency_hz:.3g} Hz"
     of_motion, _ = _largest_peak(motion - motion.mean(axis=0), t_s)
     if abs(diagnosis.frequency_hz - of_motion) <= SAME_FREQUENCY * of_motion:
@@ -364,12 +387,20 @@ class Outlier:
     @property
     def concern(self) -> Concern:
         """Concern about this sample, with the remedy."""
-        code = "residuals/first" if self.is_relaxed_start else "residuals/outlier"
-        data = {"t_s": self.t_s, "deviations": self.deviations, "percent": 100 * self.share}
+        code = (
+            "residuals/first" if self.is_relaxed_start else "residuals/outlier"
+        )
+        data = {
+            "t_s": self.t_s,
+            "deviations": self.deviations,
+            "percent": 100 * self.share,
+        }
         return Concern(code, data={"of": self.series, **data})
 
 
-def remove_outliers(fit: LinearisedFit) -> tuple[LinearisedFit, tuple[Outlier, ...]]:
+def remove_outliers(
+    fit: LinearisedFit,
+) -> tuple[LinearisedFit, tuple[Outlier, ...]]:
     """Return the fit without its outliers, which count as missing, and the outliers; the same fit
     and an empty tuple if there are none.
     """
@@ -377,16 +408,26 @@ def remove_outliers(fit: LinearisedFit) -> tuple[LinearisedFit, tuple[Outlier, .
     outliers = []
     for block in fit.blocks:
         for marker in np.flatnonzero(block.is_present.any(axis=0)).tolist():
-            allowed = max(1, int(EXCEPTIONS * block.is_present[:, marker].sum()))
-            while allowed and (outlier := _find_outlier(block, marker, RARE / len(fit.blocks))):
+            allowed = max(
+                1, int(EXCEPTIONS * block.is_present[:, marker].sum())
+            )
+            while allowed and (
+                outlier := _find_outlier(block, marker, RARE / len(fit.blocks))
+            ):
                 outliers.append(outlier)
                 block = _without_sample(block, marker, outlier.sample)
                 allowed = allowed - 1
         blocks.append(block)
-    return (replace(fit, blocks=tuple(blocks)), tuple(outliers)) if outliers else (fit, ())
+    return (
+        (replace(fit, blocks=tuple(blocks)), tuple(outliers))
+        if outliers
+        else (fit, ())
+    )
 
 
-def _find_outlier(block: ResidualBlock, marker: int, significance: float) -> Outlier | None:
+def _find_outlier(
+    block: ResidualBlock, marker: int, significance: float
+) -> Outlier | None:
     """Return the sample that dominates the residuals of a marker (index); None if none does.
 
     It would occur by chance with a probability below `significance`.
@@ -398,7 +439,11 @@ def _find_outlier(block: ResidualBlock, marker: int, significance: float) -> Out
     freedom = (
         int(block.is_measured[:, marker].sum()) / count / 2
     )  # half the coordinates of a sample
-    chance = count * block.is_present.shape[1] * beta_sf(share, freedom, (count - 1) * freedom)
+    chance = (
+        count
+        * block.is_present.shape[1]
+        * beta_sf(share, freedom, (count - 1) * freedom)
+    )
     if count < FEWEST_SAMPLES or share < MOST or chance > significance:
         return None
     return Outlier(
@@ -411,7 +456,9 @@ def _find_outlier(block: ResidualBlock, marker: int, significance: float) -> Out
     )
 
 
-def _without_sample(block: ResidualBlock, marker: int, sample: int) -> ResidualBlock:
+def _without_sample(
+    block: ResidualBlock, marker: int, sample: int
+) -> ResidualBlock:
     """Return the block without one sample of a marker, both given by index: it counts as
     missing.
     """

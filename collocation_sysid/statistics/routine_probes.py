@@ -20,7 +20,13 @@ from dataclasses import replace
 from ..recording.nuisance import CLOCK_RATE
 from .consider_analysis import ResidualChanges
 from .distributions import normal_isf
-from .relaxed_assumptions import DRIFT, Probe, SolvedFit, relaxed_probe, with_relaxed_assumption
+from .relaxed_assumptions import (
+    DRIFT,
+    Probe,
+    SolvedFit,
+    relaxed_probe,
+    with_relaxed_assumption,
+)
 from .systematic_effects import ASSUMPTIONS
 
 # Assumptions that are probed in every solve: both can be wrong while the residuals look white, bias
@@ -38,7 +44,9 @@ WIDENING = 10.0
 RELEVANT = 0.25
 
 
-def probed_deviations(deviations: Mapping[str, float | None]) -> dict[str, float | None]:
+def probed_deviations(
+    deviations: Mapping[str, float | None],
+) -> dict[str, float | None]:
     """Return deviations in which none of the routine probes is None.
 
     A quantity stated as exact is left out of the budget but still tested, with the default
@@ -72,8 +80,13 @@ def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
     limit = significance_limit(solved_fit.changes)
     probes = []
     for name in ROUTINE:
-        wide = with_relaxed_assumption(solved_fit.fit, solved_fit.changes, name, WIDENING)
-        if any(block.jacobian[..., len(solved_fit.fit.names) :].any() for block in wide.blocks):
+        wide = with_relaxed_assumption(
+            solved_fit.fit, solved_fit.changes, name, WIDENING
+        )
+        if any(
+            block.jacobian[..., len(solved_fit.fit.names) :].any()
+            for block in wide.blocks
+        ):
             probe = relaxed_probe(solved_fit, name, wide, solved_fit.parameters)
             significant = (name,) if probe.is_beyond(limit) else ()
             probes.append(replace(probe, routine=True, sentences=significant))

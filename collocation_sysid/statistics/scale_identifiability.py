@@ -14,7 +14,14 @@ import numpy as np
 from ..array_types import Array
 from ..errors import listed
 from ..fem.body import Body
-from ..fem.constants import DENSITY, is_damping, is_density, is_modulus, symbol_of, without_region
+from ..fem.constants import (
+    DENSITY,
+    is_damping,
+    is_density,
+    is_modulus,
+    symbol_of,
+    without_region,
+)
 from ..methods.stiffness_scan import SOFT_PA, typical_parameters
 from ..model.parameters import Parameters, ThetaMap
 from ..recording.experiment import Experiment
@@ -36,20 +43,26 @@ def parameters_of_open_scale(
     return _scaled_parameters(experiments, parameters, includes_declared=False)
 
 
-def relative_moduli(experiments: Iterable[Experiment], parameters: Parameters) -> tuple[str, ...]:
+def relative_moduli(
+    experiments: Iterable[Experiment], parameters: Parameters
+) -> tuple[str, ...]:
     """Return the parameters that are determined relative to the stated densities only."""
     return _scaled_parameters(experiments, parameters, includes_declared=True)
 
 
 def scale_concerns(
-    experiments: Iterable[Experiment], parameters: Parameters, grade: Grade = "check"
+    experiments: Iterable[Experiment],
+    parameters: Parameters,
+    grade: Grade = "check",
 ) -> list[Concern]:
     """Return a concern if the scale is not determined."""
     names = parameters_of_open_scale(experiments, parameters)
     return [Concern("scale/unknown", grade, {"names": names})] if names else []
 
 
-def relative_scale_note(experiments: Iterable[Experiment], parameters: Parameters) -> str | None:
+def relative_scale_note(
+    experiments: Iterable[Experiment], parameters: Parameters
+) -> str | None:
     """Return the note that moduli are relative to the stated density; None if a force sets
     the scale, or the scale is open.
     """
@@ -65,7 +78,9 @@ def relative_scale_note(experiments: Iterable[Experiment], parameters: Parameter
 
 
 def _scaled_parameters(
-    experiments: Iterable[Experiment], parameters: Parameters, includes_declared: bool
+    experiments: Iterable[Experiment],
+    parameters: Parameters,
+    includes_declared: bool,
 ) -> tuple[str, ...]:
     """Return the free parameters that multiply all moduli and densities by a common factor; empty
     if data or priors determine the factor.
@@ -79,7 +94,9 @@ def _scaled_parameters(
     includes_declared : bool
         Whether densities that are not estimated count as multiplied too.
     """
-    fitted = [experiment for experiment in experiments if not experiment.validation]
+    fitted = [
+        experiment for experiment in experiments if not experiment.validation
+    ]
     bodies = {id(e.body): e.body for e in fitted}
     with_known_force = {id(e.body) for e in fitted if e.has_known_force}
     if len(with_known_force) == len(bodies):
@@ -102,11 +119,22 @@ def _scaled_parameters(
     if not scaling.any():
         return ()
     solution = np.linalg.lstsq(matrix, scaling, rcond=None)[0]
-    moves = np.abs(solution) > LEAST_REMAINDER * np.abs(solution).max(initial=0.0)
-    priors = np.array([item.prior is not None for item in usual.free], dtype=bool)
-    if np.abs(matrix @ solution - scaling).max() > LEAST_REMAINDER or (moves & priors).any():
+    moves = np.abs(solution) > LEAST_REMAINDER * np.abs(solution).max(
+        initial=0.0
+    )
+    priors = np.array(
+        [item.prior is not None for item in usual.free], dtype=bool
+    )
+    if (
+        np.abs(matrix @ solution - scaling).max() > LEAST_REMAINDER
+        or (moves & priors).any()
+    ):
         return ()
-    return tuple(item.name for item, is_moved in zip(usual.free, moves, strict=True) if is_moved)
+    return tuple(
+        item.name
+        for item, is_moved in zip(usual.free, moves, strict=True)
+        if is_moved
+    )
 
 
 def _common_scaling(
@@ -124,7 +152,9 @@ def _common_scaling(
     includes_declared : bool
         Whether stated densities count as changeable.
     """
-    if not includes_declared and not all(part.has_free_density for part in body.parts):
+    if not includes_declared and not all(
+        part.has_free_density for part in body.parts
+    ):
         return None
     scaled = [
         is_modulus(name)
@@ -164,21 +194,36 @@ def is_motionless(experiment: Experiment) -> bool:
     present = markers.is_present[..., None]
     counts = np.maximum(present.sum(axis=0), 1)
     mean = np.where(present, markers.positions_m, 0.0).sum(axis=0) / counts
-    deviations = np.where(present, markers.positions_m - mean, 0.0) / markers.sigma_m[:, None]
+    deviations = (
+        np.where(present, markers.positions_m - mean, 0.0)
+        / markers.sigma_m[:, None]
+    )
     # Of a mean of n samples, the deviations have n − 1 degrees of freedom.
     freedom = 3 * float(np.maximum(present.sum(axis=0) - 1, 0).sum())
     return bool(np.sum(deviations**2) <= chi2_isf(RARE, max(freedom, 1.0)))
 
 
-def static_concerns(experiments: Iterable[Experiment], parameters: Parameters) -> list[Concern]:
+def static_concerns(
+    experiments: Iterable[Experiment], parameters: Parameters
+) -> list[Concern]:
     """Return a concern if nothing moves in the fitted recordings, so that damping cannot be
     determined.
     """
-    fitted = [experiment for experiment in experiments if not experiment.validation]
+    fitted = [
+        experiment for experiment in experiments if not experiment.validation
+    ]
     damping = [item.name for item in parameters.free if is_damping(item.name)]
-    if not fitted or not damping or not all(e.is_static or is_motionless(e) for e in fitted):
+    if (
+        not fitted
+        or not damping
+        or not all(e.is_static or is_motionless(e) for e in fitted)
+    ):
         return []
-    code = "static" if all(experiment.is_static for experiment in fitted) else "still"
+    code = (
+        "static"
+        if all(experiment.is_static for experiment in fitted)
+        else "still"
+    )
     names = [f"'{e.name}'" for e in fitted]
     verb = "is" if len(fitted) == 1 else "are"
     data = {"names": names, "verb": verb, "damping": damping}

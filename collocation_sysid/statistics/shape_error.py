@@ -53,10 +53,15 @@ def thickness_m(body: Body) -> float:
     """
     a, b, c = np.moveaxis(body.mesh.points_m[body.mesh.surface], 1, 0)
     area_m2 = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    return min(6 * body.mesh.volume_m3 / area_m2, float(extents_m(body.mesh.points_m)[-1]))
+    return min(
+        6 * body.mesh.volume_m3 / area_m2,
+        float(extents_m(body.mesh.points_m)[-1]),
+    )
 
 
-def surface_modes(body: Body, known: Index, correlation: float = CORRELATION) -> Array:
+def surface_modes(
+    body: Body, known: Index, correlation: float = CORRELATION
+) -> Array:
     """Return displacements (modes, n, 3) of the nodes for unit standard deviation of the surface's
     error.
 
@@ -77,18 +82,26 @@ def surface_modes(body: Body, known: Index, correlation: float = CORRELATION) ->
     surface = np.flatnonzero(area_m2 > 0)
     fields = np.zeros((len(corners.points_m), SURFACE_MODES))
     length_m = correlation * float(extents_m(corners.points_m)[0])
-    own = _correlation_modes(corners.points_m[surface], area_m2[surface], length_m)
+    own = _correlation_modes(
+        corners.points_m[surface], area_m2[surface], length_m
+    )
     fields[surface, : own.shape[1]] = own
     if known.size:
         away_m = KDTree(corners.points_m[known]).query(corners.points_m)[0]
-        fields *= 1 - np.exp(-((away_m / (KNOWN_WITHIN * length_m)) ** 2))[:, None]
+        fields *= (
+            1 - np.exp(-((away_m / (KNOWN_WITHIN * length_m)) ** 2))[:, None]
+        )
     displacements = fields[:, :, None] * normals[:, None, :]
-    harmonic = _harmonic_extension(corners, surface, displacements.reshape(len(fields), -1))
+    harmonic = _harmonic_extension(
+        corners, surface, displacements.reshape(len(fields), -1)
+    )
     of_corners = harmonic.reshape(len(fields), SURFACE_MODES, 3)
     return _extend_to_all_nodes(body, of_corners.transpose(1, 0, 2))
 
 
-def _correlation_modes(points_m: Array, weights: Array, length_m: float) -> Array:
+def _correlation_modes(
+    points_m: Array, weights: Array, length_m: float
+) -> Array:
     """Return the strongest modes (n, SURFACE_MODES or fewer) of a random field with unit variance
     and correlation length `length_m` at points (n, 3), scaled by their standard deviations.
 
@@ -96,7 +109,9 @@ def _correlation_modes(points_m: Array, weights: Array, length_m: float) -> Arra
     determines the modes.
     """
     count = min(len(points_m), MOST_NODES)
-    chosen = np.sort(np.random.default_rng(0).permutation(len(points_m))[:count])
+    chosen = np.sort(
+        np.random.default_rng(0).permutation(len(points_m))[:count]
+    )
 
     def covariance(a: Array, b: Array) -> Array:
         squares = np.sum((a[:, None] - b[None]) ** 2, axis=2)
@@ -112,7 +127,9 @@ def _correlation_modes(points_m: Array, weights: Array, length_m: float) -> Arra
     return covariance(points_m, points_m[chosen]) @ scaled
 
 
-def _harmonic_extension(nodes: ElementNodes, surface: Index, values: Array) -> Array:
+def _harmonic_extension(
+    nodes: ElementNodes, surface: Index, values: Array
+) -> Array:
     """Return values (n, m) at the corners with those inside the surface (indices of nodes) replaced
     by the solution of Laplace's equation on the mesh graph.
     """
@@ -128,7 +145,9 @@ def _harmonic_extension(nodes: ElementNodes, surface: Index, values: Array) -> A
     adjacency = sp.csr_array((ones, (rows, columns)), shape=(count, count))
     laplacian = sp.csc_array(sp.diags_array(adjacency.sum(axis=1)) - adjacency)
     right = -(laplacian[inside][:, surface] @ values[surface])
-    extended[inside] = splu(sp.csc_array(laplacian[inside][:, inside])).solve(right)
+    extended[inside] = splu(sp.csc_array(laplacian[inside][:, inside])).solve(
+        right
+    )
     return extended
 
 
@@ -141,7 +160,9 @@ def _extend_to_all_nodes(body: Body, corner_fields: Array) -> Array:
     fields[:, :corners] = corner_fields
     ends = body.nodes.ends
     if len(ends):
-        fields[:, corners : corners + len(ends)] = corner_fields[:, ends].mean(axis=2)
+        fields[:, corners : corners + len(ends)] = corner_fields[:, ends].mean(
+            axis=2
+        )
     return fields
 
 
@@ -153,10 +174,16 @@ def standing_nodes(body: Body, gravity_m_s2: Array) -> Index:
     """
     points_m = body.nodes.points_m
     length = float(np.linalg.norm(gravity_m_s2))
-    up = -np.asarray(gravity_m_s2) / length if length else np.array([0.0, 0.0, 1.0])
+    up = (
+        -np.asarray(gravity_m_s2) / length
+        if length
+        else np.array([0.0, 0.0, 1.0])
+    )
     height_m = points_m @ up
     low_m = height_m.min()
-    return np.flatnonzero(height_m <= low_m + STANDING * max(np.ptp(height_m), 1e-300))
+    return np.flatnonzero(
+        height_m <= low_m + STANDING * max(np.ptp(height_m), 1e-300)
+    )
 
 
 def sag_m(body: Body, theta: Array, support_dofs: Index, axis: int) -> Array:
@@ -194,4 +221,6 @@ def sag_m(body: Body, theta: Array, support_dofs: Index, axis: int) -> Array:
     limit_m = MOST_SAG * float(extents_m(body.mesh.points_m)[0])
     if not np.isfinite(largest):
         return np.zeros_like(x)
-    return difference_m.reshape(-1, 3) * min(1.0, limit_m / max(largest, 1e-300))
+    return difference_m.reshape(-1, 3) * min(
+        1.0, limit_m / max(largest, 1e-300)
+    )

@@ -50,19 +50,28 @@ class FirstContact:
         nearest_m = np.inf
         row = 0
         for first in range(0, len(x), ROWS_AT_ONCE):
-            gaps_m = law.gaps(contact.points.vectors(x[first : first + ROWS_AT_ONCE]))
+            gaps_m = law.gaps(
+                contact.points.vectors(x[first : first + ROWS_AT_ONCE])
+            )
             touching = np.flatnonzero((gaps_m < law.widths_m).any(axis=1))
             gaps_m = gaps_m.min(axis=1)
-            row_in_chunk = int(touching[0]) if len(touching) else int(gaps_m.argmin())
+            row_in_chunk = (
+                int(touching[0]) if len(touching) else int(gaps_m.argmin())
+            )
             if gaps_m[row_in_chunk] < nearest_m:
                 nearest_m = float(gaps_m[row_in_chunk])
                 row = first + row_in_chunk
             if len(touching):
                 break
         y = contact.points.vectors(x[row : row + 1])
-        gaps_m, slopes = law.gap_function.evaluate_with_jacobian(y, np.zeros((0, *y.shape[1:])))
+        gaps_m, slopes = law.gap_function.evaluate_with_jacobian(
+            y, np.zeros((0, *y.shape[1:]))
+        )
         gaps_m = gaps_m[0, 0]
-        weights = law.surface.area_m2 * contact.scaled_pressures(x[row : row + 1])[0, 0]
+        weights = (
+            law.surface.area_m2
+            * contact.scaled_pressures(x[row : row + 1])[0, 0]
+        )
         if not weights.any():
             weights = (gaps_m == gaps_m.min()).astype(float)
         weights = weights / weights.sum()
@@ -70,11 +79,18 @@ class FirstContact:
         # The row before has the surface as it is without contact.
         before = max(row - 1, 0)
         origin_m = x[before].reshape(-1, 3)[law.obstacle.nodes[0]]
-        place_m = origin_m + contact.points.vectors(x[before : before + 1])[:3, 0] @ weights
-        return cls(row, place_m, normal / max(float(np.linalg.norm(normal)), 1e-9))
+        place_m = (
+            origin_m
+            + contact.points.vectors(x[before : before + 1])[:3, 0] @ weights
+        )
+        return cls(
+            row, place_m, normal / max(float(np.linalg.norm(normal)), 1e-9)
+        )
 
 
-def obstacle_shifts_m(iterate: ExperimentIterate) -> Iterator[tuple[Obstacle, Array]]:
+def obstacle_shifts_m(
+    iterate: ExperimentIterate,
+) -> Iterator[tuple[Obstacle, Array]]:
     """Yield each obstacle with the shift (N, 3) per relative size that preserves first contact [m].
 
     The body scales about the middle of its grasps. Along axes that no grasp prescribes, it scales
@@ -84,22 +100,37 @@ def obstacle_shifts_m(iterate: ExperimentIterate) -> Iterator[tuple[Obstacle, Ar
     experiment = iterate.segment.experiment
     forces = iterate.equations.dynamics.forces
     t_s = iterate.equations.dynamics.t_s[: len(iterate.x)]
-    contacts = [term for term in forces.external_terms if isinstance(term, Contact)]
+    contacts = [
+        term for term in forces.external_terms if isinstance(term, Contact)
+    ]
     if not contacts:
         return
-    first_contacts = [FirstContact.from_motion(contact, iterate.x) for contact in contacts]
+    first_contacts = [
+        FirstContact.from_motion(contact, iterate.x) for contact in contacts
+    ]
     travels_m = [
-        np.ptp(iterate.x[:, c.law_of_contact.obstacle.prescribed_dofs], axis=0).max()
+        np.ptp(
+            iterate.x[:, c.law_of_contact.obstacle.prescribed_dofs], axis=0
+        ).max()
         for c in contacts
     ]
     support = min(
-        zip((each.row for each in first_contacts), travels_m, range(len(contacts)), strict=True)
+        zip(
+            (each.row for each in first_contacts),
+            travels_m,
+            range(len(contacts)),
+            strict=True,
+        )
     )
-    prescribed_axes = set("".join(grasp.axes for grasp in experiment.body_grasps))
+    prescribed_axes = set(
+        "".join(grasp.axes for grasp in experiment.body_grasps)
+    )
     free = np.array([axis not in prescribed_axes for axis in "xyz"])
     for contact, each in zip(contacts, first_contacts, strict=True):
         obstacle = contact.law_of_contact.obstacle
-        turn, shift = (values[0] for values in experiment.rigid_motion(t_s[each.row]))
+        turn, shift = (
+            values[0] for values in experiment.rigid_motion(t_s[each.row])
+        )
         pivot_m = turn @ iterate.segment.nuisance.grasp_pivot_m + shift
         pivot_m = np.where(free, first_contacts[support[-1]].place_m, pivot_m)
         way_m = each.normal * (each.normal @ (each.place_m - pivot_m))

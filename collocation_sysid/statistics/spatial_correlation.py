@@ -54,7 +54,9 @@ class SpatialCorrelation:
     freedom: float
 
 
-def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialCorrelation | None:
+def estimate_spatial_correlation(
+    block: ResidualBlock, slope: Array
+) -> SpatialCorrelation | None:
     """Estimate the spatial correlation of a block's errors.
 
     Parameters
@@ -72,16 +74,25 @@ def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialC
     residual, _, present = block.channels
     if block.places_m is None or not present.any():
         return None
-    distances_m = np.linalg.norm(block.places_m[:, None] - block.places_m, axis=2)
+    distances_m = np.linalg.norm(
+        block.places_m[:, None] - block.places_m, axis=2
+    )
     contrasts = []
-    samples = np.unique(np.linspace(0, len(residual) - 1, MOST_SAMPLES).astype(int))
+    samples = np.unique(
+        np.linspace(0, len(residual) - 1, MOST_SAMPLES).astype(int)
+    )
     for t in samples:
         present_channels = np.flatnonzero(present[t])
-        directions, singular_values, _ = np.linalg.svd(slope[t, present_channels])
+        directions, singular_values, _ = np.linalg.svd(
+            slope[t, present_channels]
+        )
         free = directions[
             :,
             np.concatenate(
-                [singular_values, np.zeros(len(present_channels) - len(singular_values))]
+                [
+                    singular_values,
+                    np.zeros(len(present_channels) - len(singular_values)),
+                ]
             )
             < LEAST_CORRELATION,
         ]
@@ -96,7 +107,9 @@ def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialC
     if not contrasts:
         return None
     count = sum(len(z) for z, _, _ in contrasts)
-    nearest = float(np.median(np.where(distances_m > 0, distances_m, np.inf).min(axis=1)))
+    nearest = float(
+        np.median(np.where(distances_m > 0, distances_m, np.inf).min(axis=1))
+    )
     longest = max(LONGEST * float(distances_m.max()), 2 * nearest)
     white, _ = _restricted_likelihood(contrasts, 0.0, length_m=1.0)
     candidates = [
@@ -109,16 +122,24 @@ def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialC
     shape = _correlation_matrix(distances_m, share, float(length))
     share_known = count / max(1, sum(len(f) for _, f, _ in contrasts))
     freedom = max(
-        1.0, len(contrasts) * share_known * np.trace(shape) ** 2 / float(np.sum(shape**2))
+        1.0,
+        len(contrasts)
+        * share_known
+        * np.trace(shape) ** 2
+        / float(np.sum(shape**2)),
     )
     return SpatialCorrelation(level * shape, float(length), p, freedom)
 
 
-def _correlation_matrix(distances_m: Array, share: float, length_m: float) -> Array:
+def _correlation_matrix(
+    distances_m: Array, share: float, length_m: float
+) -> Array:
     """Return the correlation matrix (n, n) of distances `distances_m` (n, n) for a share a and a
     length [m].
     """
-    return (1 - share) * np.eye(len(distances_m)) + share * np.exp(-distances_m / length_m)
+    return (1 - share) * np.eye(len(distances_m)) + share * np.exp(
+        -distances_m / length_m
+    )
 
 
 def _restricted_likelihood(
@@ -140,7 +161,9 @@ def _restricted_likelihood(
     logarithms = 0.0
     count = 0
     for z, free, distances_m in contrasts:
-        root = np.linalg.cholesky(free.T @ _correlation_matrix(distances_m, share, length_m) @ free)
+        root = np.linalg.cholesky(
+            free.T @ _correlation_matrix(distances_m, share, length_m) @ free
+        )
         squares += float(np.sum(np.linalg.solve(root, z) ** 2))
         logarithms += 2 * float(np.log(np.diag(root)).sum())
         count += len(z)

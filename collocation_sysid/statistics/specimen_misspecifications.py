@@ -57,7 +57,11 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
     solution : Solution
         The fit. Its recordings without specimens are not refitted.
     """
-    fitted = [part for part in solution.parts if part.segment.experiment.specimen is not None]
+    fitted = [
+        part
+        for part in solution.parts
+        if part.segment.experiment.specimen is not None
+    ]
     if not fitted:
         return []
     if _misfit(fitted) <= NOISE_LEVEL:
@@ -67,10 +71,16 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
 
     def misfit_of(corrected: Experiment) -> float | None:
         """Return the misfit of all specimens with one of them corrected; None without a fit."""
-        chosen = [corrected if e.name == corrected.name else e for e in experiments]
-        method = ReducedSpace(max_iterations=MOST_ITERATIONS, tolerance=TOLERANCE)
+        chosen = [
+            corrected if e.name == corrected.name else e for e in experiments
+        ]
+        method = ReducedSpace(
+            max_iterations=MOST_ITERATIONS, tolerance=TOLERANCE
+        )
         try:
-            refit = method(replace(solution.collocation, experiments=tuple(chosen)))
+            refit = method(
+                replace(solution.collocation, experiments=tuple(chosen))
+            )
         except (InputError, SimulationError):
             return None
         refit.unless_interrupted()
@@ -81,12 +91,20 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
         return []
     hypotheses: list[Hypothesis] = []
     test = HypothesisTest(
-        misfit, misfit_of, REQUIRED_FACTOR, smallest_misfit=1.0, noise_level=NOISE_LEVEL
+        misfit,
+        misfit_of,
+        REQUIRED_FACTOR,
+        smallest_misfit=1.0,
+        noise_level=NOISE_LEVEL,
     )
     for experiment in experiments:
         if len(experiment.t_s) < FEWEST_SAMPLES:
             continue
-        others = [_initial_slope(each) for each in experiments if each is not experiment]
+        others = [
+            _initial_slope(each)
+            for each in experiments
+            if each is not experiment
+        ]
         for hypothesis in test.accepted(_hypotheses(experiment, others)):
             hypotheses.append(hypothesis)
             if hypothesis.strength > CERTAIN:
@@ -97,14 +115,25 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
 def _thinned(experiment: Experiment) -> Experiment:
     """Return the experiment of a specimen with at most `REFITTED_SAMPLES` of its samples."""
     count = len(experiment.t_s)
-    chosen = np.unique(np.linspace(0, count - 1, min(count, REFITTED_SAMPLES)).astype(int))
+    chosen = np.unique(
+        np.linspace(0, count - 1, min(count, REFITTED_SAMPLES)).astype(int)
+    )
     readings = [
-        replace(gauge, t_s=gauge.sample_times_s[chosen], values=gauge.measured_values[chosen])
+        replace(
+            gauge,
+            t_s=gauge.sample_times_s[chosen],
+            values=gauge.measured_values[chosen],
+        )
         for gauge in experiment.readings
         if np.isfinite(gauge.measured_values[chosen]).any()
     ]
     markers = Markers.none(experiment.t_s[chosen])
-    return replace(experiment, t_s=experiment.t_s[chosen], readings=readings, markers=markers)
+    return replace(
+        experiment,
+        t_s=experiment.t_s[chosen],
+        readings=readings,
+        markers=markers,
+    )
 
 
 def _initial_slope(experiment: Experiment) -> float:
@@ -117,7 +146,9 @@ def _initial_slope(experiment: Experiment) -> float:
     if not is_known.any():
         return np.nan
     order = np.argsort(np.abs(strain[is_known]))[: len(strain) // 2 + 1]
-    return float(np.median(np.abs(stress_pa[is_known][order] / strain[is_known][order])))
+    return float(
+        np.median(np.abs(stress_pa[is_known][order] / strain[is_known][order]))
+    )
 
 
 def _misfit(parts: Sequence[ExperimentIterate]) -> float:
@@ -127,14 +158,20 @@ def _misfit(parts: Sequence[ExperimentIterate]) -> float:
     for part in parts:
         squares += float(np.sum(part.phi**2))
         for sensor in part.segment.custom_sensors:
-            predicted = sensor.without_padding(sensor.predict_motion(part.motion, part.phi))
-            residuals = (predicted - sensor.sensor.measured_values) / sensor.sensor.sigma
+            predicted = sensor.without_padding(
+                sensor.predict_motion(part.motion, part.phi)
+            )
+            residuals = (
+                predicted - sensor.sensor.measured_values
+            ) / sensor.sensor.sigma
             squares += float(np.nansum(residuals**2))
             count += int(np.isfinite(residuals).sum())
     return float(np.sqrt(squares / max(1, count)))
 
 
-def _hypotheses(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Iterator[Hypothesis]:
+def _hypotheses(
+    experiment: Experiment, other_slopes_pa: Sequence[float]
+) -> Iterator[Hypothesis]:
     """Yield each common mistake with the experiment that corrects it.
 
     Parameters
@@ -151,21 +188,36 @@ def _hypotheses(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Ite
     strain, _ = specimen_strains(experiment)
     areas = area_ratios(deformation, strain)
     if areas is not None and np.ptp(areas):
-        yield Hypothesis("specimen-true-stress", of, {}, _with_stress(experiment, areas))
+        yield Hypothesis(
+            "specimen-true-stress", of, {}, _with_stress(experiment, areas)
+        )
     is_invertible = (strain >= 0).all() and strain.max() < 1.0
-    if deformation.test in ("uniaxial", "equibiaxial", "planar") and is_invertible:
-        yield Hypothesis("specimen-compression", of, {}, _compressed(experiment))
+    if (
+        deformation.test in ("uniaxial", "equibiaxial", "planar")
+        and is_invertible
+    ):
+        yield Hypothesis(
+            "specimen-compression", of, {}, _compressed(experiment)
+        )
     if strain.max() > PERCENT_STRAIN and deformation.test != "volumetric":
-        yield Hypothesis("specimen-percent", of, {}, _strained(experiment, 0.01))
+        yield Hypothesis(
+            "specimen-percent", of, {}, _strained(experiment, 0.01)
+        )
     ratios = [other / _initial_slope(experiment) for other in other_slopes_pa]
     for unit, factor in UNIT_FACTORS.items():
-        decades = np.sign(np.log(factor)) * np.log(ratios) if ratios else np.zeros(0)
+        decades = (
+            np.sign(np.log(factor)) * np.log(ratios) if ratios else np.zeros(0)
+        )
         if (decades > np.log(UNIT_LIKE)).any():
             corrected = _with_stress(experiment, np.full_like(strain, factor))
-            yield Hypothesis("specimen-unit", of, {"unit": unit, "factor": factor}, corrected)
+            yield Hypothesis(
+                "specimen-unit", of, {"unit": unit, "factor": factor}, corrected
+            )
 
 
-def area_ratios(deformation: HomogeneousDeformation, strain: Array) -> Array | None:
+def area_ratios(
+    deformation: HomogeneousDeformation, strain: Array
+) -> Array | None:
     """Return the deformed over the undeformed area (T,) of an incompressible specimen; None where
     a test does not change it.
     """
@@ -178,7 +230,8 @@ def _with_stress(experiment: Experiment, factors: Array) -> Experiment:
     """Return the experiment with its stresses multiplied by factors (T,)."""
     readings = [
         replace(gauge, values=gauge.measured_values * factors[:, None])
-        if gauge.unit == STRESS_UNIT and len(gauge.sample_times_s) == len(factors)
+        if gauge.unit == STRESS_UNIT
+        and len(gauge.sample_times_s) == len(factors)
         else gauge
         for gauge in experiment.readings
     ]
@@ -190,14 +243,25 @@ def _strained(experiment: Experiment, factor: float) -> Experiment:
 
     def scaled(grasp: Grasp) -> Grasp:
         return replace(
-            grasp, poses=replace(grasp.poses, positions_m=factor * grasp.poses.positions_m)
+            grasp,
+            poses=replace(
+                grasp.poses, positions_m=factor * grasp.poses.positions_m
+            ),
         )
 
-    return replace(experiment, grasps=[scaled(grasp) for grasp in experiment.grasps])
+    return replace(
+        experiment, grasps=[scaled(grasp) for grasp in experiment.grasps]
+    )
 
 
 def _compressed(experiment: Experiment) -> Experiment:
     """Return the experiment with strains and stresses of the opposite sign."""
-    reversed_stress = _with_stress(experiment, np.full(len(experiment.t_s), -1.0))
-    lateral = [gauge for gauge in reversed_stress.readings if gauge.name != LATERAL_NAME]
+    reversed_stress = _with_stress(
+        experiment, np.full(len(experiment.t_s), -1.0)
+    )
+    lateral = [
+        gauge
+        for gauge in reversed_stress.readings
+        if gauge.name != LATERAL_NAME
+    ]
     return _strained(replace(reversed_stress, readings=lateral), -1.0)

@@ -8,7 +8,11 @@ import numpy as np
 
 from ..array_types import Array
 from ..fem.body import Body
-from ..fem.material_stability import is_examined, principal_stretches, stability_margins
+from ..fem.material_stability import (
+    is_examined,
+    principal_stretches,
+    stability_margins,
+)
 from ..program.experiment_iterate import ExperimentIterate
 from .concerns import Concern
 
@@ -28,10 +32,15 @@ def rest_stability_concerns(body: Body, theta: Array) -> Iterator[Concern]:
     body : Body
     theta : (k,)
     """
-    for part, constants in zip(body.parts, body.split_theta(theta), strict=True):
+    for part, constants in zip(
+        body.parts, body.split_theta(theta), strict=True
+    ):
         if is_examined(part.material):
             own = np.asarray(constants[: len(part.material.constants)])
-            if not stability_margins(part.material, own, np.ones((1, 3)))[0] > 0:
+            if (
+                not stability_margins(part.material, own, np.ones((1, 3)))[0]
+                > 0
+            ):
                 lam, mu = body.lame(theta)[part.name]
                 data = {
                     "material": part.material.name,
@@ -42,7 +51,9 @@ def rest_stability_concerns(body: Body, theta: Array) -> Iterator[Concern]:
                 yield Concern("stability/rest", "doubtful", data)
 
 
-def strain_stability_concerns(iterates: Iterable[ExperimentIterate]) -> Iterator[Concern]:
+def strain_stability_concerns(
+    iterates: Iterable[ExperimentIterate],
+) -> Iterator[Concern]:
     """Yield a concern for each experiment and part whose material is unstable at its strains.
 
     Up to `STATES` samples and, in each part, the `POINTS` quadrature points with the largest
@@ -55,7 +66,9 @@ def strain_stability_concerns(iterates: Iterable[ExperimentIterate]) -> Iterator
     """
     for iterate in iterates:
         experiment = iterate.segment.experiment
-        samples = np.linspace(0, len(experiment.t_s) - 1, STATES).round().astype(int)
+        samples = (
+            np.linspace(0, len(experiment.t_s) - 1, STATES).round().astype(int)
+        )
         samples = np.unique(samples)
         states = iterate.x[iterate.segment.markers.sample_rows[samples]]
         body = experiment.body
@@ -91,7 +104,9 @@ def _part_concerns(
     t_s : (T,)
         Times [s].
     """
-    for part, constants in zip(body.parts, body.split_theta(theta), strict=True):
+    for part, constants in zip(
+        body.parts, body.split_theta(theta), strict=True
+    ):
         if not is_examined(part.material):
             continue
         own = np.asarray(constants[: len(part.material.constants)])
@@ -101,10 +116,15 @@ def _part_concerns(
         valid = points.min(axis=1) > 0
         points = points[valid]
         times = times[valid]
-        largest = np.argsort(-np.abs(np.log(points)).max(axis=1), kind="stable")[:POINTS]
+        largest = np.argsort(
+            -np.abs(np.log(points)).max(axis=1), kind="stable"
+        )[:POINTS]
         margins = stability_margins(part.material, own, points[largest])
         shear_pa = abs(body.lame(theta)[part.name][1])
-        if not np.isfinite(margins).any() or np.nanmin(margins) >= -ROUNDING * shear_pa:
+        if (
+            not np.isfinite(margins).any()
+            or np.nanmin(margins) >= -ROUNDING * shear_pa
+        ):
             continue
         worst = largest[np.nanargmin(margins)]
         yield Concern(
@@ -115,6 +135,8 @@ def _part_concerns(
                 "where": f" of region '{part.name}'" if part.name else "",
                 "experiment": experiment,
                 "time_s": float(times[worst]),
-                "stretches": ", ".join(f"{each:.3g}" for each in points[worst][::-1]),
+                "stretches": ", ".join(
+                    f"{each:.3g}" for each in points[worst][::-1]
+                ),
             },
         )

@@ -32,7 +32,10 @@ from ..program.collocation import ExperimentIterate
 from ..program.contact_summary import surface_gaps_and_pressures
 from ..program.reaction_forces import forces_on_dofs, reaction_forces
 from ..recording.grasp import free_rigid_motions
-from ..recording.homogeneous_deformation import STRESS_PER_FORCE, HomogeneousDeformation
+from ..recording.homogeneous_deformation import (
+    STRESS_PER_FORCE,
+    HomogeneousDeformation,
+)
 from ..recording.nuisance import DEGREE
 from ..schema_tables import ByForm, Section
 from ..validated_types import Options, Positive
@@ -148,7 +151,9 @@ class ExperimentAtAnswer:
         """Return values (N, 3n) of all rows from those of the evaluations, zero before the
         first.
         """
-        return np.concatenate([np.zeros((self.dynamics.first_row, evaluated.shape[1])), evaluated])
+        return np.concatenate(
+            [np.zeros((self.dynamics.first_row, evaluated.shape[1])), evaluated]
+        )
 
     def internal_n(
         self,
@@ -173,7 +178,9 @@ class ExperimentAtAnswer:
         undamped = (self.theta if theta is None else theta).copy()
         undamped[list(self.body.tied_shares)] = 0.0
         dynamics = self.dynamics.with_theta(undamped)
-        histories = dynamics.forces_with_histories(dynamics.histories(self.iterate.x)).memory_state
+        histories = dynamics.forces_with_histories(
+            dynamics.histories(self.iterate.x)
+        ).memory_state
         xi, nu = dynamics.evaluation_states(self.iterate.x)
         evaluated = self.body if body is None else body
         return self.pad_rows(
@@ -188,7 +195,9 @@ class ExperimentAtAnswer:
     @cached_property
     def internal_force_n(self) -> Array:
         """Forces (N, 3n) of the material at the answer, without γ_m [N]."""
-        return self.internal_n(body=self.body.with_stress_free(self.stress_free_m))
+        return self.internal_n(
+            body=self.body.with_stress_free(self.stress_free_m)
+        )
 
     @cached_property
     def stress_free_m(self) -> Array:
@@ -236,7 +245,9 @@ class ExperimentAtAnswer:
         Places of the surface that are in contact with an obstacle are known and do not move.
         """
         segment = self.iterate.segment
-        gaps_m = surface_gaps_and_pressures(segment.experiment, self.theta, self.iterate.x)[0]
+        gaps_m = surface_gaps_and_pressures(
+            segment.experiment, self.theta, self.iterate.x
+        )[0]
         nearest = np.fmin.reduce(gaps_m, axis=0)
         is_in_contact = np.nan_to_num(nearest, nan=np.inf) < segment.length_m
         known = np.unique(self.body.mesh.surface[is_in_contact])
@@ -261,7 +272,10 @@ class ExperimentAtAnswer:
         """Return the weight and the mass-proportional damping (N, 3n) [N] of masses (3n,) or (N,
         3n) [kg].
         """
-        return mass_kg * (self.gravity - self.body.tied_damping_rate(self.theta) * self.states[1])
+        return mass_kg * (
+            self.gravity
+            - self.body.tied_damping_rate(self.theta) * self.states[1]
+        )
 
     @property
     def buoyancy_n(self) -> Array:
@@ -291,8 +305,14 @@ class ExperimentAtAnswer:
         x = self.iterate.x
         force = forces_on_dofs(self.dynamics, x, dofs)
         mass = self.dynamics.mass.inertia_kg[:, dofs]
-        reaction_n = reaction_forces(self.dynamics, mass, force, self.acceleration[:, dofs])
-        return np.where(np.isnan(self.iterate.equations.prescribed.positions_m), 0.0, reaction_n)
+        reaction_n = reaction_forces(
+            self.dynamics, mass, force, self.acceleration[:, dofs]
+        )
+        return np.where(
+            np.isnan(self.iterate.equations.prescribed.positions_m),
+            0.0,
+            reaction_n,
+        )
 
     @cached_property
     def contacts(self) -> dict[int, Contact]:
@@ -320,15 +340,21 @@ class ExperimentAtAnswer:
         """
         gamma_r_s = np.zeros(len(self.body.cells))
         for part, start in zip(self.body.parts, self.body.starts, strict=False):
-            if GAMMA_R in part.damping.constants and part.damping.stress is None:
-                gamma_r_s[part.cells] = self.theta[start + part.constants.index(GAMMA_R)]
+            if (
+                GAMMA_R in part.damping.constants
+                and part.damping.stress is None
+            ):
+                gamma_r_s[part.cells] = self.theta[
+                    start + part.constants.index(GAMMA_R)
+                ]
         return gamma_r_s
 
     @cached_property
     def young_pa(self) -> float:
         """Young's modulus of the softest part at small strain [Pa]."""
         return min(
-            engineering_constants(*moduli)[0] for moduli in self.body.lame(self.theta).values()
+            engineering_constants(*moduli)[0]
+            for moduli in self.body.lame(self.theta).values()
         )
 
 
@@ -376,7 +402,9 @@ class Assumption:
     @property
     def components(self) -> tuple[str, ...]:
         """Names of the components, each after that of the assumption."""
-        return tuple(f"{self.name} {a}" for a in self.component_names.split()) or (self.name,)
+        return tuple(
+            f"{self.name} {a}" for a in self.component_names.split()
+        ) or (self.name,)
 
 
 # What each changes ------------------------------------------------------------------------------
@@ -392,13 +420,19 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
     """
     larger = 1 + SMALL
     smaller = 1 - SMALL
-    force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(smaller)
+    force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(
+        smaller
+    )
     force = force / (2 * SMALL)
     # Of a body made under gravity the deflection over the size grows with the weight over s².
-    heavier = at.force_change_by_scan_weight() * (-2.0 if at.body.has_declared_mass else 1.0)
+    heavier = at.force_change_by_scan_weight() * (
+        -2.0 if at.body.has_declared_mass else 1.0
+    )
     mass = (0.0 if at.body.has_declared_mass else 3.0) * at.own_mass_kg
     for number, contact in at.contacts.items():
-        has_stiffness = contact.law_of_contact.obstacle.stiffness_pa_m is not None
+        has_stiffness = (
+            contact.law_of_contact.obstacle.stiffness_pa_m is not None
+        )
         force += (2.0 if has_stiffness else 1.0) * at.contact_n(number)
     segment = at.iterate.segment
     rotations: Array = np.nan_to_num(segment.prescribed_motion.pose_rows[0])
@@ -408,7 +442,9 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
     )
     displacement_m = np.einsum("tgj,gj->tg", rotations, arms_m)
     for obstacle, shift_m in obstacle_shifts_m(at.iterate):
-        obstacle_dofs = np.searchsorted(segment.prescribed_motion.dofs, obstacle.prescribed_dofs)
+        obstacle_dofs = np.searchsorted(
+            segment.prescribed_motion.dofs, obstacle.prescribed_dofs
+        )
         displacement_m[:, obstacle_dofs] = np.tile(shift_m, len(obstacle.nodes))
     air = 3.0 * at.buoyancy_n + 2.0 * at.air_drag_n
     return Effect(
@@ -423,7 +459,8 @@ def _mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
     if any(part.has_free_density for part in at.body.parts):
         return None
     return Effect(
-        at.weight_and_drag(at.own_mass_kg) + at.force_change_by_scan_weight(), at.own_mass_kg
+        at.weight_and_drag(at.own_mass_kg) + at.force_change_by_scan_weight(),
+        at.own_mass_kg,
     )
 
 
@@ -433,7 +470,9 @@ def _density_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
     """
     place = at.body.nodes_m[:, axis]
     middle = np.average(place, weights=at.own_mass_kg[::3])
-    mass = at.own_mass_kg * np.repeat((place - middle) / np.abs(place - middle).max(), 3)
+    mass = at.own_mass_kg * np.repeat(
+        (place - middle) / np.abs(place - middle).max(), 3
+    )
     return Effect(at.weight_and_drag(mass), mass)
 
 
@@ -454,15 +493,22 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
     gamma = at.proportional_s[:, None, None]
     for x, v, own in zip(xi, nu, force, strict=True):
         stretch, rate = (
-            np.einsum("eqa,eaj->eqj", slopes, each.reshape(-1, 3)[body.cells]) for each in (x, v)
+            np.einsum("eqa,eaj->eqj", slopes, each.reshape(-1, 3)[body.cells])
+            for each in (x, v)
         )
         squared = np.sum(stretch**2, axis=2, keepdims=True)
         strain = 0.5 * (squared - 1)
         if at.iterate.segment.experiment.specimen is not None:
             strain = (1 - squared**-1.5) / 3
-        pull = (strain + gamma * np.sum(stretch * rate, axis=2, keepdims=True)) * stretch
+        pull = (
+            strain + gamma * np.sum(stretch * rate, axis=2, keepdims=True)
+        ) * stretch
         pull = weight[..., None] * (pull + gamma * strain * rate)
-        np.subtract.at(own.reshape(-1, 3), body.cells, np.einsum("eqa,eqj->eaj", slopes, pull))
+        np.subtract.at(
+            own.reshape(-1, 3),
+            body.cells,
+            np.einsum("eqa,eqj->eaj", slopes, pull),
+        )
     force[: at.dynamics.first_row] = 0.0
     return Effect(force)
 
@@ -482,9 +528,15 @@ def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
         return None
     slower = at.internal_n(time_factor=1 + SMALL)
     faster = at.internal_n(time_factor=1 - SMALL)
-    drag = at.body.tied_damping_rate(at.theta) * at.dynamics.mass.damped_kg * at.states[1]
+    drag = (
+        at.body.tied_damping_rate(at.theta)
+        * at.dynamics.mass.damped_kg
+        * at.states[1]
+    )
     air = 2.0 * at.air_drag_n
-    return Effect((faster - slower) / (2 * SMALL) - drag + air, time_stretch=-1.0)
+    return Effect(
+        (faster - slower) / (2 * SMALL) - drag + air, time_stretch=-1.0
+    )
 
 
 def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
@@ -523,7 +575,11 @@ def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """
     prescribed = at.iterate.equations.prescribed
     holding = at.iterate.segment.experiment.body_grasps
-    gripped = [grasp.prescribed_dofs for grasp in holding if len(grasp.axes) == len(_AXES)]
+    gripped = [
+        grasp.prescribed_dofs
+        for grasp in holding
+        if len(grasp.axes) == len(_AXES)
+    ]
     if not gripped:
         return None
     area_m2 = at.body.dof_volume_m3[prescribed.dofs] ** (2 / 3)
@@ -557,10 +613,13 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
     for grasp in experiment.grasps:
         for axis in range(3):
             here = np.flatnonzero(
-                np.isin(prescribed.dofs, grasp.prescribed_dofs) & (prescribed.dofs % 3 == axis)
+                np.isin(prescribed.dofs, grasp.prescribed_dofs)
+                & (prescribed.dofs % 3 == axis)
             )
             if driven[here].any():
-                displacement_m[:, here] = -at.grasp_force_n[:, here].sum(axis=1, keepdims=True)
+                displacement_m[:, here] = -at.grasp_force_n[:, here].sum(
+                    axis=1, keepdims=True
+                )
     return Effect(displacement_m=displacement_m)
 
 
@@ -597,14 +656,20 @@ def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
     if not experiment.is_static:
         return None
     pressed = {_AXES[k] for k in np.unique(prescribed.dofs[_is_driven(at)] % 3)}
-    platens = [g for g in experiment.grasps if len(g.axes) < 3 and pressed & set(g.axes)]
+    platens = [
+        g
+        for g in experiment.grasps
+        if len(g.axes) < 3 and pressed & set(g.axes)
+    ]
     force = np.zeros_like(at.iterate.x)
     x = at.iterate.x
     start = at.body.nodes_m.ravel()
     for grasp in platens:
         across = [k for k, name in enumerate(_AXES) if name not in grasp.axes]
         for node in grasp.nodes:
-            normal = np.isin(prescribed.dofs, [3 * node + _AXES.index(a) for a in grasp.axes])
+            normal = np.isin(
+                prescribed.dofs, [3 * node + _AXES.index(a) for a in grasp.axes]
+            )
             press = np.linalg.norm(at.grasp_force_n[:, normal], axis=1)
             dofs = [3 * node + k for k in across]
             way = x[:, dofs] - start[dofs]
@@ -624,7 +689,9 @@ def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
     change_n = np.zeros_like(xi)
     for contact in contact_terms(at.iterate.segment.experiment):
         if not contact.is_complementarity:
-            change_n += contact.rigid_limit_n(forces.states_of_terms(xi, nu)(contact))
+            change_n += contact.rigid_limit_n(
+                forces.states_of_terms(xi, nu)(contact)
+            )
     return Effect(at.pad_rows(change_n))
 
 
@@ -644,7 +711,11 @@ def _added_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 def _air_drag(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of more drag, as a share of that in the model; None in a vacuum."""
-    return Effect(at.air_drag_n) if at.iterate.segment.experiment.has_air_drag else None
+    return (
+        Effect(at.air_drag_n)
+        if at.iterate.segment.experiment.has_air_drag
+        else None
+    )
 
 
 def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
@@ -657,20 +728,27 @@ def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
     body = at.body
     names = body.constants.items()
     is_damped = any(
-        constant is GAMMA_R and value for (_, constant), value in zip(names, at.theta, strict=False)
+        constant is GAMMA_R and value
+        for (_, constant), value in zip(names, at.theta, strict=False)
     )
     if at.iterate.segment.experiment.is_static or not is_damped:
         return None
     parts = tuple(
         replace(part, damping=DAMPINGS[law])
-        if part.damping in DAMPINGS.values() and part.material is not MATERIALS["linear"]
+        if part.damping in DAMPINGS.values()
+        and part.material is not MATERIALS["linear"]
         else part
         for part in body.parts
     )
-    if all(own.damping is other.damping for own, other in zip(body.parts, parts, strict=True)):
+    if all(
+        own.damping is other.damping
+        for own, other in zip(body.parts, parts, strict=True)
+    ):
         return None
     xi, nu = at.dynamics.evaluation_states(at.iterate.x)
-    histories = at.dynamics.forces_with_histories(at.dynamics.histories(at.iterate.x)).memory_state
+    histories = at.dynamics.forces_with_histories(
+        at.dynamics.histories(at.iterate.x)
+    ).memory_state
     forces_n = (
         each.force(xi, nu, at.theta, memory_input=histories)
         for each in (body.with_parts(parts), body)
@@ -696,7 +774,9 @@ def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
     if at.body.rest_shape is not None:
         return None
     return Effect(
-        at.force_change_by_reference(sag_m(at.body, at.theta, at.likely_support_dofs, axis))
+        at.force_change_by_reference(
+            sag_m(at.body, at.theta, at.likely_support_dofs, axis)
+        )
     )
 
 
@@ -969,7 +1049,9 @@ class Assumptions(Options):
         """Return the table with all assumptions exactly true ("none"), as for a simulated
         recording.
         """
-        exact: dict[str, Literal["none"]] = dict.fromkeys(vars(Assumptions()), "none")
+        exact: dict[str, Literal["none"]] = dict.fromkeys(
+            vars(Assumptions()), "none"
+        )
         return Assumptions(**exact)
 
     @property
@@ -977,7 +1059,11 @@ class Assumptions(Options):
         """Standard deviations by name; None for what is exact."""
         by_name: dict[str, float | None] = {}
         for name, deviation in vars(self).items():
-            known = deviation.deviation if isinstance(deviation, KnownEffect) else deviation
+            known = (
+                deviation.deviation
+                if isinstance(deviation, KnownEffect)
+                else deviation
+            )
             by_name[name] = None if known == "none" else known
         return by_name
 

@@ -32,7 +32,12 @@ from ..model.parameters import Parameters
 from ..program.collocation import Collocation, ExperimentIterate
 from ..program.lapack import one_blas_thread
 from ..validated_types import Options
-from .autocorrelation import Dependence, analyse_dependence, error_processes, score_covariance
+from .autocorrelation import (
+    Dependence,
+    analyse_dependence,
+    error_processes,
+    score_covariance,
+)
 from .distributions import student_ppf
 from .estimates import (
     UNDETERMINED,
@@ -207,12 +212,17 @@ def uncertainty_at(
         If the equations of motion are singular.
     """
     fit, _ = with_pose_noise(linearise_fit(collocation, z), collocation, z)
-    return uncertainty_from_fit(fit, collocation.parameters, z[: collocation.nq], error_model)
+    return uncertainty_from_fit(
+        fit, collocation.parameters, z[: collocation.nq], error_model
+    )
 
 
 @one_blas_thread()
 def uncertainty_from_fit(
-    fit: LinearisedFit, parameters: Parameters, q: Array, error_model: ErrorModel = AUTO
+    fit: LinearisedFit,
+    parameters: Parameters,
+    q: Array,
+    error_model: ErrorModel = AUTO,
 ) -> Uncertainty:
     """Return the uncertainty of the parameters from the linearised fit.
 
@@ -247,11 +257,15 @@ def uncertainty_from_fit(
     all_free, quantiles, basis = _error_bars(fit, factored, error_model)
     of_all, bounded = _reported_covariance(all_free, fit, parameters, q)
     scatter = _compare_recordings(fit, parameters, q, error_model)
-    of_q, quantiles, wider = _widen_by_scatter(of_all[:shared, :shared], quantiles, scatter)
+    of_q, quantiles, wider = _widen_by_scatter(
+        of_all[:shared, :shared], quantiles, scatter
+    )
     estimates = user_estimates(
         parameters, q, covariance_q=of_q, at_bound=bounded, quantiles=quantiles
     )
-    longest_s = max((float(np.ptp(block.t_s)) for block in fit.blocks), default=0.0)
+    longest_s = max(
+        (float(np.ptp(block.t_s)) for block in fit.blocks), default=0.0
+    )
     sizes = relative_derivatives(parameters, q)
     deviations = np.sqrt(np.diag(of_all)[shared:]).tolist()
     return Uncertainty(
@@ -269,8 +283,12 @@ def uncertainty_from_fit(
         notes=(
             *parameter_notes(parameters, estimates),
             *memory_notes(estimates, longest_s),
-            *noise_notes(error_model.noise, basis.noise, basis.level, basis.errors),
-            *correlation_notes(error_model.errors, basis.errors, basis.dependence),
+            *noise_notes(
+                error_model.noise, basis.noise, basis.level, basis.errors
+            ),
+            *correlation_notes(
+                error_model.errors, basis.errors, basis.dependence
+            ),
             *disagreement_notes(fit, scatter),
         ),
         scatter=scatter,
@@ -287,17 +305,26 @@ def _error_bars(
     level = estimate_noise_level(fit, factored)
     without_outliers, outliers = remove_outliers(fit)
     dependence, dependent = _dependence(without_outliers)
-    correlated = requested.errors == "autocorrelated" or (requested.errors == "auto" and dependent)
-    kind: Noise = level.suggested_noise if requested.noise == "auto" else requested.noise
+    correlated = requested.errors == "autocorrelated" or (
+        requested.errors == "auto" and dependent
+    )
+    kind: Noise = (
+        level.suggested_noise if requested.noise == "auto" else requested.noise
+    )
     if requested.noise == "auto" and correlated and level.pooled < 1:
         kind = "given"
     of_score, freedom = level.score_covariance(kind, factored, fit.shared_count)
     covariance = factored.fit.covariance(of_score)
     used = "independent"
     if correlated:
-        of_score, few_freedom = _correlated_score_covariance(fit, factored, kind, level)
+        of_score, few_freedom = _correlated_score_covariance(
+            fit, factored, kind, level
+        )
         persistent = factored.fit.covariance(of_score)
-        before, after = (np.diag(each)[: fit.shared_count] for each in (covariance, persistent))
+        before, after = (
+            np.diag(each)[: fit.shared_count]
+            for each in (covariance, persistent)
+        )
         widens = (after > CONSEQUENCE**2 * before).any()
         if requested.errors == "autocorrelated" or kind != "given" or widens:
             covariance = persistent
@@ -305,11 +332,15 @@ def _error_bars(
             used = "autocorrelated"
     if fit.phase_covariance is not None:
         covariance = covariance.copy()
-        covariance[: fit.shared_count, : fit.shared_count] += fit.phase_covariance
+        covariance[: fit.shared_count, : fit.shared_count] += (
+            fit.phase_covariance
+        )
     return (
         covariance,
         student_ppf(0.975, freedom),
-        ErrorBasis(kind, used, level=level, dependence=dependence, outliers=outliers),
+        ErrorBasis(
+            kind, used, level=level, dependence=dependence, outliers=outliers
+        ),
     )
 
 
@@ -324,7 +355,9 @@ def _reported_covariance(
     """
     reported = covariance.copy()
     shared = fit.shared_count
-    uninformed = _has_no_information(parameters, q, np.diag(covariance)[:shared])
+    uninformed = _has_no_information(
+        parameters, q, np.diag(covariance)[:shared]
+    )
     at_bound = fit.at_bound.copy()
     at_bound[:shared] &= ~uninformed
     reported[at_bound] = reported[:, at_bound] = np.nan
@@ -349,11 +382,19 @@ def _widen_by_scatter(
     if scatter is None:
         return covariance_q, quantiles, np.ones(len(quantiles))
     with np.errstate(invalid="ignore"):
-        factors = np.sqrt(scatter.widen(np.diag(covariance_q)) / np.diag(covariance_q))
+        factors = np.sqrt(
+            scatter.widen(np.diag(covariance_q)) / np.diag(covariance_q)
+        )
     factors = np.where(scatter.is_disagreeing, factors, 1.0)
-    of_few = np.maximum(quantiles, student_ppf(0.975, np.maximum(scatter.degrees_of_freedom, 1)))
+    of_few = np.maximum(
+        quantiles, student_ppf(0.975, np.maximum(scatter.degrees_of_freedom, 1))
+    )
     wide = np.where(scatter.is_disagreeing, of_few, quantiles)
-    return covariance_q * np.outer(factors, factors), wide, factors * wide / quantiles
+    return (
+        covariance_q * np.outer(factors, factors),
+        wide,
+        factors * wide / quantiles,
+    )
 
 
 def _compare_recordings(
@@ -370,21 +411,33 @@ def _compare_recordings(
         if alone.measurement_count <= len(alone.names):
             continue
         uncertainty = uncertainty_from_fit(alone, parameters, q, errors)
-        independent = least_squares_of_fit(alone).standard_errors[: fit.shared_count] ** 2
+        independent = (
+            least_squares_of_fit(alone).standard_errors[: fit.shared_count] ** 2
+        )
         variances = np.diag(uncertainty.covariance) / sizes**2
-        known[alone.blocks[0].name] = step[: fit.shared_count], variances, independent
+        known[alone.blocks[0].name] = (
+            step[: fit.shared_count],
+            variances,
+            independent,
+        )
     return compare_recordings(fit, known) if len(known) > 1 else None
 
 
-def _has_no_information(parameters: Parameters, q: Array, variances: Array) -> NDArray[np.bool_]:
+def _has_no_information(
+    parameters: Parameters, q: Array, variances: Array
+) -> NDArray[np.bool_]:
     """Return the mask (nq,) of damping parameters that could be a hundred times their usual value
     without being noticed, from the variances (nq,) of q.
     """
     uninformed = []
     for item, at, variance in zip(parameters.free, q, variances, strict=True):
         usual = constant_named(item.name).usual or 0.0
-        deviation = np.sqrt(variance) * item.value_derivative(item.from_coordinate(float(at)))
-        uninformed.append(is_damping(item.name) and not deviation <= UNINFORMED * usual)
+        deviation = np.sqrt(variance) * item.value_derivative(
+            item.from_coordinate(float(at))
+        )
+        uninformed.append(
+            is_damping(item.name) and not deviation <= UNINFORMED * usual
+        )
     return np.array(uninformed, dtype=bool)
 
 
@@ -395,12 +448,19 @@ def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool]:
     factored = factorise_information(fit)
     level = estimate_noise_level(fit, factored)
     tested = analyse_dependence(fit, factored)
-    tested = replace(tested, lag1_deviation=tested.lag1_deviation * level.unevenness)
-    return tested, tested.is_correlated and not _is_explained(fit, factored, level, tested)
+    tested = replace(
+        tested, lag1_deviation=tested.lag1_deviation * level.unevenness
+    )
+    return tested, tested.is_correlated and not _is_explained(
+        fit, factored, level, tested
+    )
 
 
 def _is_explained(
-    fit: LinearisedFit, factored: Information, level: NoiseLevel, result: Dependence
+    fit: LinearisedFit,
+    factored: Information,
+    level: NoiseLevel,
+    result: Dependence,
 ) -> bool:
     """Whether known disturbances (such as noise of the poses) explain residuals as correlated as
     those in `result`; false without disturbances.
@@ -411,7 +471,8 @@ def _is_explained(
     rng = np.random.default_rng(0)
     size = np.sqrt(max(1.0, level.pooled))
     errors = [
-        (each[:REPLICAS] + size * rng.normal(size=each[:REPLICAS].shape)) * block.is_measured
+        (each[:REPLICAS] + size * rng.normal(size=each[:REPLICAS].shape))
+        * block.is_measured
         for each, block in zip(added, fit.blocks, strict=True)
     ]
     _, residuals = project_errors(factored, errors)
@@ -429,7 +490,9 @@ def _is_explained(
         for k in range(len(errors[0]))
     ]
     least, most = (pick(each.lag1 for each in replicas) for pick in (min, max))
-    return least <= result.lag1 <= most and result.shared_p >= min(r.shared_p for r in replicas)
+    return least <= result.lag1 <= most and result.shared_p >= min(
+        r.shared_p for r in replicas
+    )
 
 
 def _correlated_score_covariance(
@@ -438,7 +501,9 @@ def _correlated_score_covariance(
     """Return the covariance (r, r) of the score for correlated errors, and degrees of
     freedom (shared,).
     """
-    of_score, freedom = score_covariance(factored, error_processes(fit, factored), fit.shared_count)
+    of_score, freedom = score_covariance(
+        factored, error_processes(fit, factored), fit.shared_count
+    )
     if kind == "given" or level.known_score_covariance.any():
         # In no direction less than independent errors of the σ given bring, nor than those found
         # with what is known to add to them: an autoregression may miss that.
@@ -482,7 +547,11 @@ class MarkerPlace:
     def displacement_m(self) -> float | None:
         """Distance of the estimate from the stated place [m]; None if there is none."""
         declared_m = self.declared_m
-        return None if declared_m is None else float(np.linalg.norm(self.position_m - declared_m))
+        return (
+            None
+            if declared_m is None
+            else float(np.linalg.norm(self.position_m - declared_m))
+        )
 
 
 def marker_places(
@@ -498,17 +567,23 @@ def marker_places(
     return {
         name: MarkerPlace(
             position,
-            None if errors is None or not np.isfinite(errors[m]).all() else errors[m],
+            None
+            if errors is None or not np.isfinite(errors[m]).all()
+            else errors[m],
             float(chart.sigma_m[m]),
             chart.prior_places_m[m] if markers.located[m] else None,
         )
         for m, (name, position) in enumerate(
-            zip(markers.names, segment.marker_places_m(iterate.phi), strict=True)
+            zip(
+                markers.names, segment.marker_places_m(iterate.phi), strict=True
+            )
         )
     }
 
 
-def _std_errors_m(iterate: ExperimentIterate, uncertainty: Uncertainty | None) -> Array | None:
+def _std_errors_m(
+    iterate: ExperimentIterate, uncertainty: Uncertainty | None
+) -> Array | None:
     """Return the standard errors (M, 3) of the coordinates of an experiment's marker places [m],
     zero for exact places; None without `uncertainty`.
     """
@@ -517,7 +592,9 @@ def _std_errors_m(iterate: ExperimentIterate, uncertainty: Uncertainty | None) -
     segment = iterate.segment
     chart = iterate.segment.association
     row = {name: k for k, name in enumerate(uncertainty.nuisance)}
-    at = np.array([row[name] for name in segment.nuisance.names], dtype=np.int64)
+    at = np.array(
+        [row[name] for name in segment.nuisance.names], dtype=np.int64
+    )
     errors = np.zeros(chart.centre_places_m.shape)
     for m in chart.estimated:
         indices = at[segment.markers.coordinate_parameters[m]]

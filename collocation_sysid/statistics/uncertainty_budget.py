@@ -77,14 +77,22 @@ class BudgetLine:
         low, high = map(coordinate.from_value, self.combined95)
         known_variance = ((high - low) / 2 / NORMAL_95) ** 2
         total = known_variance + deviation**2
-        shares = {name: share * known_variance / total for name, share in self.shares.items()}
+        shares = {
+            name: share * known_variance / total
+            for name, share in self.shares.items()
+        }
         shares[source] = deviation**2 / total
-        least, most = widened_interval((low, high), coordinate.from_value(self.value), deviation)
+        least, most = widened_interval(
+            (low, high), coordinate.from_value(self.value), deviation
+        )
         return BudgetLine(
             self.value,
             _ranked(shares),
             combined95=(coordinate.to_value(least), coordinate.to_value(most)),
-            combined_std_error=(most - least) / 2 / NORMAL_95 / coordinate.derivative(self.value),
+            combined_std_error=(most - least)
+            / 2
+            / NORMAL_95
+            / coordinate.derivative(self.value),
             systematic=float(np.hypot(self.systematic, deviation)),
             known_effect=self.known_effect,
         )
@@ -156,10 +164,14 @@ class VarianceSources:
         """
         free = np.flatnonzero(~fit.at_bound)
         shared = free[free < fit.shared_count]
-        all_free, known = (np.zeros((fit.shared_count, fit.shared_count)) for _ in range(2))
+        all_free, known = (
+            np.zeros((fit.shared_count, fit.shared_count)) for _ in range(2)
+        )
         information = least_squares_of_fit(fit).information
         for own, here in ((all_free, free), (known, shared)):
-            inverse = np.linalg.pinv(information[np.ix_(here, here)], hermitian=True)
+            inverse = np.linalg.pinv(
+                information[np.ix_(here, here)], hermitian=True
+            )
             own[np.ix_(shared, shared)] = inverse[: len(shared), : len(shared)]
         moved = estimate_changes(fit, assumed.blocks)[: fit.shared_count]
         by_q = _estimate_derivatives(fit, parameters, q)
@@ -172,7 +184,15 @@ class VarianceSources:
         wider = uncertainty.widening
         known_effects = dict(means or {})
         return cls(
-            assumed.names, moved, all_free, known, by_q, wider, between, freedom, known_effects
+            assumed.names,
+            moved,
+            all_free,
+            known,
+            by_q,
+            wider,
+            between,
+            freedom,
+            known_effects,
         )
 
     def noise_shares(self, by_q: Array) -> tuple[float, float]:
@@ -196,10 +216,16 @@ class VarianceSources:
         )
         if not all_free > 0:
             return 1.0, 1.0
-        agreed = 1.0 if (self.widening == 1).all() else all_free / all_scaled_by_noise
+        agreed = (
+            1.0
+            if (self.widening == 1).all()
+            else all_free / all_scaled_by_noise
+        )
         return float(np.clip(known / all_free, 0.0, 1.0)), agreed
 
-    def variance_between_recordings(self, by_q: Array, others: float, counted: float) -> float:
+    def variance_between_recordings(
+        self, by_q: Array, others: float, counted: float
+    ) -> float:
         """Return the variance due to differences of parameters between recordings, beyond what is
         counted already.
 
@@ -214,7 +240,10 @@ class VarianceSources:
         counted : float
             Variance between recordings that is counted already.
         """
-        more = max(0.0, float(np.sum((by_q @ self.recording_sensitivities) ** 2)) - counted)
+        more = max(
+            0.0,
+            float(np.sum((by_q @ self.recording_sensitivities) ** 2)) - counted,
+        )
         if not more:
             return 0.0
         freedom = self.freedom * ((others + more) / more) ** 2
@@ -224,7 +253,9 @@ class VarianceSources:
         """Return the change of an estimate with the derivative `by_q` (nq,) by all known effects,
         to first order.
         """
-        sizes = [self.means.get(name.partition(" ")[0], 0.0) for name in self.names]
+        sizes = [
+            self.means.get(name.partition(" ")[0], 0.0) for name in self.names
+        ]
         return float(by_q @ self.sensitivities @ sizes)
 
     def variances_of_assumptions(self, by_q: Array) -> dict[str, float]:
@@ -232,7 +263,9 @@ class VarianceSources:
         derivative `by_q` (nq,), by the assumption's name.
         """
         variances: dict[str, float] = {}
-        for name, way in zip(self.names, by_q @ self.sensitivities, strict=True):
+        for name, way in zip(
+            self.names, by_q @ self.sensitivities, strict=True
+        ):
             row = name.partition(" ")[0]
             variances[row] = variances.get(row, 0.0) + float(way) ** 2
         return variances
@@ -258,11 +291,18 @@ def budget(
         The parameters of the problem, with their coordinates and bounds.
     """
     lines = {}
-    for name, estimate in {**uncertainty.estimates, **uncertainty.derived}.items():
+    for name, estimate in {
+        **uncertainty.estimates,
+        **uncertainty.derived,
+    }.items():
         by_q = sources.derivatives[name]
         if estimate.statistical95 is not None and by_q.any():
             lines[name] = _line(
-                name, estimate, sources=sources, error=numerical.get(name), parameters=parameters
+                name,
+                estimate,
+                sources=sources,
+                error=numerical.get(name),
+                parameters=parameters,
             )
     return lines
 
@@ -323,7 +363,13 @@ def _line(
     assert combined.combined_std_error is not None
     return BudgetLine(
         combined.value,
-        _ranked({source: part / total for source, part in variances.items() if part > 0}),
+        _ranked(
+            {
+                source: part / total
+                for source, part in variances.items()
+                if part > 0
+            }
+        ),
         combined95=combined.combined95,
         combined_std_error=combined.combined_std_error,
         systematic=systematic,
@@ -339,7 +385,14 @@ def _variance(at: IntervalCoordinate, middle: float, ends: Interval) -> float:
     low, high = map(at.from_value, ends)
     if np.isclose(centre - low, high - centre, rtol=1e-6):
         return ((high - low) / 2 / NORMAL_95) ** 2
-    return float(np.mean([((centre - low) / NORMAL_95) ** 2, ((high - centre) / NORMAL_95) ** 2]))
+    return float(
+        np.mean(
+            [
+                ((centre - low) / NORMAL_95) ** 2,
+                ((high - centre) / NORMAL_95) ** 2,
+            ]
+        )
+    )
 
 
 def _ranked(shares: Mapping[str, float]) -> dict[str, float]:
@@ -347,7 +400,9 @@ def _ranked(shares: Mapping[str, float]) -> dict[str, float]:
     return dict(sorted(shares.items(), key=lambda part: -part[1]))
 
 
-def _estimate_derivatives(fit: LinearisedFit, parameters: Parameters, q: Array) -> dict[str, Array]:
+def _estimate_derivatives(
+    fit: LinearisedFit, parameters: Parameters, q: Array
+) -> dict[str, Array]:
     """Return the derivatives (nq,) of each estimate by q, by name: parameters, tied ones and
     derived moduli; zero for fixed ones.
     """
@@ -361,7 +416,9 @@ def _estimate_derivatives(fit: LinearisedFit, parameters: Parameters, q: Array) 
     return slopes | dict(fit.derived.derivatives)
 
 
-def main_sources(shares: Mapping[str, Mapping[str, float]], minimum_share: float) -> list[str]:
+def main_sources(
+    shares: Mapping[str, Mapping[str, float]], minimum_share: float
+) -> list[str]:
     """Return the sources with at least a share `minimum_share` in the variance of some estimate,
     the largest first.
 
@@ -373,12 +430,24 @@ def main_sources(shares: Mapping[str, Mapping[str, float]], minimum_share: float
         Smallest share of interest.
     """
     largest: dict[str, float] = {}
-    for source, share in (each for line in shares.values() for each in line.items()):
+    for source, share in (
+        each for line in shares.values() for each in line.items()
+    ):
         largest[source] = max(share, largest.get(source, 0.0))
-    return sorted((s for s in largest if largest[s] >= minimum_share), key=lambda s: -largest[s])
+    return sorted(
+        (s for s in largest if largest[s] >= minimum_share),
+        key=lambda s: -largest[s],
+    )
 
 
 def source_label(source: str) -> str:
     """Return the name of a source as text, without unit suffix."""
-    unit = next((u for u in ("_m_n", "_1_m2", "_rad", "_m", "_s") if source.endswith(u)), "")
+    unit = next(
+        (
+            u
+            for u in ("_m_n", "_1_m2", "_rad", "_m", "_s")
+            if source.endswith(u)
+        ),
+        "",
+    )
     return source.removesuffix(unit).replace("_", " ")

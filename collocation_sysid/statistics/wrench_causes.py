@@ -63,7 +63,11 @@ UNITS = (
         },
         FORCES,
     ),
-    ("torques", {"newton millimetres": 1e-3, "kilogram-force metres": 9.80665}, TORQUES),
+    (
+        "torques",
+        {"newton millimetres": 1e-3, "kilogram-force metres": 9.80665},
+        TORQUES,
+    ),
 )
 # Offset over the standard deviation of the tare's prior from which on the sensor was not zeroed.
 LARGEST_TARE = 3.0
@@ -98,10 +102,16 @@ def wrench_causes(solution: Solution) -> list[Hypothesis]:
     if not any(map(_misses, solution.parts)):
         return []
     with_markers = [
-        s for s in solution.collocation.transcriptions if s.experiment.markers.sample_count
+        s
+        for s in solution.collocation.transcriptions
+        if s.experiment.markers.sample_count
     ]
     return _of_parts(
-        _from_markers(solution.collocation, with_markers, ReducedSpace(max_iterations=MOST_SWEEPS))
+        _from_markers(
+            solution.collocation,
+            with_markers,
+            ReducedSpace(max_iterations=MOST_SWEEPS),
+        )
     )
 
 
@@ -112,15 +122,21 @@ def wrench_mistakes(collocation: Collocation) -> list[Hypothesis]:
     alone. Empty where that fit does not explain the markers.
     """
     with_both = [
-        s for s in collocation.transcriptions if s.sensors and s.experiment.markers.sample_count
+        s
+        for s in collocation.transcriptions
+        if s.sensors and s.experiment.markers.sample_count
     ]
     shorter = [first_samples(s.experiment, CHECKED_SAMPLES) for s in with_both]
     if not shorter:
         return []
     beginning = replace(collocation, experiments=shorter)
-    method = ReducedSpace(max_iterations=CHECKED_SWEEPS, tolerance=CHECKED_TOLERANCE)
+    method = ReducedSpace(
+        max_iterations=CHECKED_SWEEPS, tolerance=CHECKED_TOLERANCE
+    )
     parts = _from_markers(beginning, beginning.transcriptions, method)
-    return _of_parts([part for part in parts if _markers_misfit(part) < MARKERS_MISFIT])
+    return _of_parts(
+        [part for part in parts if _markers_misfit(part) < MARKERS_MISFIT]
+    )
 
 
 def _misses(part: ExperimentIterate) -> bool:
@@ -140,19 +156,26 @@ def _markers_misfit(part: ExperimentIterate) -> float:
     """Return the root mean square of the markers' residuals in standard deviations."""
     residuals = part.segment.markers.residuals(part.observables[0], part.phi)
     return float(
-        np.sqrt(np.sum(residuals**2) / max(1, 3 * part.segment.experiment.markers.sample_count))
+        np.sqrt(
+            np.sum(residuals**2)
+            / max(1, 3 * part.segment.experiment.markers.sample_count)
+        )
     )
 
 
 def _from_markers(
-    collocation: Collocation, transcriptions: Sequence[Transcription], method: ReducedSpace
+    collocation: Collocation,
+    transcriptions: Sequence[Transcription],
+    method: ReducedSpace,
 ) -> list[ExperimentIterate]:
     """Return experiments fitted to their markers alone by a method, with the nuisance parameters of
     the wrenches at zero; empty if there are none or the fit fails.
     """
     if not transcriptions:
         return []
-    without_wrenches = [without_grasp_sensors(segment.experiment) for segment in transcriptions]
+    without_wrenches = [
+        without_grasp_sensors(segment.experiment) for segment in transcriptions
+    ]
     try:
         solution = method(replace(collocation, experiments=without_wrenches))
     except (InputError, SimulationError):
@@ -161,7 +184,9 @@ def _from_markers(
     parts = []
     for segment, part in zip(transcriptions, solution.parts, strict=True):
         values = dict(zip(part.segment.nuisance.names, part.phi, strict=True))
-        phi = np.array([values.get(name, 0.0) for name in segment.nuisance.names])
+        phi = np.array(
+            [values.get(name, 0.0) for name in segment.nuisance.names]
+        )
         parts.append(ExperimentIterate(segment, part.q, phi, part.x))
     return parts
 
@@ -197,16 +222,23 @@ class _OneSensor:
     scale_known: bool
 
     def __init__(
-        self, part: ExperimentIterate, sensor: WrenchResidual, forced: ReactionForces
+        self,
+        part: ExperimentIterate,
+        sensor: WrenchResidual,
+        forced: ReactionForces,
     ) -> None:
         segment = part.segment
         self.part = part
         self.sensor = sensor
         self.forced = forced
         blind = without_grasp_sensors(segment.experiment)
-        self.scale_known = not segment.body.mass_derivatives or blind.has_known_force
+        self.scale_known = (
+            not segment.body.mass_derivatives or blind.has_known_force
+        )
         self._known: dict[tuple[bytes, Frame, bytes], Array] = {}
-        self.declared = DescribedWrench(sensor.wrench, segment.experiment.nuisance.tare or 0.0)
+        self.declared = DescribedWrench(
+            sensor.wrench, segment.experiment.nuisance.tare or 0.0
+        )
 
     def causes(self) -> Iterator[Hypothesis]:
         """Yield the hypotheses whose correction improves the fit far enough; if there is none, that
@@ -215,7 +247,9 @@ class _OneSensor:
         accepted: list[Hypothesis] = []
         misfit = self.misfit(self.declared)
         if misfit > MISFIT:
-            test = HypothesisTest(misfit, self.misfit, BETTER, smallest_misfit=1.0)
+            test = HypothesisTest(
+                misfit, self.misfit, BETTER, smallest_misfit=1.0
+            )
             accepted = list(test.accepted(self._mistakes()))
         yield from accepted or self._large_tare()
 
@@ -224,7 +258,9 @@ class _OneSensor:
         tare = self.declared.tare
         if not tare:
             return
-        measured, predicted = self._scaled_by_sigma(DescribedWrench(self.declared.wrench, 0.0))
+        measured, predicted = self._scaled_by_sigma(
+            DescribedWrench(self.declared.wrench, 0.0)
+        )
         factor = 1.0 if self.scale_known else _slope(measured, predicted)
         differences = measured - factor * predicted
         is_measured = np.isfinite(differences).any(axis=0)
@@ -235,7 +271,9 @@ class _OneSensor:
         )
         if largest > LARGEST_TARE:
             of = f"the wrench of '{self.part.segment.experiment.name}'"
-            yield Hypothesis("wrench-tare", of, strength=float(largest / LARGEST_TARE))
+            yield Hypothesis(
+                "wrench-tare", of, strength=float(largest / LARGEST_TARE)
+            )
 
     def misfit(self, trial: DescribedWrench) -> float:
         """Return the root mean square of the residuals of a description in standard
@@ -244,7 +282,9 @@ class _OneSensor:
         measured, predicted = self._scaled_by_sigma(trial)
         if not np.isfinite(measured).any():
             return np.inf
-        factor = 1.0 if self.scale_known else max(0.0, _slope(measured, predicted))
+        factor = (
+            1.0 if self.scale_known else max(0.0, _slope(measured, predicted))
+        )
         return float(np.sqrt(np.nanmean((measured - factor * predicted) ** 2)))
 
     def _scaled_by_sigma(self, trial: DescribedWrench) -> tuple[Array, Array]:
@@ -253,9 +293,16 @@ class _OneSensor:
         """
         wrench = trial.wrench
         sigmas = trial.wrench.sigmas
-        predicted = np.where(wrench.is_measured, self._predicted(wrench), np.nan) / sigmas
-        measured = np.where(np.isfinite(predicted), wrench.values / sigmas, np.nan)
-        return _without_tare(measured, trial.tare), _without_tare(predicted, trial.tare)
+        predicted = (
+            np.where(wrench.is_measured, self._predicted(wrench), np.nan)
+            / sigmas
+        )
+        measured = np.where(
+            np.isfinite(predicted), wrench.values / sigmas, np.nan
+        )
+        return _without_tare(measured, trial.tare), _without_tare(
+            predicted, trial.tare
+        )
 
     def _predicted(self, wrench: Wrench) -> Array:
         """Return the predicted wrench (S, 6) at the times, in the frame and about the point
@@ -264,7 +311,9 @@ class _OneSensor:
         at = (wrench.t_s.tobytes(), wrench.frame, wrench.point_m.tobytes())
         if at not in self._known:
             phi = np.zeros(self.part.segment.nuisance.size)
-            self._known[at] = self.sensor.with_wrench(wrench).predict_reactions(self.forced, phi)
+            self._known[at] = self.sensor.with_wrench(wrench).predict_reactions(
+                self.forced, phi
+            )
         return self._known[at]
 
     def _gain(self, columns: slice) -> float:
@@ -277,7 +326,11 @@ class _OneSensor:
         # A common factor cannot be told where the scale is unknown, that of one kind can.
         if not self.scale_known:
             others = np.delete(np.arange(6), np.arange(6)[columns])
-            slope /= _slope(measured[:, others], predicted[:, others]) if len(others) else np.nan
+            slope /= (
+                _slope(measured[:, others], predicted[:, others])
+                if len(others)
+                else np.nan
+            )
         return 1 / slope if slope > 0 else np.nan
 
     def _point_shift_m(self) -> Array:
@@ -292,15 +345,26 @@ class _OneSensor:
         factor = 1.0
         if (
             not self.scale_known
-            and not (factor := _slope(measured[:, FORCES], predicted[:, FORCES])) > 0
+            and not (
+                factor := _slope(measured[:, FORCES], predicted[:, FORCES])
+            )
+            > 0
         ):
             return np.zeros(3)
         wrench = self.declared.wrench
         forces = self._predicted(wrench)[:, FORCES]
-        by_shift = np.cross(forces[:, None], np.eye(3)[None]) / wrench.sigmas[3]  # (S, shift, 3)
-        by_shift = np.where(np.isfinite(measured[:, None, TORQUES]), by_shift, np.nan)
+        by_shift = (
+            np.cross(forces[:, None], np.eye(3)[None]) / wrench.sigmas[3]
+        )  # (S, shift, 3)
+        by_shift = np.where(
+            np.isfinite(measured[:, None, TORQUES]), by_shift, np.nan
+        )
         slopes = np.stack(
-            [_without_tare(by_shift[:, k], self.declared.tare) for k in range(3)], axis=2
+            [
+                _without_tare(by_shift[:, k], self.declared.tare)
+                for k in range(3)
+            ],
+            axis=2,
         )
         differences = (measured - factor * predicted)[:, TORQUES]
         is_measured = np.isfinite(differences)
@@ -315,7 +379,9 @@ class _OneSensor:
         of = f"the wrench of '{self.part.segment.experiment.name}'"
         wrench = self.declared.wrench
 
-        def hypothesis(code: str, without: Wrench, handicap: float = 1.0, **data) -> Hypothesis:
+        def hypothesis(
+            code: str, without: Wrench, handicap: float = 1.0, **data
+        ) -> Hypothesis:
             return Hypothesis(
                 code,
                 of,
@@ -329,20 +395,32 @@ class _OneSensor:
         for what, columns in (("forces", FORCES), ("torques", TORQUES)):
             if wrench.measured_components[columns].any():
                 yield hypothesis(
-                    "wrench-sign/part", _multiplied(wrench, columns, factor=-1.0), what=what
+                    "wrench-sign/part",
+                    _multiplied(wrench, columns, factor=-1.0),
+                    what=what,
                 )
         other: Frame = "grasp" if wrench.frame == "world" else "world"
-        yield hypothesis("wrench-frame", replace(wrench, frame=other), other=other)
+        yield hypothesis(
+            "wrench-frame", replace(wrench, frame=other), other=other
+        )
         for axes, (order, signs) in OTHER_AXES.items():
             if len({*signs}) == 1 and order == (0, 1, 2):
                 continue  # a matter of the sign
-            turned = np.tile(signs, 2) * values[:, [*order, *(3 + k for k in order)]]
+            turned = (
+                np.tile(signs, 2) * values[:, [*order, *(3 + k for k in order)]]
+            )
             without = replace(wrench, values=turned)
             yield hypothesis("wrench-axes", without, ONE_OF_MANY, axes=axes)
         for what, units, columns in UNITS:
-            for unit, factor in units.items() if wrench.measured_components[columns].any() else ():
+            for unit, factor in (
+                units.items()
+                if wrench.measured_components[columns].any()
+                else ()
+            ):
                 without = _multiplied(wrench, columns, factor)
-                yield hypothesis("wrench-unit", without, what=what, unit=unit, factor=factor)
+                yield hypothesis(
+                    "wrench-unit", without, what=what, unit=unit, factor=factor
+                )
         for what, columns in (
             ("forces and torques", BOTH),
             ("forces", FORCES),
@@ -352,7 +430,10 @@ class _OneSensor:
             if factor > 0 and abs(factor - 1) > SAME_GAIN:
                 data = {"what": what, "factor": factor}
                 yield hypothesis(
-                    "wrench-gain", _multiplied(wrench, columns, factor), FITTED, **data
+                    "wrench-gain",
+                    _multiplied(wrench, columns, factor),
+                    FITTED,
+                    **data,
                 )
         shift_m = self._point_shift_m()
         if np.linalg.norm(shift_m) > SAME_POINT_M:
@@ -361,12 +442,23 @@ class _OneSensor:
                 "by_mm": 1e3 * np.linalg.norm(shift_m),
                 "point": str(np.round(point_m, 3).tolist()),
             }
-            yield hypothesis("wrench-point", replace(wrench, point_m=point_m), FITTED, **data)
+            yield hypothesis(
+                "wrench-point", replace(wrench, point_m=point_m), FITTED, **data
+            )
         span_s = LATEST * float(np.ptp(wrench.t_s))
         for shift_s in np.linspace(-span_s, span_s, SHIFTS + 1):
-            data = {"by_ms": 1e3 * abs(shift_s), "when": "later" if shift_s < 0 else "earlier"}
-            yield hypothesis("wrench-clock", replace(wrench, t_s=wrench.t_s + shift_s), **data)
-        yield Hypothesis("wrench-tare", of, corrected=replace(self.declared, tare=np.inf))
+            data = {
+                "by_ms": 1e3 * abs(shift_s),
+                "when": "later" if shift_s < 0 else "earlier",
+            }
+            yield hypothesis(
+                "wrench-clock",
+                replace(wrench, t_s=wrench.t_s + shift_s),
+                **data,
+            )
+        yield Hypothesis(
+            "wrench-tare", of, corrected=replace(self.declared, tare=np.inf)
+        )
 
 
 def _without_tare(values: Array, tare: float) -> Array:
@@ -374,7 +466,9 @@ def _without_tare(values: Array, tare: float) -> Array:
     `tare` standard deviations explains: none for 0, the mean if infinite. NaN is ignored.
     """
     is_measured = np.isfinite(values)
-    prior_weight = 0.0 if np.isinf(tare) else np.inf if not tare else 1 / tare**2
+    prior_weight = (
+        0.0 if np.isinf(tare) else np.inf if not tare else 1 / tare**2
+    )
     return values - np.nansum(values, axis=0) / np.maximum(
         is_measured.sum(axis=0) + prior_weight, 1e-12
     )
@@ -401,5 +495,6 @@ def _multiplied(wrench: Wrench, columns: slice, factor: float) -> Wrench:
         wrench,
         values=values,
         sigma_n=wrench.sigma_n * (larger if of_forces else 1.0),
-        sigma_nm=wrench.sigma_nm and wrench.sigma_nm * (larger if of_torques else 1.0),
+        sigma_nm=wrench.sigma_nm
+        and wrench.sigma_nm * (larger if of_torques else 1.0),
     )

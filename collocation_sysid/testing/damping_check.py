@@ -10,7 +10,13 @@ import casadi as ca
 import numpy as np
 
 from ..array_types import Array
-from ..fem.materials import DampingLaw, Energy, Material, as_damping, as_material
+from ..fem.materials import (
+    DampingLaw,
+    Energy,
+    Material,
+    as_damping,
+    as_material,
+)
 from .internal_force_check import check_internal_forces, damping_stress
 from .material_check import deformation_gradients, random_rotation
 from .missing_constant_check import check_missing_constant
@@ -69,11 +75,19 @@ def check_damping(
     known = as_material(material)
     check = PropertyCheck(f"damping law {made.name!r}")
     if (made.stress is None) == (made.potential is None):
-        check.fail("it has both or neither of a stress and a potential", made, "one of both")
+        check.fail(
+            "it has both or neither of a stress and a potential",
+            made,
+            "one of both",
+        )
     values = usual_constants((*known.constants, *made.constants), constants)
     stress = DampingStress(made, known, np.array([*values.values()]))
-    for number, F in enumerate(deformation_gradients(check.rng, DEFORMATIONS, largest_strain)):
-        where = f"at random deformation {number} (strains up to {largest_strain:g})"
+    for number, F in enumerate(
+        deformation_gradients(check.rng, DEFORMATIONS, largest_strain)
+    ):
+        where = (
+            f"at random deformation {number} (strains up to {largest_strain:g})"
+        )
         rate = check.rng.standard_normal(9)
         _check_derivatives(check, stress, F, rate, where)
         if is_dissipative:
@@ -94,7 +108,11 @@ def check_damping(
     check_missing_constant(check, own, material=known, damping=made)
     F = next(iter(deformation_gradients(check.rng, 1, largest_strain)))
     check_pickling(
-        check, made, lambda each: DampingStress(each, known, stress.values).evaluate(F, F)[0]
+        check,
+        made,
+        lambda each: DampingStress(each, known, stress.values).evaluate(F, F)[
+            0
+        ],
     )
 
 
@@ -120,33 +138,55 @@ class DampingStress:
         F = ca.SX.sym("F", 9)
         rate = ca.SX.sym("rate", 9)
         count = len(self.material.constants)
-        constants = [ca.SX(ca.DM(each)) for each in np.split(self.values, [count])]
-        stress, stated = damping_stress(self.law, self.material, [F, rate, *constants])
+        constants = [
+            ca.SX(ca.DM(each)) for each in np.split(self.values, [count])
+        ]
+        stress, stated = damping_stress(
+            self.law, self.material, [F, rate, *constants]
+        )
         by_F = ca.jacobian(stress, F)
         by_rate = ca.jacobian(stress, rate)
         outputs = [stress, by_F if stated is None else stated, by_F, by_rate]
-        return ca.Function("damping", [F, rate], [ca.densify(each) for each in outputs])
+        return ca.Function(
+            "damping", [F, rate], [ca.densify(each) for each in outputs]
+        )
 
-    def evaluate(self, F: Array, rate: Array) -> tuple[Array, Array, Array, Array]:
+    def evaluate(
+        self, F: Array, rate: Array
+    ) -> tuple[Array, Array, Array, Array]:
         """Return P_v (9,), the stated and the automatic ∂P_v/∂F, and ∂P_v/∂Ḟ, each (9, 9)."""
-        stress, stated, by_F, by_rate = (o.full() for o in self._function.call([F, rate]))
+        stress, stated, by_F, by_rate = (
+            o.full() for o in self._function.call([F, rate])
+        )
         return stress.ravel(), stated, by_F, by_rate
 
 
 def _check_derivatives(
-    check: PropertyCheck, stress: DampingStress, F: Array, rate: Array, where: str
+    check: PropertyCheck,
+    stress: DampingStress,
+    F: Array,
+    rate: Array,
+    where: str,
 ) -> None:
     """Require linearity in the rate, a symmetric ∂P_v/∂Ḟ, and the right ∂P_v/∂F."""
     value, stated, by_F, by_rate = stress.evaluate(F, rate)
-    check.require_equal(by_rate, by_rate.T, statement=f"∂P_v/∂Ḟ is not symmetric {where}")
-    check.require_equal(value, by_rate @ rate, statement=f"P_v is not linear in the rate Ḟ {where}")
+    check.require_equal(
+        by_rate, by_rate.T, statement=f"∂P_v/∂Ḟ is not symmetric {where}"
+    )
+    check.require_equal(
+        value,
+        by_rate @ rate,
+        statement=f"P_v is not linear in the rate Ḟ {where}",
+    )
     check.require_equal(
         stress.evaluate(F, -2.5 * rate)[0],
         -2.5 * value,
         statement=f"P_v is not linear in the rate Ḟ {where}",
     )
     check.require_equal(
-        stated, by_F, statement=f"the stated ∂P_v/∂F is not the automatic derivative of P_v {where}"
+        stated,
+        by_F,
+        statement=f"the stated ∂P_v/∂F is not the automatic derivative of P_v {where}",
     )
     check.require_derivative(
         lambda at: stress.evaluate(at, rate)[0],
@@ -157,7 +197,9 @@ def _check_derivatives(
     )
 
 
-def _check_dissipation(check: PropertyCheck, stress: DampingStress, F: Array, where: str) -> None:
+def _check_dissipation(
+    check: PropertyCheck, stress: DampingStress, F: Array, where: str
+) -> None:
     """Require that no eigenvalue of ∂P_v/∂Ḟ is negative: P_v:Ḟ ≥ 0 for every rate."""
     by_rate = stress.evaluate(F, np.zeros(9))[3]
     powers = np.linalg.eigvalsh((by_rate + by_rate.T) / 2)
@@ -171,15 +213,23 @@ def _check_dissipation(check: PropertyCheck, stress: DampingStress, F: Array, wh
 
 
 def _check_objectivity(
-    check: PropertyCheck, stress: DampingStress, F: Array, rate: Array, where: str
+    check: PropertyCheck,
+    stress: DampingStress,
+    F: Array,
+    rate: Array,
+    where: str,
 ) -> None:
     """Require P_v(QF, Q(Ḟ + ΩF)) = Q P_v(F, Ḟ) for a rotation Q and a spin Ω."""
     value = stress.evaluate(F, rate)[0]
     Q = random_rotation(check.rng)
     spin = np.asarray(ca.skew(3 * check.rng.standard_normal(3)), dtype=float)
-    gradient, gradient_rate = (each.reshape(3, 3, order="F") for each in (F, rate))
+    gradient, gradient_rate = (
+        each.reshape(3, 3, order="F") for each in (F, rate)
+    )
     spinning = Q @ (gradient_rate + spin @ gradient)
-    found = stress.evaluate((Q @ gradient).ravel(order="F"), spinning.ravel(order="F"))[0]
+    found = stress.evaluate(
+        (Q @ gradient).ravel(order="F"), spinning.ravel(order="F")
+    )[0]
     check.require_equal(
         found.reshape(3, 3, order="F"),
         Q @ value.reshape(3, 3, order="F"),

@@ -15,7 +15,10 @@ STEP = 1e-3
 
 
 def directional_derivative(
-    function: Callable[[Array], ArrayLike], point: ArrayLike, direction: Array, step: float = STEP
+    function: Callable[[Array], ArrayLike],
+    point: ArrayLike,
+    direction: Array,
+    step: float = STEP,
 ) -> Array:
     """Return d/ds function(point + s direction) at s = 0, by fourth-order central differences.
 
@@ -32,11 +35,14 @@ def directional_derivative(
 
     def evaluate_at(steps: int) -> Array:
         """Return the function a number of steps along the direction."""
-        return np.asarray(function(np.asarray(point) + steps * step * direction))
+        return np.asarray(
+            function(np.asarray(point) + steps * step * direction)
+        )
 
-    return (8 * (evaluate_at(1) - evaluate_at(-1)) - (evaluate_at(2) - evaluate_at(-2))) / (
-        12 * step
-    )
+    return (
+        8 * (evaluate_at(1) - evaluate_at(-1))
+        - (evaluate_at(2) - evaluate_at(-2))
+    ) / (12 * step)
 
 
 def assert_derivative(
@@ -78,7 +84,9 @@ def assert_derivative(
         assert found.shape == expected.shape
         error = np.linalg.norm(found - expected)
         size = np.linalg.norm(expected)
-        assert error <= tolerance * size, f"off by {error:.3g}, the derivative's norm is {size:.3g}"
+        assert error <= tolerance * size, (
+            f"off by {error:.3g}, the derivative's norm is {size:.3g}"
+        )
 
 
 def relative_error(found: ArrayLike, expected: ArrayLike) -> float:

@@ -16,7 +16,13 @@ from ..array_types import Array
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.constants import Constant
-from ..fem.node_force import CONTEXT_OFFSETS, CONTEXT_SIZE, ForceContext, Law, NodeForce
+from ..fem.node_force import (
+    CONTEXT_OFFSETS,
+    CONTEXT_SIZE,
+    ForceContext,
+    Law,
+    NodeForce,
+)
 from ..model.generated_functions import GeneratedFunction
 from ..problem.code_loader import CodeLoader
 from ..problem.schema import NodeForceSection
@@ -103,9 +109,14 @@ def check_force(
     check = PropertyCheck(f"force {made.name!r}")
     values = usual_constants(made.constants, constants)
     if energy is not None and made.on != "nodes":
-        raise InputError(f"force {made.name!r} is on faces; expected no energy, or one on nodes")
+        raise InputError(
+            f"force {made.name!r} is on faces; expected no energy, or one on nodes"
+        )
     law = ForceLaw(made, np.array([*values.values()]))
-    states = [law.random_state(check.rng, place) for place in _places(check.rng, positions_m)]
+    states = [
+        law.random_state(check.rng, place)
+        for place in _places(check.rng, positions_m)
+    ]
     for number, state in enumerate(states):
         where = f"at random state {number}"
         _check_derivatives(check, law, state, where)
@@ -117,12 +128,17 @@ def check_force(
         u, data = law.state_at_rest(states[0])
         found = law.evaluate_plain(u, data)[: law.dofs]
         check.require_equal(
-            found, np.zeros(law.dofs), statement="the force at rest is not zero", scale=1.0
+            found,
+            np.zeros(law.dofs),
+            statement="the force at rest is not zero",
+            scale=1.0,
         )
     unplaced = replace(made, nodes=None)
     _check_messages(check, unplaced, values)
     _check_round_trips(check, law, states[0], file)
-    small = body or Body(uneven_box(1), density_kg_m3=DENSITY_KG_M3, forces=[unplaced])
+    small = body or Body(
+        uneven_box(1), density_kg_m3=DENSITY_KG_M3, forces=[unplaced]
+    )
     check_program(check, program_of(swung_experiment(small), values))
 
 
@@ -165,17 +181,33 @@ class ForceLaw:
             is_compiled=self.force.is_compiled,
         )
 
-    def random_state(self, rng: np.random.Generator, place: Array) -> tuple[Array, Array]:
+    def random_state(
+        self, rng: np.random.Generator, place: Array
+    ) -> tuple[Array, Array]:
         """Return inputs u and data of a random state near a place (3,)."""
         corners = np.zeros((self.dofs // 3, 3))
         corners[1:] = FACE_EDGE_M * np.eye(3)[: self.dofs // 3 - 1]
-        x = place + corners + rng.uniform(-DISPLACEMENT_M, DISPLACEMENT_M, corners.shape)
+        x = (
+            place
+            + corners
+            + rng.uniform(-DISPLACEMENT_M, DISPLACEMENT_M, corners.shape)
+        )
         v = VELOCITY_M_S * rng.standard_normal(self.dofs)
         before = 1e-3 * rng.standard_normal(self.force.internal_variable_count)
         normal = rng.standard_normal(3)
         normal /= np.linalg.norm(normal)
-        data = [2.5 * TIMESTEP_S, *place, AREA_M2, VOLUME_M3, *normal, TIMESTEP_S, 0.0]
-        return np.concatenate([x.ravel(), v, self.values, before]), np.array(data)
+        data = [
+            2.5 * TIMESTEP_S,
+            *place,
+            AREA_M2,
+            VOLUME_M3,
+            *normal,
+            TIMESTEP_S,
+            0.0,
+        ]
+        return np.concatenate([x.ravel(), v, self.values, before]), np.array(
+            data
+        )
 
     def state_at_rest(self, state: tuple[Array, Array]) -> tuple[Array, Array]:
         """Return the state of an undeformed body at the start, without velocity."""
@@ -198,12 +230,16 @@ class ForceLaw:
         """
         dofs = self.dofs
         constants = len(self.values)
-        x, v, values, before = ca.vertsplit(u, [0, dofs, 2 * dofs, 2 * dofs + constants, u.numel()])
+        x, v, values, before = ca.vertsplit(
+            u, [0, dofs, 2 * dofs, 2 * dofs + constants, u.numel()]
+        )
         at = ForceContext(*ca.vertsplit(data, [*CONTEXT_OFFSETS]))
         if dofs > 3:
             a, b, c = (x[3 * k : 3 * k + 3] for k in range(3))
             area = ca.cross(b - a, c - a) / 2
-            at = at._replace(area_m2=ca.norm_2(area), normal=area / ca.norm_2(area))
+            at = at._replace(
+                area_m2=ca.norm_2(area), normal=area / ca.norm_2(area)
+            )
             x = (a + b + c) / 3
             v = (v[:3] + v[3:6] + v[6:]) / 3
         named = {c.name: values[k] for k, c in enumerate(self.force.constants)}
@@ -217,7 +253,9 @@ class ForceLaw:
 
     def evaluate_plain(self, u: Array, data: Array) -> Array:
         """Return the plain law, called with numbers."""
-        return np.ravel(ca.evalf(ca.SX(self.plain(ca.DM(u), ca.DM(data)))).full())
+        return np.ravel(
+            ca.evalf(ca.SX(self.plain(ca.DM(u), ca.DM(data)))).full()
+        )
 
     @cached_property
     def automatic(self) -> ca.Function:
@@ -244,15 +282,25 @@ def _check_derivatives(
     columns = data[:, None]
     y, jacobian = law.generated.evaluate_with_jacobian(u[:, None], columns)
     weights = check.rng.standard_normal(len(y))
-    hessian = law.generated.weighted_hessian(u[:, None], columns, weights[:, None])[..., 0]
-    first, second = (each.full() for each in law.automatic.call([u, data, weights]))
+    hessian = law.generated.weighted_hessian(
+        u[:, None], columns, weights[:, None]
+    )[..., 0]
+    first, second = (
+        each.full() for each in law.automatic.call([u, data, weights])
+    )
     plain = law.evaluate_plain(u, data)
-    check.require_equal(y[:, 0], plain, statement=f"the generated force is not the law {where}")
+    check.require_equal(
+        y[:, 0], plain, statement=f"the generated force is not the law {where}"
+    )
     automatic = "is not the automatic derivative of the law"
     check.require_equal(
-        jacobian[..., 0], first, statement=f"the first derivative {automatic} {where}"
+        jacobian[..., 0],
+        first,
+        statement=f"the first derivative {automatic} {where}",
     )
-    check.require_equal(hessian, second, statement=f"the second derivative {automatic} {where}")
+    check.require_equal(
+        hessian, second, statement=f"the second derivative {automatic} {where}"
+    )
     scale = np.maximum(np.abs(u), DISPLACEMENT_M)
     scale[: law.dofs] = DISPLACEMENT_M
     check.require_derivative(
@@ -263,7 +311,12 @@ def _check_derivatives(
         scale=scale,
     )
     check.require_derivative(
-        lambda at: weights @ law.generated.evaluate_with_jacobian(at[:, None], columns)[1][..., 0],
+        lambda at: (
+            weights
+            @ law.generated.evaluate_with_jacobian(at[:, None], columns)[1][
+                ..., 0
+            ]
+        ),
         hessian,
         u,
         statement=f"the second derivative of the force by (x, v, constants) is wrong {where}",
@@ -283,13 +336,22 @@ def _check_energy(
     u[3:6] = 0.0
     force = law.evaluate_plain(u, state[1])[:3]
     at = ForceContext(*ca.vertsplit(ca.SX(ca.DM(state[1])), [*CONTEXT_OFFSETS]))
-    named = {c.name: float(v) for c, v in zip(law.force.constants, law.values, strict=True)}
+    named = {
+        c.name: float(v)
+        for c, v in zip(law.force.constants, law.values, strict=True)
+    }
     x = ca.SX.sym("x", 3)
-    gradient = ca.Function("gradient", [x], [ca.gradient(ca.SX(energy(x, at, **named)), x)])
+    gradient = ca.Function(
+        "gradient", [x], [ca.gradient(ca.SX(energy(x, at, **named)), x)]
+    )
     statement = f"the force is not −∂energy/∂x {where}"
-    check.require_equal(force, -gradient(u[:3]).full().ravel(), statement=statement)
+    check.require_equal(
+        force, -gradient(u[:3]).full().ravel(), statement=statement
+    )
     check.require_derivative(
-        lambda place: np.ravel(ca.evalf(ca.SX(energy(ca.DM(place), at, **named))).full()),
+        lambda place: np.ravel(
+            ca.evalf(ca.SX(energy(ca.DM(place), at, **named))).full()
+        ),
         -force,
         u[:3],
         statement=statement,
@@ -308,7 +370,11 @@ def _check_dissipation(
     powers = []
     largest = 0.0
     for _ in range(VELOCITIES):
-        v = VELOCITY_M_S * 10 ** check.rng.uniform(-3, 1) * check.rng.standard_normal(law.dofs)
+        v = (
+            VELOCITY_M_S
+            * 10 ** check.rng.uniform(-3, 1)
+            * check.rng.standard_normal(law.dofs)
+        )
         u[velocity] = v
         force = law.evaluate_plain(u, state[1])[: law.dofs] - still
         powers.append(float(force @ v))
@@ -321,12 +387,17 @@ def _check_dissipation(
         )
 
 
-def _check_messages(check: PropertyCheck, force: NodeForce, values: dict[str, float]) -> None:
+def _check_messages(
+    check: PropertyCheck, force: NodeForce, values: dict[str, float]
+) -> None:
     """Require that a missing constant and a misspelt definition are refused by their names."""
     misspelt = f"no_{next(iter(values), 'constant')}"
     check.require_refusal(
         lambda: NodeForce.from_law(
-            force.law, Constant(misspelt), on=force.on, carries=force.internal_variable_count
+            force.law,
+            Constant(misspelt),
+            on=force.on,
+            carries=force.internal_variable_count,
         ),
         naming=misspelt,
         statement=f"the definition of {misspelt!r}, which the law does not have",
@@ -335,7 +406,10 @@ def _check_messages(check: PropertyCheck, force: NodeForce, values: dict[str, fl
 
 
 def _check_round_trips(
-    check: PropertyCheck, law: ForceLaw, state: tuple[Array, Array], file: str | Path | None
+    check: PropertyCheck,
+    law: ForceLaw,
+    state: tuple[Array, Array],
+    file: str | Path | None,
 ) -> None:
     """Require the same forces after pickling and from a problem file."""
 
@@ -345,7 +419,9 @@ def _check_round_trips(
 
     def load(loader: CodeLoader, table: Mapping[str, Any]) -> NodeForce:
         """Return the force of a table of a problem file."""
-        return loader.force(NodeForceSection.model_validate(table), "object.force.0")
+        return loader.force(
+            NodeForceSection.model_validate(table), "object.force.0"
+        )
 
     check_pickling(check, law.force, evaluate)
     if file is not None:
@@ -355,4 +431,11 @@ def _check_round_trips(
             "on": law.force.on,
             "carries": law.force.internal_variable_count,
         }
-        check_problem_file(check, file, table, load=load, extension=law.force, evaluate=evaluate)
+        check_problem_file(
+            check,
+            file,
+            table,
+            load=load,
+            extension=law.force,
+            evaluate=evaluate,
+        )

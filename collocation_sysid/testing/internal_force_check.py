@@ -82,7 +82,11 @@ class PlainInternalForce:
         part = self.body.parts[0]
         constants = len(part.material.constants) + len(part.damping.constants)
         node_fields = [ca.SX.sym(name, size) for name in "xvw"]
-        return [*node_fields, ca.SX.sym("geometry", width, points), ca.SX.sym("c", constants)]
+        return [
+            *node_fields,
+            ca.SX.sym("geometry", width, points),
+            ca.SX.sym("c", constants),
+        ]
 
     @cached_property
     def _element_force(self) -> ca.SX:
@@ -93,8 +97,13 @@ class PlainInternalForce:
         force = ca.SX(3 * nodes, 1)
         for point in ca.horzsplit(geometry):
             gradients = ca.reshape(point[:-1], 3, nodes).T
-            F, rate = (ca.vec(ca.reshape(field, 3, nodes) @ gradients) for field in (x, v))
-            stress = self._stress(F, rate, ca.vertsplit(constants, self._split(part.material)))
+            F, rate = (
+                ca.vec(ca.reshape(field, 3, nodes) @ gradients)
+                for field in (x, v)
+            )
+            stress = self._stress(
+                F, rate, ca.vertsplit(constants, self._split(part.material))
+            )
             force -= point[-1] * ca.vec(ca.reshape(stress, 3, 3) @ gradients.T)
         return force
 
@@ -108,7 +117,9 @@ class PlainInternalForce:
         part = self.body.parts[0]
         symbols = [ca.SX.sym("F", 9), ca.SX.sym("rate", 9)]
         psi = part.material.psi(ca.reshape(symbols[0], 3, 3), constants[0])
-        viscous, _ = damping_stress(part.damping, part.material, [*symbols, *constants])
+        viscous, _ = damping_stress(
+            part.damping, part.material, [*symbols, *constants]
+        )
         total = ca.gradient(psi, symbols[0]) + viscous
         return ca.substitute(total, ca.vertcat(*symbols), ca.vertcat(F, rate))
 
@@ -121,11 +132,15 @@ class PlainInternalForce:
         second, _ = ca.hessian(ca.dot(w, force), u)
         inputs = self._symbols
         return (
-            ca.Function("first", inputs, [force, ca.densify(ca.jacobian(force, u))]),
+            ca.Function(
+                "first", inputs, [force, ca.densify(ca.jacobian(force, u))]
+            ),
             ca.Function("second", inputs, [ca.densify(second)]),
         )
 
-    def evaluate(self, x: Array, v: Array, w: Array, theta: Array) -> tuple[Array, Array, Array]:
+    def evaluate(
+        self, x: Array, v: Array, w: Array, theta: Array
+    ) -> tuple[Array, Array, Array]:
         """Return f (3n,), ∂f/∂u (3n, u) and ∂²(wᵀf)/∂u² (u, u) by u = (x, v, θ), of one state.
 
         Parameters
@@ -141,14 +156,22 @@ class PlainInternalForce:
         force = np.zeros(size)
         jacobian = np.zeros((size, count))
         hessian = np.zeros((count, count))
-        for cell, geometry in zip(self.body.cells, self.body.geometry, strict=True):
+        for cell, geometry in zip(
+            self.body.cells, self.body.geometry, strict=True
+        ):
             dofs: Index = (3 * cell[:, None] + np.arange(3)).ravel()
             state = [x[dofs], v[dofs], w[dofs], geometry.T, theta[:laws]]
-            columns = np.concatenate([dofs, size + dofs, 2 * size + np.arange(laws)])
-            element_force, element_jacobian = (o.full() for o in self._functions[0].call(state))
+            columns = np.concatenate(
+                [dofs, size + dofs, 2 * size + np.arange(laws)]
+            )
+            element_force, element_jacobian = (
+                o.full() for o in self._functions[0].call(state)
+            )
             force[dofs] += element_force.ravel()
             jacobian[np.ix_(dofs, columns)] += element_jacobian
-            hessian[np.ix_(columns, columns)] += self._functions[1].call(state)[0].full()
+            hessian[np.ix_(columns, columns)] += (
+                self._functions[1].call(state)[0].full()
+            )
         drag = theta[-1] * self.body.dof_mass
         force -= drag * v
         jacobian[:, size : 2 * size] -= np.diag(drag)
@@ -193,15 +216,25 @@ def check_internal_forces(
     AssertionError
         If a force or derivative differs.
     """
-    body = Body(uneven_box(1), material, DENSITY_KG_M3, element, damping=damping)
-    theta = np.array([*usual_constants(tuple(body.constants.values()), values).values()])
-    x = body.nodes_m.ravel() + check.rng.uniform(-DISPLACEMENT_M, DISPLACEMENT_M, body.nodes_m.size)
+    body = Body(
+        uneven_box(1), material, DENSITY_KG_M3, element, damping=damping
+    )
+    theta = np.array(
+        [*usual_constants(tuple(body.constants.values()), values).values()]
+    )
+    x = body.nodes_m.ravel() + check.rng.uniform(
+        -DISPLACEMENT_M, DISPLACEMENT_M, body.nodes_m.size
+    )
     v = VELOCITY_M_S * check.rng.standard_normal(x.size)
     w = check.rng.standard_normal(x.size)
     plain = None if body.element.mean_dilatation else PlainInternalForce(body)
-    first = _check_derivatives(check, body, [x, v, w], theta, plain=plain, where="")
+    first = _check_derivatives(
+        check, body, [x, v, w], theta, plain=plain, where=""
+    )
     at_rest = [body.nodes_m.ravel(), np.zeros_like(v), w]
-    _check_derivatives(check, body, at_rest, theta, plain=plain, where=" undeformed")
+    _check_derivatives(
+        check, body, at_rest, theta, plain=plain, where=" undeformed"
+    )
     _check_energy(check, body, x, theta)
     if is_objective:
         _check_objectivity(check, body, x, v, theta)
@@ -244,7 +277,10 @@ def _check_derivatives(
     first = _first_derivatives(body, x, v, theta)
     second = _second_derivatives(body, state, theta)
     # Forces of an undeformed body are zero; what counts is their change by a large change of x.
-    size = max(float(np.abs(force).max()), LARGE_CHANGE_M * float(np.abs(first[:, : x.size]).max()))
+    size = max(
+        float(np.abs(force).max()),
+        LARGE_CHANGE_M * float(np.abs(first[:, : x.size]).max()),
+    )
     check.require_equal(
         body.second_derivatives(x, v, w, theta).theta[0],
         w @ first[:, 2 * x.size :],
@@ -253,8 +289,14 @@ def _check_derivatives(
     )
     if plain is not None:
         expected = plain.evaluate(x, v, w, theta)
-        names = ("force", "first derivative of the force", "second derivative of the force")
-        for name, found, value in zip(names, (force, first, second), expected, strict=True):
+        names = (
+            "force",
+            "first derivative of the force",
+            "second derivative of the force",
+        )
+        for name, found, value in zip(
+            names, (force, first, second), expected, strict=True
+        ):
             check.require_equal(
                 found,
                 value,
@@ -263,14 +305,20 @@ def _check_derivatives(
                 tolerance=SECOND_DERIVATIVES if value is expected[2] else EXACT,
                 scale=size if value is expected[0] else None,
             )
-    _check_differences(check, body, state=state, theta=theta, derivatives=(first, second))
+    _check_differences(
+        check, body, state=state, theta=theta, derivatives=(first, second)
+    )
     return first
 
 
-def _check_energy(check: PropertyCheck, body: Body, x: Array, theta: Array) -> None:
+def _check_energy(
+    check: PropertyCheck, body: Body, x: Array, theta: Array
+) -> None:
     """Require that the compiled force without velocities is minus the gradient of the energy."""
     named = dict(zip(body.constants, theta, strict=True))
-    constants = {c.name: named[c.name] for c in body.parts[0].material.constants}
+    constants = {
+        c.name: named[c.name] for c in body.parts[0].material.constants
+    }
     direction = LARGE_CHANGE_M * check.rng.standard_normal(x.size)
     force = body.force(x, np.zeros_like(x), theta)[0]
     check.require_product(
@@ -283,7 +331,9 @@ def _check_energy(check: PropertyCheck, body: Body, x: Array, theta: Array) -> N
     )
 
 
-def _check_objectivity(check: PropertyCheck, body: Body, x: Array, v: Array, theta: Array) -> None:
+def _check_objectivity(
+    check: PropertyCheck, body: Body, x: Array, v: Array, theta: Array
+) -> None:
     """Require f(Qx, Q(v + ω × x)) = Q f(x, v) without mass-proportional damping."""
     constants = theta.copy()
     constants[-1] = 0.0
@@ -302,7 +352,9 @@ def _check_objectivity(check: PropertyCheck, body: Body, x: Array, v: Array, the
     )
 
 
-def _check_dissipation(check: PropertyCheck, body: Body, by_velocity: Array) -> None:
+def _check_dissipation(
+    check: PropertyCheck, body: Body, by_velocity: Array
+) -> None:
     """Require that no velocity increases the energy: no eigenvalue of ∂f/∂v is positive."""
     powers = np.linalg.eigvalsh((by_velocity + by_velocity.T) / 2)
     if not powers[-1] <= EXACT * np.abs(powers).max():
@@ -326,7 +378,9 @@ def _check_differences(
     x, v, w = state
     size = len(x)
     point = np.concatenate([x, v, theta])
-    scale = np.concatenate([np.full(size, LARGE_CHANGE_M), np.ones(size), theta])
+    scale = np.concatenate(
+        [np.full(size, LARGE_CHANGE_M), np.ones(size), theta]
+    )
     direction = scale * check.rng.standard_normal(len(point))
 
     def force_at(u: Array) -> Array:
@@ -335,7 +389,9 @@ def _check_differences(
 
     def weighted_derivative_at(u: Array) -> Array:
         """Return the compiled first derivative of wᵀ f at (x, v, θ)."""
-        return w @ _first_derivatives(body, u[:size], u[size : 2 * size], u[2 * size :])
+        return w @ _first_derivatives(
+            body, u[:size], u[size : 2 * size], u[2 * size :]
+        )
 
     where = f"of the compiled force of {body.element.name} elements is wrong"
     check.require_product(

@@ -153,12 +153,19 @@ class EnergyDerivatives:
         rule = self.material.chain_rule(gradient, values)
         psi = self.material.psi_in(rule, gradient, values)
         stress = rule.gradient(psi, F)
-        outputs = [psi, stress, rule.jacobian(stress, F), rule.jacobian(stress, values)]
+        outputs = [
+            psi,
+            stress,
+            rule.jacobian(stress, F),
+            rule.jacobian(stress, values),
+        ]
         return ca.Function("kernel", [F, values], rule.eliminate(outputs))
 
     def evaluate(self, F: Array) -> tuple[Array, Array, Array]:
         """Return ψ (1,), P (9,) and ∂P/∂F (9, 9) at F (9,), stacked column after column."""
-        psi, stress, tangent = (output.full() for output in self._function.call([F]))
+        psi, stress, tangent = (
+            output.full() for output in self._function.call([F])
+        )
         return psi.ravel(), stress.ravel(), tangent
 
     def evaluate_kernel(
@@ -173,14 +180,17 @@ class EnergyDerivatives:
             Values of the constants in place of those of this object.
         """
         constants = self.values if values is None else values
-        outputs = (each.full() for each in self._kernel_function.call([F, constants]))
+        outputs = (
+            each.full() for each in self._kernel_function.call([F, constants])
+        )
         psi, stress, tangent, by_constants = outputs
         return psi.ravel(), stress.ravel(), tangent, by_constants
 
     def evaluate_plain(self, F: Array) -> Array:
         """Return ψ (1,) by calling the energy function with numbers."""
         named = {
-            c.name: float(v) for c, v in zip(self.material.constants, self.values, strict=True)
+            c.name: float(v)
+            for c, v in zip(self.material.constants, self.values, strict=True)
         }
         psi = self.material.energy(ca.DM(F.reshape(3, 3, order="F")), **named)
         return np.ravel(ca.evalf(ca.SX(psi)).full())
@@ -205,13 +215,26 @@ def deformation_gradients(
         yield F.ravel(order="F")
 
 
-def _deformations(rng: np.random.Generator, largest_strain: float) -> Iterator[tuple[str, Array]]:
+def _deformations(
+    rng: np.random.Generator, largest_strain: float
+) -> Iterator[tuple[str, Array]]:
     """Return descriptions and deformation gradients (9,): random ones, then equal stretches."""
-    for number, F in enumerate(deformation_gradients(rng, DEFORMATIONS, largest_strain)):
-        yield f"at random deformation {number} (strains up to {largest_strain:g})", F
+    for number, F in enumerate(
+        deformation_gradients(rng, DEFORMATIONS, largest_strain)
+    ):
+        yield (
+            f"at random deformation {number} (strains up to {largest_strain:g})",
+            F,
+        )
     for stretch in (1 + largest_strain, 1 - largest_strain):
-        yield f"at a uniaxial stretch of {stretch:g}", np.diag([1.0, 1.0, stretch]).ravel()
-        yield f"at a volumetric stretch of {stretch:g}", stretch * np.eye(3).ravel()
+        yield (
+            f"at a uniaxial stretch of {stretch:g}",
+            np.diag([1.0, 1.0, stretch]).ravel(),
+        )
+        yield (
+            f"at a volumetric stretch of {stretch:g}",
+            stretch * np.eye(3).ravel(),
+        )
 
 
 def random_rotation(rng: np.random.Generator) -> Array:
@@ -225,13 +248,23 @@ def _check_undeformed(check: PropertyCheck, law: EnergyDerivatives) -> None:
     stiffness = max(float(np.abs(tangent).max()), np.finfo(float).tiny)
     zero = np.zeros(9)
     where = "of the undeformed material is not zero"
-    check.require_equal(psi, zero[:1], statement=f"the energy {where}", scale=stiffness)
-    check.require_equal(stress, zero, statement=f"the stress {where}", scale=stiffness)
-    shears = [(np.outer(a, b) + np.outer(b, a)) / np.sqrt(2) for a, b in _pairs()]
+    check.require_equal(
+        psi, zero[:1], statement=f"the energy {where}", scale=stiffness
+    )
+    check.require_equal(
+        stress, zero, statement=f"the stress {where}", scale=stiffness
+    )
+    shears = [
+        (np.outer(a, b) + np.outer(b, a)) / np.sqrt(2) for a, b in _pairs()
+    ]
     strains = np.array([each.ravel() for each in (*DIAGONAL, *shears)])
     smallest = np.linalg.eigvalsh(strains @ tangent @ strains.T)[0]
     if not smallest > 0:
-        check.fail("the undeformed material does not resist every strain", smallest, "above 0 Pa")
+        check.fail(
+            "the undeformed material does not resist every strain",
+            smallest,
+            "above 0 Pa",
+        )
 
 
 def _pairs() -> list[tuple[Array, Array]]:
@@ -240,7 +273,9 @@ def _pairs() -> list[tuple[Array, Array]]:
     return [(axes[0], axes[1]), (axes[0], axes[2]), (axes[1], axes[2])]
 
 
-def _check_derivatives(check: PropertyCheck, law: EnergyDerivatives, F: Array, where: str) -> None:
+def _check_derivatives(
+    check: PropertyCheck, law: EnergyDerivatives, F: Array, where: str
+) -> None:
     """Require that stress and stiffness are the derivatives of the energy."""
     psi, stress, tangent = law.evaluate(F)
     if not np.isfinite(psi).all():
@@ -250,13 +285,23 @@ def _check_derivatives(check: PropertyCheck, law: EnergyDerivatives, F: Array, w
             "a finite energy, or a smaller largest_strain",
         )
     check.require_equal(
-        psi, law.evaluate_plain(F), statement=f"the energy differs from its function {where}"
+        psi,
+        law.evaluate_plain(F),
+        statement=f"the energy differs from its function {where}",
     )
     check.require_derivative(
-        lambda at: law.evaluate(at)[0], stress, F, statement=f"P is not ∂ψ/∂F {where}", scale=0.1
+        lambda at: law.evaluate(at)[0],
+        stress,
+        F,
+        statement=f"P is not ∂ψ/∂F {where}",
+        scale=0.1,
     )
     check.require_derivative(
-        lambda at: law.evaluate(at)[1], tangent, F, statement=f"∂P/∂F is wrong {where}", scale=0.1
+        lambda at: law.evaluate(at)[1],
+        tangent,
+        F,
+        statement=f"∂P/∂F is wrong {where}",
+        scale=0.1,
     )
     _check_kernel_derivatives(check, law, F, where)
 
@@ -269,7 +314,9 @@ def _check_kernel_derivatives(
     *kernel, by_constants = law.evaluate_kernel(F)
     # Stress and energy may vanish, in a volumetric stretch for instance.
     stiffness = float(np.abs(plain[2]).max())
-    for name, found, expected in zip(("ψ", "P", "∂P/∂F"), kernel, plain, strict=True):
+    for name, found, expected in zip(
+        ("ψ", "P", "∂P/∂F"), kernel, plain, strict=True
+    ):
         check.require_equal(
             found,
             expected,
@@ -287,14 +334,19 @@ def _check_kernel_derivatives(
     )
 
 
-def _check_objectivity(check: PropertyCheck, law: EnergyDerivatives, F: Array, where: str) -> None:
+def _check_objectivity(
+    check: PropertyCheck, law: EnergyDerivatives, F: Array, where: str
+) -> None:
     """Require ψ(QF) = ψ(F) and P(QF) = Q P(F)."""
     psi, stress, _ = law.evaluate(F)
     Q = random_rotation(check.rng)
     rotated = (Q @ F.reshape(3, 3, order="F")).ravel(order="F")
     rotated_psi, rotated_stress, _ = law.evaluate(rotated)
     check.require_equal(
-        rotated_psi, psi, statement=f"a rotation changes the energy {where}", tolerance=1e-8
+        rotated_psi,
+        psi,
+        statement=f"a rotation changes the energy {where}",
+        tolerance=1e-8,
     )
     check.require_equal(
         rotated_stress.reshape(3, 3, order="F"),
@@ -304,11 +356,15 @@ def _check_objectivity(check: PropertyCheck, law: EnergyDerivatives, F: Array, w
     )
 
 
-def _check_messages(check: PropertyCheck, material: Material, values: dict[str, float]) -> None:
+def _check_messages(
+    check: PropertyCheck, material: Material, values: dict[str, float]
+) -> None:
     """Require that a missing constant and a misspelt definition are refused by their names."""
     misspelt = f"no_{material.constants[0].name}"
     check.require_refusal(
-        lambda: Material.from_energy(material.energy, material.name, Constant(misspelt)),
+        lambda: Material.from_energy(
+            material.energy, material.name, Constant(misspelt)
+        ),
         naming=misspelt,
         statement=f"the definition of {misspelt!r}, which the energy does not have",
     )
@@ -324,7 +380,11 @@ def _check_round_trips(
 ) -> None:
     """Require the same energies after pickling and from a problem file."""
     constants = np.array([*values.values()])
-    deformations = [*deformation_gradients(np.random.default_rng(0), DEFORMATIONS, ROUND_TRIP)]
+    deformations = [
+        *deformation_gradients(
+            np.random.default_rng(0), DEFORMATIONS, ROUND_TRIP
+        )
+    ]
 
     def evaluate(made: Material) -> Array:
         """Return ψ at a few deformations."""
@@ -333,10 +393,14 @@ def _check_round_trips(
 
     def load(loader: CodeLoader, table: Mapping[str, Any]) -> Material:
         """Return the material of a table of a problem file."""
-        return loader.material(CodeSection.model_validate(table), "object.material")
+        return loader.material(
+            CodeSection.model_validate(table), "object.material"
+        )
 
     check_pickling(check, material, evaluate)
     if file is not None:
         name = function or getattr(material.energy, "__name__", material.name)
         table = {"file": Path(file).name, "function": name}
-        check_problem_file(check, file, table, load=load, extension=material, evaluate=evaluate)
+        check_problem_file(
+            check, file, table, load=load, extension=material, evaluate=evaluate
+        )

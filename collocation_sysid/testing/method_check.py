@@ -24,7 +24,12 @@ from .round_trip import check_pickling
 from .small_problems import DENSITY_KG_M3, swung_experiment
 
 # Parameters of the simulated recording, and the guesses of those that are estimated.
-TRUTH = {"young_pa": 800.0, "poisson": 0.25, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.3}
+TRUTH = {
+    "young_pa": 800.0,
+    "poisson": 0.25,
+    "gamma_r_s": 5e-3,
+    "gamma_m_1_s": 0.3,
+}
 GUESSES = {"young_pa": 1200.0, "gamma_r_s": 8e-3}
 # Largest relative error of an estimate: markers without noise determine the parameters exactly.
 LARGEST_ERROR = 1e-3
@@ -62,16 +67,22 @@ def check_method(
     AssertionError
         For the first property that fails: which one, where, found and expected value.
     """
-    name = getattr(method, "name", None) or getattr(method, "__name__", type(method).__name__)
+    name = getattr(method, "name", None) or getattr(
+        method, "__name__", type(method).__name__
+    )
     check = PropertyCheck(f"method {name!r}")
     collocation = small_recording()
     lines: list[Iteration] = []
     before = _fingerprint(collocation)
     solution = method(collocation, watch=lines.append)
-    _check_answer(check, solution, is_exact=is_exact, largest_error=largest_error)
+    _check_answer(
+        check, solution, is_exact=is_exact, largest_error=largest_error
+    )
     _check_history(check, solution, lines)
     check.require_equal(
-        _fingerprint(collocation), before, statement="it changes the collocation that it solves"
+        _fingerprint(collocation),
+        before,
+        statement="it changes the collocation that it solves",
     )
     again = method(collocation, start=solution.z)
     _check_answer(
@@ -88,19 +99,33 @@ def check_method(
 
 def small_recording() -> Collocation:
     """Return the program of a simulated swing of a foam block without noise, with two unknowns."""
-    body = Body(box_mesh((0.05, 0.05, 0.1), (1, 1, 2)), density_kg_m3=DENSITY_KG_M3)
+    body = Body(
+        box_mesh((0.05, 0.05, 0.1), (1, 1, 2)), density_kg_m3=DENSITY_KG_M3
+    )
     experiment = swung_experiment(body)
-    seen = with_markers(experiment, simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m)
-    unknowns: Mapping[str, Any] = TRUTH | {name: Unknown(value) for name, value in GUESSES.items()}
+    seen = with_markers(
+        experiment,
+        simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m,
+    )
+    unknowns: Mapping[str, Any] = TRUTH | {
+        name: Unknown(value) for name, value in GUESSES.items()
+    }
     return Collocation([seen], Parameters.from_mapping(unknowns))
 
 
 def _fingerprint(collocation: Collocation) -> Array:
     """Return numbers that change if a method changes the program in place."""
     p = collocation.guess_p
-    rigid = [s.experiment.rigid_positions(s.dynamics.t_s) for s in collocation.transcriptions]
+    rigid = [
+        s.experiment.rigid_positions(s.dynamics.t_s)
+        for s in collocation.transcriptions
+    ]
     z = collocation.pack(p, [x.reshape(len(x), -1) for x in rigid])
-    values = [collocation.constraint_values(z), collocation.gradient(z), *collocation.bounds()]
+    values = [
+        collocation.constraint_values(z),
+        collocation.gradient(z),
+        *collocation.bounds(),
+    ]
     numbers = np.concatenate([p, [collocation.objective(z)], *values])
     return np.where(np.isfinite(numbers), numbers, 0.0)
 
@@ -115,15 +140,23 @@ def _check_answer(
 ) -> None:
     """Require convergence to the truth, within the bounds, with the equations satisfied."""
     if not isinstance(solution, Solution):
-        check.fail("it does not return a Solution", type(solution).__name__, "Solution")
+        check.fail(
+            "it does not return a Solution", type(solution).__name__, "Solution"
+        )
     if not solution.status.converged:
-        check.fail(f"it does not converge{where}", solution.status.value, "converged")
+        check.fail(
+            f"it does not converge{where}", solution.status.value, "converged"
+        )
     for name in GUESSES:
         value = solution.parameters[name]
         if not abs(value / TRUTH[name] - 1) <= largest_error:
-            check.fail(f"the estimate of {name} is wrong{where}", value, TRUTH[name])
+            check.fail(
+                f"the estimate of {name} is wrong{where}", value, TRUTH[name]
+            )
     low, high = solution.collocation.bounds()
-    excess = float(np.maximum(low - solution.z, solution.z - high).max(initial=0.0))
+    excess = float(
+        np.maximum(low - solution.z, solution.z - high).max(initial=0.0)
+    )
     if not excess <= 1e-9:
         check.fail(f"a variable is outside its bounds{where}", excess, "0")
     violation = solution.max_violation_relative
@@ -135,19 +168,32 @@ def _check_answer(
         )
 
 
-def _check_history(check: PropertyCheck, solution: Solution, lines: list[Iteration]) -> None:
+def _check_history(
+    check: PropertyCheck, solution: Solution, lines: list[Iteration]
+) -> None:
     """Require a history that `watch` got line by line, and that ends below its begin."""
     if not solution.history:
         check.fail("the history of the solve is empty", 0, "at least one line")
     if lines != list(solution.history):
-        check.fail("watch did not get every line of the history", len(lines), len(solution.history))
+        check.fail(
+            "watch did not get every line of the history",
+            len(lines),
+            len(solution.history),
+        )
     first, last = solution.history[0].loss, solution.history[-1].loss
     whole = [line.loss for line in solution.history if line.share >= 1.0]
     if not (whole and min(last, *whole) <= max(first, *whole)):
-        check.fail("the last line of the history has not the lowest loss", last, first)
-    expected = solution.collocation.objective(solution.z) / solution.collocation.loss_scale
+        check.fail(
+            "the last line of the history has not the lowest loss", last, first
+        )
+    expected = (
+        solution.collocation.objective(solution.z)
+        / solution.collocation.loss_scale
+    )
     if not np.isfinite(expected):
-        check.fail("the loss of the answer is not finite", expected, "a finite loss")
+        check.fail(
+            "the loss of the answer is not finite", expected, "a finite loss"
+        )
 
 
 def _check_options(check: PropertyCheck, method: Any) -> None:
@@ -163,7 +209,9 @@ def _check_options(check: PropertyCheck, method: Any) -> None:
     for name, value in options.items():
         if isinstance(value, bool | int | float):
             check.require_refusal(
-                lambda name=name: method_from_options(kind, {name: "text"}, key),
+                lambda name=name: method_from_options(
+                    kind, {name: "text"}, key
+                ),
                 naming=f"{key}.{name}",
                 statement=f"the text 'text' as the option {name}",
             )
@@ -173,8 +221,16 @@ def _check_options(check: PropertyCheck, method: Any) -> None:
         if value is not None and not callable(value)
     }
     try:
-        read = method_from_options(kind, tomllib.loads(tomli_w.dumps(stated)), key)
+        read = method_from_options(
+            kind, tomllib.loads(tomli_w.dumps(stated)), key
+        )
     except InputError as error:
-        check.fail("its options from a problem file are refused", error, "the same method")
+        check.fail(
+            "its options from a problem file are refused",
+            error,
+            "the same method",
+        )
     if read != method:
-        check.fail("its options from a problem file give another method", read, method)
+        check.fail(
+            "its options from a problem file give another method", read, method
+        )

@@ -22,7 +22,12 @@ from ..recording.nuisance import KINDS, Nuisance, NuisanceRow
 from .program_derivatives import check_program
 from .property_check import PropertyCheck
 from .round_trip import check_pickling, check_problem_file
-from .small_problems import DENSITY_KG_M3, program_of, swung_experiment, uneven_box
+from .small_problems import (
+    DENSITY_KG_M3,
+    program_of,
+    swung_experiment,
+    uneven_box,
+)
 
 # Standard deviation of a kind that has none by default.
 USUAL_SIGMA = 0.01
@@ -69,12 +74,16 @@ def check_nuisance(
         If the reading or clock cannot be evaluated, has the wrong shape, or is not finite at zero.
     """
     check = PropertyCheck(f"nuisance parameter {row.name!r}")
-    base = experiment or swung_experiment(Body(uneven_box(1), density_kg_m3=DENSITY_KG_M3))
+    base = experiment or swung_experiment(
+        Body(uneven_box(1), density_kg_m3=DENSITY_KG_M3)
+    )
     changed = _with_row(base, row)
     size = NuisanceMap.from_experiment(changed).size
     if size == NuisanceMap.from_experiment(base).size:
         check.fail(
-            f"the recording {base.name!r} does not have it", "no value", "at least one value"
+            f"the recording {base.name!r} does not have it",
+            "no value",
+            "at least one value",
         )
     collocation = program_of(changed, {})
     data = collocation.transcriptions[0].nuisance
@@ -92,7 +101,9 @@ def _with_row(experiment: Experiment, row: NuisanceRow) -> Experiment:
     """Return the experiment in which the parameter of a row is estimated."""
     nuisance = experiment.nuisance
     if row not in KINDS:
-        return replace(experiment, nuisance=replace(nuisance, own=(*nuisance.own, row)))
+        return replace(
+            experiment, nuisance=replace(nuisance, own=(*nuisance.own, row))
+        )
     sigma = row.sigma or row.considered or USUAL_SIGMA
     return replace(experiment, nuisance=replace(nuisance, **{row.name: sigma}))
 
@@ -102,7 +113,9 @@ def _value_count(row: NuisanceRow) -> int:
     return len(row.axes.split()) or 1
 
 
-def _read(row: NuisanceRow, y: Array, values: Array, t_s: float, data: NuisanceMap) -> Array:
+def _read(
+    row: NuisanceRow, y: Array, values: Array, t_s: float, data: NuisanceMap
+) -> Array:
     """Return the reading (3,) or the delay (1,) of a row by calling its function with numbers."""
     argument = ca.DM(values)
     result = (
@@ -113,7 +126,9 @@ def _read(row: NuisanceRow, y: Array, values: Array, t_s: float, data: NuisanceM
     return np.ravel(ca.evalf(ca.SX(result)).full())
 
 
-def _check_reading(check: PropertyCheck, row: NuisanceRow, collocation: Collocation) -> None:
+def _check_reading(
+    check: PropertyCheck, row: NuisanceRow, collocation: Collocation
+) -> None:
     """Require no effect of zero, right derivatives, and the reading in predicted markers."""
     assert row.reading is not None
     (transcription,) = collocation.transcriptions
@@ -132,8 +147,16 @@ def _check_reading(check: PropertyCheck, row: NuisanceRow, collocation: Collocat
     expression = ca.SX(row.reading(symbol[:3], symbol[3:], t_s, data))
     first = ca.jacobian(expression, symbol)
     second, _ = ca.hessian(ca.dot(ca.DM(weights), expression), symbol)
-    derivatives = ca.Function("d", [symbol], [ca.densify(first), ca.densify(second)])
-    u = np.concatenate([y, sigma * check.rng.uniform(-LARGEST_DEVIATION, LARGEST_DEVIATION, count)])
+    derivatives = ca.Function(
+        "d", [symbol], [ca.densify(first), ca.densify(second)]
+    )
+    u = np.concatenate(
+        [
+            y,
+            sigma
+            * check.rng.uniform(-LARGEST_DEVIATION, LARGEST_DEVIATION, count),
+        ]
+    )
     jacobian, hessian = (each.full() for each in derivatives.call([u]))
     scale = np.concatenate([np.full(3, 0.01), np.full(count, sigma)])
     check.require_derivative(
@@ -156,7 +179,9 @@ def _check_reading(check: PropertyCheck, row: NuisanceRow, collocation: Collocat
 def _marker_residual(collocation: Collocation) -> MarkerResidual:
     """Return the measurement model of the markers of a small recording."""
     (transcription,) = collocation.transcriptions
-    (markers,) = (r for r in transcription.residuals if isinstance(r, MarkerResidual))
+    (markers,) = (
+        r for r in transcription.residuals if isinstance(r, MarkerResidual)
+    )
     return markers
 
 
@@ -170,8 +195,14 @@ def _check_predicted_reading(
     phi = np.zeros(data.size)
     plain = residual.predict_positions(x, phi)
     for marker in range(plain.shape[1]):
-        of_marker = [k for k in residual.own_parameters[marker] if data.entries[k].row == row]
-        values = check.rng.uniform(-LARGEST_DEVIATION, LARGEST_DEVIATION, len(of_marker))
+        of_marker = [
+            k
+            for k in residual.own_parameters[marker]
+            if data.entries[k].row == row
+        ]
+        values = check.rng.uniform(
+            -LARGEST_DEVIATION, LARGEST_DEVIATION, len(of_marker)
+        )
         phi[of_marker] = values
         predicted = residual.predict_positions(x, phi)[:, marker]
         physical = values * data.scales[of_marker]
@@ -185,14 +216,22 @@ def _check_predicted_reading(
             )
 
 
-def _check_clock(check: PropertyCheck, row: NuisanceRow, collocation: Collocation) -> None:
+def _check_clock(
+    check: PropertyCheck, row: NuisanceRow, collocation: Collocation
+) -> None:
     """Require no delay at zero, and markers of a known motion at the later time."""
     residual = _marker_residual(collocation)
     data = residual.nuisance
     count = _value_count(row)
-    late = _read(row, np.zeros(3), np.zeros(count), float(data.recorded_s[1]), data)
-    check.require_equal(late, np.zeros(1), statement="zero changes the clock", scale=1.0)
-    indices = np.array([k for k, entry in enumerate(data.entries) if entry.row == row])
+    late = _read(
+        row, np.zeros(3), np.zeros(count), float(data.recorded_s[1]), data
+    )
+    check.require_equal(
+        late, np.zeros(1), statement="zero changes the clock", scale=1.0
+    )
+    indices = np.array(
+        [k for k, entry in enumerate(data.entries) if entry.row == row]
+    )
     phi = np.zeros(data.size)
     phi[indices] = LARGEST_DEVIATION
     x = _smooth_motion(check, collocation)
@@ -212,17 +251,25 @@ def _check_clock(check: PropertyCheck, row: NuisanceRow, collocation: Collocatio
         )
 
 
-def _smooth_motion(check: PropertyCheck, collocation: Collocation, shift_s: float = 0.0) -> Array:
+def _smooth_motion(
+    check: PropertyCheck, collocation: Collocation, shift_s: float = 0.0
+) -> Array:
     """Return grid positions (N, 3n) of a motion that is affine in space and quadratic in time."""
     (transcription,) = collocation.transcriptions
     nodes_m = transcription.body.nodes_m
     rates = np.random.default_rng(3).standard_normal((2, 3, 3))
     t_s = transcription.dynamics.t_s + shift_s
-    steps = rates[0] * t_s[:, None, None] + 10 * rates[1] * t_s[:, None, None] ** 2
-    return np.einsum("tij,nj->tni", np.eye(3) + steps, nodes_m).reshape(len(t_s), -1)
+    steps = (
+        rates[0] * t_s[:, None, None] + 10 * rates[1] * t_s[:, None, None] ** 2
+    )
+    return np.einsum("tij,nj->tni", np.eye(3) + steps, nodes_m).reshape(
+        len(t_s), -1
+    )
 
 
-def _check_messages(check: PropertyCheck, row: NuisanceRow, experiment: Experiment) -> None:
+def _check_messages(
+    check: PropertyCheck, row: NuisanceRow, experiment: Experiment
+) -> None:
     """Require that a repeated name and a prior without width are refused by the name."""
     nuisance = experiment.nuisance
     check.require_refusal(
@@ -246,13 +293,17 @@ def _check_round_trips(
 ) -> None:
     """Require the same effect and prior after pickling and from a problem file."""
     y = np.array([0.03, 0.05, 0.02])
-    values = (row.sigma or USUAL_SIGMA) * np.linspace(0.3, 0.5, _value_count(row))
+    values = (row.sigma or USUAL_SIGMA) * np.linspace(
+        0.3, 0.5, _value_count(row)
+    )
     t_s = float(np.mean(data.recorded_s))
 
     def evaluate(each: NuisanceRow) -> Array:
         """Return prior, limits and effect of a row."""
         has_effect = each.reading is not None or each.clock is not None
-        effect = _read(each, y, values, t_s, data) if has_effect else np.zeros(0)
+        effect = (
+            _read(each, y, values, t_s, data) if has_effect else np.zeros(0)
+        )
         limits = np.array([each.low, each.high, each.reach])
         limits = np.where(np.isfinite(limits), limits, 0.0)
         return np.concatenate([[each.sigma or 0.0], limits, effect])
@@ -265,5 +316,11 @@ def _check_round_trips(
     if file is not None:
         table = {"file": Path(file).name, "row": name_in_file or row.name}
         check_problem_file(
-            check, file, table, load=load, extension=row, evaluate=evaluate, key="row"
+            check,
+            file,
+            table,
+            load=load,
+            extension=row,
+            evaluate=evaluate,
+            key="row",
         )

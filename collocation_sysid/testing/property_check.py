@@ -40,7 +40,9 @@ class PropertyCheck:
     """
 
     subject: str
-    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+    rng: np.random.Generator = field(
+        default_factory=lambda: np.random.default_rng(0)
+    )
 
     def fail(self, statement: str, found: Any, expected: Any) -> NoReturn:
         """Raise the `AssertionError` of a property.
@@ -91,7 +93,9 @@ class PropertyCheck:
             return
         size = np.abs(references).max() if scale is None else scale
         errors = np.abs(values - references)
-        worst = np.unravel_index(int(np.argmax(np.nan_to_num(errors, nan=np.inf))), errors.shape)
+        worst = np.unravel_index(
+            int(np.argmax(np.nan_to_num(errors, nan=np.inf))), errors.shape
+        )
         if not errors[worst] <= tolerance * size:
             entry = f", entry {tuple(map(int, worst))}" if worst else ""
             self.fail(f"{statement}{entry}", values[worst], references[worst])
@@ -128,7 +132,9 @@ class PropertyCheck:
             If they differ.
         """
         steps = np.broadcast_to(np.asarray(scale, dtype=float), point.shape)
-        found = np.asarray(derivative, dtype=float).reshape(-1, point.size) * steps
+        found = (
+            np.asarray(derivative, dtype=float).reshape(-1, point.size) * steps
+        )
 
         def differences(step: float) -> Array:
             """Return the derivative by differences, times the scale."""
@@ -180,7 +186,9 @@ class PropertyCheck:
         size = _size(found, function(point))
         expected = _closest(
             found,
-            lambda step: directional_derivative(function, point, direction, step),
+            lambda step: directional_derivative(
+                function, point, direction, step
+            ),
             tolerance=tolerance * size,
         )
         self.require_equal(
@@ -191,7 +199,9 @@ class PropertyCheck:
             scale=size,
         )
 
-    def require_refusal(self, call: Callable[[], Any], *, naming: str, statement: str) -> None:
+    def require_refusal(
+        self, call: Callable[[], Any], *, naming: str, statement: str
+    ) -> None:
         """Require that a call raises an `InputError` that contains a name.
 
         Parameters
@@ -213,14 +223,24 @@ class PropertyCheck:
             call()
         except InputError as error:
             if naming not in str(error):
-                self.fail(f"the message for {statement} lacks the name", str(error), expected)
+                self.fail(
+                    f"the message for {statement} lacks the name",
+                    str(error),
+                    expected,
+                )
         except Exception as error:  # any other error is what the check reports
-            self.fail(f"{statement} is not refused", f"{type(error).__name__}: {error}", expected)
+            self.fail(
+                f"{statement} is not refused",
+                f"{type(error).__name__}: {error}",
+                expected,
+            )
         else:
             self.fail(f"{statement} is not refused", "no error", expected)
 
 
-def _closest(found: Array, differences: Callable[[float], Array], *, tolerance: float) -> Array:
+def _closest(
+    found: Array, differences: Callable[[float], Array], *, tolerance: float
+) -> Array:
     """Return the differences that are closest to a derivative.
 
     Parameters
@@ -237,8 +257,12 @@ def _closest(found: Array, differences: Callable[[float], Array], *, tolerance: 
     for step in STEPS:
         candidates.append(differences(step))
         has_shape = candidates[-1].shape == found.shape
-        errors = np.abs(candidates[-1] - found) if has_shape else np.array(np.inf)
-        distances.append(float(np.nan_to_num(errors, nan=np.inf).max(initial=0.0)))
+        errors = (
+            np.abs(candidates[-1] - found) if has_shape else np.array(np.inf)
+        )
+        distances.append(
+            float(np.nan_to_num(errors, nan=np.inf).max(initial=0.0))
+        )
         if distances[-1] <= tolerance:
             break
     return candidates[int(np.argmin(distances))]
@@ -247,9 +271,15 @@ def _closest(found: Array, differences: Callable[[float], Array], *, tolerance: 
 def _size(derivative: Array, value: ArrayLike) -> float:
     """Return the size of a derivative, not less than the rounding of the function's value."""
     largest = float(np.abs(derivative).max(initial=0.0))
-    return max(largest, ROUNDING * float(np.abs(value).max(initial=0.0)), np.finfo(float).tiny)
+    return max(
+        largest,
+        ROUNDING * float(np.abs(value).max(initial=0.0)),
+        np.finfo(float).tiny,
+    )
 
 
 def _shown(value: Any) -> str:
     """Return a value as part of a sentence."""
-    return f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
+    return (
+        f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
+    )

@@ -18,7 +18,12 @@ from .finite_differences import observed_order
 from .program_derivatives import check_program
 from .property_check import PropertyCheck
 from .round_trip import check_pickling
-from .small_problems import DENSITY_KG_M3, program_of, swung_experiment, usual_constants
+from .small_problems import (
+    DENSITY_KG_M3,
+    program_of,
+    swung_experiment,
+    usual_constants,
+)
 
 # Rounding of sums of coefficients.
 ROUNDING = 1e-12
@@ -101,7 +106,10 @@ def _check_start(check: PropertyCheck, stencil: Stencil, row: int) -> None:
         "the velocity ν of a constant (Σ q)": (_moment(stencil.q, 0), 0.0),
         "the velocity ν of a straight line": (_moment(stencil.q, 1), 1.0),
         "the acceleration of a constant (Σ s)": (_moment(stencil.s, 0), 0.0),
-        "the acceleration at constant velocity": (_moment(stencil.s, 1) + stencil.r, 0.0),
+        "the acceleration at constant velocity": (
+            _moment(stencil.s, 1) + stencil.r,
+            0.0,
+        ),
     }
     _check_values(check, expected, f"the stencil of row {row}")
     points = max(len(stencil.p), len(stencil.q)) + len(stencil.w) - 1
@@ -167,7 +175,10 @@ class PlainRows:
         for lag, weight in enumerate(stencil.w):
             own = self.scheme.stencil(row - lag)
             xi = sum(c * x[row - lag - i] for i, c in enumerate(own.p))
-            nu = sum(c * x[row - lag - i] for i, c in enumerate(own.q)) / self.timestep_s
+            nu = (
+                sum(c * x[row - lag - i] for i, c in enumerate(own.q))
+                / self.timestep_s
+            )
             total = total + weight * self.force(xi, nu)
         inertia: Any = sum(c * x[row - i] for i, c in enumerate(stencil.s))
         inertia = inertia + stencil.r * self.timestep_s * self.start_velocity
@@ -191,24 +202,34 @@ def _check_order(check: PropertyCheck, scheme: Scheme) -> None:
         for row in range(1, count + 1):
             at_zero = rows.residual(x, row)
             x[row] = 1.0
-            x[row] = at_zero / (at_zero - rows.residual(x, row))  # a row is affine in x_t
+            x[row] = at_zero / (
+                at_zero - rows.residual(x, row)
+            )  # a row is affine in x_t
         damped = omega * np.sqrt(1 - DAMPING_RATIO**2)
-        exact = np.exp(-DAMPING_RATIO * omega * t_s) * np.sin(damped * t_s) / damped
+        exact = (
+            np.exp(-DAMPING_RATIO * omega * t_s) * np.sin(damped * t_s) / damped
+        )
         errors.append(np.abs(x - exact).max())
     order = observed_order(DURATION_S / np.array(STEP_COUNTS), np.array(errors))
     if not abs(order - scheme.order) <= ORDER_TOLERANCE:
-        check.fail("the error of an oscillator has another order than stated", order, scheme.order)
+        check.fail(
+            "the error of an oscillator has another order than stated",
+            order,
+            scheme.order,
+        )
 
 
 def _check_simulation(check: PropertyCheck, scheme: Scheme) -> None:
     """Require that a simulated motion satisfies the rows; check its program's derivatives."""
-    body = Body(box_mesh((0.05, 0.05, 0.1), (1, 1, 2)), density_kg_m3=DENSITY_KG_M3)
+    body = Body(
+        box_mesh((0.05, 0.05, 0.1), (1, 1, 2)), density_kg_m3=DENSITY_KG_M3
+    )
     values = usual_constants(tuple(body.constants.values()), None)
     experiment = replace(swung_experiment(body), start="undeformed")
     try:
-        x = simulate(experiment, values, scheme, substeps=1).positions_m.reshape(
-            -1, 3 * len(body.nodes_m)
-        )
+        x = simulate(
+            experiment, values, scheme, substeps=1
+        ).positions_m.reshape(-1, 3 * len(body.nodes_m))
     except SimulationError as error:
         check.fail("a small body cannot be simulated", error, "a motion")
     theta = np.array([*values.values()])

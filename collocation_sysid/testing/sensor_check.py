@@ -21,7 +21,13 @@ from ..recording.custom_sensor import GRASP_INPUTS, POINT_INPUTS, Gauge, Look
 from .program_derivatives import check_program
 from .property_check import PropertyCheck
 from .round_trip import check_pickling, check_problem_file
-from .small_problems import DENSITY_KG_M3, STEPS, TIMESTEP_S, program_of, swung_experiment
+from .small_problems import (
+    DENSITY_KG_M3,
+    STEPS,
+    TIMESTEP_S,
+    program_of,
+    swung_experiment,
+)
 
 # Number of random states.
 STATES = 3
@@ -41,7 +47,10 @@ SAMPLES = 7
 
 
 def check_sensor(
-    sensor: Gauge, *, file: str | Path | None = None, function: str | None = None
+    sensor: Gauge,
+    *,
+    file: str | Path | None = None,
+    function: str | None = None,
 ) -> None:
     """Check a custom sensor: values, derivatives, predictions, messages and round trips.
 
@@ -73,7 +82,9 @@ def check_sensor(
         u = expression.random_state(check.rng)
         _check_derivatives(check, expression, u, f"at random state {number}")
     check.require_refusal(
-        lambda: replace(sensor, unknowns={**sensor.unknowns, "no_such_unknown": 1.0}),
+        lambda: replace(
+            sensor, unknowns={**sensor.unknowns, "no_such_unknown": 1.0}
+        ),
         naming="no_such_unknown",
         statement="an unknown that the expression does not have",
     )
@@ -102,7 +113,8 @@ class SensorExpression:
             return {name: np.ones((3, 1)) for name in GRASP_INPUTS}
         points = np.asarray(self.sensor.points_m).T
         return {
-            name: points if name == "position_m" else np.zeros_like(points) for name in POINT_INPUTS
+            name: points if name == "position_m" else np.zeros_like(points)
+            for name in POINT_INPUTS
         }
 
     @property
@@ -113,17 +125,26 @@ class SensorExpression:
     def random_state(self, rng: np.random.Generator) -> Array:
         """Return inputs near the undeformed ones, and unknowns of the size of their priors."""
         changed = [
-            (each + SIZES[name] * rng.standard_normal(each.shape)).ravel(order="F")
+            (each + SIZES[name] * rng.standard_normal(each.shape)).ravel(
+                order="F"
+            )
             for name, each in self.inputs.items()
         ]
         sigmas = np.array([*self.sensor.unknowns.values()], dtype=float)
-        return np.concatenate([*changed, sigmas * rng.standard_normal(len(sigmas))])
+        return np.concatenate(
+            [*changed, sigmas * rng.standard_normal(len(sigmas))]
+        )
 
     @property
     def scale(self) -> Array:
         """Size of a large change of each entry of u."""
-        sizes = [np.full(each.size, SIZES[name]) for name, each in self.inputs.items()]
-        return np.concatenate([*sizes, np.array([*self.sensor.unknowns.values()], dtype=float)])
+        sizes = [
+            np.full(each.size, SIZES[name])
+            for name, each in self.inputs.items()
+        ]
+        return np.concatenate(
+            [*sizes, np.array([*self.sensor.unknowns.values()], dtype=float)]
+        )
 
     def evaluate_plain(self, u: Array, t_s: float | None = None) -> Array:
         """Return the numbers of the sensor by calling its expression with numbers.
@@ -138,18 +159,30 @@ class SensorExpression:
         ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
         *parts, unknowns = np.split(u, ends)
         values = (
-            ca.DM(part.reshape(shape, order="F")) for part, shape in zip(parts, shapes, strict=True)
+            ca.DM(part.reshape(shape, order="F"))
+            for part, shape in zip(parts, shapes, strict=True)
         )
-        named = dict(zip(self.sensor.unknowns, map(float, unknowns), strict=True))
-        at = Look(self.t_s if t_s is None else t_s, **dict(zip(self.inputs, values, strict=True)))
+        named = dict(
+            zip(self.sensor.unknowns, map(float, unknowns), strict=True)
+        )
+        at = Look(
+            self.t_s if t_s is None else t_s,
+            **dict(zip(self.inputs, values, strict=True)),
+        )
         numbers = self.sensor.expression(at, **named)
-        column = ca.vertcat(*numbers) if isinstance(numbers, list | tuple) else numbers
+        column = (
+            ca.vertcat(*numbers)
+            if isinstance(numbers, list | tuple)
+            else numbers
+        )
         return np.ravel(ca.evalf(ca.SX(column)).full(), order="F")
 
     @cached_property
     def automatic(self) -> ca.Function:
         """Function of u and weights: y, ∂y/∂u and ∂²(wᵀy)/∂u², from the expression in SX."""
-        symbols = [ca.SX.sym(name, *each.shape) for name, each in self.inputs.items()]
+        symbols = [
+            ca.SX.sym(name, *each.shape) for name, each in self.inputs.items()
+        ]
         unknowns = ca.SX.sym("unknowns", len(self.sensor.unknowns))
         own = ca.vertsplit(unknowns) if self.sensor.unknowns else []
         y = self.sensor.read(ca.SX(self.t_s), symbols, own)
@@ -166,9 +199,13 @@ def _check_derivatives(
     """Compare value and derivatives of the expression in SX with the one called with numbers."""
     plain = expression.evaluate_plain(u)
     weights = check.rng.standard_normal(len(plain))
-    y, jacobian, hessian = (each.full() for each in expression.automatic.call([u, weights]))
+    y, jacobian, hessian = (
+        each.full() for each in expression.automatic.call([u, weights])
+    )
     check.require_equal(
-        y.ravel(), plain, statement=f"the expression differs from its function {where}"
+        y.ravel(),
+        plain,
+        statement=f"the expression differs from its function {where}",
     )
     check.require_derivative(
         expression.evaluate_plain,
@@ -189,7 +226,11 @@ def _check_derivatives(
 def _small_program(sensor: Gauge) -> Collocation:
     """Return the program of a small recording with a sensor, whose body contains its points."""
     points = np.asarray(sensor.points_m).reshape(-1, 3)
-    low = points.min(axis=0, initial=0.0) if not len(points) else points.min(axis=0)
+    low = (
+        points.min(axis=0, initial=0.0)
+        if not len(points)
+        else points.min(axis=0)
+    )
     high = points.max(axis=0) if len(points) else low + 0.06
     size = tuple(float(each) for each in high - low + 2 * MARGIN_M)
     box = box_mesh(size, (1, 1, 2))
@@ -206,13 +247,19 @@ def _check_prediction(
 ) -> None:
     """Require the expression's value for a motion that is affine in space and quadratic in time."""
     transcription = collocation.transcriptions[0]
-    rates = [scale * check.rng.standard_normal((3, 3)) for scale in (0.05, 1.0, 20.0)]
+    rates = [
+        scale * check.rng.standard_normal((3, 3)) for scale in (0.05, 1.0, 20.0)
+    ]
     identity = np.eye(3)
 
     def gradient_at(t: float) -> list[Array]:
         """Return the matrix of the motion, its velocity and its acceleration at a time."""
         zero, one, two = rates
-        return [identity + zero + one * t + two * t**2, one + 2 * two * t, 2 * two]
+        return [
+            identity + zero + one * t + two * t**2,
+            one + 2 * two * t,
+            2 * two,
+        ]
 
     grid_s = transcription.dynamics.t_s
     nodes_m = transcription.body.nodes_m
@@ -221,21 +268,32 @@ def _check_prediction(
     p[collocation.nq :] = check.rng.standard_normal(collocation.nphi)
     (iterate,) = collocation.iterates_at(p, [x])
     (residual,) = transcription.custom_sensors
-    found = residual.without_padding(residual.predict_motion(iterate.motion, iterate.phi))
-    unknowns = iterate.phi * np.array([*expression.sensor.unknowns.values()], dtype=float)
+    found = residual.without_padding(
+        residual.predict_motion(iterate.motion, iterate.phi)
+    )
+    unknowns = iterate.phi * np.array(
+        [*expression.sensor.unknowns.values()], dtype=float
+    )
     points = np.asarray(expression.sensor.points_m).T
     for t_s, numbers in zip(residual.t_s, found, strict=True):
-        exact = [(matrix @ points).ravel(order="F") for matrix in gradient_at(t_s)]
+        exact = [
+            (matrix @ points).ravel(order="F") for matrix in gradient_at(t_s)
+        ]
         check.require_equal(
             numbers,
-            expression.evaluate_plain(np.concatenate([*exact, unknowns]), float(t_s)),
+            expression.evaluate_plain(
+                np.concatenate([*exact, unknowns]), float(t_s)
+            ),
             statement=f"the prediction for a known motion is wrong at t = {t_s:.4g} s",
             tolerance=1e-7,
         )
 
 
 def _check_round_trips(
-    check: PropertyCheck, sensor: Gauge, file: str | Path | None, function: str | None
+    check: PropertyCheck,
+    sensor: Gauge,
+    file: str | Path | None,
+    function: str | None,
 ) -> None:
     """Require the same readings after pickling and from a problem file."""
     u = SensorExpression(sensor).random_state(check.rng)
@@ -246,11 +304,15 @@ def _check_round_trips(
 
     def load(loader: CodeLoader, table: Mapping[str, Any]) -> Gauge:
         """Return the sensor with the expression that a table of a problem file names."""
-        _, expression = loader.function(table["code"], table["function"], "reading.0.code")
+        _, expression = loader.function(
+            table["code"], table["function"], "reading.0.code"
+        )
         return replace(sensor, expression=expression)
 
     check_pickling(check, sensor, evaluate)
     if file is not None:
         name = function or getattr(sensor.expression, "__name__", sensor.name)
         table = {"code": Path(file).name, "function": name}
-        check_problem_file(check, file, table, load=load, extension=sensor, evaluate=evaluate)
+        check_problem_file(
+            check, file, table, load=load, extension=sensor, evaluate=evaluate
+        )

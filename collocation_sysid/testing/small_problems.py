@@ -38,7 +38,9 @@ def uneven_box(divisions: int) -> TetMesh:
         Number of cells along each edge; each consists of six tetrahedra.
     """
     mesh = box_mesh((0.10, 0.12, 0.09), (divisions,) * 3)
-    jitter = np.random.default_rng(1).uniform(-0.008, 0.008, mesh.points_m.shape)
+    jitter = np.random.default_rng(1).uniform(
+        -0.008, 0.008, mesh.points_m.shape
+    )
     return TetMesh(mesh.points_m + jitter, mesh.tetrahedra)
 
 
@@ -75,7 +77,10 @@ def usual_constants(
         Stated values.
     """
     stated = dict(values or {})
-    return {c.name: float(stated.get(c.name, _usual_constant(c.name))) for c in constants}
+    return {
+        c.name: float(stated.get(c.name, _usual_constant(c.name)))
+        for c in constants
+    }
 
 
 def _usual_constant(name: str) -> float:
@@ -115,7 +120,9 @@ def swung_experiment(body: Body, **changes: Any) -> Experiment:
     return Experiment(body, t_s, **(arguments | changes))
 
 
-def program_of(experiment: Experiment, values: Mapping[str, float]) -> Collocation:
+def program_of(
+    experiment: Experiment, values: Mapping[str, float]
+) -> Collocation:
     """Return the program of an experiment in which all constants of its body are estimated.
 
     Parameters
@@ -124,8 +131,12 @@ def program_of(experiment: Experiment, values: Mapping[str, float]) -> Collocati
     values : mapping of name to float
         Guesses; constants without one have the values of a soft foam.
     """
-    constants = usual_constants(tuple(experiment.body.constants.values()), values)
-    unknowns: dict[str, Any] = {name: _unknown(value) for name, value in constants.items()}
+    constants = usual_constants(
+        tuple(experiment.body.constants.values()), values
+    )
+    unknowns: dict[str, Any] = {
+        name: _unknown(value) for name, value in constants.items()
+    }
     return Collocation([experiment], Parameters.from_mapping(unknowns))
 
 
@@ -134,7 +145,9 @@ def _unknown(value: float) -> Unknown | float:
     return Unknown(value) if value else value
 
 
-def shaken_variables(collocation: Collocation, rng: np.random.Generator) -> Array:
+def shaken_variables(
+    collocation: Collocation, rng: np.random.Generator
+) -> Array:
     """Return variables z that satisfy no equation: rigid motions and parameters with noise.
 
     Parameters
@@ -144,13 +157,17 @@ def shaken_variables(collocation: Collocation, rng: np.random.Generator) -> Arra
     """
     positions = []
     for transcription in collocation.transcriptions:
-        rigid = transcription.experiment.rigid_positions(transcription.dynamics.t_s)
+        rigid = transcription.experiment.rigid_positions(
+            transcription.dynamics.t_s
+        )
         rigid = rigid.reshape(-1, transcription.dof_count)
         positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
     p = collocation.guess_p
     p[: collocation.nq] += 0.1 * rng.normal(size=collocation.nq)
     p[collocation.nq :] += 0.5 * rng.normal(size=collocation.nphi)
-    is_lag = np.array(["lag of" in name for name in collocation.parameter_names], dtype=bool)
+    is_lag = np.array(
+        ["lag of" in name for name in collocation.parameter_names], dtype=bool
+    )
     p[is_lag] = np.abs(p[is_lag]) + 0.1
     z = collocation.pack(p, positions)
     for lifted in collocation.lifted:

@@ -30,8 +30,17 @@ import casadi as ca
 
 from ...errors import InputError
 from .batch import CasadiEvaluator, Evaluator, KernelBatch, VectorCodeError
-from .combine import CombinationPlan, Combiner, combine_with_numpy, compile_combiner
-from .instances import Instances, compile_instance_evaluator, make_casadi_instance_evaluator
+from .combine import (
+    CombinationPlan,
+    Combiner,
+    combine_with_numpy,
+    compile_combiner,
+)
+from .instances import (
+    Instances,
+    compile_instance_evaluator,
+    make_casadi_instance_evaluator,
+)
 from .threads import (
     COMPILING,
     available_threads,
@@ -86,7 +95,9 @@ def choose_evaluator(choice: str = "auto") -> str:
     choice = _requested_evaluator(choice)
     has_llvm = find_spec("llvmlite") is not None
     if choice == "simd" and not has_llvm:
-        raise InputError("evaluator 'simd' needs llvmlite: pip install llvmlite, or use 'casadi'")
+        raise InputError(
+            "evaluator 'simd' needs llvmlite: pip install llvmlite, or use 'casadi'"
+        )
     return "casadi" if choice == "casadi" or not has_llvm else "simd"
 
 
@@ -98,7 +109,9 @@ def _requested_evaluator(choice: str) -> str:
     if choice == "auto":
         choice = os.environ.get("COLLOCATION_SYSID_EVALUATOR", "auto")
     if choice not in EVALUATORS:
-        raise InputError(f"no evaluator {choice!r}; available: {', '.join(EVALUATORS)}")
+        raise InputError(
+            f"no evaluator {choice!r}; available: {', '.join(EVALUATORS)}"
+        )
     return choice
 
 
@@ -123,7 +136,9 @@ def make_evaluator(batch: KernelBatch, name: str) -> Evaluator:
         return SimdEvaluator(batch)
     except RuntimeError as error:  # what llvmlite raises
         kernel = batch.kernel.pieces.name()
-        raise VectorCodeError(f"LLVM cannot compile the {kernel} kernel ({error})") from error
+        raise VectorCodeError(
+            f"LLVM cannot compile the {kernel} kernel ({error})"
+        ) from error
 
 
 class EvaluatorChoice:
@@ -185,7 +200,9 @@ class EvaluatorChoice:
         name.
         """
         if not self._may_yield:
-            message = f"{error.message}; choose evaluator='casadi' for this material"
+            message = (
+                f"{error.message}; choose evaluator='casadi' for this material"
+            )
             raise VectorCodeError(message) from error
         self.name = "casadi"
         self.notes += (

@@ -33,7 +33,10 @@ def make_casadi_instance_evaluator(function: ca.Function) -> Instances:
     def evaluate(inputs: list[Array]) -> list[Array]:
         count = inputs[0].shape[1]
         arguments = [np.ascontiguousarray(each.T, float) for each in inputs]
-        outputs = [np.empty((count, function.nnz_out(k))) for k in range(function.n_out())]
+        outputs = [
+            np.empty((count, function.nnz_out(k)))
+            for k in range(function.n_out())
+        ]
         for first in range(0, count, BLOCK):
             block = slice(first, min(count, first + BLOCK))
             size = block.stop - first
@@ -72,7 +75,9 @@ def compile_instance_evaluator(function: ca.Function) -> Instances:
     arrays = function.n_in() + function.n_out()
     key = f"instances {lanes} {hashlib.sha256(function.serialize().encode()).hexdigest()}"
     signature = (ctypes.c_int64, *[ctypes.c_void_p] * arrays)
-    run = compile_function(NativeCode("instances", key, signature, lambda: _emit(function, lanes)))
+    run = compile_function(
+        NativeCode("instances", key, signature, lambda: _emit(function, lanes))
+    )
 
     def evaluate(inputs: list[Array]) -> list[Array]:
         count = inputs[0].shape[1]
@@ -82,7 +87,10 @@ def compile_instance_evaluator(function: ca.Function) -> Instances:
             instance_indices = np.minimum(np.arange(padded_count), count - 1)
             inputs = [each[:, instance_indices] for each in inputs]
         arguments = [np.ascontiguousarray(each, float) for each in inputs]
-        outputs = [np.empty((function.nnz_out(k), padded_count)) for k in range(function.n_out())]
+        outputs = [
+            np.empty((function.nnz_out(k), padded_count))
+            for k in range(function.n_out())
+        ]
         run(padded_count, *map(address, [*arguments, *outputs]))
         return [each[:, :count] for each in outputs]
 
@@ -111,7 +119,9 @@ def _emit(function: ca.Function, lanes: int) -> Any:
         first = b.mul(block, I64(lanes))
 
         def pointer(array: int, entry: int) -> Value:
-            place = b.gep(places[array], [b.add(b.mul(I64(entry), count), first)])
+            place = b.gep(
+                places[array], [b.add(b.mul(I64(entry), count), first)]
+            )
             return b.bitcast(place, vector.as_pointer())
 
         def read(array: int, entry: int) -> Value:

@@ -65,7 +65,9 @@ class SkylineFactorisation:
         Shape of a side.
     """
 
-    def __init__(self, size: int, rows: Index, columns: Index, source: Index) -> None:
+    def __init__(
+        self, size: int, rows: Index, columns: Index, source: Index
+    ) -> None:
         low = np.minimum(rows, columns)
         high = np.maximum(rows, columns)
         reach = np.arange(size)
@@ -86,7 +88,9 @@ class SkylineFactorisation:
         self._signs = np.where(rows < columns, -1.0, 1.0)[order]
         (self._reached,) = _addresses(self._reach)
         self._fixed = _addresses(self._source, self._places, self._signs)
-        self._kernels = {k: (_compile("fill", k), _compile("factorise", k)) for k in (1, 2)}
+        self._kernels = {
+            k: (_compile("fill", k), _compile("factorise", k)) for k in (1, 2)
+        }
         self._solve = _compile("solve", 1)
 
     def allocate(self, sides: int) -> FactorMemory:
@@ -100,7 +104,9 @@ class SkylineFactorisation:
             np.zeros((2, size + width)),
         )
 
-    def factorise(self, room: FactorMemory, symmetric: Array, skew: Array) -> tuple[Array, Array]:
+    def factorise(
+        self, room: FactorMemory, symmetric: Array, skew: Array
+    ) -> tuple[Array, Array]:
         """Compute L and U without their unit diagonals in the given memory.
 
         For a symmetric matrix only L.
@@ -125,7 +131,10 @@ class SkylineFactorisation:
         room.sides[:count].fill(0)
         room.results.fill(0)
         fill, factorise = self._kernels[count]
-        parts = [np.ascontiguousarray(part, dtype=float) for part in (symmetric, skew)]
+        parts = [
+            np.ascontiguousarray(part, dtype=float)
+            for part in (symmetric, skew)
+        ]
         ends = room.ends[:1] * 2 if count == 1 else room.ends
         fill(len(self._source), *self._fixed, *_addresses(*parts), *ends)
         factorise(size, width, self._reached, *ends, *room.results_at)
@@ -135,7 +144,9 @@ class SkylineFactorisation:
                 growth = growth / symmetric[self._diagonal]
         return pivots, growth
 
-    def solve(self, first: Array, pivots: Array, second: Array, right: Array) -> Array:
+    def solve(
+        self, first: Array, pivots: Array, second: Array, right: Array
+    ) -> Array:
         """Return the solutions of L D Uᵀ x = b for the rows b of `right`, (columns, n).
 
         Parameters
@@ -181,13 +192,17 @@ def _addresses(*arrays: NDArray[Any]) -> list[int]:
 
 def _compile(name: str, sides: int) -> CompiledFunction:
     """Return one of the compiled functions "fill", "factorise" and "solve"."""
-    emit: Callable[[_SkylineEmitter], ir.Module] = getattr(_SkylineEmitter, name)
+    emit: Callable[[_SkylineEmitter], ir.Module] = getattr(
+        _SkylineEmitter, name
+    )
     integers, *arrays = ARGUMENTS[name]
     lanes = vector_lanes()
     signature = (*[ctypes.c_int64] * integers, *[ctypes.c_void_p] * sum(arrays))
     key = f"skyline {name} {sides} {lanes}"
     return compile_function(
-        NativeCode(name, key, signature, lambda: emit(_SkylineEmitter(lanes, sides)))
+        NativeCode(
+            name, key, signature, lambda: emit(_SkylineEmitter(lanes, sides))
+        )
     )
 
 
@@ -211,8 +226,12 @@ class _SkylineEmitter:
     def _begin(self, name: str) -> Sequence[Value]:
         """Begin a function, and return its arguments."""
         integers, maps, arrays = ARGUMENTS[name]
-        kinds = [I64] * integers + [I64.as_pointer()] * maps + [DOUBLES] * arrays
-        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), kinds), name)
+        kinds = (
+            [I64] * integers + [I64.as_pointer()] * maps + [DOUBLES] * arrays
+        )
+        function = ir.Function(
+            self.module, ir.FunctionType(ir.VoidType(), kinds), name
+        )
         self.b: Builder = ir.IRBuilder(function.append_basic_block("entry"))
         return function.args
 
@@ -220,10 +239,14 @@ class _SkylineEmitter:
         """Return the module of ``fill(entries, source, places, signs, symmetric, skew, lower,
         upper)``.
         """
-        count, source, places, signs, symmetric, skew, lower, upper = self._begin("fill")
+        count, source, places, signs, symmetric, skew, lower, upper = (
+            self._begin("fill")
+        )
         b = self.b
         with for_range(b, I64(0), count, "entry") as k:
-            origin, place = (b.load(b.gep(array, [k])) for array in (source, places))
+            origin, place = (
+                b.load(b.gep(array, [k])) for array in (source, places)
+            )
             value = b.load(b.gep(symmetric, [origin]))
             if self.count == 1:
                 b.store(value, b.gep(lower, [place]))
@@ -238,10 +261,14 @@ class _SkylineEmitter:
 
     def factorise(self) -> Any:
         """Return the module of ``factorise(n, width, reach, lower, upper, pivots, growth)``."""
-        size, self.width, self.reach, *sides, self.pivots, self.growth = self._begin("factorise")
+        size, self.width, self.reach, *sides, self.pivots, self.growth = (
+            self._begin("factorise")
+        )
         self.sides = sides[: self.count]
         kind = ir.FunctionType(self.vector, [self.vector])
-        self.absolute = ir.Function(self.module, kind, f"llvm.fabs.v{self.lanes}f64")
+        self.absolute = ir.Function(
+            self.module, kind, f"llvm.fabs.v{self.lanes}f64"
+        )
         b = self.b
         groups = b.sdiv(size, I64(PIVOTS))
         with for_range(b, I64(0), groups, "group") as group:
@@ -272,12 +299,16 @@ class _SkylineEmitter:
         diagonal = b.load(self._entry(self.sides[0], pivot, pivot))
         b.store(diagonal, b.gep(self.pivots, [pivot]))
         inverse = self._splat(b.fdiv(DOUBLE(1.0), diagonal))
-        lanes = ir.Constant(ir.VectorType(I64, self.lanes), list(range(self.lanes)))
+        lanes = ir.Constant(
+            ir.VectorType(I64, self.lanes), list(range(self.lanes))
+        )
         with self._vectors(pivot, last) as start:
             after = b.icmp_signed(">", lanes, self._splat(b.sub(pivot, start)))
             places = [self._entry(side, pivot, start) for side in self.sides]
             nothing = ir.Constant(self.vector, [0.0] * self.lanes)
-            values = [b.select(after, self._load(place), nothing) for place in places]
+            values = [
+                b.select(after, self._load(place), nothing) for place in places
+            ]
             scaled = [b.fmul(value, inverse) for value in values]
             for place, value in zip(places, scaled, strict=True):
                 self._store(value, place)
@@ -286,7 +317,9 @@ class _SkylineEmitter:
                 change = b.call(self.absolute, [b.fmul(values[0], scaled[1])])
                 self._store(b.fadd(self._load(grown), change), grown)
 
-    def _subtract(self, pivots: Sequence[Value], row: Value, last: Value) -> None:
+    def _subtract(
+        self, pivots: Sequence[Value], row: Value, last: Value
+    ) -> None:
         """Subtract the contribution of pivots from a row of either side, up to the position
         `last`.
         """
@@ -294,15 +327,22 @@ class _SkylineEmitter:
         scales = []
         for pivot in pivots:
             diagonal = b.load(b.gep(self.pivots, [pivot]))
-            row_entries = [b.load(self._entry(side, pivot, row)) for side in reversed(self.sides)]
-            scales.append([self._splat(b.fmul(diagonal, value)) for value in row_entries])
+            row_entries = [
+                b.load(self._entry(side, pivot, row))
+                for side in reversed(self.sides)
+            ]
+            scales.append(
+                [self._splat(b.fmul(diagonal, value)) for value in row_entries]
+            )
         with self._vectors(row, last) as start:
             for k, side in enumerate(self.sides):
                 target = self._entry(side, row, start)
                 value = self._load(target)
                 for pivot, scale in zip(pivots, scales, strict=True):
                     value = self._multiply_subtract(
-                        value, self._load(self._entry(side, pivot, start)), scale[k]
+                        value,
+                        self._load(self._entry(side, pivot, start)),
+                        scale[k],
                     )
                 self._store(value, target)
 
@@ -310,10 +350,22 @@ class _SkylineEmitter:
         """Return the module of ``solve(n, width, columns, stride, reach, first, second, pivots,
         rows)``.
         """
-        size, self.width, columns, stride, reach, first, second, pivots, rows = self._begin("solve")
+        (
+            size,
+            self.width,
+            columns,
+            stride,
+            reach,
+            first,
+            second,
+            pivots,
+            rows,
+        ) = self._begin("solve")
         b = self.b
         kind = ir.FunctionType(DOUBLE, [DOUBLE, self.vector])
-        total = ir.Function(self.module, kind, f"llvm.vector.reduce.fadd.v{self.lanes}f64")
+        total = ir.Function(
+            self.module, kind, f"llvm.vector.reduce.fadd.v{self.lanes}f64"
+        )
         dot = b.alloca(self.vector)
         with for_range(b, I64(0), size, "forward") as k:
             last = b.load(b.gep(reach, [k]))
@@ -324,7 +376,9 @@ class _SkylineEmitter:
                     place = b.gep(right, [start])
                     factor = self._entry(first, k, start)
                     self._store(
-                        self._multiply_subtract(self._load(place), self._load(factor), loaded),
+                        self._multiply_subtract(
+                            self._load(place), self._load(factor), loaded
+                        ),
                         place,
                     )
         with for_range(b, I64(0), size, "backward") as done:
@@ -345,7 +399,10 @@ class _SkylineEmitter:
                     )
                 solution = b.gep(right, [k])
                 scaled = b.fdiv(b.load(solution), diagonal)
-                b.store(b.call(total, [scaled, b.load(dot)], fastmath=("reassoc",)), solution)
+                b.store(
+                    b.call(total, [scaled, b.load(dot)], fastmath=("reassoc",)),
+                    solution,
+                )
         b.ret_void()
         return self.module
 
@@ -367,11 +424,15 @@ class _SkylineEmitter:
 
     def _load(self, place: Value) -> Value:
         """Load a vector from a pointer."""
-        return self.b.load(self.b.bitcast(place, self.vector.as_pointer()), align=8)
+        return self.b.load(
+            self.b.bitcast(place, self.vector.as_pointer()), align=8
+        )
 
     def _store(self, value: Value, place: Value) -> None:
         """Store a vector at a pointer."""
-        self.b.store(value, self.b.bitcast(place, self.vector.as_pointer()), align=8)
+        self.b.store(
+            value, self.b.bitcast(place, self.vector.as_pointer()), align=8
+        )
 
     def _multiply_subtract(self, value: Value, x: Value, y: Value) -> Value:
         """Return value − x y."""
@@ -379,6 +440,10 @@ class _SkylineEmitter:
 
     def _splat(self, value: Value) -> Value:
         """Return a vector of equal numbers."""
-        nothing = ir.Constant(ir.VectorType(value.type, self.lanes), ir.Undefined)
+        nothing = ir.Constant(
+            ir.VectorType(value.type, self.lanes), ir.Undefined
+        )
         zeros = ir.Constant(ir.VectorType(I32, self.lanes), [0] * self.lanes)
-        return self.b.shuffle_vector(self.b.insert_element(nothing, value, I32(0)), nothing, zeros)
+        return self.b.shuffle_vector(
+            self.b.insert_element(nothing, value, I32(0)), nothing, zeros
+        )

@@ -44,7 +44,9 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads)
 
 
-def run_in_slices(run: Callable[[int, int], None], count: int, threads: int) -> None:
+def run_in_slices(
+    run: Callable[[int, int], None], count: int, threads: int
+) -> None:
     """Call ``run(start, stop)`` on consecutive slices of ``range(count)``, one per thread, and wait
     for all.
 
@@ -70,7 +72,9 @@ def run_in_slices(run: Callable[[int, int], None], count: int, threads: int) -> 
         other.result()
 
 
-def map_experiments(run: Callable[[T], R], items: Sequence[T], threads: int) -> list[R]:
+def map_experiments(
+    run: Callable[[T], R], items: Sequence[T], threads: int
+) -> list[R]:
     """Return ``run(item)`` of every item, in their order.
 
     Each item runs on one thread, see `concurrent_count`.
@@ -93,7 +97,13 @@ def map_experiments(run: Callable[[T], R], items: Sequence[T], threads: int) -> 
 
     with ThreadPoolExecutor(count) as pool:
         try:
-            return list(pool.map(lambda context, item: context.run(passed, item), contexts, items))
+            return list(
+                pool.map(
+                    lambda context, item: context.run(passed, item),
+                    contexts,
+                    items,
+                )
+            )
         except BaseException:
             stop.set()  # only the main thread hears of Ctrl-C, and it waits for the others
             raise

@@ -76,7 +76,10 @@ class CasadiSolver(Options):
     casadi: Mapping[str, Any] = field(default_factory=dict)
 
     def __call__(
-        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
+        self,
+        collocation: Collocation,
+        watch: Watch | None = None,
+        start: Array | None = None,
     ) -> Solution:
         """Solve the NLP, see `Method`.
 
@@ -104,10 +107,15 @@ class CasadiSolver(Options):
         """Return the options of the plugin with its cache of functions; options of the user
         (`casadi`) replace those of the method, and mappings are merged.
         """
-        cache = {n: functions.function(n, *o.split()) for n, o in self.functions.items()}
+        cache = {
+            n: functions.function(n, *o.split())
+            for n, o in self.functions.items()
+        }
         settings = {"cache": cache, **self._plugin_settings()}
         for name, value in self.casadi.items():
-            are_mappings = isinstance(value, Mapping) and isinstance(settings.get(name), Mapping)
+            are_mappings = isinstance(value, Mapping) and isinstance(
+                settings.get(name), Mapping
+            )
             settings[name] = settings[name] | value if are_mappings else value
         return settings
 
@@ -182,7 +190,9 @@ class Sleqp(CasadiSolver):
 
 PLUGINS = {kind.name.removeprefix(PREFIX): kind for kind in (SqpMethod, Sleqp)}
 
-_LIBRARY = "it needs a library, and usually a licence, that are not part of CasADi"
+_LIBRARY = (
+    "it needs a library, and usually a licence, that are not part of CasADi"
+)
 REFUSED: dict[str, str] = {
     "ipopt": 'its own method is "interior-point"',
     "alpaqa": "it derives an augmented Lagrangian from expressions, and the NLP has only callbacks",
@@ -197,7 +207,9 @@ REFUSED: dict[str, str] = {
     "bonmin": 'without integers it is IPOPT, whose method is "interior-point"; its progress '
     "cannot be shown, and it cannot be interrupted",
     "ampl": "it starts an external AMPL solver, which does not support callbacks",
-    **dict.fromkeys(("ccopt", "conopt", "knitro", "madnlp", "snopt", "worhp"), _LIBRARY),
+    **dict.fromkeys(
+        ("ccopt", "conopt", "knitro", "madnlp", "snopt", "worhp"), _LIBRARY
+    ),
 }
 
 
@@ -217,7 +229,9 @@ def refusal_reason(name: str) -> str | None:
     return f"found {name!r}, which CasADi does not have; {hint}expected one of {offered}"
 
 
-def _judge(collocation: Collocation, status: Status, z: Array, multipliers: Array) -> Status:
+def _judge(
+    collocation: Collocation, status: Status, z: Array, multipliers: Array
+) -> Status:
     """Return the status of a solution after a check of its constraints and optimality: a converged
     one that violates constraints is infeasible, and one that stalled is acceptable if it is nearly
     optimal.
@@ -231,12 +245,16 @@ def _judge(collocation: Collocation, status: Status, z: Array, multipliers: Arra
     return status
 
 
-def _hessian_values(collocation: Collocation, hessian: Hessian) -> HessianValues:
+def _hessian_values(
+    collocation: Collocation, hessian: Hessian
+) -> HessianValues:
     """Return the function that writes the Hessian's values at z to its last argument, in place; the
     multipliers are used only if `hessian` is "exact".
     """
 
     def values(z: Array, weight: float, multipliers: Array, out: Array) -> None:
-        collocation.hessian_values(z, weight, multipliers if hessian == "exact" else None, out)
+        collocation.hessian_values(
+            z, weight, multipliers if hessian == "exact" else None, out
+        )
 
     return values

@@ -59,7 +59,9 @@ class CgDescentOptions:
     max_trials: int = 60
 
 
-Ending = Literal["converged", "iteration-limit", "stopped", "line-search", "not-finite"]
+Ending = Literal[
+    "converged", "iteration-limit", "stopped", "line-search", "not-finite"
+]
 
 # First step size over the size of the start (ψ0).
 FIRST = 0.01
@@ -176,7 +178,12 @@ def minimise_cg_descent(
     def result(ending: Ending, iterations: int) -> CgResult:
         """Return the last iterate as the result."""
         return CgResult(
-            x, f, gradient=g, iterations=iterations, evaluations=counted.evaluations, ending=ending
+            x,
+            f,
+            gradient=g,
+            iterations=iterations,
+            evaluations=counted.evaluations,
+            ending=ending,
         )
 
     if not (np.isfinite(f) and np.isfinite(g).all()):
@@ -204,9 +211,13 @@ def minimise_cg_descent(
             options=options,
         )
         trial = line.search(
-            _initial_step(x, f, g) if k == 0 else _initial_step_after(line, step, change)
+            _initial_step(x, f, g)
+            if k == 0
+            else _initial_step_after(line, step, change)
         )
-        if trial is None and line.slope > -float(g @ g) * (1 - 1e-12):  # once down the gradient
+        if trial is None and line.slope > -float(g @ g) * (
+            1 - 1e-12
+        ):  # once down the gradient
             d = -g
             line = _LineSearch(
                 counted,
@@ -233,7 +244,13 @@ def minimise_cg_descent(
         last_direction = d
         d = _next_direction(d, before, g=g, y=y, truncation=options.truncation)
         state = CgState(
-            k + 1, x, value=f, gradient=g, direction=last_direction, slope=slope, step=step
+            k + 1,
+            x,
+            value=f,
+            gradient=g,
+            direction=last_direction,
+            slope=slope,
+            step=step,
         )
         if callback is not None and callback(state):
             return result("stopped", k + 1)
@@ -242,7 +259,9 @@ def minimise_cg_descent(
     return result("iteration-limit", options.max_iterations)
 
 
-def _next_direction(d: Array, previous: Array, g: Array, y: Array, truncation: float) -> Array:
+def _next_direction(
+    d: Array, previous: Array, g: Array, y: Array, truncation: float
+) -> Array:
     """Return the next direction of descent (n,); the steepest descent after a step without positive
     curvature.
 
@@ -261,7 +280,9 @@ def _next_direction(d: Array, previous: Array, g: Array, y: Array, truncation: f
     if curvature <= 0:
         return -g
     beta = float((y - 2 * d * (float(y @ y) / curvature)) @ g) / curvature
-    size = float(np.linalg.norm(d)) * min(truncation, float(np.linalg.norm(previous)))
+    size = float(np.linalg.norm(d)) * min(
+        truncation, float(np.linalg.norm(previous))
+    )
     return -g + max(beta, -1 / size) * d
 
 
@@ -301,7 +322,9 @@ class _CountedFunction:
     """Function with a count of the evaluations of its gradient."""
 
     def __init__(
-        self, fun_and_grad: ValueAndGradient, value: Callable[[Array], float] | None
+        self,
+        fun_and_grad: ValueAndGradient,
+        value: Callable[[Array], float] | None,
     ) -> None:
         self._fun_and_grad = fun_and_grad
         self._value = value
@@ -436,8 +459,12 @@ class _LineSearch:
         self.trials += 1
         value, gradient = self.function(self.x + step * self.direction)
         # Out of the domain the slope is not a number: neither up nor down, and the value is high.
-        slope = float(gradient @ self.direction) if np.isfinite(value) else np.nan
-        trial = _LineTrial(step, value if np.isfinite(slope) else np.inf, slope, gradient)
+        slope = (
+            float(gradient @ self.direction) if np.isfinite(value) else np.nan
+        )
+        trial = _LineTrial(
+            step, value if np.isfinite(slope) else np.inf, slope, gradient
+        )
         if self._satisfies_wolfe(trial):
             raise _TrialAccepted(trial)
         return trial
@@ -448,9 +475,13 @@ class _LineSearch:
         curvature = self.options.curvature
         if not trial.slope >= curvature * self.slope:
             return False
-        if (2 * decrease - 1) * self.slope >= trial.slope and trial.value <= self.limit:
+        if (
+            2 * decrease - 1
+        ) * self.slope >= trial.slope and trial.value <= self.limit:
             return True
-        is_decreased = trial.value - self.value <= decrease * trial.step * self.slope
+        is_decreased = (
+            trial.value - self.value <= decrease * trial.step * self.slope
+        )
         return is_decreased and not self.approximate
 
     def _bracket(self, step: float) -> tuple[_LineTrial, _LineTrial]:
@@ -467,7 +498,9 @@ class _LineSearch:
             low = trial
             step = EXPANSION * step
 
-    def _update(self, a: _LineTrial, b: _LineTrial, step: float) -> tuple[_LineTrial, _LineTrial]:
+    def _update(
+        self, a: _LineTrial, b: _LineTrial, step: float
+    ) -> tuple[_LineTrial, _LineTrial]:
         """Return an interval within (a, b) with the trial at `step` as one of its ends, rules U0 …
         U3; (a, b) itself if `step` is outside.
 
@@ -482,7 +515,9 @@ class _LineSearch:
             return trial, b
         return self._cut(a, trial)
 
-    def _cut(self, a: _LineTrial, b: _LineTrial) -> tuple[_LineTrial, _LineTrial]:
+    def _cut(
+        self, a: _LineTrial, b: _LineTrial
+    ) -> tuple[_LineTrial, _LineTrial]:
         """Return an interval with an ascending end within (a, b), from a low descending point a and
         a high one b, rule U3. See `_try` for the exceptions.
         """
@@ -495,7 +530,9 @@ class _LineSearch:
             else:
                 b = trial
 
-    def _double_secant(self, a: _LineTrial, b: _LineTrial) -> tuple[_LineTrial, _LineTrial]:
+    def _double_secant(
+        self, a: _LineTrial, b: _LineTrial
+    ) -> tuple[_LineTrial, _LineTrial]:
         """Return an interval within (a, b) after two secant steps, rules S1 … S4. See `_try` for
         the exceptions.
         """

@@ -18,7 +18,9 @@ from scipy.optimize import minimize as scipy_minimise
 from ...array_types import Array
 from .cg_descent import CgDescentOptions
 from .cg_descent import minimise_cg_descent as cg_descent
-from .levenberg_marquardt import minimise_levenberg_marquardt as levenberg_marquardt
+from .levenberg_marquardt import (
+    minimise_levenberg_marquardt as levenberg_marquardt,
+)
 from .merit import MeritFunction
 
 Report = Callable[[Array, float, Array], None]
@@ -66,7 +68,11 @@ def minimise_merit(
     """
     if inner == "levenberg-marquardt":
         return levenberg_marquardt(
-            merit, z, tolerance=tolerance, max_iterations=max_iterations, report=report
+            merit,
+            z,
+            tolerance=tolerance,
+            max_iterations=max_iterations,
+            report=report,
         )
     scaled = _ScaledMerit(merit, z, smooth=inner != "l-bfgs-b")
     follow = _ConvergenceCheck(scaled, tolerance, report)
@@ -108,7 +114,9 @@ def minimise_merit(
 class _ConvergenceCheck:
     """Callback that reports iterates of the scaled problem and checks convergence."""
 
-    def __init__(self, scaled: _ScaledMerit, tolerance: float, report: Report) -> None:
+    def __init__(
+        self, scaled: _ScaledMerit, tolerance: float, report: Report
+    ) -> None:
         self.scaled = scaled
         self.tolerance = tolerance
         self.report = report
@@ -122,7 +130,9 @@ class _ConvergenceCheck:
         self.scaled.replacement_value = STEEP * abs(value) + 1e-300
         projected = self.scaled.project_gradient(s, z, gradient)
         self.report(z, value, projected)
-        self.converged = bool(np.abs(projected).max(initial=0.0) <= self.tolerance)
+        self.converged = bool(
+            np.abs(projected).max(initial=0.0) <= self.tolerance
+        )
         return self.converged
 
 
@@ -145,14 +155,23 @@ class _ScaledMerit:
         problem = merit.problem
         self.free = np.flatnonzero(problem.is_free)
         _, jacobian = problem.constraints_and_jacobian(z)
-        loss = problem.nlp.hessian(z, 1.0, np.zeros(problem.nlp.constraint_count)).diagonal()
+        loss = problem.nlp.hessian(
+            z, 1.0, np.zeros(problem.nlp.constraint_count)
+        ).diagonal()
         diagonal = loss + merit.rho * (jacobian.power(2).sum(axis=0))
         diagonal = diagonal[self.free]
         self.unit = 1 / np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max()))
         lower = problem.lower[self.free]
         upper = problem.upper[self.free]
-        self.bounds = Bounds((lower - z[self.free]) / self.unit, (upper - z[self.free]) / self.unit)
-        self.mapped = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper)) if smooth else []
+        self.bounds = Bounds(
+            (lower - z[self.free]) / self.unit,
+            (upper - z[self.free]) / self.unit,
+        )
+        self.mapped = (
+            np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
+            if smooth
+            else []
+        )
         at = z[self.free][self.mapped]
         low = np.maximum(lower[self.mapped], at - LEAST_CONTACT_DISTANCE)
         high = np.minimum(upper[self.mapped], at + LEAST_CONTACT_DISTANCE)
@@ -171,13 +190,17 @@ class _ScaledMerit:
         """
         z = self.z.copy()
         free_values = z[self.free] + self.unit * s
-        free_values[self.mapped] = self.middle + self.half * np.sin(self._angles(s))
+        free_values[self.mapped] = self.middle + self.half * np.sin(
+            self._angles(s)
+        )
         z[self.free] = free_values
         return z
 
     def _angles(self, s: Array) -> Array:
         """Return the angles of the sine map at s."""
-        return self.angle + (self.unit * s)[self.mapped] / (self.half * np.cos(self.angle))
+        return self.angle + (self.unit * s)[self.mapped] / (
+            self.half * np.cos(self.angle)
+        )
 
     def _slopes(self, s: Array) -> Array:
         """Return the derivatives (free,) of the free variables by unit · s: those of the sine map
@@ -211,7 +234,9 @@ class _ScaledMerit:
         """
         value, gradient = self.value_and_gradient(s)
         return (
-            (value, gradient) if np.isfinite(value) else (self.replacement_value, np.zeros(len(s)))
+            (value, gradient)
+            if np.isfinite(value)
+            else (self.replacement_value, np.zeros(len(s)))
         )
 
     def project_gradient(self, s: Array, z: Array, gradient: Array) -> Array:

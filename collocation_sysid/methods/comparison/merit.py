@@ -47,7 +47,9 @@ class PenaltyProblem:
         Stopwatch that measures evaluations.
     """
 
-    def __init__(self, collocation: Collocation, stopwatch: Stopwatch | None = None) -> None:
+    def __init__(
+        self, collocation: Collocation, stopwatch: Stopwatch | None = None
+    ) -> None:
         self.original = collocation
         self.stopwatch = stopwatch or Stopwatch()
         with self.stopwatch.building():
@@ -61,7 +63,9 @@ class PenaltyProblem:
             indptr, indices = self.nlp.jacobian_structure
             shape = (self.nlp.constraint_count, self.nlp.variable_count)
             self._entries = np.zeros(len(indices))
-            self._jacobian = sp.csc_array((self._entries, indices, indptr), shape=shape)
+            self._jacobian = sp.csc_array(
+                (self._entries, indices, indptr), shape=shape
+            )
         self.evaluations = 0
         self.lower, self.upper = self.nlp.bounds()
         self.is_free = self.lower != self.upper
@@ -122,18 +126,24 @@ class PenaltyProblem:
         prescribed = self.nlp.pack(self.nlp.parameters_from(z), positions)
         prescribed[~self.is_free] = z[~self.is_free]
         return convert_variables(
-            prescribed if self.has_valid_elements(prescribed) else z, self.nlp, self.original
+            prescribed if self.has_valid_elements(prescribed) else z,
+            self.nlp,
+            self.original,
         )
 
     def to_original_multipliers(self, multipliers: Array) -> Array:
         """Return multipliers of the given problem from those of all constraints (constraints,)."""
-        pairs = zip(self.original.transcriptions, self.nlp.transcriptions, strict=True)
+        pairs = zip(
+            self.original.transcriptions, self.nlp.transcriptions, strict=True
+        )
         rows = ((block, s, multipliers[s.rows]) for block, s in pairs)
         return np.concatenate(
             [
                 each
                 if values.constraints_per_time == s.constraints_per_time
-                else each.reshape(-1, s.dof_count)[:, values.constrained_dofs].ravel()
+                else each.reshape(-1, s.dof_count)[
+                    :, values.constrained_dofs
+                ].ravel()
                 for values, s, each in rows
             ]
         )
@@ -171,13 +181,17 @@ class MeritFunction:
         if not self.problem.has_valid_elements(z):
             return np.inf, np.full(len(z), np.nan)
         rows, jacobian = self.problem.constraints_and_jacobian(z)
-        return self.value_from_constraints(z, rows), self.gradient(z, rows, jacobian)
+        return self.value_from_constraints(z, rows), self.gradient(
+            z, rows, jacobian
+        )
 
     def gradient(self, z: Array, rows: Array, jacobian: sp.csc_array) -> Array:
         """Return ∇m (variables,) from the constraints g (`rows`) and their Jacobian at z, zero for
         constant variables.
         """
-        slope = self.problem.nlp.gradient(z) + jacobian.T @ self.multiplier_estimate(rows)
+        slope = self.problem.nlp.gradient(
+            z
+        ) + jacobian.T @ self.multiplier_estimate(rows)
         return np.where(self.problem.is_free, slope, 0.0)
 
     def multiplier_estimate(self, rows: Array) -> Array:

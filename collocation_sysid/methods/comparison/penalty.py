@@ -141,10 +141,15 @@ class PenaltyOptions(Options):
         super().__post_init__()
         if self.last_rho < self.rho:
             finding = f"found {self.rho_max:g} with rho = {self.rho:g}"
-            raise InputError(f"{finding}; expected no less than rho", None, "rho_max")
+            raise InputError(
+                f"{finding}; expected no less than rho", None, "rho_max"
+            )
 
     def __call__(
-        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
+        self,
+        collocation: Collocation,
+        watch: Watch | None = None,
+        start: Array | None = None,
     ) -> Solution:
         """Solve the NLP, see `Method`; entries of the history count inner iterations.
 
@@ -156,7 +161,11 @@ class PenaltyOptions(Options):
         InputError
             For a start with inverted elements.
         """
-        climb = _PenaltySolve(self, Recorder(self.name, collocation, watch, self.max_time_s), start)
+        climb = _PenaltySolve(
+            self,
+            Recorder(self.name, collocation, watch, self.max_time_s),
+            start,
+        )
         status, why = climb.recorder.run_search(climb.run)
         return climb.solution(status, why)
 
@@ -170,7 +179,9 @@ class PenaltyOptions(Options):
         """Tolerance of the first stage."""
         return self.tolerance
 
-    def next_stage(self, stage: Stage, previous_violation: ConstraintViolation, z: Array) -> Stage:
+    def next_stage(
+        self, stage: Stage, previous_violation: ConstraintViolation, z: Array
+    ) -> Stage:
         """Return the next stage.
 
         Parameters
@@ -214,7 +225,9 @@ class Penalty(PenaltyOptions):
         """Largest ρ of the solve."""
         return self.rho if self.schedule == "constant" else self.rho_max
 
-    def next_stage(self, stage: Stage, before: ConstraintViolation, z: Array) -> Stage:
+    def next_stage(
+        self, stage: Stage, before: ConstraintViolation, z: Array
+    ) -> Stage:
         """Return the next stage, with a larger ρ if the schedule says so; see
         `PenaltyOptions.next_stage` for the arguments.
 
@@ -225,7 +238,8 @@ class Penalty(PenaltyOptions):
         """
         rho = stage.merit.rho
         is_increase_due = (
-            self.schedule != "progress" or stage.violation.relative > FALL * before.relative
+            self.schedule != "progress"
+            or stage.violation.relative > FALL * before.relative
         )
         if is_increase_due and rho >= self.last_rho:
             if stage.is_minimum:
@@ -255,7 +269,9 @@ class AugmentedLagrangian(PenaltyOptions):
         """Tolerance of the first stage."""
         return max(FIRST_GRADIENT, self.tolerance)
 
-    def next_stage(self, stage: Stage, before: ConstraintViolation, z: Array) -> Stage:
+    def next_stage(
+        self, stage: Stage, before: ConstraintViolation, z: Array
+    ) -> Stage:
         """Return the next stage with updated multipliers, and a larger ρ if much violation remains;
         see `PenaltyOptions.next_stage` for the arguments.
 
@@ -269,7 +285,11 @@ class AugmentedLagrangian(PenaltyOptions):
         slack = stage.violation
         is_feasible = slack.relative <= self.violation
         is_last = rho >= self.rho_max or is_feasible
-        if is_last and tolerance <= self.tolerance and slack.scaled > STUCK * before.scaled:
+        if (
+            is_last
+            and tolerance <= self.tolerance
+            and slack.scaled > STUCK * before.scaled
+        ):
             if stage.is_minimum:
                 raise SearchEnded(
                     Status.STALLED,
@@ -284,8 +304,15 @@ class AugmentedLagrangian(PenaltyOptions):
         if not is_feasible and slack.scaled > FALL * before.scaled:
             rho = min(self.rho_factor * rho, self.rho_max)
         rows = stage.merit.problem.constraint_values(z)
-        merit = replace(stage.merit, rho=rho, multipliers=stage.merit.multiplier_estimate(rows))
-        return Stage(merit, max(0.0 if is_feasible else TIGHTER * tolerance, self.tolerance))
+        merit = replace(
+            stage.merit,
+            rho=rho,
+            multipliers=stage.merit.multiplier_estimate(rows),
+        )
+        return Stage(
+            merit,
+            max(0.0 if is_feasible else TIGHTER * tolerance, self.tolerance),
+        )
 
 
 class _PenaltySolve:
@@ -293,7 +320,9 @@ class _PenaltySolve:
     and counts.
     """
 
-    def __init__(self, options: PenaltyOptions, recorder: Recorder, start: Array | None) -> None:
+    def __init__(
+        self, options: PenaltyOptions, recorder: Recorder, start: Array | None
+    ) -> None:
         self.options = options
         self.recorder = recorder
         self.problem = PenaltyProblem(recorder.collocation, recorder.stopwatch)
@@ -301,7 +330,9 @@ class _PenaltySolve:
         began = self.problem.from_original(recorder.initial_variables(start))
         self.variables = np.clip(began, self.problem.lower, self.problem.upper)
         if not self.problem.has_valid_elements(self.variables):
-            raise InputError("elements are inverted at the initial point; start from another guess")
+            raise InputError(
+                "elements are inverted at the initial point; start from another guess"
+            )
         no_weights = np.zeros(nlp.constraint_count)
         merit = MeritFunction(self.problem, options.rho, no_weights)
         self.stage = Stage(merit, options.first_gradient)
@@ -309,7 +340,9 @@ class _PenaltySolve:
         self.gradient = np.inf
         curvature = nlp.hessian(self.variables, 1.0, no_weights).diagonal()
         self._curvature = float(curvature.max(initial=0.0))
-        self._every = EVERY_OF_FIRST_ORDER if options.inner in FIRST_ORDER else EVERY
+        self._every = (
+            EVERY_OF_FIRST_ORDER if options.inner in FIRST_ORDER else EVERY
+        )
 
     def run(self) -> tuple[Status, str]:
         """Solve one stage after the other; return status and message.
@@ -329,7 +362,9 @@ class _PenaltySolve:
                 and is_feasible
                 and ended_stage.tolerance <= options.tolerance
             ):
-                message = "Converged: gradient and slack are within their tolerances."
+                message = (
+                    "Converged: gradient and slack are within their tolerances."
+                )
                 return Status.CONVERGED, message
             self.stage = options.next_stage(ended_stage, before, self.variables)
             before = ended_stage.violation
@@ -337,7 +372,9 @@ class _PenaltySolve:
     def solution(self, status: Status, reason: str) -> Solution:
         """Return the last iterate as a solution of the given problem."""
         merit = self.stage.merit
-        estimate = merit.multiplier_estimate(self.problem.constraint_values(self.variables))
+        estimate = merit.multiplier_estimate(
+            self.problem.constraint_values(self.variables)
+        )
         return self.recorder.solution(
             status,
             f"{reason} Remaining violation of the equations of motion at ρ = {merit.rho:.3g}: "
@@ -362,7 +399,9 @@ class _PenaltySolve:
         stage = self.stage
         options = self.options
         recorder = self.recorder
-        tolerance = max(stage.tolerance, ROUNDING * (stage.merit.rho + self._curvature))
+        tolerance = max(
+            stage.tolerance, ROUNDING * (stage.merit.rho + self._curvature)
+        )
         before = self.iterations
         done = 0
 
@@ -376,7 +415,10 @@ class _PenaltySolve:
                 self._record()
             if recorder.is_late:
                 raise SearchEnded(Status.TIME_LIMIT)
-            if self.iterations >= options.max_iterations and self.gradient > tolerance:
+            if (
+                self.iterations >= options.max_iterations
+                and self.gradient > tolerance
+            ):
                 raise SearchEnded(Status.ITERATION_LIMIT)
             done += 1
 
@@ -392,14 +434,19 @@ class _PenaltySolve:
         if recorder.history[-1].number < self.iterations:
             self._record()
         return replace(
-            stage, gradient=self.gradient, is_minimum=reached, violation=self._violation()
+            stage,
+            gradient=self.gradient,
+            is_minimum=reached,
+            violation=self._violation(),
         )
 
     def _record(self) -> None:
         """Add the last iterate to the history, as variables of the given problem with its loss."""
         nlp = self.problem.original
         z = self.problem.to_original(self.variables)
-        self.recorder.add_variables(self.iterations, z, nlp.objective(z) / nlp.loss_scale)
+        self.recorder.add_variables(
+            self.iterations, z, nlp.objective(z) / nlp.loss_scale
+        )
 
     def _violation(self) -> ConstraintViolation:
         """Return the violation at the last iterate, with grasped nodes at their prescribed
@@ -407,7 +454,11 @@ class _PenaltySolve:
         """
         nlp = self.problem.original
         z = self.problem.to_original(self.variables)
-        newtons = max(float(np.abs(r).max(initial=0.0)) for r in nlp.residuals_n(z))
+        newtons = max(
+            float(np.abs(r).max(initial=0.0)) for r in nlp.residuals_n(z)
+        )
         rows = self.problem.constraint_values(self.variables)
         scaled = float(np.abs(rows).max(initial=0.0))
-        return ConstraintViolation(newtons, newtons / max(nlp.largest_force_n(z), 1e-300), scaled)
+        return ConstraintViolation(
+            newtons, newtons / max(nlp.largest_force_n(z), 1e-300), scaled
+        )

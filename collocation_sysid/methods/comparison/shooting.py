@@ -68,7 +68,10 @@ class Shooting(Options):
     max_time_s: Positive = 1e6
 
     def __call__(
-        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
+        self,
+        collocation: Collocation,
+        watch: Watch | None = None,
+        start: Array | None = None,
     ) -> Solution:
         """Solve the NLP, see `Method`; entries of the history are simulations better than all
         before.
@@ -89,7 +92,9 @@ class Shooting(Options):
             multipliers = None
         if best is not None and search.failures:
             failed = f"{search.failures} of {shots} simulations failed"
-            recorder.notes.append(f"{failed}; each time the search continued with a shorter step")
+            recorder.notes.append(
+                f"{failed}; each time the search continued with a shorter step"
+            )
         return recorder.solution(status, message, z, multipliers, shots, shots)
 
 
@@ -110,7 +115,9 @@ def simulate_variables(
     SimulationError
         If a simulation fails; it names the time step.
     """
-    positions, failure = simulate_trajectories(collocation, p, stopwatch=stopwatch)
+    positions, failure = simulate_trajectories(
+        collocation, p, stopwatch=stopwatch
+    )
     if failure is not None:
         raise failure
     return collocation.pack(p, positions)
@@ -172,20 +179,30 @@ class _ShootingSearch:
         Linearised problem; None with adjoint gradients.
     """
 
-    def __init__(self, options: Shooting, recorder: Recorder, start: Array | None) -> None:
+    def __init__(
+        self, options: Shooting, recorder: Recorder, start: Array | None
+    ) -> None:
         self.options = options
         self.recorder = recorder
         self.collocation = collocation = recorder.collocation
         self.lower, self.upper = collocation.parameter_bounds
-        first = collocation.guess_p if start is None else collocation.parameters_from(start)
+        first = (
+            collocation.guess_p
+            if start is None
+            else collocation.parameters_from(start)
+        )
         self.first = np.clip(first, self.lower, self.upper)
         self.simulations = self.failures = 0
         self.last: _SimulatedPoint | None = None
         self.best: _SimulatedPoint | None = None
         self.horizon = None
         if options.gradient == "forward":
-            rows = [segment.grid_times for segment in collocation.transcriptions]
-            self.horizon = Horizon(collocation, rows, stopwatch=recorder.stopwatch)
+            rows = [
+                segment.grid_times for segment in collocation.transcriptions
+            ]
+            self.horizon = Horizon(
+                collocation, rows, stopwatch=recorder.stopwatch
+            )
 
     def run(self) -> tuple[Status, str]:
         """Search, and return the status and a sentence with SciPy's message.
@@ -217,7 +234,9 @@ class _ShootingSearch:
             ftol=ROUNDING,
             gtol=self.options.tolerance,
         )
-        status = Status.ITERATION_LIMIT if result.status == 0 else Status.CONVERGED
+        status = (
+            Status.ITERATION_LIMIT if result.status == 0 else Status.CONVERGED
+        )
         return status, f"{status.sentence} (SciPy: {result.message})"
 
     def _residual(self, step: Array) -> Array:
@@ -226,7 +245,11 @@ class _ShootingSearch:
         """
         shot = self._try(self.first + step)
         assert self.best is not None
-        return np.full(len(self.best.residual), np.inf) if shot is None else shot.residual
+        return (
+            np.full(len(self.best.residual), np.inf)
+            if shot is None
+            else shot.residual
+        )
 
     def _residual_slope(self, step: Array) -> Array:
         """Return the derivatives of the residuals after a step from the first parameters."""
@@ -246,7 +269,8 @@ class _ShootingSearch:
                 "gtol": self.options.tolerance,
                 "ftol": ROUNDING,
                 "maxcor": MEMORY,
-                "maxiter": 10 * self.options.max_iterations + 10,  # shots are counted here
+                "maxiter": 10 * self.options.max_iterations
+                + 10,  # shots are counted here
                 "maxfun": 10 * self.options.max_iterations + 10,
             },
         )
@@ -323,12 +347,20 @@ class _ShootingSearch:
             point = self.horizon.evaluate(p, collocation.unpack(z)[1])
             value = point.loss * collocation.loss_scale
             shot = _SimulatedPoint(
-                p.copy(), z, objective=value, residual=point.fit.residual, slope=point.fit.jacobian
+                p.copy(),
+                z,
+                objective=value,
+                residual=point.fit.residual,
+                slope=point.fit.jacobian,
             )
         else:
             slope = adjoint_gradient(collocation, z, self.recorder.stopwatch)
             shot = _SimulatedPoint(
-                p.copy(), z, objective=collocation.objective(z), residual=np.zeros(0), slope=slope
+                p.copy(),
+                z,
+                objective=collocation.objective(z),
+                residual=np.zeros(0),
+                slope=slope,
             )
         if self.best is None or shot.objective < self.best.objective:
             self.best = shot

@@ -18,7 +18,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from ...fem.constants import is_field_coefficient
 from ...problem.recording_schema import MovedSection
 from ...problem.schema import ProblemFile, with_experiment_defaults
-from ...recording import PoseSequence, write_markers_csv, write_poses_csv, write_wrench_csv
+from ...recording import (
+    PoseSequence,
+    write_markers_csv,
+    write_poses_csv,
+    write_wrench_csv,
+)
 from ...result.animation import film
 from ...result.pictures.album import save_pictures
 from ...result.replay import MotionRecord
@@ -50,7 +55,15 @@ OF_MARKERS = (
     "max_template_residual_m",
 )
 # Whose texts are files, wherever they stand.
-OF_FILES = ("mesh", "surface", "file", "poses", "displacement", "tension", "pressure")
+OF_FILES = (
+    "mesh",
+    "surface",
+    "file",
+    "poses",
+    "displacement",
+    "tension",
+    "pressure",
+)
 OF_TABLE = ("columns", "axis", "sign", "area_m2", "symmetry")
 OF_TIME = ("window_s", "resample_hz", "every", "validation")
 HEAD = """\
@@ -61,7 +74,10 @@ HEAD = """\
 
 
 def write_design(
-    design: Design, folder: str | Path, with_film: bool = True, say: Callable[[str], None] = print
+    design: Design,
+    folder: str | Path,
+    with_film: bool = True,
+    say: Callable[[str], None] = print,
 ) -> Path:
     """Write the folder of a design atomically, and return its path.
 
@@ -82,23 +98,43 @@ def write_design(
         If the folder contains anything but an earlier design.
     """
     target = Path(folder)
-    with replaced_folder(target, marker_file=DESIGN_FILE, content_word="design") as place:
+    with replaced_folder(
+        target, marker_file=DESIGN_FILE, content_word="design"
+    ) as place:
         write_poses_csv(place / POSES_FILE, _gripper_poses(design))
         experiment = design.experiment
         markers = experiment.markers
-        write_markers_csv(place / MARKERS_FILE, markers.t_s, markers.names, markers.positions_m)
-        for sensor, wrench in zip(experiment.wrenches, design.predicted.wrenches, strict=True):
+        write_markers_csv(
+            place / MARKERS_FILE,
+            markers.t_s,
+            markers.names,
+            markers.positions_m,
+        )
+        for sensor, wrench in zip(
+            experiment.wrenches, design.predicted.wrenches, strict=True
+        ):
             write_wrench_csv(place / WRENCH_FILE, sensor.t_s, wrench)
         if design.recording.problem.origin is not None:
-            text = HEAD + tomli_w.dumps(_problem_content(design, target.resolve()))
+            text = HEAD + tomli_w.dumps(
+                _problem_content(design, target.resolve())
+            )
             (place / PROBLEM_FILE).write_text(text, encoding="utf-8")
         save_pictures(place, design_figures(design))
         if with_film:
             say("rendering the film of the motion")
             shapes_m = design.predicted.positions_m
-            replay = MotionRecord.from_experiment(experiment, (shapes_m, markers.positions_m))
-            film(replay, place / FILM_FILE, FRAMES_PER_SECOND, names=("predicted", ""))
-        (place / DESIGN_FILE).write_text(as_json(design_json(design)), encoding="utf-8")
+            replay = MotionRecord.from_experiment(
+                experiment, (shapes_m, markers.positions_m)
+            )
+            film(
+                replay,
+                place / FILM_FILE,
+                FRAMES_PER_SECOND,
+                names=("predicted", ""),
+            )
+        (place / DESIGN_FILE).write_text(
+            as_json(design_json(design)), encoding="utf-8"
+        )
     return target
 
 
@@ -119,7 +155,9 @@ def design_json(design: Design) -> dict[str, Any]:
             "relative_error": design.minimised_error,
         },
         "recordings_count": design.added,
-        "before": None if design.before is None else _error_bars_json(design.before),
+        "before": None
+        if design.before is None
+        else _error_bars_json(design.before),
         "after": _error_bars_json(design.after),
         "limits": {
             name: {"limit": getattr(limits, name), "share_used": share}
@@ -129,7 +167,9 @@ def design_json(design: Design) -> dict[str, Any]:
         "search": {
             "evaluations": len(search.history),
             "interrupted": search.is_interrupted,
-            "history": [float(np.exp(min(value, 100.0))) for value in search.history],
+            "history": [
+                float(np.exp(min(value, 100.0))) for value in search.history
+            ],
         },
         "motion": content(design.motion),
     }
@@ -164,7 +204,9 @@ def _gripper_poses(design: Design) -> PoseSequence:
     if (transform := section.grasp_list[0].gripper_to_body) is None:
         return design.poses
     rotation = Rotation.from_quat(transform.quaternion_xyzw)
-    body_in_gripper = RigidTransform.from_components(transform.position_m, rotation)
+    body_in_gripper = RigidTransform.from_components(
+        transform.position_m, rotation
+    )
     return design.poses.after(body_in_gripper.inv().as_matrix())
 
 
@@ -179,14 +221,23 @@ def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
     problem_table.pop("experiment_defaults", None)
     old_folder = origin.path.resolve().parent
     for key in ("object", "experiment"):
-        problem_table[key] = _relative_to(problem_table[key], old_folder, folder)
+        problem_table[key] = _relative_to(
+            problem_table[key], old_folder, folder
+        )
     tables = problem_table["experiment"]
     names = [each.get("name") for each in tables]
     new = deepcopy(tables[names.index(recording.template.name)])
     used_names = {*names} if design.added else set()
-    candidate_names = (f"{NAME}_{k}" if k > 1 else NAME for k in range(1, len(names) + 2))
-    new["name"] = next(name for name in candidate_names if name not in used_names)
-    problem_table["experiment"] = [*(tables if design.added else []), _designed_table(new)]
+    candidate_names = (
+        f"{NAME}_{k}" if k > 1 else NAME for k in range(1, len(names) + 2)
+    )
+    new["name"] = next(
+        name for name in candidate_names if name not in used_names
+    )
+    problem_table["experiment"] = [
+        *(tables if design.added else []),
+        _designed_table(new),
+    ]
     for item in recording.problem.parameters.free:
         if is_field_coefficient(item.name):
             continue
@@ -204,7 +255,11 @@ def _designed_table(table: dict[str, Any]) -> dict[str, Any]:
     """
     for key in OF_TIME:
         table.pop(key, None)
-    grasp = table["grasp"][0] if isinstance(table["grasp"], list) else table["grasp"]
+    grasp = (
+        table["grasp"][0]
+        if isinstance(table["grasp"], list)
+        else table["grasp"]
+    )
     for key in OF_POSES:
         grasp.pop(key, None)
     grasp["poses"] = POSES_FILE
@@ -222,8 +277,14 @@ def _designed_wrench(wrench: dict[str, Any]) -> dict[str, Any]:
     modelled part of the body.
     """
     parts = wrench.get("symmetry", 1)
-    sigmas = {key: wrench[key] / parts for key in ("sigma_n", "sigma_nm") if key in wrench}
-    remaining = {key: value for key, value in wrench.items() if key not in OF_TABLE}
+    sigmas = {
+        key: wrench[key] / parts
+        for key in ("sigma_n", "sigma_nm")
+        if key in wrench
+    }
+    remaining = {
+        key: value for key, value in wrench.items() if key not in OF_TABLE
+    }
     return remaining | sigmas | {"file": WRENCH_FILE}
 
 

@@ -36,7 +36,8 @@ class CameraSection(Section):
         description="A point [x, y, z] that appears in the middle of its image."
     )
     field_of_view_deg: Positive = Field(
-        lt=180, description="Full angle of the cone of view: that of the image's shorter side."
+        lt=180,
+        description="Full angle of the cone of view: that of the image's shorter side.",
     )
 
     @model_validator(mode="after")
@@ -58,12 +59,17 @@ class Limits(Section):
         "hand may be, in the world frame of the poses."
     )
     speed_m_s: Positive = Field(description="Largest speed of the hand.")
-    acceleration_m_s2: Positive = Field(description="Largest acceleration of the hand.")
+    acceleration_m_s2: Positive = Field(
+        description="Largest acceleration of the hand."
+    )
     rotation_deg: Positive = Field(
-        lt=180, description="Largest angle between its orientation and that of the start."
+        lt=180,
+        description="Largest angle between its orientation and that of the start.",
     )
     angular_speed_deg_s: Positive = Field(description="Largest angular speed.")
-    angular_acceleration_deg_s2: Positive = Field(description="Largest angular acceleration.")
+    angular_acceleration_deg_s2: Positive = Field(
+        description="Largest angular acceleration."
+    )
     frequency_hz: Positive | None = Field(
         None,
         description="Largest frequency in the motion; a tenth of the sampling rate by default.",
@@ -85,7 +91,10 @@ class Limits(Section):
         """Raise `ValueError` for corners in the wrong order, or too few cameras."""
         for key in ("workspace_m", "markers_box_m"):
             corners = getattr(self, key)
-            if corners is not None and not (np.array(corners[0]) < corners[1]).all():
+            if (
+                corners is not None
+                and not (np.array(corners[0]) < corners[1]).all()
+            ):
                 raise ValueError(f"{key} has the corners {list(map(list, corners))}; expected the "
                                  "lower one first, below the other along every axis")  # fmt: skip
         if self.camera and self.cameras_per_marker > len(self.camera):
@@ -142,10 +151,15 @@ class Limits(Section):
         worst = 0.0
         if self.markers_box_m is not None:
             low, high = (np.array(corner) for corner in self.markers_box_m)
-            beyond = np.maximum(low - markers_m, markers_m - high).max(initial=0.0)
+            beyond = np.maximum(low - markers_m, markers_m - high).max(
+                initial=0.0
+            )
             worst = float(beyond / np.linalg.norm(high - low))
         if self.camera and markers_m.size:
-            beyond = np.sort([_beyond_cone(camera, markers_m) for camera in self.camera], axis=0)
+            beyond = np.sort(
+                [_beyond_cone(camera, markers_m) for camera in self.camera],
+                axis=0,
+            )
             worst = max(worst, float(beyond[self.cameras_per_marker - 1].max()))
         return worst
 
@@ -157,8 +171,15 @@ def _beyond_cone(camera: CameraSection, points_m: Array) -> Array:
     position_m = np.array(camera.position_m)
     ray = points_m - position_m
     axis = np.array(camera.looks_at_m) - position_m
-    cosine = ray @ axis / (np.linalg.norm(ray, axis=-1) * np.linalg.norm(axis) + 1e-300)
-    return np.arccos(np.clip(cosine, -1.0, 1.0)) - np.radians(camera.field_of_view_deg) / 2
+    cosine = (
+        ray
+        @ axis
+        / (np.linalg.norm(ray, axis=-1) * np.linalg.norm(axis) + 1e-300)
+    )
+    return (
+        np.arccos(np.clip(cosine, -1.0, 1.0))
+        - np.radians(camera.field_of_view_deg) / 2
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +216,9 @@ class HandBounds:
     def shares(self, motion: HandMotion) -> dict[str, float]:
         """Return the largest values of a motion as shares of the limits, by name of the limit."""
         course = motion.derivatives(motion.grid_s)
-        return self._translation_shares(*course) | self._rotation_shares(*course)
+        return self._translation_shares(*course) | self._rotation_shares(
+            *course
+        )
 
     def _translation_shares(self, *course: Array) -> dict[str, float]:
         """Return the largest translation, speed and acceleration as shares of their limits, by name
@@ -209,9 +232,12 @@ class HandBounds:
         shift, rate, curvature = (each[:, :3] for each in course)
         limits = self.limits
         return {
-            "workspace_m": float(np.maximum(shift / self.low_m, shift / self.high_m).max()),
+            "workspace_m": float(
+                np.maximum(shift / self.low_m, shift / self.high_m).max()
+            ),
             "speed_m_s": _largest_norm(rate) / limits.speed_m_s,
-            "acceleration_m_s2": _largest_norm(curvature) / limits.acceleration_m_s2,
+            "acceleration_m_s2": _largest_norm(curvature)
+            / limits.acceleration_m_s2,
         }
 
     def _rotation_shares(self, *course: Array) -> dict[str, float]:
@@ -225,10 +251,20 @@ class HandBounds:
         """
         turn = course[0][:, 3:]
         limits = self.limits
-        largest = map(_largest_norm, (turn, *angular_motion(*(each[:, 3:] for each in course))))
-        names = "rotation_deg", "angular_speed_deg_s", "angular_acceleration_deg_s2"
+        largest = map(
+            _largest_norm,
+            (turn, *angular_motion(*(each[:, 3:] for each in course))),
+        )
+        names = (
+            "rotation_deg",
+            "angular_speed_deg_s",
+            "angular_acceleration_deg_s2",
+        )
         pairs = zip(names, largest, strict=True)
-        return {name: np.degrees(peak) / getattr(limits, name) for name, peak in pairs}
+        return {
+            name: np.degrees(peak) / getattr(limits, name)
+            for name, peak in pairs
+        }
 
     def scale_to_limits(self, motion: HandMotion) -> HandMotion:
         """Return the motion with translations and rotations reduced so that every limit is
@@ -238,7 +274,9 @@ class HandBounds:
         their scale, those of rotations nearly.
         """
         course = motion.derivatives(motion.grid_s)
-        shift = WITHIN / max(WITHIN, *self._translation_shares(*course).values())
+        shift = WITHIN / max(
+            WITHIN, *self._translation_shares(*course).values()
+        )
         return motion.scaled(shift, self._rotation_scale(course))
 
     def _rotation_scale(self, course: tuple[Array, Array, Array]) -> float:
@@ -247,7 +285,9 @@ class HandBounds:
         """
         scale = 1.0
         while (
-            largest := max(self._rotation_shares(*(scale * c for c in course)).values())
+            largest := max(
+                self._rotation_shares(*(scale * c for c in course)).values()
+            )
         ) > WITHIN:
             scale *= TIGHTER * WITHIN / largest
         return scale

@@ -90,16 +90,25 @@ class HandMotion:
         """
         rise, active = (
             low + (high - low) * _to_unit_interval(u)
-            for (low, high), u in zip((RISE, ACTIVE), coefficients[:OWN], strict=True)
+            for (low, high), u in zip(
+                (RISE, ACTIVE), coefficients[:OWN], strict=True
+            )
         )
         share, first, last, phase = coefficients[OWN:].reshape(PER_WAVE, 6, -1)
-        low, high = np.log([min(FEWEST_PERIODS / duration_s, highest_hz), highest_hz])
+        low, high = np.log(
+            [min(FEWEST_PERIODS / duration_s, highest_hz), highest_hz]
+        )
         first_hz, last_hz = (
-            np.exp(low + (high - low) * _to_unit_interval(u)) for u in (first, last)
+            np.exp(low + (high - low) * _to_unit_interval(u))
+            for u in (first, last)
         )
         angular = 2 * np.pi * np.maximum(first_hz, last_hz)
-        size, rate, rate_of_rate = (np.repeat(each, 3)[:, None] for each in reach)
-        largest_amplitude = np.minimum(size, np.minimum(rate / angular, rate_of_rate / angular**2))
+        size, rate, rate_of_rate = (
+            np.repeat(each, 3)[:, None] for each in reach
+        )
+        largest_amplitude = np.minimum(
+            size, np.minimum(rate / angular, rate_of_rate / angular**2)
+        )
         active_s = float(active * duration_s)
         return cls(
             duration_s,
@@ -116,7 +125,9 @@ class HandMotion:
         """Return the number of coefficients of a motion with `waves` waves per coordinate."""
         return OWN + PER_WAVE * 6 * waves
 
-    def scaled(self, translation: float = 1.0, rotation: float = 1.0) -> HandMotion:
+    def scaled(
+        self, translation: float = 1.0, rotation: float = 1.0
+    ) -> HandMotion:
         """Return the motion with all translations multiplied by `translation` and all rotation
         vectors by `rotation`.
         """
@@ -126,7 +137,9 @@ class HandMotion:
     @cached_property
     def grid_s(self) -> Array:
         """Times [s] that resolve all peaks of the motion."""
-        fastest = max(self.first_hz.max(), self.last_hz.max(), 0.5 / self.rise_s)
+        fastest = max(
+            self.first_hz.max(), self.last_hz.max(), 0.5 / self.rise_s
+        )
         points = FEWEST_POINTS + POINTS_PER_PERIOD * fastest * self.duration_s
         return np.linspace(0.0, self.duration_s, int(points))
 
@@ -136,7 +149,9 @@ class HandMotion:
         window, rate, curvature = self._window(t)
         t = t[:, None, None]
         change = (self.last_hz - self.first_hz) / self.active_s
-        angle = 2 * np.pi * (self.first_hz * t + change * t**2 / 2) + self.phase_rad
+        angle = (
+            2 * np.pi * (self.first_hz * t + change * t**2 / 2) + self.phase_rad
+        )
         angular = 2 * np.pi * (self.first_hz + change * t)
         growth = 2 * np.pi * change
         sine = np.sin(angle)
@@ -144,7 +159,8 @@ class HandMotion:
         first = angular * cosine
         second = growth * cosine - angular**2 * sine
         wave, wave_rate, wave_curvature = (
-            (self.amplitude * each).sum(axis=-1) for each in (sine, first, second)
+            (self.amplitude * each).sum(axis=-1)
+            for each in (sine, first, second)
         )
         return (
             window * wave,
@@ -159,7 +175,9 @@ class HandMotion:
         With u from 0 to 1 it rises as 10 u³ − 15 u⁴ + 6 u⁵, and falls likewise.
         """
         rising = t <= self.active_s / 2
-        u = np.clip(np.where(rising, t, self.active_s - t) / self.rise_s, 0.0, 1.0)
+        u = np.clip(
+            np.where(rising, t, self.active_s - t) / self.rise_s, 0.0, 1.0
+        )
         slope = np.where(rising, 1.0, -1.0) / self.rise_s
         value = u**3 * (10 - 15 * u + 6 * u**2)
         first = 30 * u**2 * (1 - u) ** 2 * slope
@@ -167,19 +185,29 @@ class HandMotion:
         return value[:, None], first[:, None], second[:, None]
 
 
-def angular_motion(r: Array, rate: Array, curvature: Array) -> tuple[Array, Array]:
+def angular_motion(
+    r: Array, rate: Array, curvature: Array
+) -> tuple[Array, Array]:
     """Return angular velocity [rad/s] and acceleration [rad/s²] (T, 3), in the fixed frame, of the
     rotation exp(r), from the rotation vector r (T, 3) and its first two derivatives.
     """
     angle = np.linalg.norm(r, axis=1)
-    a, b, a_slope, b_slope = (each[:, None] for each in _jacobian_factors(angle))
+    a, b, a_slope, b_slope = (
+        each[:, None] for each in _jacobian_factors(angle)
+    )
     projection = np.einsum("ti,ti->t", r, rate)[:, None]
     across = np.cross(r, rate)
     double_cross = np.cross(r, across)
     drive = np.cross(r, curvature)
     velocity = rate + a * across + b * double_cross
-    acceleration = curvature + a * drive + b * (np.cross(rate, across) + np.cross(r, drive))
-    return velocity, acceleration + projection * (a_slope * across + b_slope * double_cross)
+    acceleration = (
+        curvature
+        + a * drive
+        + b * (np.cross(rate, across) + np.cross(r, drive))
+    )
+    return velocity, acceleration + projection * (
+        a_slope * across + b_slope * double_cross
+    )
 
 
 def _jacobian_factors(angle: Array) -> tuple[Array, Array, Array, Array]:
@@ -205,7 +233,9 @@ def _jacobian_factors(angle: Array) -> tuple[Array, Array, Array, Array]:
         -1 / 12 + square / 180,
         -1 / 60 + square / 1260,
     )
-    return tuple(np.where(small, s, e) for s, e in zip(series, exact, strict=True))  # type: ignore[return-value]
+    return tuple(
+        np.where(small, s, e) for s, e in zip(series, exact, strict=True)
+    )  # type: ignore[return-value]
 
 
 def _to_unit_interval(u: Array | float) -> Array:

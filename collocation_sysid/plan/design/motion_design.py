@@ -101,7 +101,10 @@ class ErrorBars:
         all draws.
         """
         each = [error.relative for error in errors]
-        lowest, highest = ({n: pick(e[n] for e in each) for n in each[0]} for pick in (min, max))
+        lowest, highest = (
+            {n: pick(e[n] for e in each) for n in each[0]}
+            for pick in (min, max)
+        )
         return cls(errors[0].values, each[0], lowest, highest)
 
 
@@ -254,7 +257,9 @@ class MotionObjective:
             return self.criterion.log_size(self.errors(information, middle))
 
         size = HandMotion.coefficient_count(options.waves)
-        return minimise(value, size, evaluations=count, seed=options.seed, watch=report)
+        return minimise(
+            value, size, evaluations=count, seed=options.seed, watch=report
+        )
 
     def value(self, coefficients: Array, bound: float) -> float:
         """Return the logarithm of the error bar of a motion; `FORBIDDEN` or more if a simulation
@@ -270,17 +275,23 @@ class MotionObjective:
         bound : float
             Bound beyond which the value need not be exact.
         """
-        experiment = self.recording.experiment(self.recording.poses(self.motion(coefficients)))
+        experiment = self.recording.experiment(
+            self.recording.poses(self.motion(coefficients))
+        )
         sizes = []
         for q in self.draws:
             try:
                 result = self.recording.simulate_motion(experiment, q)
             except SimulationError as failure:
-                simulated_share = (failure.time_s - experiment.t_s[0]) / experiment.duration_s
+                simulated_share = (
+                    failure.time_s - experiment.t_s[0]
+                ) / experiment.duration_s
                 return FORBIDDEN * (3 - min(1.0, simulated_share))
             if (excess := self.limits.out_of_view(result.markers_m)) > 0:
                 return FORBIDDEN * (1 + excess / (1 + excess))
-            sizes.append(self.criterion.log_size(self.errors(result.information, q)))
+            sizes.append(
+                self.criterion.log_size(self.errors(result.information, q))
+            )
             if len(sizes) == 1 and sizes[0] > bound:
                 break
         return self.criterion.combine_draws(sizes)
@@ -334,22 +345,34 @@ def design_motion(
     """
     if not 0 < duration_s < np.inf:
         raise InputError(
-            f"found {duration_s:g}; expected a number of seconds above 0", None, "--duration"
+            f"found {duration_s:g}; expected a number of seconds above 0",
+            None,
+            "--duration",
         )
-    recording = FutureRecording(problem, _select_experiment(problem, experiment), duration_s)
+    recording = FutureRecording(
+        problem, _select_experiment(problem, experiment), duration_s
+    )
     recording.bounds(limits)
     recording.highest_hz(limits)
     if not problem.parameters.free:
-        raise InputError("every parameter is fixed; expected one to estimate", problem.path)
+        raise InputError(
+            "every parameter is fixed; expected one to estimate", problem.path
+        )
     if add:
         say("identifying the parameters from the existing recordings")
         draws, known = _draws_from_recordings(problem, options)
     else:
         _require_guesses(problem)
-        draws = prior_draws(problem.parameters, options.spread, options.pairs, options.seed)
+        draws = prior_draws(
+            problem.parameters, options.spread, options.pairs, options.seed
+        )
         known = np.zeros((len(draws[0]),) * 2)
     judge = MotionObjective(
-        recording, limits, criterion=criterion, draws=draws, known_information=known
+        recording,
+        limits,
+        criterion=criterion,
+        draws=draws,
+        known_information=known,
     )
     criterion.require_known(judge.errors(0.0, draws[0]))
     first = judge.first_guess(options, say)
@@ -370,7 +393,9 @@ def design_motion(
     return _evaluate_design(judge, best, add)
 
 
-def _evaluate_design(judge: MotionObjective, best: SearchResult, add: bool) -> Design:
+def _evaluate_design(
+    judge: MotionObjective, best: SearchResult, add: bool
+) -> Design:
     """Return the design with the best motion, its error bars and its simulation; `best` must have
     coefficients.
     """
@@ -382,7 +407,9 @@ def _evaluate_design(judge: MotionObjective, best: SearchResult, add: bool) -> D
     after = _error_bars(judge, results)
     problem = recording.problem
     values = problem.parameters.values(judge.draws[0])
-    predicted = simulate(experiment, values, problem.scheme, substeps=problem.first_substeps)
+    predicted = simulate(
+        experiment, values, problem.scheme, substeps=problem.first_substeps
+    )
     return Design(
         recording,
         motion,
@@ -412,21 +439,29 @@ def _before(judge: MotionObjective, add: bool) -> ErrorBars | None:
         return None
     shipped = replace(recording, duration_s=template.duration_s)
     try:
-        simulations = [shipped.simulate_motion(template, q) for q in judge.draws]
+        simulations = [
+            shipped.simulate_motion(template, q) for q in judge.draws
+        ]
     except SimulationError:
         return None
     return _error_bars(judge, simulations)
 
 
-def _error_bars(judge: MotionObjective, results: list[SimulatedMotion]) -> ErrorBars:
+def _error_bars(
+    judge: MotionObjective, results: list[SimulatedMotion]
+) -> ErrorBars:
     """Return the error bars of a motion, together with existing recordings and priors, from its
     information at all draws of q.
     """
     pairs = zip(results, judge.draws, strict=True)
-    return ErrorBars.from_draws([judge.errors(each.information, q) for each, q in pairs])
+    return ErrorBars.from_draws(
+        [judge.errors(each.information, q) for each, q in pairs]
+    )
 
 
-def _draws_from_recordings(problem: Problem, options: DesignOptions) -> tuple[list[Array], Array]:
+def _draws_from_recordings(
+    problem: Problem, options: DesignOptions
+) -> tuple[list[Array], Array]:
     """Solve the existing recordings; return draws (nq,) of the parameters q around the estimate,
     the estimate first, and the information (nq, nq) of the recordings.
 
@@ -451,14 +486,20 @@ def _draws_from_recordings(problem: Problem, options: DesignOptions) -> tuple[li
         )
     known = shared_information(linearise_fit(solution.collocation, solution.z))
     constants = ThetaMap(problem.parameters, problem.experiments[0].body)
-    errors = PredictedErrors.from_information(known, problem.parameters, constants, solution.q)
+    errors = PredictedErrors.from_information(
+        known, problem.parameters, constants, solution.q
+    )
     # Where they tell next to nothing of a parameter, as far about the answer as about a guess.
     largest_deviation = np.log(options.spread)
     deviations = np.sqrt(np.diag(errors.covariance))
     factors = np.minimum(1.0, largest_deviation / deviations)
     root = factors[:, None] * np.linalg.cholesky(errors.covariance)
     return symmetric_draws(
-        problem.parameters, solution.q, root=root, pairs=options.pairs, seed=options.seed
+        problem.parameters,
+        solution.q,
+        root=root,
+        pairs=options.pairs,
+        seed=options.seed,
     ), known
 
 
@@ -466,7 +507,9 @@ def _select_experiment(problem: Problem, name: str | None) -> Experiment:
     """Return the experiment with a name, or the first that is not static for None."""
     moving = [each for each in problem.experiments if not each.is_static]
     if not moving:
-        raise InputError("every experiment is static; expected one that moves", problem.path)
+        raise InputError(
+            "every experiment is static; expected one that moves", problem.path
+        )
     if name is None:
         return moving[0]
     named = {each.name: each for each in moving}

@@ -85,9 +85,15 @@ class DesignCriterion:
         slopes = errors.slopes_of(self.names)
         covariance = slopes @ errors.covariance @ slopes.T
         if self.kind == "D":
-            return float(np.linalg.slogdet(covariance)[1]) / (2 * len(covariance))
+            return float(np.linalg.slogdet(covariance)[1]) / (
+                2 * len(covariance)
+            )
         variances = np.diag(covariance)
-        return 0.5 * float(np.log(variances.max() if self.kind == "worst" else variances.mean()))
+        return 0.5 * float(
+            np.log(
+                variances.max() if self.kind == "worst" else variances.mean()
+            )
+        )
 
     def combine_draws(self, sizes: Sequence[float]) -> float:
         """Return the mean, or the largest value if `over` is "worst", of those at several draws of
@@ -134,7 +140,11 @@ class PredictedErrors:
 
     @classmethod
     def from_information(
-        cls, information: Array, parameters: Parameters, constants: ThetaMap, q: Array
+        cls,
+        information: Array,
+        parameters: Parameters,
+        constants: ThetaMap,
+        q: Array,
     ) -> PredictedErrors:
         """Return the errors from the information (nq, nq) of all recordings and the priors of q.
 
@@ -153,21 +163,31 @@ class PredictedErrors:
             Parameters in the solver's coordinates.
         """
         sizes = relative_derivatives(parameters, q)
-        prior = parameters.prior_residuals(q)[1] ** 2 + (sizes / UNDETERMINED) ** 2
+        prior = (
+            parameters.prior_residuals(q)[1] ** 2 + (sizes / UNDETERMINED) ** 2
+        )
         units = 1 / np.sqrt(np.diag(information) + prior)
         scaled = units[:, None] * (information + np.diag(prior)) * units
         covariance = units[:, None] * np.linalg.inv(scaled) * units
         values = dict[str, float]()
         slopes = dict[str, Array]()
-        for item, c, slope in zip(parameters.free, q, np.diag(sizes), strict=True):
+        for item, c, slope in zip(
+            parameters.free, q, np.diag(sizes), strict=True
+        ):
             if not is_field_coefficient(item.name):
                 values[item.name] = item.from_coordinate(float(c))
                 slopes[item.name] = slope
         estimated_count = len(values)
         derived = DerivedModuli.from_bodies([constants], q)
-        varying = {name: by_q for name, by_q in derived.derivatives.items() if by_q.any()}
+        varying = {
+            name: by_q
+            for name, by_q in derived.derivatives.items()
+            if by_q.any()
+        }
         values |= {name: derived.values[name] for name in varying}
-        slopes |= {name: by_q / derived.values[name] for name, by_q in varying.items()}
+        slopes |= {
+            name: by_q / derived.values[name] for name, by_q in varying.items()
+        }
         return cls(covariance, values, slopes, estimated_count)
 
     def slopes_of(self, names: Sequence[str]) -> Array:
@@ -186,7 +206,9 @@ class PredictedErrors:
         }
 
 
-def prior_draws(parameters: Parameters, spread: float, pairs: int, seed: int) -> list[Array]:
+def prior_draws(
+    parameters: Parameters, spread: float, pairs: int, seed: int
+) -> list[Array]:
     """Return draws (nq,) of q: the middle, followed by pairs on either side of it.
 
     A parameter with a prior is drawn from it. Others are drawn around their guess: logarithms with
@@ -194,13 +216,20 @@ def prior_draws(parameters: Parameters, spread: float, pairs: int, seed: int) ->
     """
     middle = parameters.guess_q.copy()
     deviation = np.array(
-        [np.log(spread) if item.scale == "log" else spread - 1 for item in parameters.free]
+        [
+            np.log(spread) if item.scale == "log" else spread - 1
+            for item in parameters.free
+        ]
     )
     for k, item in enumerate(parameters.free):
         if item.prior is not None:
             middle[k] = item.to_coordinate(item.prior[0])
-            deviation[k] = item.prior[1] / (1.0 if item.scale == "log" else item.unit)
-    return symmetric_draws(parameters, middle, root=np.diag(deviation), pairs=pairs, seed=seed)
+            deviation[k] = item.prior[1] / (
+                1.0 if item.scale == "log" else item.unit
+            )
+    return symmetric_draws(
+        parameters, middle, root=np.diag(deviation), pairs=pairs, seed=seed
+    )
 
 
 def symmetric_draws(
@@ -226,7 +255,10 @@ def symmetric_draws(
     deviations = [root @ rng.normal(size=len(middle)) for _ in range(pairs)]
     lower, upper = parameters.bounds_q
     margin = 1e-3 * np.minimum(upper - lower, 1.0)
-    draws = [middle, *(middle + sign * way for way in deviations for sign in (1, -1))]
+    draws = [
+        middle,
+        *(middle + sign * way for way in deviations for sign in (1, -1)),
+    ]
     return [np.clip(q, lower + margin, upper - margin) for q in draws]
 
 
@@ -245,7 +277,9 @@ def shared_information(fit: LinearisedFit) -> Array:
     included.
     """
     alone = least_squares_of_fit(fit).marginal(fit.shared_count)
-    return alone.information - np.diag(fit.prior_jacobian[: fit.shared_count] ** 2)
+    return alone.information - np.diag(
+        fit.prior_jacobian[: fit.shared_count] ** 2
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,25 +315,33 @@ class FutureRecording:
     problem: Problem
     template: Experiment
     duration_s: float
-    _starts: dict[bytes, Array] = field(default_factory=dict, init=False, repr=False)
+    _starts: dict[bytes, Array] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     def __post_init__(self) -> None:
         try:
             self._validate()
         except InputError as error:
-            raise error.located(self.problem.path, f"experiment '{self.template.name}'") from error
+            raise error.located(
+                self.problem.path, f"experiment '{self.template.name}'"
+            ) from error
 
     def _validate(self) -> None:
         """Raise `InputError` if a motion cannot be designed for the experiment."""
         template = self.template
         if template.is_static:
-            raise InputError("is static; expected one that moves, to design a motion for")
+            raise InputError(
+                "is static; expected one that moves, to design a motion for"
+            )
         if len(template.grasps) != 1:
             raise InputError(
                 f"has {len(template.grasps)} grasps; expected one, whose motion is designed"
             )
         (grasp,) = template.grasps
-        if grasp.axes != "xyz" or not (np.isinf(grasp.from_s) and np.isinf(grasp.until_s)):
+        if grasp.axes != "xyz" or not (
+            np.isinf(grasp.from_s) and np.isinf(grasp.until_s)
+        ):
             raise InputError(
                 "has a grasp that holds only some axes, or a part of the time; expected one that "
                 "holds throughout"
@@ -319,19 +361,26 @@ class FutureRecording:
     @cached_property
     def since_start_s(self) -> Array:
         """Times (T,) of the samples since the start [s]."""
-        return np.asarray(np.arange(self.samples) * self.template.timestep_s, dtype=np.float64)
+        return np.asarray(
+            np.arange(self.samples) * self.template.timestep_s, dtype=np.float64
+        )
 
     @cached_property
     def start_pose(self) -> tuple[Array, Array]:
         """Rotation (3, 3) and translation (3,) [m] of the first pose."""
-        rotations, translations = self.template.rigid_motion(self.template.t_s[:1])
+        rotations, translations = self.template.rigid_motion(
+            self.template.t_s[:1]
+        )
         return rotations[0], translations[0]
 
     @cached_property
     def hand_m(self) -> Array:
         """Centre (3,) of the grasped nodes in the undeformed body [m]."""
         (grasp,) = self.template.grasps
-        return np.asarray(self.template.body.nodes_m[grasp.nodes].mean(axis=0), dtype=np.float64)
+        return np.asarray(
+            self.template.body.nodes_m[grasp.nodes].mean(axis=0),
+            dtype=np.float64,
+        )
 
     def bounds(self, limits: Limits) -> HandBounds:
         """Return the limits of the hand relative to its initial position."""
@@ -365,17 +414,23 @@ class FutureRecording:
 
     def poses(self, motion: HandMotion) -> PoseSequence:
         """Return the poses of a motion."""
-        return self.poses_from_coordinates(motion.derivatives(self.pose_times_s)[0])
+        return self.poses_from_coordinates(
+            motion.derivatives(self.pose_times_s)[0]
+        )
 
     def poses_from_coordinates(self, coordinates: Array) -> PoseSequence:
         """Return the poses at `pose_times_s` from translation and rotation vector (P, 6) of
         the hand.
         """
         rotation, translation = self.start_pose
-        turned = Rotation.from_rotvec(coordinates[:, 3:]) * Rotation.from_matrix(rotation)
+        turned = Rotation.from_rotvec(
+            coordinates[:, 3:]
+        ) * Rotation.from_matrix(rotation)
         hand = rotation @ self.hand_m + translation + coordinates[:, :3]
         placed = hand - turned.apply(self.hand_m)
-        return PoseSequence(self.pose_times_s + self.template.t_s[0], placed, turned.as_quat())
+        return PoseSequence(
+            self.pose_times_s + self.template.t_s[0], placed, turned.as_quat()
+        )
 
     def experiment(self, poses: PoseSequence) -> Experiment:
         """Return the future experiment with given poses; markers are placeholders at the origin."""
@@ -386,11 +441,17 @@ class FutureRecording:
         return replace(
             template,
             t_s=t_s,
-            grasps=(replace(grasp, poses=poses, wrench=_resampled(grasp.wrench, t_s)),),
+            grasps=(
+                replace(
+                    grasp, poses=poses, wrench=_resampled(grasp.wrench, t_s)
+                ),
+            ),
             markers=replace(template.markers, t_s=t_s, positions_m=nowhere),
         )
 
-    def simulate_motion(self, experiment: Experiment, q: Array) -> SimulatedMotion:
+    def simulate_motion(
+        self, experiment: Experiment, q: Array
+    ) -> SimulatedMotion:
         """Return information and marker positions of an experiment simulated at the parameters q
         (nq,), in the solver's coordinates.
 
@@ -400,18 +461,29 @@ class FutureRecording:
             If the simulation does not reach the end.
         """
         fit, x = self.linearise(experiment, q)
-        positions = x[:: self.problem.first_substeps].reshape(len(experiment.t_s), -1, 3)
+        positions = x[:: self.problem.first_substeps].reshape(
+            len(experiment.t_s), -1, 3
+        )
         return SimulatedMotion(
-            shared_information(fit), experiment.markers.predict_positions(positions)
+            shared_information(fit),
+            experiment.markers.predict_positions(positions),
         )
 
     def program(self, experiment: Experiment) -> Collocation:
         """Return the nonlinear program of one experiment."""
         problem = self.problem
-        fitted = replace(experiment, validation=False) if experiment.validation else experiment
-        return Collocation([fitted], problem.parameters, problem.scheme, problem.first_substeps)
+        fitted = (
+            replace(experiment, validation=False)
+            if experiment.validation
+            else experiment
+        )
+        return Collocation(
+            [fitted], problem.parameters, problem.scheme, problem.first_substeps
+        )
 
-    def linearise(self, experiment: Experiment, q: Array) -> tuple[LinearisedFit, Array]:
+    def linearise(
+        self, experiment: Experiment, q: Array
+    ) -> tuple[LinearisedFit, Array]:
         """Return the linearised fit of an experiment simulated at the parameters q (nq,), and its
         positions (N, 3n) [m] at the time steps.
 
@@ -422,7 +494,9 @@ class FutureRecording:
         """
         alone = self.program(experiment)
         (segment,) = alone.transcriptions
-        known = self._starts.get(q.tobytes())  # every motion starts from the same rest
+        known = self._starts.get(
+            q.tobytes()
+        )  # every motion starts from the same rest
         x, failure = continue_simulation(
             experiment,
             segment.dynamics.with_theta(segment.constants.theta(q)),
@@ -432,7 +506,9 @@ class FutureRecording:
         if failure is not None:
             raise failure
         self._starts[q.tobytes()] = x[:1]
-        return linearise_fit(alone, alone.pack(np.append(q, segment.guess_phi), [x])), x
+        return linearise_fit(
+            alone, alone.pack(np.append(q, segment.guess_phi), [x])
+        ), x
 
 
 def _resampled(wrench: Wrench | None, t_s: Array) -> Wrench | None:
@@ -444,7 +520,9 @@ def _resampled(wrench: Wrench | None, t_s: Array) -> Wrench | None:
     rate_hz = (len(wrench.t_s) - 1) / max(np.ptp(wrench.t_s), 1e-300)
     count = max(3, 1 + int(np.ptp(t_s) * rate_hz + 1e-6))
     times = t_s[0] + np.arange(count) / rate_hz
-    values = np.tile(np.where(wrench.measured_components, 0.0, np.nan), (count, 1))
+    values = np.tile(
+        np.where(wrench.measured_components, 0.0, np.nan), (count, 1)
+    )
     return replace(wrench, t_s=times, values=values)
 
 
@@ -482,10 +560,18 @@ class LinearRecording:
         """Return the memory of the responses [GB]."""
         (segment,) = recording.program(recording.template).transcriptions
         markers = 3 * len(recording.template.markers.names)
-        return 6 * 16e-9 * recording.samples * markers * len(segment.parameter_indices)
+        return (
+            6
+            * 16e-9
+            * recording.samples
+            * markers
+            * len(segment.parameter_indices)
+        )
 
     @classmethod
-    def from_simulations(cls, recording: FutureRecording, q: Array) -> LinearRecording:
+    def from_simulations(
+        cls, recording: FutureRecording, q: Array
+    ) -> LinearRecording:
         """Return the response at q (nq,), from seven simulations.
 
         Raises
@@ -493,15 +579,17 @@ class LinearRecording:
         SimulationError
             If a simulation does not reach the end.
         """
-        still = recording.linearise(recording.experiment(_pulse_poses(recording, np.zeros(6))), q)[
-            0
-        ]
+        still = recording.linearise(
+            recording.experiment(_pulse_poses(recording, np.zeros(6))), q
+        )[0]
         (at_rest,) = still.blocks
         count = recording.samples
         length = 1 << (2 * count - 1).bit_length()
         answers = []
         for k, height in enumerate(HEIGHTS):
-            pulsed = recording.experiment(_pulse_poses(recording, height * np.eye(6)[k]))
+            pulsed = recording.experiment(
+                _pulse_poses(recording, height * np.eye(6)[k])
+            )
             (block,) = recording.linearise(pulsed, q)[0].blocks
             change = (block.channels[1] - at_rest.channels[1]) / height
             answers.append(np.fft.rfft(change, length, axis=0))
@@ -517,9 +605,13 @@ class LinearRecording:
         of_course = np.fft.rfft(course[CENTRE:], self.length, axis=0)
         transform = np.einsum("fk,kfcp->fcp", of_course, self.responses)
         (rest,) = self.rest.blocks
-        change = np.fft.irfft(transform, self.length, axis=0)[: recording.samples]
+        change = np.fft.irfft(transform, self.length, axis=0)[
+            : recording.samples
+        ]
         slope = rest.jacobian + change.reshape(rest.jacobian.shape)
-        return shared_information(replace(self.rest, blocks=(replace(rest, jacobian=slope),)))
+        return shared_information(
+            replace(self.rest, blocks=(replace(rest, jacobian=slope),))
+        )
 
 
 def _pulse_poses(recording: FutureRecording, heights: Array) -> PoseSequence:

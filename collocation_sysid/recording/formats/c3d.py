@@ -57,19 +57,29 @@ def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
         If ezc3d is not installed, or the file is damaged or inconsistent.
     """
     if find_spec("ezc3d") is None:
-        raise InputError("reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'")
+        raise InputError(
+            "reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'"
+        )
     header_points, header_frames = _header_counts(content)
     try:
-        read = run_isolated(_WORKER, str(Path(path).resolve()), limits=ProcessLimits.for_file(path))
+        read = run_isolated(
+            _WORKER,
+            str(Path(path).resolve()),
+            limits=ProcessLimits.for_file(path),
+        )
     except Failed as error:
-        raise InputError(f"is a damaged C3D file: ezc3d says '{error}'") from error
+        raise InputError(
+            f"is a damaged C3D file: ezc3d says '{error}'"
+        ) from error
     points = read.pop("points")  # (3, points, frames)
     for what, declared, count in (
         ("points", header_points, points.shape[1]),
         ("frames", header_frames, points.shape[2]),
     ):
         if declared is not None and count != declared:
-            raise InputError(f"the header states {declared} {what}, but the file contains {count}")
+            raise InputError(
+                f"the header states {declared} {what}, but the file contains {count}"
+            )
     labels = _labels(read)
     if len(labels) != points.shape[1]:
         raise InputError(

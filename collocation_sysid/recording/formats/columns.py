@@ -73,19 +73,33 @@ DISPLACEMENT = Quantity(
     "weg standardweg traversenweg verformung déplacement",
 )
 FORCE = Quantity("force", "force", "n", "force load kraft standardkraft")
-STRAIN = Quantity("strain", "ratio", "1", "strain dehnung stauchung déformation")
+STRAIN = Quantity(
+    "strain", "ratio", "1", "strain dehnung stauchung déformation"
+)
 STRESS = Quantity("stress", "pressure", "pa", "stress spannung contrainte")
 TENSION = Quantity("tension", "force", "n", "tension")
 PRESSURE = Quantity("pressure", "pressure", "pa", "pressure druck pression")
 _STRETCHES = "stretch lambda λ streckung"
 STRETCH = Quantity("stretch", "ratio", "1", _STRETCHES, unitless=True)
-SECOND_STRETCH = Quantity("second_stretch", "ratio", "1", _STRETCHES, "second", unitless=True)
-LATERAL_STRETCH = Quantity("lateral_stretch", "ratio", "1", _STRETCHES, "lateral", unitless=True)
+SECOND_STRETCH = Quantity(
+    "second_stretch", "ratio", "1", _STRETCHES, "second", unitless=True
+)
+LATERAL_STRETCH = Quantity(
+    "lateral_stretch", "ratio", "1", _STRETCHES, "lateral", unitless=True
+)
 SECOND_STRAIN = Quantity("second_strain", "ratio", "1", STRAIN.words, "second")
-LATERAL_STRAIN = Quantity("lateral_strain", "ratio", "1", STRAIN.words, "lateral")
-VOLUME_RATIO = Quantity("volume_ratio", "ratio", "1", "volumenverhältnis", unitless=True)
-SECOND_STRESS = Quantity("second_stress", "pressure", "pa", STRESS.words, "second")
-TRUE_STRESS = Quantity("true_stress", "pressure", "pa", STRESS.words, "deformed")
+LATERAL_STRAIN = Quantity(
+    "lateral_strain", "ratio", "1", STRAIN.words, "lateral"
+)
+VOLUME_RATIO = Quantity(
+    "volume_ratio", "ratio", "1", "volumenverhältnis", unitless=True
+)
+SECOND_STRESS = Quantity(
+    "second_stress", "pressure", "pa", STRESS.words, "second"
+)
+TRUE_STRESS = Quantity(
+    "true_stress", "pressure", "pa", STRESS.words, "deformed"
+)
 KNOWN_QUANTITIES = (
     *(TIME, *DISPLACEMENTS, *FORCES, *TORQUES),
     *(DISPLACEMENT, FORCE, STRAIN, STRESS, TENSION, PRESSURE),
@@ -163,14 +177,22 @@ def read_columns(
         _require_known_columns(grid, quantities, requires_all)
     places = _find_columns(grid, quantities, column_names or {})
     t = places.pop(TIME.key, None)
-    if len(places) < (len(quantities) if requires_all else 1) or (requires_times and t is None):
+    if len(places) < (len(quantities) if requires_all else 1) or (
+        requires_times and t is None
+    ):
         raise _columns_error(grid, quantities, requires_all)
     values = {}
     for key, (place, factor) in places.items():
         values[key] = factor * numeric_cells(grid, [place], blank_allowed)[:, 0]
         if np.isnan(values[key]).all():
-            raise InputError(f"column {grid.columns[place]} has no values; remove it")
-    t_s = np.arange(float(len(grid.rows))) if t is None else times_in_column(grid, *t)
+            raise InputError(
+                f"column {grid.columns[place]} has no values; remove it"
+            )
+    t_s = (
+        np.arange(float(len(grid.rows)))
+        if t is None
+        else times_in_column(grid, *t)
+    )
     return QuantityTable(grid, t_s, values)
 
 
@@ -201,19 +223,27 @@ def _find_columns(
     by_key = {quantity.key: quantity for quantity in (TIME, *quantities)}
     for key in mapped:
         if key not in by_key:
-            expected = f"expected one of {', '.join(by_key)}{hint_at(key, by_key)}"
+            expected = (
+                f"expected one of {', '.join(by_key)}{hint_at(key, by_key)}"
+            )
             raise InputError(f"columns has the key {key!r}; {expected}")
-    chosen = {key: _column_named_by_user(grid, by_key[key], name) for key, name in mapped.items()}
+    chosen = {
+        key: _column_named_by_user(grid, by_key[key], name)
+        for key, name in mapped.items()
+    }
     sought = quantities if not chosen.keys() - {TIME.key} else ()
     recognised = {
         quantity.key: column
         for quantity in (TIME, *sought)
-        if quantity.key not in chosen and (column := find_column(grid, quantity)) is not None
+        if quantity.key not in chosen
+        and (column := find_column(grid, quantity)) is not None
     }
     return chosen | recognised
 
 
-def _column_named_by_user(grid: TextTable, quantity: Quantity, name: str) -> tuple[int, float]:
+def _column_named_by_user(
+    grid: TextTable, quantity: Quantity, name: str
+) -> tuple[int, float]:
     """Return index and factor to SI of the column that the user names for a quantity; the unit is
     in `name` or in the name of the column.
 
@@ -245,7 +275,9 @@ def _column_named_by_user(grid: TextTable, quantity: Quantity, name: str) -> tup
     return grid.columns.index(column), factor
 
 
-def find_column(grid: TextTable, quantity: Quantity) -> tuple[int, float] | None:
+def find_column(
+    grid: TextTable, quantity: Quantity
+) -> tuple[int, float] | None:
     """Return index and factor to SI of the column whose name and unit fit a quantity; None if no
     name fits.
 
@@ -261,8 +293,14 @@ def find_column(grid: TextTable, quantity: Quantity) -> tuple[int, float] | None
     }
     if quantity.unitless:
         units = {k: unit or quantity.unit for k, unit in units.items()}
-    factors = {k: si_factor(unit, quantity.dimension) for k, unit in units.items() if unit}
-    fitting = [(k, factor) for k, factor in factors.items() if factor is not None]
+    factors = {
+        k: si_factor(unit, quantity.dimension)
+        for k, unit in units.items()
+        if unit
+    }
+    fitting = [
+        (k, factor) for k, factor in factors.items() if factor is not None
+    ]
     if len(fitting) > 1:
         raise grid.error_at(
             f"the columns {', '.join(grid.columns[k] for k, _ in fitting)} could all be "
@@ -305,7 +343,9 @@ def _words(name: str) -> set[str]:
 # Refusals -----------------------------------------------------------------------------------------
 
 
-def _require_known_columns(grid: TextTable, quantities: Sequence[Quantity], all_of: bool) -> None:
+def _require_known_columns(
+    grid: TextTable, quantities: Sequence[Quantity], all_of: bool
+) -> None:
     """Check that every column holds a known quantity; see `_columns_error` for `quantities` and
     `all_of`.
 
@@ -318,7 +358,9 @@ def _require_known_columns(grid: TextTable, quantities: Sequence[Quantity], all_
     for column in grid.columns:
         if name_and_unit(column)[0].lower() not in known:
             hint = hint_at(column, [quantity.column for quantity in quantities])
-            raise _columns_error(grid, quantities, all_of, f": {column} is not among them{hint}")
+            raise _columns_error(
+                grid, quantities, all_of, f": {column} is not among them{hint}"
+            )
 
 
 def _columns_error(
@@ -350,7 +392,9 @@ def _columns_error(
     )
 
 
-def _unit_error(grid: TextTable, column: str, unit: str | None, quantity: Quantity) -> InputError:
+def _unit_error(
+    grid: TextTable, column: str, unit: str | None, quantity: Quantity
+) -> InputError:
     """Return the error for a column without a unit (`unit` is None), or with a unit of another
     dimension.
     """

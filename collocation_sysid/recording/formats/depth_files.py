@@ -93,7 +93,10 @@ class _LazyImages(Sequence[Array]):
 
 
 def read_depth(
-    path: Path, count_m: float | None, length_m: float, known_camera_fields: Container[str] = ()
+    path: Path,
+    count_m: float | None,
+    length_m: float,
+    known_camera_fields: Container[str] = (),
 ) -> DepthFileContent:
     """Read a file, a topic of a log, or all files of a folder in the order of their names.
 
@@ -115,7 +118,11 @@ def read_depth(
     if (address := TopicAddress.from_path(path)) is not None:
         with located(path):
             return _read_topic(
-                path, address, count_m=count_m, length_m=length_m, known=known_camera_fields
+                path,
+                address,
+                count_m=count_m,
+                length_m=length_m,
+                known=known_camera_fields,
             )
     if path.is_dir():
         return _read_folder(path, count_m, length_m)
@@ -124,14 +131,17 @@ def read_depth(
     if kind not in _READERS:
         expected = ", ".join(_READERS)
         raise InputError(
-            f"is a {kind or 'file without an ending'}; expected one of {expected}", path
+            f"is a {kind or 'file without an ending'}; expected one of {expected}",
+            path,
         )
     try:
         content = _READERS[kind](path)
     except InputError as error:
         raise error.located(path) from error
     except (Exception, SystemExit) as error:
-        raise InputError(f"cannot be read ({reason(error)}); expected {kind}", path) from error
+        raise InputError(
+            f"cannot be read ({reason(error)}); expected {kind}", path
+        ) from error
     if isinstance(content, DepthFileContent):
         return content
     if kind in CLOUDS:
@@ -141,7 +151,11 @@ def read_depth(
 
 
 def _read_topic(
-    path: Path, address: TopicAddress, count_m: float | None, length_m: float, known: Container[str]
+    path: Path,
+    address: TopicAddress,
+    count_m: float | None,
+    length_m: float,
+    known: Container[str],
 ) -> DepthFileContent:
     """Read the messages of a topic in the order of their times, and the camera model beside them.
 
@@ -165,7 +179,9 @@ def _read_topic(
     """
     with open_log(address.log, address.episode) as log:
         require_topic(log, address.topic)
-        t_s, messages = sort_by_time(list(log.messages(address.topic)), log.start_ns)
+        t_s, messages = sort_by_time(
+            list(log.messages(address.topic)), log.start_ns
+        )
         camera = _camera_of_topic(log, address.topic)
     if not messages or not (kind := depth_kind(messages[0])):
         raise InputError(
@@ -174,7 +190,9 @@ def _read_topic(
         )
     if "images" not in kind:
         clouds = [
-            _scaled_cloud(_points_from_columns(decode_cloud(each)), path, length_m)
+            _scaled_cloud(
+                _points_from_columns(decode_cloud(each)), path, length_m
+            )
             for each in messages
         ]
         return DepthFileContent([], clouds, t_s)
@@ -197,13 +215,17 @@ def _camera_of_topic(log: Log, topic: str) -> tuple[str, Any] | None:
     """
     above = [str(each) for each in PurePosixPath(topic).parents]
     names = [f"{each.rstrip('/')}/{CAMERA}" for each in above]
-    if (name := next((each for each in names if each in log.topics), None)) is None:
+    if (
+        name := next((each for each in names if each in log.topics), None)
+    ) is None:
         return None
     message = next((each for _, each in log.messages(name)), None)
     return (name, message) if is_camera_model(message) else None
 
 
-def _read_folder(path: Path, count_m: float | None, length_m: float) -> DepthFileContent:
+def _read_folder(
+    path: Path, count_m: float | None, length_m: float
+) -> DepthFileContent:
     """Read all depth files of a folder, in the order of their names.
 
     Parameters
@@ -221,11 +243,21 @@ def _read_folder(path: Path, count_m: float | None, length_m: float) -> DepthFil
     InputError
         If there are no files, files of several kinds, or another number of times than files.
     """
-    files = sorted(each for each in path.iterdir() if each.suffix.lower() in (*IMAGES, *CLOUDS))
+    files = sorted(
+        each
+        for each in path.iterdir()
+        if each.suffix.lower() in (*IMAGES, *CLOUDS)
+    )
     if not files:
-        raise InputError(f"has no {', '.join((*IMAGES, *CLOUDS))}; expected images or clouds", path)
+        raise InputError(
+            f"has no {', '.join((*IMAGES, *CLOUDS))}; expected images or clouds",
+            path,
+        )
     if len(kinds := {each.suffix.lower() for each in files}) > 1:
-        raise InputError(f"contains {', '.join(sorted(kinds))}; expected files of one kind", path)
+        raise InputError(
+            f"contains {', '.join(sorted(kinds))}; expected files of one kind",
+            path,
+        )
     parts = [read_depth(each, count_m, length_m) for each in files]
     times = path / "times.csv"
     t_s = None
@@ -233,9 +265,13 @@ def _read_folder(path: Path, count_m: float | None, length_m: float) -> DepthFil
         with located(times):
             t_s = times_in_column(read_table(decode(read_bytes(times))), 0)
         if len(t_s) != len(files):
-            raise InputError(f"has {len(t_s)} times for {len(files)} files", times)
+            raise InputError(
+                f"has {len(t_s)} times for {len(files)} files", times
+            )
     images = [image for part in parts for image in part.images_m]
-    return DepthFileContent(images, [cloud for part in parts for cloud in part.clouds_m], t_s)
+    return DepthFileContent(
+        images, [cloud for part in parts for cloud in part.clouds_m], t_s
+    )
 
 
 def _in_metres(image: Array, count_m: float | None) -> Array:
@@ -248,7 +284,9 @@ def _in_metres(image: Array, count_m: float | None) -> Array:
         If the image has several channels.
     """
     if image.ndim != 2:
-        raise InputError(f"has the shape {image.shape}; expected one channel of depths")
+        raise InputError(
+            f"has the shape {image.shape}; expected one channel of depths"
+        )
     if image.dtype.kind in "iu":
         return image * (USUAL_COUNT_M if count_m is None else count_m)
     metres = image.astype(float)
@@ -264,7 +302,9 @@ def _require_possible_lengths(values_m: Array) -> None:
     InputError
         With the largest length, which no camera can have measured.
     """
-    largest_m = np.max(np.abs(values_m), initial=0.0, where=np.isfinite(values_m))
+    largest_m = np.max(
+        np.abs(values_m), initial=0.0, where=np.isfinite(values_m)
+    )
     if largest_m > LARGEST_LENGTH_M:
         raise InputError(
             f"contains the length {largest_m:.3g} m; expected at most {LARGEST_LENGTH_M:,.0f} m: "
@@ -287,7 +327,9 @@ def _scaled_cloud(points: Array, path: Path, length_m: float) -> Array:
     InputError
         For another shape.
     """
-    with np.errstate(invalid="ignore"):  # a damaged file may have signalling NaN
+    with np.errstate(
+        invalid="ignore"
+    ):  # a damaged file may have signalling NaN
         points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise InputError(
@@ -313,7 +355,11 @@ def _read_npz(path: Path) -> DepthFileContent:
         If the archive has none of the three arrays, or several.
     """
     arrays = load_arrays(path)
-    names = [name for name in ("depth_m", "depth_counts", "points_m") if name in arrays]
+    names = [
+        name
+        for name in ("depth_m", "depth_counts", "points_m")
+        if name in arrays
+    ]
     if len(names) != 1:
         raise InputError(
             f"has {', '.join(arrays) or 'nothing'}; expected one of depth_m, depth_counts with "
@@ -322,12 +368,19 @@ def _read_npz(path: Path) -> DepthFileContent:
     values = arrays[names[0]]
     if names[0] == "depth_counts":
         values = values * float(arrays.get("count_m", USUAL_COUNT_M))
-    samples = [np.asarray(each, dtype=float) for each in (values if values.ndim == 3 else [values])]
+    samples = [
+        np.asarray(each, dtype=float)
+        for each in (values if values.ndim == 3 else [values])
+    ]
     clouded = names[0] == "points_m"
     for sample in samples:
         _require_possible_lengths(sample)
-    camera = (arrays.get(name) for name in ("t_s", "camera_matrix", "camera_pose"))
-    return DepthFileContent([] if clouded else samples, samples if clouded else [], *camera)
+    camera = (
+        arrays.get(name) for name in ("t_s", "camera_matrix", "camera_pose")
+    )
+    return DepthFileContent(
+        [] if clouded else samples, samples if clouded else [], *camera
+    )
 
 
 @contextmanager
@@ -366,7 +419,9 @@ def _read_exr(path: Path) -> Array:
     # What the library writes on both streams it also raises.
     with redirect_stdout(None), _standard_error_silenced():
         channels: Mapping[str, Any] = library.File(str(path)).channels()
-    names = [name for name in ("Z", "R", "Y", "V") if name in channels] or [*channels]
+    names = [name for name in ("Z", "R", "Y", "V") if name in channels] or [
+        *channels
+    ]
     return np.asarray(channels[names[0]].pixels, dtype=float)
 
 
@@ -379,8 +434,12 @@ def _points_from_columns(columns: Mapping[str, Array]) -> Array:
         If x, y or z is missing.
     """
     if not {*"xyz"} <= {*columns}:
-        raise InputError(f"has the columns {', '.join(columns)}; expected x, y and z among them")
-    return _with_normals(np.column_stack([columns[axis] for axis in "xyz"]), columns)
+        raise InputError(
+            f"has the columns {', '.join(columns)}; expected x, y and z among them"
+        )
+    return _with_normals(
+        np.column_stack([columns[axis] for axis in "xyz"]), columns
+    )
 
 
 def _with_normals(points: Array, columns: Mapping[str, Array]) -> Array:
@@ -405,14 +464,18 @@ def _read_pcd(path: Path) -> Array:
     while "DATA" not in head:
         ends = raw.find(b"\n", begins)
         if ends < 0:
-            raise InputError("has no line that begins with DATA; expected a PCD file")
+            raise InputError(
+                "has no line that begins with DATA; expected a PCD file"
+            )
         words = raw[begins:ends].decode("ascii", "replace").split()
         head |= {words[0]: words[1:]} if words and words[0] != "#" else {}
         begins = ends + 1
     kinds = zip(head["TYPE"], head["SIZE"], strict=True)
     counts = head.get("COUNT", ["1"] * len(head["FIELDS"]))
     fields = zip(head["FIELDS"], kinds, counts, strict=True)
-    form = np.dtype([(f, f"<{t.lower()}{s}", (int(c),)) for f, (t, s), c in fields])
+    form = np.dtype(
+        [(f, f"<{t.lower()}{s}", (int(c),)) for f, (t, s), c in fields]
+    )
     if head["DATA"] == ["binary"]:
         rows = np.frombuffer(raw, form, int(head["POINTS"][0]), begins)
         columns = {name: rows[name][:, 0] for name in rows.dtype.names or ()}

@@ -20,7 +20,16 @@ from ...files import reason
 # Of pixels: integers count, floats are metres.
 ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 # Of columns of clouds, by their numbers there.
-_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_TYPES = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    8: "f8",
+}
 # Before the PNG of an image that is packed for depth: a word, and two numbers of how.
 _PACKED = np.dtype([("kind", "<i4"), ("scale", "<f4"), ("shift", "<f4")])
 
@@ -31,10 +40,14 @@ def depth_kind(message: Any) -> str:
     """
     if hasattr(message, "point_step") and hasattr(message, "fields"):
         return "clouds of points"
-    if getattr(message, "encoding", None) in ENCODINGS and hasattr(message, "step"):
+    if getattr(message, "encoding", None) in ENCODINGS and hasattr(
+        message, "step"
+    ):
         return f"depth images, {message.width} x {message.height}"
     packed = str(getattr(message, "format", ""))
-    if hasattr(message, "data") and ("compressedDepth" in packed or "16UC1" in packed):
+    if hasattr(message, "data") and (
+        "compressedDepth" in packed or "16UC1" in packed
+    ):
         return "compressed depth images"
     return ""
 
@@ -42,11 +55,14 @@ def depth_kind(message: Any) -> str:
 def is_camera_model(message: Any) -> bool:
     """Return whether a message holds a camera model."""
     return (
-        all(_field(message, name) is not None for name in "kpd") and len(_field(message, "k")) == 9
+        all(_field(message, name) is not None for name in "kpd")
+        and len(_field(message, "k")) == 9
     )
 
 
-def camera_matrix(message: Any, rectified: bool, shape: tuple[int, int]) -> Array:
+def camera_matrix(
+    message: Any, rectified: bool, shape: tuple[int, int]
+) -> Array:
     """Return the matrix (3, 3) of the camera model in a message.
 
     Parameters
@@ -150,7 +166,11 @@ def _decode_compressed(kind: str, data: bytes) -> Any:
         return counts
     how = np.frombuffer(data, _PACKED, 1)[0]
     with np.errstate(divide="ignore"):
-        return np.where(counts > 0, float(how["scale"]) / (counts - float(how["shift"])), np.nan)
+        return np.where(
+            counts > 0,
+            float(how["scale"]) / (counts - float(how["shift"])),
+            np.nan,
+        )
 
 
 def read_png(source: Path | BytesIO) -> Any:
@@ -167,7 +187,9 @@ def read_png(source: Path | BytesIO) -> Any:
 
     image = opened(source)
     if image.mode not in ("I;16", "I;16B", "I"):
-        raise InputError(f"has the mode {image.mode}; expected depths of 16 bits in one channel")
+        raise InputError(
+            f"has the mode {image.mode}; expected depths of 16 bits in one channel"
+        )
     return np.asarray(image).astype(np.int64)
 
 
@@ -192,7 +214,9 @@ def decode_cloud(message: Any) -> dict[str, Array]:
             }
         )
     except (KeyError, ValueError) as error:
-        columns = ", ".join(f"{each.name} of type {each.datatype}" for each in fields)
+        columns = ", ".join(
+            f"{each.name} of type {each.datatype}" for each in fields
+        )
         raise InputError(
             f"has the columns {columns} in points of {message.point_step} bytes; expected each "
             "once, of types 1 to 8, within these"
@@ -225,9 +249,15 @@ def _unpadded_rows(message: Any, step: int, size: int) -> Any:
             f"has {len(data)} bytes in a message; expected {height} rows of {message.width} times "
             f"{size} bytes, {step} from row to row"
         )
-    return np.ascontiguousarray(data.reshape(height, step)[:, : message.width * size])
+    return np.ascontiguousarray(
+        data.reshape(height, step)[:, : message.width * size]
+    )
 
 
 def _message_data(message: Any) -> bytes:
     """Return the data of a message; JSON messages have it in base64."""
-    return b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)
+    return (
+        b64decode(message.data)
+        if isinstance(message.data, str)
+        else bytes(message.data)
+    )

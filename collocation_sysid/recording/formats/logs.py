@@ -82,7 +82,9 @@ class TopicAddress:
                 options["episode"] = int(part)
             else:
                 expected = "two frames PARENT>CHILD, a robot.urdf, rad or deg, or an episode"
-                raise InputError(f"found {part!r} after the topic; expected {expected}")
+                raise InputError(
+                    f"found {part!r} after the topic; expected {expected}"
+                )
         return cls(Path(log), topic, **options)
 
 
@@ -152,14 +154,18 @@ def open_log(path: Path, episode: int | None = None) -> Iterator[Log]:
     except (InputError, ImportError):
         raise
     except Exception as error:  # the libraries have exceptions of their own
-        raise InputError(f"is damaged, or a file of another type: {reason(error)}") from error
+        raise InputError(
+            f"is damaged, or a file of another type: {reason(error)}"
+        ) from error
 
 
 def require_topic(log: Log, topic: str) -> None:
     """Raise an `InputError` with the most similar topic if a log does not have a topic."""
     if topic not in log.topics:
         there = ", ".join(log.topics)
-        raise InputError(f"there is no topic {topic!r}; it has {there}{hint_at(topic, log.topics)}")
+        raise InputError(
+            f"there is no topic {topic!r}; it has {there}{hint_at(topic, log.topics)}"
+        )
 
 
 def require_packages(*modules: str) -> None:
@@ -186,7 +192,8 @@ class _Bag:
     def __enter__(self) -> Log:
         self._reader.open()
         self.topics = {
-            name: (str(info.msgtype), info.msgcount) for name, info in self._reader.topics.items()
+            name: (str(info.msgtype), info.msgcount)
+            for name, info in self._reader.topics.items()
         }
         self.start_ns = self._reader.start_time
         return self
@@ -195,7 +202,9 @@ class _Bag:
         self._reader.close()
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        chosen = [each for each in self._reader.connections if each.topic == topic]
+        chosen = [
+            each for each in self._reader.connections if each.topic == topic
+        ]
         for connection, at_ns, content in self._reader.messages(chosen):
             yield at_ns, self._reader.deserialize(content, connection.msgtype)
 
@@ -219,7 +228,9 @@ class _Mcap:
         self._reader = make_reader(self._file, decoder_factories=decoders)
         summary = self._reader.get_summary()
         if summary is None or summary.statistics is None:
-            raise InputError("is truncated: it has no summary; `mcap recover` creates one")
+            raise InputError(
+                "is truncated: it has no summary; `mcap recover` creates one"
+            )
         counts = summary.statistics.channel_message_counts
         self.topics = {}
         for key, channel in summary.channels.items():
@@ -234,7 +245,9 @@ class _Mcap:
         self._file.close()
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        for _, _, message, content in self._reader.iter_decoded_messages(topics=[topic]):
+        for _, _, message, content in self._reader.iter_decoded_messages(
+            topics=[topic]
+        ):
             yield message.log_time, content
 
 
@@ -244,7 +257,9 @@ class _Json:
     def decoder_for(self, message_encoding: str, schema: Any) -> Any:
         if message_encoding != "json":
             return None
-        return partial(json.loads, object_hook=lambda each: SimpleNamespace(**each))
+        return partial(
+            json.loads, object_hook=lambda each: SimpleNamespace(**each)
+        )
 
 
 @dataclass
@@ -271,10 +286,15 @@ class _Dataset:
 
     def __enter__(self) -> Log:
         require_packages("pyarrow")
-        info = json.loads((self.path / "meta" / "info.json").read_text(encoding="utf-8"))
+        info = json.loads(
+            (self.path / "meta" / "info.json").read_text(encoding="utf-8")
+        )
         self._episodes = int(info["total_episodes"])
         for name, feature in info["features"].items():
-            if feature["dtype"].startswith(("float", "int")) and "index" not in name:
+            if (
+                feature["dtype"].startswith(("float", "int"))
+                and "index" not in name
+            ):
                 self.topics[name] = feature["dtype"], int(info["total_frames"])
                 self.names[name] = _component_names(feature, name)
         self.topics.pop("timestamp", None)
@@ -291,15 +311,22 @@ class _Dataset:
             )
         episode = self.episode or 0
         if episode >= self._episodes:
-            raise InputError(f"has the episodes 0 to {self._episodes - 1}; found {episode}")
+            raise InputError(
+                f"has the episodes 0 to {self._episodes - 1}; found {episode}"
+            )
         frames = dataset.dataset(self.path / "data", format="parquet").to_table(
-            columns=["timestamp", topic], filter=dataset.field("episode_index") == episode
+            columns=["timestamp", topic],
+            filter=dataset.field("episode_index") == episode,
         )
         values: Array = np.asarray(frames[topic].to_pylist(), dtype=float)
-        for t_s, each in zip(frames["timestamp"].to_pylist(), values, strict=True):
+        for t_s, each in zip(
+            frames["timestamp"].to_pylist(), values, strict=True
+        ):
             yield (
                 round(t_s * 1e9),
-                SimpleNamespace(name=self.names[topic], position=np.atleast_1d(each)),
+                SimpleNamespace(
+                    name=self.names[topic], position=np.atleast_1d(each)
+                ),
             )
 
 

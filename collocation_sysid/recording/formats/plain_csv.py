@@ -21,7 +21,9 @@ from .units import METRES_PER_UNIT
 def read(text: str, choose: LabelChooser) -> RawTracks:
     """Read a plain CSV file, wide or long; `choose` picks the markers."""
     table = read_table(text)
-    return (_read_long if "marker" in table.columns else _read_wide)(table, choose)
+    return (_read_long if "marker" in table.columns else _read_wide)(
+        table, choose
+    )
 
 
 def _read_wide(table: TextTable, choose: LabelChooser) -> RawTracks:
@@ -52,17 +54,28 @@ def _wide_labels(table: TextTable) -> list[str]:
     """
     header = table.columns
     labels = dict.fromkeys(
-        column[:-2] for column in header if len(column) > 2 and column[-2:] in ("_x", "_y", "_z")
+        column[:-2]
+        for column in header
+        if len(column) > 2 and column[-2:] in ("_x", "_y", "_z")
     )
-    expected = ["t_s", *(f"{label}_{axis}" for label in labels for axis in "xyz")]
+    expected = [
+        "t_s",
+        *(f"{label}_{axis}" for label in labels for axis in "xyz"),
+    ]
     counts = Counter(header)
     known = set(expected)
     faulty = {
         "unknown": [column for column in header if column not in known],
         "missing": [column for column in expected if column not in counts],
-        "repeated": sorted(column for column, count in counts.items() if count > 1),
+        "repeated": sorted(
+            column for column, count in counts.items() if count > 1
+        ),
     }
-    faults = [f"{what} {', '.join(columns)}" for what, columns in faulty.items() if columns]
+    faults = [
+        f"{what} {', '.join(columns)}"
+        for what, columns in faulty.items()
+        if columns
+    ]
     if not faults and labels:
         return list(labels)
     raise InputError(
@@ -85,10 +98,14 @@ def _read_long(table: TextTable, choose: LabelChooser) -> RawTracks:
     axes, unit = _long_columns(table)
     of_row = [row.cells[table.columns.index("marker")] for row in table.rows]
     if "" in of_row:
-        raise table.error_at("column marker is blank; expected a name", of_row.index(""))
+        raise table.error_at(
+            "column marker is blank; expected a name", of_row.index("")
+        )
     labels = list(dict.fromkeys(of_row))
     chosen = [labels[k] for k in choose(labels)]
-    row_t_s = numeric_cells(table, [table.columns.index("t_s")], blank_allowed=False)[:, 0]
+    row_t_s = numeric_cells(
+        table, [table.columns.index("t_s")], blank_allowed=False
+    )[:, 0]
     t_s, frame = np.unique(row_t_s, return_inverse=True)
     coordinates = np.full((len(t_s), len(chosen), 3), np.nan)
     for k, label in enumerate(chosen):
@@ -97,7 +114,9 @@ def _read_long(table: TextTable, choose: LabelChooser) -> RawTracks:
         if fault := first_unordered_time(row_t_s[own]):
             raise rows.error_at(f"marker '{label}': {fault[1]}", fault[0])
         columns = [table.columns.index(axis) for axis in axes]
-        coordinates[frame[own], k] = numeric_cells(rows, columns, blank_allowed=True)
+        coordinates[frame[own], k] = numeric_cells(
+            rows, columns, blank_allowed=True
+        )
     return RawTracks(
         chosen,
         coordinates,

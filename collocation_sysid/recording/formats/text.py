@@ -105,9 +105,14 @@ def decode(content: bytes) -> str:
     InputError
         If it is empty, or not text.
     """
-    text = next(filter(None, (_decoded(content, encoding) for encoding in _ENCODINGS)), None)
+    text = next(
+        filter(None, (_decoded(content, encoding) for encoding in _ENCODINGS)),
+        None,
+    )
     if text is None and content:
-        raise InputError("is not a CSV text file (UTF-8), nor any other format known here")
+        raise InputError(
+            "is not a CSV text file (UTF-8), nor any other format known here"
+        )
     if not text or not text.strip():
         raise InputError(_EMPTY)
     return text
@@ -115,13 +120,17 @@ def decode(content: bytes) -> str:
 
 def _decoded(content: bytes, encoding: str) -> str | None:
     """Decode text in an encoding; None if it is not text in that encoding."""
-    if encoding == "utf-16" and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
+    if encoding == "utf-16" and not content.startswith(
+        (b"\xff\xfe", b"\xfe\xff")
+    ):
         return None
     try:
         text = content.decode(encoding)
     except UnicodeDecodeError:
         return None
-    odd = encoding != "utf-8-sig" and (_CONTROL.search(text) or not _SEPARATOR.search(text))
+    odd = encoding != "utf-8-sig" and (
+        _CONTROL.search(text) or not _SEPARATOR.search(text)
+    )
     return None if "\0" in text or odd else text
 
 
@@ -146,17 +155,27 @@ def separated_rows(text: str, separator: str | None = None) -> list[Row]:
     """
     if separator is None:
         lines = text.splitlines()
-        shares = {mark: sum(mark in line for line in lines) / len(lines) for mark in ";\t"}
-        separator = next((mark for mark, share in shares.items() if share > 0.5), ",")
+        shares = {
+            mark: sum(mark in line for line in lines) / len(lines)
+            for mark in ";\t"
+        }
+        separator = next(
+            (mark for mark, share in shares.items() if share > 0.5), ","
+        )
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
     try:
-        rows = [Row(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+        rows = [
+            Row(reader.line_num, [cell.strip() for cell in cells])
+            for cells in reader
+        ]
     except csv.Error as error:
         raise InputError(f"is not a CSV text file: {error}") from error
     rows = [row for row in rows if any(row.cells)]
     if not rows:
         raise InputError(_EMPTY)
-    if separator != "," and not any(_POINTED.fullmatch(cell) for row in rows for cell in row.cells):
+    if separator != "," and not any(
+        _POINTED.fullmatch(cell) for row in rows for cell in row.cells
+    ):
         for row in rows:
             commas = [_DECIMAL_COMMA.fullmatch(cell) for cell in row.cells]
             row.cells[:] = [
@@ -169,10 +188,16 @@ def separated_rows(text: str, separator: str | None = None) -> list[Row]:
 def tab_rows(text: str) -> list[Row]:
     """Rows of a tab-separated file; lines without any character are skipped."""
     lines = enumerate(re.split("\r\n|\r|\n", text), start=1)
-    return [Row(k, [cell.strip() for cell in line.split("\t")]) for k, line in lines if line]
+    return [
+        Row(k, [cell.strip() for cell in line.split("\t")])
+        for k, line in lines
+        if line
+    ]
 
 
-def table_of_rows(columns: list[str], rows: list[Row], names_line: int = 1) -> TextTable:
+def table_of_rows(
+    columns: list[str], rows: list[Row], names_line: int = 1
+) -> TextTable:
     """Return a table of rows that are as wide as their column names.
 
     Blank columns at the end of all rows are cut.
@@ -193,12 +218,16 @@ def table_of_rows(columns: list[str], rows: list[Row], names_line: int = 1) -> T
         raise InputError("has column names but no rows of numbers")
     width = len(columns)
     common = len(rows[0].cells)
-    if common > width and all(len(r.cells) == common and not any(r.cells[width:]) for r in rows):
+    if common > width and all(
+        len(r.cells) == common and not any(r.cells[width:]) for r in rows
+    ):
         rows = [Row(row.line, row.cells[:width]) for row in rows]
     table = TextTable(columns, rows, names_line)
     for k, row in enumerate(rows):
         if len(row.cells) != width:
-            raise table.error_at(f"{len(row.cells)} cells, but the header has {width} columns", k)
+            raise table.error_at(
+                f"{len(row.cells)} cells, but the header has {width} columns", k
+            )
     return table
 
 
@@ -218,13 +247,17 @@ def read_table(text: str) -> TextTable:
     numeric = (
         k
         for k, row in enumerate(rows)
-        if len(row.cells) > 1 and all(is_number(c.replace(",", ".")) for c in row.cells if c)
+        if len(row.cells) > 1
+        and all(is_number(c.replace(",", ".")) for c in row.cells if c)
     )
     names = 0 if "t_s" in rows[0].cells else max(next(numeric, 0) - 1, 0)
     header = rows[names].cells
     if names and all(map(_is_unit, header)):
         above = rows[names - 1].cells
-        header = [f"{a} ({u.strip('()[]')})" for a, u in zip_longest(above, header, fillvalue="")]
+        header = [
+            f"{a} ({u.strip('()[]')})"
+            for a, u in zip_longest(above, header, fillvalue="")
+        ]
     return table_of_rows(header, rows[names + 1 :], rows[names].line)
 
 
@@ -232,13 +265,19 @@ def _is_unit(cell: str) -> bool:
     """Return whether a cell may be a unit: blank, in brackets, or a known unit."""
     bare = cell.strip("()[]")
     bracketed = cell in (f"({bare})", f"[{bare}]")
-    return not bare or bracketed or any(si_factor(bare, dimension) for dimension in UNITS)
+    return (
+        not bare
+        or bracketed
+        or any(si_factor(bare, dimension) for dimension in UNITS)
+    )
 
 
 # Cells --------------------------------------------------------------------------------------------
 
 
-def numeric_cells(grid: TextTable, columns: Sequence[int], blank_allowed: bool) -> Array:
+def numeric_cells(
+    grid: TextTable, columns: Sequence[int], blank_allowed: bool
+) -> Array:
     """Return the cells of some columns as numbers (rows, columns); NaN where blank.
 
     Parameters
@@ -262,11 +301,16 @@ def numeric_cells(grid: TextTable, columns: Sequence[int], blank_allowed: bool) 
                 value = number_from_text(cell) if cell else math.nan
             except ValueError:
                 value = math.inf
-            if abs(value) > LARGEST_NUMBER or (math.isnan(value) and not blank_allowed):
-                expected = "a number or a blank cell" if blank_allowed else "a number"
+            if abs(value) > LARGEST_NUMBER or (
+                math.isnan(value) and not blank_allowed
+            ):
+                expected = (
+                    "a number or a blank cell" if blank_allowed else "a number"
+                )
                 name = grid.columns[column]
                 raise grid.error_at(
-                    f"column {name} holds '{excerpt(cell)}'; expected {expected}", i
+                    f"column {name} holds '{excerpt(cell)}'; expected {expected}",
+                    i,
                 )
             values[i, j] = value
     return values

@@ -33,7 +33,14 @@ _POSES = (
     ("translation", "rotation"),
     ("position", "orientation"),
 )
-_POINTS = ("pose.pose.position", "pose.position", "position", "translation", "point", "pose")
+_POINTS = (
+    "pose.pose.position",
+    "pose.position",
+    "position",
+    "translation",
+    "point",
+    "pose",
+)
 _NAMES = ("marker_name", "name", "id", "ns", "child_frame_id")
 _NUMBER_FIELDS = {
     "fluid_pressure": "pressure_pa",
@@ -116,11 +123,16 @@ def topic_as_csv(address: TopicAddress) -> bytes:
             )
         if _is_transforms(messages[0][1]):
             return _csv_content(
-                POSE, *_poses_through_frames(_all_transforms(log, messages, address.topic), address)
+                POSE,
+                *_poses_through_frames(
+                    _all_transforms(log, messages, address.topic), address
+                ),
             )
         times, ordered = sort_by_time(messages, log.start_ns)
         by_namespace = has_namespaces(ordered)
-        rows = [_message_values(each, by_namespace=by_namespace) for each in ordered]
+        rows = [
+            _message_values(each, by_namespace=by_namespace) for each in ordered
+        ]
         unit = address.unit or log.unit
     columns = list(dict.fromkeys(name for row in rows for name in row))
     if not columns:
@@ -128,9 +140,13 @@ def topic_as_csv(address: TopicAddress) -> bytes:
             f"the topic {address.topic} contains neither poses, points, wrenches, joint positions "
             "nor numbers"
         )
-    values = np.array([[row.get(name, np.nan) for name in columns] for row in rows])
+    values = np.array(
+        [[row.get(name, np.nan) for name in columns] for row in rows]
+    )
     if address.robot is not None:
-        return _csv_content(POSE, times, _poses_from_joints(columns, values, address, unit))
+        return _csv_content(
+            POSE, times, _poses_from_joints(columns, values, address, unit)
+        )
     return _csv_content(columns, times, values)
 
 
@@ -154,11 +170,15 @@ def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
     write = [f"{path.name}#{name}"]
     if first and _is_transforms(first[0][1]):
         chains = moving_chains(_all_transforms(log, log.messages(name), name))
-        serves = "poses of one frame relative to another" if chains else "static frames"
+        serves = (
+            "poses of one frame relative to another"
+            if chains
+            else "static frames"
+        )
         write = [f"{write[0]}#{parent}>{child}" for parent, child in chains]
-        if name.removesuffix(STATIC_TOPIC_SUFFIX) in log.topics and name.endswith(
+        if name.removesuffix(
             STATIC_TOPIC_SUFFIX
-        ):
+        ) in log.topics and name.endswith(STATIC_TOPIC_SUFFIX):
             serves += f", part of the chains of {name.removesuffix(STATIC_TOPIC_SUFFIX)}"
     elif first and (depth_type := depth_kind(first[0][1])):
         serves = f"{depth_type}: [[experiment.depth]]"
@@ -169,7 +189,10 @@ def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
         messages = [message for _, message in first]
         by_namespace = has_namespaces(messages)
         columns = set[str]().union(
-            *(_message_values(each, by_namespace=by_namespace) for each in messages)
+            *(
+                _message_values(each, by_namespace=by_namespace)
+                for each in messages
+            )
         )
         serves = _possible_uses(columns, messages[0])
         if serves.startswith("positions"):
@@ -199,14 +222,18 @@ def _possible_uses(columns: set[str], message: Any) -> str:
     if all(column[-2:] in ("_x", "_y", "_z") for column in columns):
         markers = sorted({column[:-2] for column in columns})
         spaces = groupby(markers, key=lambda marker: marker.rpartition("/")[0])
-        return "marker tracks: " + "; ".join(", ".join(markers) for _, markers in spaces)
+        return "marker tracks: " + "; ".join(
+            ", ".join(markers) for _, markers in spaces
+        )
     return "numbers: a pressure, a tension, a reading"
 
 
 # From messages to rows ----------------------------------------------------------------------------
 
 
-def sort_by_time(messages: list[tuple[int, Any]], start_ns: int) -> tuple[Array, list[Any]]:
+def sort_by_time(
+    messages: list[tuple[int, Any]], start_ns: int
+) -> tuple[Array, list[Any]]:
     """Return the times (S,) [s] of messages, and the messages in this order; duplicates in time are
     cut.
 
@@ -217,7 +244,12 @@ def sort_by_time(messages: list[tuple[int, Any]], start_ns: int) -> tuple[Array,
     start_ns : int
         Time of recording of the log's first message.
     """
-    t_s = np.array([measurement_time_s(message, at_ns, start_ns) for at_ns, message in messages])
+    t_s = np.array(
+        [
+            measurement_time_s(message, at_ns, start_ns)
+            for at_ns, message in messages
+        ]
+    )
     times, first = np.unique(t_s, return_index=True)
     return times, [messages[k][1] for k in first]
 
@@ -241,7 +273,9 @@ def measurement_time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
         _nested_field(message, "timestamp"),
         _nested_field(first, "header.stamp"),
     )
-    stamped_ns = next((_nanoseconds(each) for each in stamps if each is not None), 0)
+    stamped_ns = next(
+        (_nanoseconds(each) for each in stamps if each is not None), 0
+    )
     if not stamped_ns:
         return (recorded_ns - start_ns) / 1e9
     is_another = abs(stamped_ns - recorded_ns) > SAME_CLOCK_NS
@@ -252,9 +286,22 @@ def _nanoseconds(stamp: Any) -> int:
     """Return a stamp of seconds and nanoseconds, under any of the usual field names, in
     nanoseconds.
     """
-    counted = {10**9: ("sec", "seconds", "secs"), 1: ("nanosec", "nsec", "nanos", "nsecs")}
+    counted = {
+        10**9: ("sec", "seconds", "secs"),
+        1: ("nanosec", "nsec", "nanos", "nsecs"),
+    }
     return sum(
-        factor * int(next((getattr(stamp, name) for name in names if hasattr(stamp, name)), 0))
+        factor
+        * int(
+            next(
+                (
+                    getattr(stamp, name)
+                    for name in names
+                    if hasattr(stamp, name)
+                ),
+                0,
+            )
+        )
         for factor, names in counted.items()
     )
 
@@ -276,12 +323,22 @@ def _message_values(message: Any, *, by_namespace: bool) -> Row:
         return dict(zip(POSE, pose, strict=True))
     points = _points_of_message(message, by_namespace=by_namespace)
     if points:
-        return {f"{name}_{axis}": p[k] for name, p in points.items() for k, axis in enumerate(AXES)}
+        return {
+            f"{name}_{axis}": p[k]
+            for name, p in points.items()
+            for k, axis in enumerate(AXES)
+        }
     for name, column in _NUMBER_FIELDS.items():
         if isinstance(value := _nested_field(message, name), (int, float)):
             return {column: float(value)}
-        if name == "data" and isinstance(value, (list, np.ndarray)) and len(np.shape(value)) == 1:
-            return {f"{column}_{k}": float(each) for k, each in enumerate(value)}
+        if (
+            name == "data"
+            and isinstance(value, (list, np.ndarray))
+            and len(np.shape(value)) == 1
+        ):
+            return {
+                f"{column}_{k}": float(each) for k, each in enumerate(value)
+            }
     return {}
 
 
@@ -289,19 +346,28 @@ def _pose_of_message(message: Any) -> tuple[float, ...] | None:
     """Return position and quaternion (x, y, z, w) of a message; None if it has no pose."""
     for position, rotation in _POSES:
         if hasattr(turned := _nested_field(message, rotation), "w"):
-            return *_vector(_nested_field(message, position)), *_vector(turned), turned.w
+            return (
+                *_vector(_nested_field(message, position)),
+                *_vector(turned),
+                turned.w,
+            )
     return None
 
 
-def _points_of_message(message: Any, *, by_namespace: bool) -> dict[str, tuple[float, ...]]:
+def _points_of_message(
+    message: Any, *, by_namespace: bool
+) -> dict[str, tuple[float, ...]]:
     """Return positions by name: of a single point, or of the items of the first list that has
     some.
     """
     if _is_vector(one := _nested_field(message, "point")):
-        return {_nested_field(message, "header.frame_id") or "point": _vector(one)}
+        return {
+            _nested_field(message, "header.frame_id") or "point": _vector(one)
+        }
     items = enumerate(_first_list(message))
     places = {
-        _item_name(item, k, by_namespace=by_namespace): _position_of_item(item) for k, item in items
+        _item_name(item, k, by_namespace=by_namespace): _position_of_item(item)
+        for k, item in items
     }
     return {key: place for key, place in places.items() if place is not None}
 
@@ -317,16 +383,25 @@ def _position_of_item(item: Any) -> tuple[float, ...] | None:
     if _is_vector(item):
         return _vector(item)
     return next(
-        (_vector(p) for name in _POINTS if _is_vector(p := _nested_field(item, name))), None
+        (
+            _vector(p)
+            for name in _POINTS
+            if _is_vector(p := _nested_field(item, name))
+        ),
+        None,
     )
 
 
 def _item_name(item: Any, index: int, *, by_namespace: bool) -> str:
     """Return the name of an item of a list; its number, counted from 1, if it has none."""
     names = (_nested_field(item, name) for name in _NAMES)
-    name = str(next((name for name in names if name not in (None, "")), index + 1))
+    name = str(
+        next((name for name in names if name not in (None, "")), index + 1)
+    )
     return (
-        f"{namespace}/{name}" if by_namespace and (namespace := _nested_field(item, "ns")) else name
+        f"{namespace}/{name}"
+        if by_namespace and (namespace := _nested_field(item, "ns"))
+        else name
     )
 
 
@@ -336,7 +411,11 @@ def has_namespaces(messages: Iterable[Any]) -> bool:
     """
     return (
         len(
-            {_nested_field(item, "ns") for each in messages for item in _first_list(each)}
+            {
+                _nested_field(item, "ns")
+                for each in messages
+                for item in _first_list(each)
+            }
             - {None, ""}
         )
         > 1
@@ -366,7 +445,8 @@ def _vector(value: Any) -> tuple[float, ...]:
 def _is_transforms(message: Any) -> bool:
     """Return whether a message places one frame in another."""
     return (
-        _nested_field(message, "transforms") is not None or _transform_frames(message) is not None
+        _nested_field(message, "transforms") is not None
+        or _transform_frames(message) is not None
     )
 
 
@@ -376,11 +456,18 @@ def _transform_frames(transform: Any) -> tuple[str, str] | None:
     parent = _nested_field(transform, "parent_frame_id") or _nested_field(
         transform, "header.frame_id"
     )
-    is_one = child and parent and _pose_of_message(transform) and not hasattr(transform, "twist")
+    is_one = (
+        child
+        and parent
+        and _pose_of_message(transform)
+        and not hasattr(transform, "twist")
+    )
     return (parent.lstrip("/"), child.lstrip("/")) if is_one else None
 
 
-def _poses_of_transforms(messages: Iterable[tuple[int, Any]], start_ns: int) -> Edges:
+def _poses_of_transforms(
+    messages: Iterable[tuple[int, Any]], start_ns: int
+) -> Edges:
     """Return poses of child frames in their parents, by (parent, child) and time [s].
 
     Of several poses at a time the first is kept.
@@ -389,14 +476,18 @@ def _poses_of_transforms(messages: Iterable[tuple[int, Any]], start_ns: int) -> 
     for at_ns, message in messages:
         for each in _nested_field(message, "transforms") or [message]:
             pose = _pose_of_message(each)
-            if (edge := _transform_frames(each)) is not None and pose is not None:
+            if (
+                edge := _transform_frames(each)
+            ) is not None and pose is not None:
                 edges.setdefault(edge, {}).setdefault(
                     measurement_time_s(each, at_ns, start_ns), pose
                 )
     return edges
 
 
-def _all_transforms(log: Log, moving: Iterable[tuple[int, Any]], topic: str) -> Edges:
+def _all_transforms(
+    log: Log, moving: Iterable[tuple[int, Any]], topic: str
+) -> Edges:
     """Return the poses of a topic's transforms `moving` and of the fixed transforms in its static
     topic, which have the time 0, by (parent, child) and time [s].
     """
@@ -422,7 +513,9 @@ def moving_chains(edges: Edges) -> list[tuple[str, str]]:
     chains = []
     for frame in above:
         chain = [frame]
-        while (parent := above.get(chain[-1])) is not None and parent not in chain:
+        while (
+            parent := above.get(chain[-1])
+        ) is not None and parent not in chain:
             chain.append(parent)
         if chain[-1] not in above and moving & set(chain):
             chains.append((chain[-1], frame))
@@ -430,7 +523,9 @@ def moving_chains(edges: Edges) -> list[tuple[str, str]]:
     return sorted(chains, key=lambda chain: chain[1] in carrying)
 
 
-def _poses_through_frames(edges: Edges, address: TopicAddress) -> tuple[Array, Array]:
+def _poses_through_frames(
+    edges: Edges, address: TopicAddress
+) -> tuple[Array, Array]:
     """Return times (T,) [s] and poses (T, 7) of one frame in another: position, then quaternion (x,
     y, z, w), through all frames between them.
 
@@ -449,25 +544,40 @@ def _poses_through_frames(edges: Edges, address: TopicAddress) -> tuple[Array, A
         If no frame moves between them, or there is no common time.
     """
     require_packages("pytransform3d")
-    from pytransform3d.trajectories import pqs_from_transforms, transforms_from_pqs
-    from pytransform3d.transform_manager import NumpyTimeseriesTransform as Series
+    from pytransform3d.trajectories import (
+        pqs_from_transforms,
+        transforms_from_pqs,
+    )
+    from pytransform3d.transform_manager import (
+        NumpyTimeseriesTransform as Series,
+    )
     from pytransform3d.transform_manager import StaticTransform as Static
-    from pytransform3d.transform_manager import TemporalTransformManager as Manager
+    from pytransform3d.transform_manager import (
+        TemporalTransformManager as Manager,
+    )
 
     parent, child = _requested_frames(edges, address)
     path = _frame_path(edges, parent, child)
-    moving = [np.array(sorted(edges[edge])) for edge in path if len(edges[edge]) > 1]
+    moving = [
+        np.array(sorted(edges[edge])) for edge in path if len(edges[edge]) > 1
+    ]
     if not moving:
-        raise InputError(f"nothing moves between {parent} and {child}; omit the poses instead")
+        raise InputError(
+            f"nothing moves between {parent} and {child}; omit the poses instead"
+        )
     first = max(t[0] for t in moving)
     last = min(t[-1] for t in moving)
     times = max((t[(t >= first) & (t <= last)] for t in moving), key=len)
     if not len(times):
-        raise InputError(f"the transforms between {parent} and {child} have no common time span")
+        raise InputError(
+            f"the transforms between {parent} and {child} have no common time span"
+        )
     manager = Manager(check=False)
     for edge in path:
         at_s = np.array(sorted(edges[edge]))
-        poses = np.array([edges[edge][t] for t in at_s])[:, [0, 1, 2, 6, 3, 4, 5]]
+        poses = np.array([edges[edge][t] for t in at_s])[
+            :, [0, 1, 2, 6, 3, 4, 5]
+        ]
         if len(at_s) > 1:
             series: Any = Series(at_s, poses)
         else:
@@ -526,8 +636,13 @@ def _frame_path(
 
     ours = up(child)
     theirs = up(parent)
-    path = [edge for edge in (*ours, *theirs) if (edge in ours) != (edge in theirs)]
-    roots = {(each[-1][0] if each else frame) for each, frame in ((ours, child), (theirs, parent))}
+    path = [
+        edge for edge in (*ours, *theirs) if (edge in ours) != (edge in theirs)
+    ]
+    roots = {
+        (each[-1][0] if each else frame)
+        for each, frame in ((ours, child), (theirs, parent))
+    }
     if not path or len(roots) > 1:
         raise InputError(f"no chain of frames leads from {parent} to {child}")
     return path
@@ -555,12 +670,16 @@ def _poses_from_joints(
     assert address.robot is not None
     require_regular(address.robot)
     if address.frames is None:
-        raise InputError(f"expected two frames after {address.robot.name}, as in #base>tool")
+        raise InputError(
+            f"expected two frames after {address.robot.name}, as in #base>tool"
+        )
     robot = UrdfTransformManager(check=False)
     try:
         robot.load_urdf(address.robot.read_text(encoding="utf-8"))
     except Exception as error:  # lxml's and the library's own
-        raise InputError(f"is not a URDF file: {error}", address.robot) from error
+        raise InputError(
+            f"is not a URDF file: {error}", address.robot
+        ) from error
     parent, child = address.frames
     for frame in address.frames:
         if not robot.has_frame(frame):
@@ -573,7 +692,11 @@ def _poses_from_joints(
         raise InputError(
             "does not state the unit of its joints; expected #rad or #deg after the topic"
         )
-    limits = {name: robot.get_joint_limits(name) for name in columns if _has_joint(robot, name)}
+    limits = {
+        name: robot.get_joint_limits(name)
+        for name in columns
+        if _has_joint(robot, name)
+    }
     if not limits:
         joints = ", ".join(columns)
         raise InputError(f"has none of the joints {joints}", address.robot)
@@ -584,7 +707,9 @@ def _poses_from_joints(
                 angle = np.radians(value) if unit == "deg" else value
                 _require_joint_limits(name, angle, limits[name], address)
                 robot.set_joint(name, angle)
-        poses[row] = pq_from_transform(robot.get_transform(child, parent))[[0, 1, 2, 4, 5, 6, 3]]
+        poses[row] = pq_from_transform(robot.get_transform(child, parent))[
+            [0, 1, 2, 4, 5, 6, 3]
+        ]
     return poses
 
 
@@ -601,8 +726,16 @@ def _require_joint_limits(
     name: str, angle: float, limits: tuple[float, float], address: TopicAddress
 ) -> None:
     """Raise an `InputError` if a joint is beyond its limits: the library would silently clip it."""
-    if not limits[0] - JOINT_LIMIT_SLACK <= angle <= limits[1] + JOINT_LIMIT_SLACK:
-        hint = "" if address.unit else "; if these are degrees, append #deg to the topic"
+    if (
+        not limits[0] - JOINT_LIMIT_SLACK
+        <= angle
+        <= limits[1] + JOINT_LIMIT_SLACK
+    ):
+        hint = (
+            ""
+            if address.unit
+            else "; if these are degrees, append #deg to the topic"
+        )
         raise InputError(
             f"the joint {name} is at {angle:.4g}, beyond its limits {limits[0]:.4g} to "
             f"{limits[1]:.4g} in {address.robot and address.robot.name}{hint}"

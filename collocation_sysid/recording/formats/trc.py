@@ -25,15 +25,22 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     """
     rows = [row for row in tab_rows(text) if any(row.cells)]
     if len(rows) < 5:
-        raise InputError("ends within the header of a TRC file", where=f"line {rows[-1].line}")
+        raise InputError(
+            "ends within the header of a TRC file",
+            where=f"line {rows[-1].line}",
+        )
     _, keys, values, names, axes, *frames = rows
-    header_values = zip(values.cells, [values.line] * len(keys.cells), strict=False)
+    header_values = zip(
+        values.cells, [values.line] * len(keys.cells), strict=False
+    )
     header = Header(dict(zip(keys.cells, header_values, strict=False)))
     if missing := [key for key in _KEYS if key not in header.entries]:
         there = ", ".join(filter(None, keys.cells))
         message = f"the header lacks {', '.join(missing)}; found {there}"
         raise InputError(message, where=f"line {keys.line}")
-    unit = length_unit_of_text(header.entries["Units"][0], f"line {values.line}")
+    unit = length_unit_of_text(
+        header.entries["Units"][0], f"line {values.line}"
+    )
     labels = [cell for cell in names.cells[2:] if cell]
     if names.cells[0] != "Frame#" or axes.cells[0]:
         raise InputError(

@@ -29,13 +29,19 @@ IDENTIFIED_FILE = "identified.json"
 
 
 TARGETS: dict[str, ExportTarget] = {
-    "mujoco": ExportTarget("MuJoCo", mujoco.MODEL, mujoco.export, mujoco.verify),
+    "mujoco": ExportTarget(
+        "MuJoCo", mujoco.MODEL, mujoco.export, mujoco.verify
+    ),
     "newton": ExportTarget("Newton", newton.MODULE_FILE, newton.export),
     "usd": ExportTarget("OpenUSD", usd.STAGE_FILE, usd.export, usd.verify),
     "sofa": ExportTarget("SOFA", sofa.SCENE, sofa.export),
     "febio": ExportTarget("FEBio", febio.MODEL, febio.export),
-    "calculix": ExportTarget("CalculiX", calculix.DECK, calculix.export, calculix.verify),
-    "json": ExportTarget("JSON", IDENTIFIED_FILE, lambda body: ExportedFiles({}, ())),
+    "calculix": ExportTarget(
+        "CalculiX", calculix.DECK, calculix.export, calculix.verify
+    ),
+    "json": ExportTarget(
+        "JSON", IDENTIFIED_FILE, lambda body: ExportedFiles({}, ())
+    ),
 }
 # Main file of each format: the targets, and the recording for a viewer.
 MAIN_FILES = {
@@ -44,7 +50,9 @@ MAIN_FILES = {
 }
 
 
-def write_export(body: IdentifiedBody, target_name: str, folder: str | Path) -> ExportedFiles:
+def write_export(
+    body: IdentifiedBody, target_name: str, folder: str | Path
+) -> ExportedFiles:
     """Write a body for a target: its files, ``identified.json``, and the poses of its grasps and
     obstacles.
 
@@ -67,12 +75,18 @@ def write_export(body: IdentifiedBody, target_name: str, folder: str | Path) -> 
         For an unknown target, a body that the target cannot express, or a folder with other files.
     """
     exported = target_named(target_name).export(body)
-    with replaced_folder(folder, marker_file=IDENTIFIED_FILE, content_word="export") as place:
+    with replaced_folder(
+        folder, marker_file=IDENTIFIED_FILE, content_word="export"
+    ) as place:
         for name, text in exported.files.items():
             (place / name).write_text(text, encoding="utf-8")
         content = {**body.as_dict(), "not_expressed": exported.limitations}
-        (place / IDENTIFIED_FILE).write_text(as_json(content) + "\n", encoding="utf-8")
-        for k, grasp in enumerate((*body.experiment.grasps, *body.obstacles), start=1):
+        (place / IDENTIFIED_FILE).write_text(
+            as_json(content) + "\n", encoding="utf-8"
+        )
+        for k, grasp in enumerate(
+            (*body.experiment.grasps, *body.obstacles), start=1
+        ):
             write_poses_csv(place / f"poses_{k}.csv", grasp.poses)
     return exported
 
@@ -97,20 +111,35 @@ def verify_export(
     """
     target = target_named(target_name)
     if target.verify is None:
-        able = ", ".join(name for name, each in TARGETS.items() if each.verify is not None)
-        raise InputError(f"{target.name} cannot be run by this program; --verify works with {able}")
+        able = ", ".join(
+            name for name, each in TARGETS.items() if each.verify is not None
+        )
+        raise InputError(
+            f"{target.name} cannot be run by this program; --verify works with {able}"
+        )
     # It may leave files of its own behind.
     with tempfile.TemporaryDirectory() as scratch:
         place = Path(shutil.copytree(folder, Path(scratch) / "export"))
         return target.verify(body, place)
 
 
-def comparison_table(name: str, comparisons: Sequence[PredictionComparison]) -> Table:
+def comparison_table(
+    name: str, comparisons: Sequence[PredictionComparison]
+) -> Table:
     """Return the table of predictions of the simulator `name` and of this package."""
     rows = []
     for each in comparisons:
-        values = (f"{value:.5g} {each.unit}" for value in (each.theirs, each.ours))
-        rows.append((each.what, *values, f"{each.relative_difference:+.2%}", each.remark))
+        values = (
+            f"{value:.5g} {each.unit}" for value in (each.theirs, each.ours)
+        )
+        rows.append(
+            (
+                each.what,
+                *values,
+                f"{each.relative_difference:+.2%}",
+                each.remark,
+            )
+        )
     return Table("", ("", name, "ours", "difference", ""), tuple(rows), names=5)
 
 
@@ -124,7 +153,9 @@ def target_named(name: str) -> ExportTarget:
     """
     if name not in TARGETS:
         known = (*TARGETS, rerun_recording.TARGET)
-        raise InputError(f"no target {name!r}; available: {', '.join(known)}{hint_at(name, known)}")
+        raise InputError(
+            f"no target {name!r}; available: {', '.join(known)}{hint_at(name, known)}"
+        )
     return TARGETS[name]
 
 

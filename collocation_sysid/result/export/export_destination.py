@@ -103,13 +103,18 @@ class ExportDestination:
             for file, each in contents.items():
                 draft = stack.enter_context(replaced_file(file))
                 draft.write_bytes(each.read_bytes())
-            listing = stack.enter_context(replaced_file(self.folder / LIST_FILE))
+            listing = stack.enter_context(
+                replaced_file(self.folder / LIST_FILE)
+            )
             text = list_as_text(listed_hashes(self.folder) | hashes)
             listing.write_text(text, encoding="utf-8")
 
 
 def parse_destination(
-    text: str, main_files: Mapping[str, str], run_folder: Path, out: Path | None = None
+    text: str,
+    main_files: Mapping[str, str],
+    run_folder: Path,
+    out: Path | None = None,
 ) -> ExportDestination:
     """Return the destination that --to names.
 
@@ -133,17 +138,28 @@ def parse_destination(
     """
     if text in main_files:
         folder = out or run_folder / f"export-{text}"
-        return ExportDestination(text, folder, folder / main_files[text], is_folder=True)
+        return ExportDestination(
+            text, folder, folder / main_files[text], is_folder=True
+        )
     path = Path(text)
     suffix = path.suffix.lower()
     if suffix:
-        formats = [name for name, file in main_files.items() if Path(file).suffix == suffix]
+        formats = [
+            name
+            for name, file in main_files.items()
+            if Path(file).suffix == suffix
+        ]
     else:
-        formats = [name for name in main_files if f"-{path.name}".endswith(f"-{name}")]
+        formats = [
+            name for name in main_files if f"-{path.name}".endswith(f"-{name}")
+        ]
     if not formats:
         raise InputError(
             f"found {text!r}; expected the name of a format, or a file with its suffix: "
-            + ", ".join(f"{name} ({Path(file).suffix})" for name, file in main_files.items())
+            + ", ".join(
+                f"{name} ({Path(file).suffix})"
+                for name, file in main_files.items()
+            )
             + hint_at(text, main_files),
             None,
             "--to",
@@ -165,7 +181,9 @@ def parse_destination(
     (name,) = formats
     if suffix:
         return ExportDestination(name, path.parent, path, is_folder=False)
-    return ExportDestination(name, path, path / main_files[name], is_folder=True)
+    return ExportDestination(
+        name, path, path / main_files[name], is_folder=True
+    )
 
 
 def _require_replaceable(file: Path) -> None:

@@ -37,9 +37,7 @@ MOTION = (
     "grasped nodes are fixed at their positions of the first sample; the motion is in the CSV "
     "files of poses beside this file, and your simulation has to apply it"
 )
-UNTESTED = (
-    "untested: written according to the description of the format, but never read by the simulator"
-)
+UNTESTED = "untested: written according to the description of the format, but never read by the simulator"
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,9 @@ class PredictionComparison:
     @property
     def relative_difference(self) -> float:
         """Relative difference (theirs − ours) / ours; NaN if ours is zero."""
-        return (self.theirs - self.ours) / self.ours if self.ours else float("nan")
+        return (
+            (self.theirs - self.ours) / self.ours if self.ours else float("nan")
+        )
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,9 @@ class ExportTarget:
     name: str
     main_file: str
     export: Callable[[IdentifiedBody], ExportedFiles]
-    verify: Callable[[IdentifiedBody, Path], Sequence[PredictionComparison]] | None = None
+    verify: (
+        Callable[[IdentifiedBody, Path], Sequence[PredictionComparison]] | None
+    ) = None
 
 
 @dataclass(frozen=True)
@@ -128,9 +130,7 @@ class TargetCapabilities:
     """
 
     materials: Mapping[str, str]
-    other_materials: str = (
-        "{material} becomes the neo-Hookean material of the same λ and μ at small strain"
-    )
+    other_materials: str = "{material} becomes the neo-Hookean material of the same λ and μ at small strain"
     stiffness_damping: str = ""
     mass_damping: str = "γ_m = {gamma_m_1_s:.4g} 1/s is not supported"
     damping_law: str = ""
@@ -139,7 +139,13 @@ class TargetCapabilities:
     has_moving_obstacles: bool = False
     node_forces: str = "forces on nodes are not exported"
     has_quadratic_elements: bool = False
-    obstacle_shapes: tuple[str, ...] = ("plane", "sphere", "box", "cylinder", "capsule")
+    obstacle_shapes: tuple[str, ...] = (
+        "plane",
+        "sphere",
+        "box",
+        "cylinder",
+        "capsule",
+    )
     has_rounded_edges: bool = True
     has_contact_faces: bool = True
     has_friction: bool = True
@@ -154,15 +160,19 @@ class TargetCapabilities:
         for region in body.regions:
             damped = bool(region.gamma_r_s)
             templates = [
-                *[VISCOELASTICITY] * (bool(region.branches) and not self.has_viscoelasticity),
-                *[self.other_materials] * (region.material not in self.materials),
-                *[self.stiffness_damping] * (damped and region.damping != self.damping_law),
+                *[VISCOELASTICITY]
+                * (bool(region.branches) and not self.has_viscoelasticity),
+                *[self.other_materials]
+                * (region.material not in self.materials),
+                *[self.stiffness_damping]
+                * (damped and region.damping != self.damping_law),
                 *[self.mass_damping] * bool(region.gamma_m_1_s),
             ]
             at_once = 1 + sum(branch.share for branch in region.branches)
             values = {**vars(region), "at_once": at_once}
             sentences += [
-                f"{region.name}: {each.format(**values)}" for each in filter(None, templates)
+                f"{region.name}: {each.format(**values)}"
+                for each in filter(None, templates)
             ]
         if not self.has_moving_grasps:
             sentences.append(MOTION)
@@ -178,10 +188,15 @@ class TargetCapabilities:
     def _obstacle_limitations(self, body: IdentifiedBody) -> Iterator[str]:
         """Yield sentences on what the simulator cannot express of the obstacles."""
         for each in body.obstacles:
-            if (kind := Primitive.from_solid(each.shape).kind) not in self.obstacle_shapes:
+            if (
+                kind := Primitive.from_solid(each.shape).kind
+            ) not in self.obstacle_shapes:
                 yield f"{each.name}: an obstacle of the kind {kind} is not exported"
                 continue
-            if getattr(each.shape, "rounding_m", 0.0) and not self.has_rounded_edges:
+            if (
+                getattr(each.shape, "rounding_m", 0.0)
+                and not self.has_rounded_edges
+            ):
                 yield f"{each.name}: its edges are not rounded"
             if each.faces is not None and not self.has_contact_faces:
                 yield f"{each.name}: the whole surface of the body may touch it"
@@ -210,7 +225,9 @@ def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
     ):
         yield "forces and point masses stay as they are at the first sample"
     if any(not grasp.is_active(times).all() for grasp in e.grasps):
-        yield ("grasps that begin or end within the recording stay as they are at the first sample")
+        yield (
+            "grasps that begin or end within the recording stay as they are at the first sample"
+        )
 
 
 def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
@@ -243,18 +260,26 @@ def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
         air_density_kg_m3="none",
     )
     if samples > 1:
-        states = simulate(experiment, body.theta).positions_m[:samples].reshape(samples, -1)
+        states = (
+            simulate(experiment, body.theta)
+            .positions_m[:samples]
+            .reshape(samples, -1)
+        )
     else:
         states = equilibrium(experiment, body.theta)[None]
     # In statics what slides is the way since the sample before.
     ways = np.diff(states, axis=0, prepend=states[:1])
-    forces = Forces.from_experiment(experiment, experiment.t_s[:samples], body.theta).total(
-        states, ways
-    )
+    forces = Forces.from_experiment(
+        experiment, experiment.t_s[:samples], body.theta
+    ).total(states, ways)
     on_nodes = forces.reshape(samples, -1, 3)
     on_body = [-on_nodes[:, each.nodes].sum(axis=1) for each in body.obstacles]
-    moved_m = states.reshape(samples, -1, 3)[:, : len(body.nodes_m)] - body.nodes_m
-    return moved_m, np.stack(on_body, axis=1) if on_body else np.zeros((samples, 0, 3))
+    moved_m = (
+        states.reshape(samples, -1, 3)[:, : len(body.nodes_m)] - body.nodes_m
+    )
+    return moved_m, np.stack(on_body, axis=1) if on_body else np.zeros(
+        (samples, 0, 3)
+    )
 
 
 def longest_displacement_m(displacements_m: Array) -> float:
@@ -272,9 +297,13 @@ def linear_tetrahedra(body: IdentifiedBody) -> list[Index]:
     return [eight[region.cells].reshape(-1, 4) for region in body.regions]
 
 
-def values_as_text(values: Iterable[float] | Array, separator: str = " ") -> str:
+def values_as_text(
+    values: Iterable[float] | Array, separator: str = " "
+) -> str:
     """Return numbers as text from which they are read back exactly."""
-    return separator.join(repr(float(value)) for value in np.ravel(np.asarray(values)))
+    return separator.join(
+        repr(float(value)) for value in np.ravel(np.asarray(values))
+    )
 
 
 def comment_lines(
@@ -297,7 +326,10 @@ def comment_lines(
             f"gamma_m = {region.gamma_m_1_s:.6g} 1/s"
         )
     # No line may end the comment itself.
-    texts = (re.sub("-(?=-)", "- ", " ".join(printable(line).split())) for line in lines)
+    texts = (
+        re.sub("-(?=-)", "- ", " ".join(printable(line).split()))
+        for line in lines
+    )
     return "".join(f"{start}{text}{end}\n" for text in texts)
 
 

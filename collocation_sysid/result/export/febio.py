@@ -10,7 +10,12 @@ import numpy as np
 
 from ...array_types import Index
 from ...fem.constants import MOST_TERMS
-from .export_target import ExportedFiles, TargetCapabilities, comment_lines, values_as_text
+from .export_target import (
+    ExportedFiles,
+    TargetCapabilities,
+    comment_lines,
+    values_as_text,
+)
 from .identified import IdentifiedBody, IdentifiedRegion
 from .obstacle_shapes import FacetedObstacle, faceted_obstacles
 
@@ -41,11 +46,14 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     """Return the model of a static step with growing loads, and what FEBio cannot express."""
     limits = CAPABILITIES.limitations(body)
     materials = "".join(
-        _material_xml(k, region, limits) for k, region in enumerate(body.regions, 1)
+        _material_xml(k, region, limits)
+        for k, region in enumerate(body.regions, 1)
     )
     if body.node_loads_n.any():
         limits.append("point masses and forces on nodes are not exported")
-    xml = '<?xml version="1.0" encoding="UTF-8"?>\n' + comment_lines(body, limits, "<!-- ", " -->")
+    xml = '<?xml version="1.0" encoding="UTF-8"?>\n' + comment_lines(
+        body, limits, "<!-- ", " -->"
+    )
     xml += '<febio_spec version="4.0">\n<Module type="solid"/>\n'
     xml += (
         "<Control><analysis>STATIC</analysis><time_steps>10</time_steps>"
@@ -71,16 +79,18 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     return ExportedFiles({MODEL: f"{xml}</febio_spec>\n"}, tuple(limits))
 
 
-def _material_xml(number: int, region: IdentifiedRegion, limits: list[str]) -> str:
+def _material_xml(
+    number: int, region: IdentifiedRegion, limits: list[str]
+) -> str:
     """Return the XML of the material numbered `number` from 1, with its viscoelastic branches;
     sentences on what it does not express are appended to `limits`, in place.
     """
     kind, values, uncoupled = _elastic_law(region, limits)
-    inner = "".join(f"<{tag}>{value!r}</{tag}>" for tag, value in values.items())
+    inner = "".join(
+        f"<{tag}>{value!r}</{tag}>" for tag, value in values.items()
+    )
     if uncoupled:
-        inner += (
-            f"<k>{region.kappa_pa!r}</k><pressure_model>{QUADRATIC_PRESSURE_MODEL}</pressure_model>"
-        )
+        inner += f"<k>{region.kappa_pa!r}</k><pressure_model>{QUADRATIC_PRESSURE_MODEL}</pressure_model>"
     density = f"<density>{region.density_kg_m3!r}</density>"
     name = f'name="{region.name}"'
     if not region.branches:
@@ -100,7 +110,9 @@ def _material_xml(number: int, region: IdentifiedRegion, limits: list[str]) -> s
     )
 
 
-def _elastic_law(region: IdentifiedRegion, limits: list[str]) -> tuple[str, dict[str, float], bool]:
+def _elastic_law(
+    region: IdentifiedRegion, limits: list[str]
+) -> tuple[str, dict[str, float], bool]:
     """Return the type of a material, its constants, and whether it is uncoupled into shape and
     volume.
 
@@ -108,12 +120,19 @@ def _elastic_law(region: IdentifiedRegion, limits: list[str]) -> tuple[str, dict
     """
     c = region.constants
     if region.material == "mooney-rivlin":
-        return CAPABILITIES.materials[region.material], {"c1": c["c10_pa"], "c2": c["c01_pa"]}, True
+        return (
+            CAPABILITIES.materials[region.material],
+            {"c1": c["c10_pa"], "c2": c["c01_pa"]},
+            True,
+        )
     if region.material in CAPABILITIES.materials and region.terms:
         # The energy of a term is c/m² (Σ λ̄^m − 3).
         values = {}
         for number, term in enumerate(region.terms, start=1):
-            values |= {f"c{number}": term.mu_pa * term.alpha, f"m{number}": term.alpha}
+            values |= {
+                f"c{number}": term.mu_pa * term.alpha,
+                f"m{number}": term.alpha,
+            }
         return CAPABILITIES.materials[region.material], values, True
     moduli = {"E": region.young_pa, "v": region.poisson}
     if region.material == "linear":
@@ -121,10 +140,16 @@ def _elastic_law(region: IdentifiedRegion, limits: list[str]) -> tuple[str, dict
             f"{region.name}: the linear material of FEBio rotates with the body, that "
             "of this program does not"
         )
-    return CAPABILITIES.materials.get(region.material, "neo-Hookean"), moduli, False
+    return (
+        CAPABILITIES.materials.get(region.material, "neo-Hookean"),
+        moduli,
+        False,
+    )
 
 
-def _mesh_xml(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) -> str:
+def _mesh_xml(
+    body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]
+) -> str:
     """Return the XML of nodes, elements, sets and prescribed displacements, also of obstacles."""
     solids, facets = _obstacle_mesh_xml(body, obstacles)
     xml = '<Mesh>\n<Nodes name="nodes">\n'
@@ -134,7 +159,9 @@ def _mesh_xml(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) -> str
     for region in body.regions:
         kind = "tet10" if body.is_quadratic else "tet4"
         xml += f'<Elements type="{kind}" name="cells_{region.name}">\n'
-        for cell, nodes in zip(region.cells, body.body.cells[region.cells] + 1, strict=True):
+        for cell, nodes in zip(
+            region.cells, body.body.cells[region.cells] + 1, strict=True
+        ):
             xml += f'<elem id="{cell + 1}">{",".join(map(str, nodes))}</elem>\n'
         xml += "</Elements>\n"
     for axis, is_prescribed in zip("xyz", body.is_prescribed.T, strict=True):
@@ -144,11 +171,15 @@ def _mesh_xml(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) -> str
     xml += facets
     domains = "".join(
         f'<SolidDomain name="cells_{name}" mat="{name}"/>\n'
-        for name in [r.name for r in body.regions] + [f"wall_{k}" for k in range(len(obstacles))]
+        for name in [r.name for r in body.regions]
+        + [f"wall_{k}" for k in range(len(obstacles))]
     )
     maps = ""
     for axis, is_prescribed, displacement in zip(
-        "xyz", body.is_prescribed.T, body.prescribed_displacements_m.T, strict=True
+        "xyz",
+        body.is_prescribed.T,
+        body.prescribed_displacements_m.T,
+        strict=True,
     ):
         if displacement.any():
             rows = "".join(
@@ -166,7 +197,10 @@ def _prescribed_displacement_xml(body: IdentifiedBody) -> str:
     """
     conditions = ""
     for axis, is_prescribed, displacement in zip(
-        "xyz", body.is_prescribed.T, body.prescribed_displacements_m.T, strict=True
+        "xyz",
+        body.is_prescribed.T,
+        body.prescribed_displacements_m.T,
+        strict=True,
     ):
         where = f'name="hold_{axis}" node_set="held_{axis}"'
         if displacement.any():
@@ -225,7 +259,9 @@ def _contact_xml(obstacles: Sequence[FacetedObstacle]) -> str:
     driven = ""
     contacts = ""
     for k, wall in enumerate(obstacles):
-        fixed = "".join(f"<{dof}_dof>1</{dof}_dof>" for dof in ("Ru", "Rv", "Rw"))
+        fixed = "".join(
+            f"<{dof}_dof>1</{dof}_dof>" for dof in ("Ru", "Rv", "Rw")
+        )
         driven += f'<rigid_bc type="rigid_fixed"><rb>wall_{k}</rb>{fixed}</rigid_bc>\n'
         for axis, way in zip("xyz", -wall.retraction_m, strict=True):
             driven += (
@@ -238,4 +274,8 @@ def _contact_xml(obstacles: Sequence[FacetedObstacle]) -> str:
             "<auto_penalty>0</auto_penalty><symmetric_stiffness>0</symmetric_stiffness>"
             f"<fric_coeff>{float(wall.obstacle.friction)!r}</fric_coeff></contact>\n"
         )
-    return f"<Rigid>\n{driven}</Rigid>\n<Contact>\n{contacts}</Contact>\n" if obstacles else ""
+    return (
+        f"<Rigid>\n{driven}</Rigid>\n<Contact>\n{contacts}</Contact>\n"
+        if obstacles
+        else ""
+    )

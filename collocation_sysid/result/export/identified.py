@@ -115,16 +115,24 @@ def without_obstacles(experiment: Experiment) -> Experiment:
     t_s = experiment.t_s
     own = len(body.nodes.points_m)
     started = {
-        name: None if (positions_m := getattr(experiment, name)) is None else positions_m[:own]
+        name: None
+        if (positions_m := getattr(experiment, name)) is None
+        else positions_m[:own]
         for name in ("start_positions_m", "start_velocities_m_s")
     }
     # Exports need no measurements, and all of them may be of the obstacles.
     some = Markers(
-        t_s, np.zeros((len(t_s), 1, 3)), sigma_m=1e-3, names=["corner"], places_m=body.nodes_m[:1]
+        t_s,
+        np.zeros((len(t_s), 1, 3)),
+        sigma_m=1e-3,
+        names=["corner"],
+        places_m=body.nodes_m[:1],
     )
     unmeasured: dict[str, Any] = {"markers": some, "readings": (), "depths": ()}
     try:
-        return replace(experiment, grasps=experiment.body_grasps, **started, **unmeasured)
+        return replace(
+            experiment, grasps=experiment.body_grasps, **started, **unmeasured
+        )
     except InputError as error:
         raise InputError(
             "exports leave obstacles out, and the body has no equilibrium without them; expected a "
@@ -169,7 +177,10 @@ class IdentifiedBody:
 
     @classmethod
     def read(
-        cls, run: str | Path, experiment: str | None = None, allow_code: bool = False
+        cls,
+        run: str | Path,
+        experiment: str | None = None,
+        allow_code: bool = False,
     ) -> IdentifiedBody:
         """Read the body from a run folder.
 
@@ -193,12 +204,16 @@ class IdentifiedBody:
         home = result.problem_folder(folder, "which export needs")
         with damaged_run_refused(folder):
             warnings = _warnings(result)
-        problem = Problem.read(folder / "problem.toml", allow_code=allow_code, folder=home)
+        problem = Problem.read(
+            folder / "problem.toml", allow_code=allow_code, folder=home
+        )
         problem = problem.with_lengths(
             {n: each.shapes.length_m for n, each in result.fields.items()}
         )
         if problem.parameters.free:
-            problem = answer.apply_to_problem(problem)  # which may state no guess itself
+            problem = answer.apply_to_problem(
+                problem
+            )  # which may state no guess itself
         if any(body.scan_conditions is not None for body in problem.bodies):
             raise InputError(
                 "the mesh was made under gravity, but simulators assume a stress-free mesh; "
@@ -208,26 +223,38 @@ class IdentifiedBody:
                 "object.rest_shape",
             )
         collocation = problem.collocation()
-        names = [segment.experiment.name for segment in collocation.transcriptions]
+        names = [
+            segment.experiment.name for segment in collocation.transcriptions
+        ]
         if experiment is not None and experiment not in names:
             raise InputError(
-                f"no experiment {experiment!r} was fitted; expected {', '.join(names)}", folder
+                f"no experiment {experiment!r} was fitted; expected {', '.join(names)}",
+                folder,
             )
-        segment = collocation.transcriptions[names.index(experiment) if experiment else 0]
+        segment = collocation.transcriptions[
+            names.index(experiment) if experiment else 0
+        ]
         with damaged_run_refused(folder):
             values = {
-                item.name: result.parameters[item.name].value for item in problem.parameters.items
+                item.name: result.parameters[item.name].value
+                for item in problem.parameters.items
             }
-        phi = answer.apply_to_nuisance(collocation)[0][segment.nuisance_indices.indices]
+        phi = answer.apply_to_nuisance(collocation)[0][
+            segment.nuisance_indices.indices
+        ]
         with damaged_run_refused(folder):
-            replay = MotionRecord.from_arrays(segment.experiment.name, read_arrays(folder))
+            replay = MotionRecord.from_arrays(
+                segment.experiment.name, read_arrays(folder)
+            )
             body = segment.body
             if replay.undeformed_m.shape != body.nodes.points_m.shape:
                 raise ValueError("the mesh is not that of the problem file")
         corrected = segment.corrected_experiment(phi)
         rolled_out_m = replay.rolled_out_positions_m
         obstacles = tuple(
-            replace(o, friction=values[o.friction]) if isinstance(o.friction, str) else o
+            replace(o, friction=values[o.friction])
+            if isinstance(o.friction, str)
+            else o
             for o in corrected.obstacles
         )
         touching = corrected.with_obstacles(obstacles) if obstacles else None
@@ -235,12 +262,20 @@ class IdentifiedBody:
             with located(folder):
                 corrected = without_obstacles(corrected)
             body = corrected.body
-            rolled_out_m = None if rolled_out_m is None else rolled_out_m[:, : len(body.nodes_m)]
+            rolled_out_m = (
+                None
+                if rolled_out_m is None
+                else rolled_out_m[:, : len(body.nodes_m)]
+            )
         return cls(
             problem.title,
             result.trust.verdict,
             warnings,
-            {n: each for n, each in result.parameters.items() if n in result.values},
+            {
+                n: each
+                for n, each in result.parameters.items()
+                if n in result.values
+            },
             body,
             body.theta_from_values(values),
             corrected,
@@ -317,7 +352,9 @@ class IdentifiedBody:
         of the body.
         """
         weight = self.point_masses_kg[:, None] * self.experiment.gravity_m_s2
-        return self.experiment.declared_node_forces_n([self.start_s])[0] + weight
+        return (
+            self.experiment.declared_node_forces_n([self.start_s])[0] + weight
+        )
 
     @cached_property
     def regions(self) -> tuple[IdentifiedRegion, ...]:
@@ -327,8 +364,13 @@ class IdentifiedBody:
         lame = body.lame(self.theta)
         shares = body.split_theta(self.theta)
         densities = body.densities(self.theta)
-        for part, share, density in zip(body.parts, shares, densities, strict=True):
-            values = {c.name: float(v) for c, v in zip(part.constants, share, strict=True)}
+        for part, share, density in zip(
+            body.parts, shares, densities, strict=True
+        ):
+            values = {
+                c.name: float(v)
+                for c, v in zip(part.constants, share, strict=True)
+            }
             young, poisson = engineering_constants(*lame[part.name])
             regions.append(
                 IdentifiedRegion(
@@ -345,7 +387,9 @@ class IdentifiedBody:
                     values.get("gamma_m_1_s", 0.0),
                     tuple(
                         IdentifiedBranch(
-                            b.name, values[f"{b.name}.share"], values[f"{b.name}.tau_s"]
+                            b.name,
+                            values[f"{b.name}.share"],
+                            values[f"{b.name}.tau_s"],
                         )
                         for b in part.prony
                     ),
@@ -419,9 +463,13 @@ def _warnings(result: Result) -> tuple[str, ...]:
     if not result.converged:
         warnings.append("the run did not converge")
     if (verdict := result.trust.verdict) != "good":
-        warnings.append(f"the verdict on the run is {verdict!r}: {'; '.join(result.trust.reasons)}")
+        warnings.append(
+            f"the verdict on the run is {verdict!r}: {'; '.join(result.trust.reasons)}"
+        )
     if result.fields:
-        warnings.append(f"{listed(result.fields)} varies in space: the mean is exported")
+        warnings.append(
+            f"{listed(result.fields)} varies in space: the mean is exported"
+        )
     for name, each in result.parameters.items():
         if each.at_bound and not each.fixed:
             warnings.append(

@@ -68,7 +68,10 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         For grasps that hold single axes, or not during the whole recording.
     """
     for k, grasp in enumerate(body.experiment.grasps, start=1):
-        if grasp.axes != "xyz" or not grasp.is_active(body.experiment.t_s).all():
+        if (
+            grasp.axes != "xyz"
+            or not grasp.is_active(body.experiment.t_s).all()
+        ):
             raise InputError(
                 f"grasp {k} holds only {grasp.axes}, from {grasp.from_s:g} s until "
                 f"{grasp.until_s:g} s; a mocap body of MuJoCo holds nodes along all axes, "
@@ -158,7 +161,9 @@ def _weld_xml(body: IdentifiedBody, step_s: float) -> str:
 def _pose_at(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
     """Return position (3,) [m] and quaternion (w, x, y, z) of a grasp or obstacle at a time."""
     rotations, positions = grasp.poses.at([t_s])
-    return positions[0], np.roll(Rotation.from_matrix(rotations[0]).as_quat(), 1)
+    return positions[0], np.roll(
+        Rotation.from_matrix(rotations[0]).as_quat(), 1
+    )
 
 
 def _node_xml(body: IdentifiedBody) -> str:
@@ -167,9 +172,12 @@ def _node_xml(body: IdentifiedBody) -> str:
     mass = body.total_node_mass_kg
     for n in np.flatnonzero(~body.is_node_prescribed):
         joints = "".join(
-            f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1")
+            f'<joint type="slide" axis="{axis}"/>'
+            for axis in ("1 0 0", "0 1 0", "0 0 1")
         )
-        inertia = max(1e-6 * float(mass[n]), 1e-12)  # a node does not turn, but must have some
+        inertia = max(
+            1e-6 * float(mass[n]), 1e-12
+        )  # a node does not turn, but must have some
         lines += (
             f'<body name="node{n}" pos="{values_as_text(body.nodes_m[n])}">'
             f'<inertial pos="0 0 0" mass="{float(mass[n])!r}" '
@@ -182,14 +190,18 @@ def _flex_xml(body: IdentifiedBody) -> str:
     """Return the XML of a flex for each region: node positions relative to their bodies, and
     elements.
     """
-    names = np.array([f"node{n}" for n in range(len(body.nodes_m))], dtype=object)
+    names = np.array(
+        [f"node{n}" for n in range(len(body.nodes_m))], dtype=object
+    )
     places = np.zeros_like(body.nodes_m)
     for k, grasp in enumerate(body.experiment.grasps):
         names[grasp.nodes] = f"grasp{k}"
         places[grasp.nodes] = body.body.nodes_m[grasp.nodes]
     skin = RELATIVE_SKIN_RADIUS * _mean_edge_m(body)
     lines = ""
-    for region, cells in zip(body.regions, linear_tetrahedra(body), strict=True):
+    for region, cells in zip(
+        body.regions, linear_tetrahedra(body), strict=True
+    ):
         used, elements = np.unique(cells, return_inverse=True)
         lines += (
             f'<flex name="{region.name}" dim="3" radius="{skin!r}" body="{" ".join(names[used])}" '
@@ -215,9 +227,15 @@ def _keyframe_xml(body: IdentifiedBody) -> str:
     started = body.experiment.start_velocities_m_s
     velocity = np.zeros_like(shape) if started is None else started
     grasps = body.experiment.grasps
-    carriers = [np.concatenate(_pose_at(grasp, body.start_s)) for grasp in grasps]
-    places = values_as_text(np.concatenate([*carriers, (shape - body.nodes_m)[free].ravel()]))
-    speeds = values_as_text(np.concatenate([np.zeros(6 * len(grasps)), velocity[free].ravel()]))
+    carriers = [
+        np.concatenate(_pose_at(grasp, body.start_s)) for grasp in grasps
+    ]
+    places = values_as_text(
+        np.concatenate([*carriers, (shape - body.nodes_m)[free].ravel()])
+    )
+    speeds = values_as_text(
+        np.concatenate([np.zeros(6 * len(grasps)), velocity[free].ravel()])
+    )
     return f'<key name="start" qpos="{places}" qvel="{speeds}"/>\n'
 
 
@@ -250,7 +268,9 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     try:
         model = mujoco.MjModel.from_xml_path(str(folder / MODEL))
     except ValueError as error:
-        raise InputError(f"MuJoCo refuses the model: {error}", folder / MODEL) from error
+        raise InputError(
+            f"MuJoCo refuses the model: {error}", folder / MODEL
+        ) from error
     compared = [_compare_first_frequency(body, mujoco, model)]
     if not body.experiment.is_static and body.simulated_m is not None:
         compared.append(_compare_motion(body, mujoco, model))
@@ -303,17 +323,25 @@ def _compare_first_frequency(
         columns[:, column] = (ends[1] - ends[0]) / (2 * probe)
     mass = np.repeat((body.total_node_mass_kg)[free], 3)
     root = 1 / np.sqrt(mass)
-    squares = eigh((columns + columns.T) / 2 * np.outer(root, root), eigvals_only=True)
+    squares = eigh(
+        (columns + columns.T) / 2 * np.outer(root, root), eigvals_only=True
+    )
     oscillating = squares[squares > 1e-9 * squares[-1]]
     theirs = float(np.sqrt(oscillating[0])) / (2 * np.pi)
     dofs = np.flatnonzero(np.repeat(free, 3))
     in_vacuum = replace(body.experiment, air_density_kg_m3="none")
     forces = Forces.from_experiment(in_vacuum, body.start_s, body.theta)
-    ours = natural_modes(forces, body.nodes_m, free_dofs=dofs, count=1).frequencies_hz
-    return PredictionComparison("first natural frequency, undeformed", theirs, float(ours[0]), "Hz")
+    ours = natural_modes(
+        forces, body.nodes_m, free_dofs=dofs, count=1
+    ).frequencies_hz
+    return PredictionComparison(
+        "first natural frequency, undeformed", theirs, float(ours[0]), "Hz"
+    )
 
 
-def _compare_motion(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> PredictionComparison:
+def _compare_motion(
+    body: IdentifiedBody, mujoco: ModuleType, model: Any
+) -> PredictionComparison:
     """Return the RMS deformation over the recording in MuJoCo and here [m].
 
     Deformation is the distance from the rigidly moved body.
@@ -338,7 +366,10 @@ def _compare_motion(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> Pre
     shapes = [data.qpos[first:].reshape(-1, 3).copy()]
     for k in range(steps * (len(e.t_s) - 1)):
         _set_grasp_state(
-            body, mujoco, data, (body.start_s + k * model.opt.timestep, model.opt.timestep)
+            body,
+            mujoco,
+            data,
+            (body.start_s + k * model.opt.timestep, model.opt.timestep),
         )
         mujoco.mj_step(model, data)
         if (k + 1) % steps == 0:
@@ -353,12 +384,19 @@ def _compare_motion(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> Pre
     remark = f"both simulations differ by {difference_m:.3g} m (RMS){share}"
     what = "RMS deformation over the recording"
     return PredictionComparison(
-        what, _rms_length(theirs - rigid_m), ours=size_m, unit="m", remark=remark
+        what,
+        _rms_length(theirs - rigid_m),
+        ours=size_m,
+        unit="m",
+        remark=remark,
     )
 
 
 def _set_grasp_state(
-    body: IdentifiedBody, mujoco: ModuleType, data: Any, time_and_step_s: tuple[float, float]
+    body: IdentifiedBody,
+    mujoco: ModuleType,
+    data: Any,
+    time_and_step_s: tuple[float, float],
 ) -> None:
     """Set pose and velocity of the bodies that carry grasped nodes, and the pose of obstacles, in
     `data`.
@@ -369,10 +407,14 @@ def _set_grasp_state(
     last_s = float(body.experiment.t_s[-1])
     turning = np.zeros(3)
     for k, grasp in enumerate(body.experiment.grasps):
-        here, there = (_pose_at(grasp, min(at_s, last_s)) for at_s in (t_s, t_s + step_s))
+        here, there = (
+            _pose_at(grasp, min(at_s, last_s)) for at_s in (t_s, t_s + step_s)
+        )
         mujoco.mju_subQuat(turning, there[1], here[1])
         data.qpos[7 * k : 7 * k + 7] = np.concatenate(here)
-        data.qvel[6 * k : 6 * k + 6] = np.concatenate([there[0] - here[0], turning]) / step_s
+        data.qvel[6 * k : 6 * k + 6] = (
+            np.concatenate([there[0] - here[0], turning]) / step_s
+        )
     for k, each in enumerate(body.obstacles, len(body.experiment.grasps)):
         data.mocap_pos[k], data.mocap_quat[k] = _pose_at(each, min(t_s, last_s))
 

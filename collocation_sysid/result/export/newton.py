@@ -9,7 +9,12 @@ import numpy as np
 
 from ...recording import Obstacle
 from ...serialisation import content
-from .export_target import ExportedFiles, TargetCapabilities, comment_lines, linear_tetrahedra
+from .export_target import (
+    ExportedFiles,
+    TargetCapabilities,
+    comment_lines,
+    linear_tetrahedra,
+)
 from .identified import IdentifiedBody
 from .obstacle_shapes import Primitive, SharedContact, faceted_obstacles
 
@@ -104,7 +109,9 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         cells.append(own)
         # Its damping stress is 4 k Ė, ours γ_r (2 μ Ė + λ tr Ė): alike where the volume stays.
         damping = region.gamma_r_s * region.mu_pa / 2
-        constants.append(np.tile([region.mu_pa, region.lambda_pa, damping], (len(own), 1)))
+        constants.append(
+            np.tile([region.mu_pa, region.lambda_pa, damping], (len(own), 1))
+        )
     contact = SharedContact.from_obstacles(faceted_obstacles(body))
     limits = [
         *CAPABILITIES.limitations(body),
@@ -115,7 +122,9 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     ]
     k_mu, k_lambda, k_damp = np.concatenate(constants).T
     data = {
-        "nodes_m": np.where(body.is_prescribed, body.prescribed_m, body.nodes_m),
+        "nodes_m": np.where(
+            body.is_prescribed, body.prescribed_m, body.nodes_m
+        ),
         "cells": np.concatenate(cells),
         "k_mu": k_mu,
         "k_lambda": k_lambda,
@@ -126,7 +135,9 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         "contact_m": contact.particle_radius_m,
         "contact_n_m": contact.node_stiffness_n_m,
         "contact_mu": contact.friction,
-        "obstacles": [_obstacle_data(each, body.start_s) for each in body.obstacles],
+        "obstacles": [
+            _obstacle_data(each, body.start_s) for each in body.obstacles
+        ],
     }
     files = {
         MODULE_FILE: comment_lines(body, limits, "# ") + _MODULE_SOURCE,
@@ -145,7 +156,9 @@ def _obstacle_data(obstacle: Obstacle, t_s: float) -> dict[str, Any]:
     return {
         "name": obstacle.name,
         "kind": shape.kind,
-        "size": dict(zip(SIZE_ARGUMENTS[shape.kind], sizes.tolist(), strict=True)),
+        "size": dict(
+            zip(SIZE_ARGUMENTS[shape.kind], sizes.tolist(), strict=True)
+        ),
         "place_m": place_m,
         "quaternion_xyzw": turn.as_quat(),
         "friction": float(obstacle.friction),

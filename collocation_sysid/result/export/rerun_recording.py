@@ -48,7 +48,9 @@ BLACK = (20, 20, 20)
 GREY = (150, 160, 170)
 
 
-def write_rerun(run: str | Path, folder: str | Path, experiment: str | None = None) -> list[str]:
+def write_rerun(
+    run: str | Path, folder: str | Path, experiment: str | None = None
+) -> list[str]:
     """Write the recording of a run folder for the Rerun viewer.
 
     Parameters
@@ -79,7 +81,9 @@ def write_rerun(run: str | Path, folder: str | Path, experiment: str | None = No
     if not replays:
         raise InputError("no experiment of this run has a trajectory", run)
     stresses = [_stress_on_faces(run, replay) for replay in replays]
-    with replaced_folder(folder, marker_file=RECORDING_FILE, content_word="recording") as place:
+    with replaced_folder(
+        folder, marker_file=RECORDING_FILE, content_word="recording"
+    ) as place:
         recording = _Recording(place / RECORDING_FILE, result, replays)
         limits = _limits(stresses)
         for replay, stress in zip(replays, stresses, strict=True):
@@ -104,14 +108,23 @@ def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
 
 def _limits(stresses: Sequence[Array | None]) -> tuple[float, float]:
     """Return the ends of the colour scale, the same for all experiments."""
-    known = [each for each in stresses if each is not None and np.isfinite(each).any()]
+    known = [
+        each
+        for each in stresses
+        if each is not None and np.isfinite(each).any()
+    ]
     if not known:
         return 0.0, 1.0
-    return min(float(np.nanmin(s)) for s in known), max(float(np.nanmax(s)) for s in known)
+    return min(float(np.nanmin(s)) for s in known), max(
+        float(np.nanmax(s)) for s in known
+    )
 
 
 def vertex_colours(
-    faces: NDArray[np.integer], values: Array, limits: tuple[float, float], count: int
+    faces: NDArray[np.integer],
+    values: Array,
+    limits: tuple[float, float],
+    count: int,
 ) -> NDArray[np.uint8]:
     """Return the colours of vertices from values on the triangles around them.
 
@@ -156,7 +169,9 @@ class _Recording:
         Experiments that will be written; they determine the layout and the time span.
     """
 
-    def __init__(self, file: Path, result: Result, replays: Sequence[MotionRecord]) -> None:
+    def __init__(
+        self, file: Path, result: Result, replays: Sequence[MotionRecord]
+    ) -> None:
         rr: Any = import_module("rerun")
         self.rr = rr
         self.stream = rr.RecordingStream(APPLICATION)
@@ -166,7 +181,10 @@ class _Recording:
         summary = as_markdown(run_summary(result))
         document = rr.TextDocument(summary, media_type=rr.MediaType.MARKDOWN)
         self.stream.log("summary", document, static=True)
-        span_s = min(each.t_s[0] for each in replays), max(each.t_s[-1] for each in replays)
+        span_s = (
+            min(each.t_s[0] for each in replays),
+            max(each.t_s[-1] for each in replays),
+        )
         self._write_parameters(result, np.array(span_s))
 
     def close(self) -> None:
@@ -177,14 +195,20 @@ class _Recording:
     def _layout(self, replays: Sequence[MotionRecord]) -> Any:
         """Return the layout of the viewer: the bodies beside curves and the summary."""
         views: Any = import_module("rerun.blueprint")
-        bodies = [views.Spatial3DView(origin=self._path(e.name), name=e.name) for e in replays]
+        bodies = [
+            views.Spatial3DView(origin=self._path(e.name), name=e.name)
+            for e in replays
+        ]
         curves = [
             views.TimeSeriesView(
-                origin=self._path(e.name, "residuals_mm"), name=f"{e.name}: residuals [mm]"
+                origin=self._path(e.name, "residuals_mm"),
+                name=f"{e.name}: residuals [mm]",
             )
             for e in replays
         ]
-        parameters = views.TimeSeriesView(origin="parameters", name="parameters")
+        parameters = views.TimeSeriesView(
+            origin="parameters", name="parameters"
+        )
         summary = views.TextDocumentView(origin="summary", name="summary")
         right = views.Vertical(views.Tabs(*curves), parameters, summary)
         return views.Blueprint(views.Horizontal(views.Tabs(*bodies), right))
@@ -198,12 +222,22 @@ class _Recording:
         for name, each in result.values.items():
             curves = {"value": each.value}
             if each.combined95 is not None:
-                curves |= {"lower": each.combined95[0], "upper": each.combined95[1]}
+                curves |= {
+                    "lower": each.combined95[0],
+                    "upper": each.combined95[1],
+                }
             for curve, value in curves.items():
-                self._write_curve(self._path("parameters", name, curve), span_s, [value, value])
+                self._write_curve(
+                    self._path("parameters", name, curve),
+                    span_s,
+                    [value, value],
+                )
 
     def write_experiment(
-        self, replay: MotionRecord, stress: Array | None, limits: tuple[float, float]
+        self,
+        replay: MotionRecord,
+        stress: Array | None,
+        limits: tuple[float, float],
     ) -> None:
         """Write an experiment.
 
@@ -223,7 +257,9 @@ class _Recording:
         radius_m = MARKER_RADIUS_RATIO * extent_m
         shapes_m = replay.shapes_m
         assert shapes_m is not None
-        grasped_m = [x[h] for x, h in zip(shapes_m, replay.is_prescribed, strict=True)]
+        grasped_m = [
+            x[h] for x, h in zip(shapes_m, replay.is_prescribed, strict=True)
+        ]
         self._write_points(
             self._path(name, "grasped"),
             replay.t_s,
@@ -239,13 +275,23 @@ class _Recording:
             if markers_m is not None and len(replay.marker_names):
                 path = self._path(name, "markers", kind)
                 self._write_points(
-                    path, replay.t_s, points_m=[*markers_m], colour=colour, radius_m=radius_m
+                    path,
+                    replay.t_s,
+                    points_m=[*markers_m],
+                    colour=colour,
+                    radius_m=radius_m,
                 )
-        depth_points_m = [replay.depth_points_m(k) for k in range(len(replay.t_s))]
+        depth_points_m = [
+            replay.depth_points_m(k) for k in range(len(replay.t_s))
+        ]
         if any(map(len, depth_points_m)):
             path = self._path(name, "depth_points")
             self._write_points(
-                path, replay.t_s, points_m=depth_points_m, colour=ORANGE, radius_m=radius_m / 4
+                path,
+                replay.t_s,
+                points_m=depth_points_m,
+                colour=ORANGE,
+                radius_m=radius_m / 4,
             )
         self._write_obstacles(replay)
         self._write_residuals(replay)
@@ -255,10 +301,15 @@ class _Recording:
         """Return the viewer's axis that is nearest to a direction (3,)."""
         axis = int(np.abs(up).argmax())
         end = "UP" if up[axis] > 0 else "DOWN"
-        return getattr(self.rr.ViewCoordinates, f"RIGHT_HAND_{'XYZ'[axis]}_{end}")
+        return getattr(
+            self.rr.ViewCoordinates, f"RIGHT_HAND_{'XYZ'[axis]}_{end}"
+        )
 
     def _write_surface(
-        self, replay: MotionRecord, stress: Array | None, limits: tuple[float, float]
+        self,
+        replay: MotionRecord,
+        stress: Array | None,
+        limits: tuple[float, float],
     ) -> None:
         """Write the deforming surface; samples that are not finite are left out."""
         rr = self.rr
@@ -271,15 +322,21 @@ class _Recording:
         count = len(nodes)
         path = self._path(replay.name, "body")
         topology = rr.Mesh3D.from_fields(
-            triangle_indices=triangles, albedo_factor=GREY if stress is None else None
+            triangle_indices=triangles,
+            albedo_factor=GREY if stress is None else None,
         )
         self.stream.log(path, topology, static=True)
-        columns: dict[str, Any] = {"vertex_positions": positions_m.reshape(-1, 3)}
+        columns: dict[str, Any] = {
+            "vertex_positions": positions_m.reshape(-1, 3)
+        }
         if stress is not None:
             colours = vertex_colours(triangles, stress[there], limits, count)
             columns["vertex_colors"] = colours.reshape(-1, 4)
         self._send(
-            path, replay.t_s[there], rr.Mesh3D.columns(**columns), [count] * len(positions_m)
+            path,
+            replay.t_s[there],
+            rr.Mesh3D.columns(**columns),
+            [count] * len(positions_m),
         )
         if stress is not None:
             largest = np.nanmax(np.nan_to_num(stress, nan=-np.inf), axis=1)
@@ -309,7 +366,9 @@ class _Recording:
         if replay.obstacles_m is None:
             return
         path = self._path(replay.name, "obstacles")
-        for time_s, points_m in zip(replay.t_s, replay.obstacles_m, strict=True):
+        for time_s, points_m in zip(
+            replay.t_s, replay.obstacles_m, strict=True
+        ):
             strips = [*_polylines(points_m)]
             self.stream.set_time(TIMELINE, duration=float(time_s))
             self.stream.log(path, self.rr.LineStrips3D(strips, colors=BLACK))
@@ -317,11 +376,17 @@ class _Recording:
 
     def _write_residuals(self, replay: MotionRecord) -> None:
         """Write the distances of the fitted (or else simulated) markers from the measured ones."""
-        model_m = replay.rolled_out_m if replay.markers_m is None else replay.markers_m
+        model_m = (
+            replay.rolled_out_m
+            if replay.markers_m is None
+            else replay.markers_m
+        )
         if model_m is None:
             return
         distances_mm = 1e3 * np.linalg.norm(model_m - replay.measured_m, axis=2)
-        for marker, values in zip(replay.marker_names, distances_mm.T, strict=True):
+        for marker, values in zip(
+            replay.marker_names, distances_mm.T, strict=True
+        ):
             path = self._path(replay.name, "residuals_mm", str(marker))
             self._write_curve(path, replay.t_s, values)
 
@@ -331,14 +396,20 @@ class _Recording:
             t_s = columns[:, 0]
             values = columns[:, 1:].reshape(len(t_s), 3, len(COMPONENTS))
             for kind, each in zip(
-                ("measured", "fitted", "simulated"), np.moveaxis(values, 1, 0), strict=True
+                ("measured", "fitted", "simulated"),
+                np.moveaxis(values, 1, 0),
+                strict=True,
             ):
-                for component, unit, curve in zip(COMPONENTS, UNITS, each.T, strict=True):
+                for component, unit, curve in zip(
+                    COMPONENTS, UNITS, each.T, strict=True
+                ):
                     label = f"{component} [{unit}]"
                     path = self._path(replay.name, f"wrench_{k}", label, kind)
                     self._write_curve(path, t_s, curve)
 
-    def _write_curve(self, path: str, t_s: Array, values: Sequence[float] | Array) -> None:
+    def _write_curve(
+        self, path: str, t_s: Array, values: Sequence[float] | Array
+    ) -> None:
         """Write a number over time; times at which it is not finite are left out."""
         curve = np.asarray(values, dtype=float)
         is_finite = np.isfinite(curve)
@@ -346,7 +417,9 @@ class _Recording:
             columns = self.rr.Scalars.columns(scalars=curve[is_finite])
             self._send(path, t_s[is_finite], columns=columns, counts=None)
 
-    def _send(self, path: str, t_s: Array, columns: Any, counts: Sequence[int] | None) -> None:
+    def _send(
+        self, path: str, t_s: Array, columns: Any, counts: Sequence[int] | None
+    ) -> None:
         """Send columns at times [s]; `counts` are the numbers of rows per time, None for one."""
         times = [self.rr.TimeColumn(TIMELINE, duration=t_s)]
         data = columns if counts is None else columns.partition(counts)

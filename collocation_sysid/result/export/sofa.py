@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from ...errors import InputError
-from .export_target import ExportedFiles, TargetCapabilities, comment_lines, values_as_text
+from .export_target import (
+    ExportedFiles,
+    TargetCapabilities,
+    comment_lines,
+    values_as_text,
+)
 from .identified import IdentifiedBody, IdentifiedRegion
 from .obstacle_shapes import Primitive, faceted_obstacles, offset_solid
 
@@ -62,10 +67,14 @@ def export(body: IdentifiedBody) -> ExportedFiles:
             "for SOFA supports one region of linear tetrahedra: export to calculix, febio or json"
         )
     if (body.is_prescribed.any(axis=1) != body.is_node_prescribed).any():
-        raise InputError("a grasp holds single axes, which the scene for SOFA does not support")
+        raise InputError(
+            "a grasp holds single axes, which the scene for SOFA does not support"
+        )
     region = body.regions[0]
     limits = [*CAPABILITIES.limitations(body)]
-    limits.append(OGDEN_VOLUME if region.material == "ogden-1" else NEO_HOOKEAN_VERSIONS)
+    limits.append(
+        OGDEN_VOLUME if region.material == "ogden-1" else NEO_HOOKEAN_VERSIONS
+    )
     force = _elastic_law_xml(region)
     if (np.abs(body.prescribed_displacements_m) > 1e-9).any():
         limits.append(
@@ -78,7 +87,9 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     x = '<?xml version="1.0"?>\n' + comment_lines(body, limits, "<!-- ", " -->")
     x += f'<Node name="root" dt="{body.experiment.timestep_s / 4!r}" '
     x += f'gravity="{values_as_text(body.experiment.gravity_m_s2)}">\n'
-    x += "".join(f'<RequiredPlugin name="Sofa.Component.{name}"/>\n' for name in PLUGINS)
+    x += "".join(
+        f'<RequiredPlugin name="Sofa.Component.{name}"/>\n' for name in PLUGINS
+    )
     x += '<DefaultAnimationLoop/>\n<Node name="body">\n'
     x += f'<EulerImplicitSolver rayleighStiffness="{region.gamma_r_s!r}" '
     x += f'rayleighMass="{region.gamma_m_1_s!r}"/>\n'
@@ -99,7 +110,9 @@ def _contact_xml(body: IdentifiedBody) -> str:
     """
     lines = ""
     for wall in faceted_obstacles(body):
-        shape = Primitive.from_solid(offset_solid(wall.obstacle.shape, wall.width_m / 2))
+        shape = Primitive.from_solid(
+            offset_solid(wall.obstacle.shape, wall.width_m / 2)
+        )
         place_m, turn = shape.pose_at(wall.obstacle, body.start_s)
         stiff = f'stiffness="{wall.node_stiffness_n_m!r}" damping="0"'
         if shape.kind == "plane":
@@ -124,7 +137,7 @@ def _elastic_law_xml(region: IdentifiedRegion) -> str:
     if region.material == "ogden-1":
         (term,) = region.terms
         # The energy is μ/α² (Σ λ̄^α − 3) + ½ κ ln² J.
-        moduli = values_as_text((term.mu_pa * term.alpha, term.alpha, region.kappa_pa))
-    return (
-        f'<TetrahedronHyperelasticityFEMForceField materialName="{name}" ParameterSet="{moduli}"/>'
-    )
+        moduli = values_as_text(
+            (term.mu_pa * term.alpha, term.alpha, region.kappa_pa)
+        )
+    return f'<TetrahedronHyperelasticityFEMForceField materialName="{name}" ParameterSet="{moduli}"/>'

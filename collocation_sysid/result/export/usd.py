@@ -63,9 +63,7 @@ TILT = (
     "gravity points {degrees:.3g}° away from −z of the stage, as estimated from the recording; a "
     "simulator that uses its magnitude only, along −z, ignores this"
 )
-NO_SIMULATION = (
-    "the points of the body are those of the first sample: the run has no forward simulation"
-)
+NO_SIMULATION = "the points of the body are those of the first sample: the run has no forward simulation"
 # Angle from which gravity counts as tilted: single precision of its direction rounds to less.
 LEAST_TILT_DEG = 1e-3
 # Frames per second of a single sample, which has no rate of its own.
@@ -108,28 +106,51 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     gravity = body.experiment.gravity_m_s2
     size = float(np.linalg.norm(gravity))
     scene.CreateGravityMagnitudeAttr(size)
-    scene.CreateGravityDirectionAttr(pxr.Gf.Vec3f(*(gravity / (size or 1.0)).tolist()))
+    scene.CreateGravityDirectionAttr(
+        pxr.Gf.Vec3f(*(gravity / (size or 1.0)).tolist())
+    )
     placed_m = np.where(body.is_prescribed, body.prescribed_m, body.nodes_m)
     _add_mesh(pxr, stage, body, placed_m)
     for k, grasp in enumerate(body.experiment.grasps, start=1):
-        _add_gripper(pxr, stage, number=k, grasp=grasp, body=body, start_positions_m=placed_m)
+        _add_gripper(
+            pxr,
+            stage,
+            number=k,
+            grasp=grasp,
+            body=body,
+            start_positions_m=placed_m,
+        )
     for k, obstacle in enumerate(body.obstacles, start=1):
-        _add_obstacle(pxr, stage, path=f"/World/Obstacle_{k}", obstacle=obstacle, body=body)
-    return ExportedFiles({STAGE_FILE: stage.GetRootLayer().ExportToString()}, tuple(limits))
+        _add_obstacle(
+            pxr,
+            stage,
+            path=f"/World/Obstacle_{k}",
+            obstacle=obstacle,
+            body=body,
+        )
+    return ExportedFiles(
+        {STAGE_FILE: stage.GetRootLayer().ExportToString()}, tuple(limits)
+    )
 
 
 def _rate_hz(t_s: Array) -> float:
     """Return the time codes per second: one for each sample (T,), on average where samples are
     uneven.
     """
-    return (len(t_s) - 1) / float(np.ptp(t_s)) if len(t_s) > 1 else SINGLE_RATE_HZ
+    return (
+        (len(t_s) - 1) / float(np.ptp(t_s)) if len(t_s) > 1 else SINGLE_RATE_HZ
+    )
 
 
 def _tilt_deg(gravity_m_s2: Array) -> float:
     """Return the angle between gravity (3,) and −z [°]; 0 without gravity."""
     downwards = -gravity_m_s2[2]
     across = np.linalg.norm(gravity_m_s2[:2])
-    return float(np.degrees(np.arctan2(across, downwards))) if gravity_m_s2.any() else 0.0
+    return (
+        float(np.degrees(np.arctan2(across, downwards)))
+        if gravity_m_s2.any()
+        else 0.0
+    )
 
 
 def _import_usd() -> Any:
@@ -143,12 +164,18 @@ def _import_usd() -> Any:
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
     except ImportError as error:
-        raise InputError("USD needs usd-core: pip install 'collocation-sysid[usd]'") from error
+        raise InputError(
+            "USD needs usd-core: pip install 'collocation-sysid[usd]'"
+        ) from error
     modules = (Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt)
-    return SimpleNamespace(**{each.__name__.rpartition(".")[2]: each for each in modules})
+    return SimpleNamespace(
+        **{each.__name__.rpartition(".")[2]: each for each in modules}
+    )
 
 
-def _add_mesh(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Array) -> None:
+def _add_mesh(
+    pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Array
+) -> None:
     """Add the tetrahedra, masses, materials and simulated motion of the body to the stage.
 
     `pxr` are the modules of `_import_usd`; `start_positions_m` (n, 3) are the initial node
@@ -169,24 +196,38 @@ def _add_mesh(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Arr
         for code, shape_m in zip(codes, body.simulated_m, strict=True):
             points.Set(shape_m.astype(np.float32), code)
     mesh.CreateTetVertexIndicesAttr(np.concatenate(cells).astype(np.int32))
-    mesh.CreateSurfaceFaceVertexIndicesAttr(pxr.UsdGeom.TetMesh.ComputeSurfaceFaces(mesh))
+    mesh.CreateSurfaceFaceVertexIndicesAttr(
+        pxr.UsdGeom.TetMesh.ComputeSurfaceFaces(mesh)
+    )
     number = pxr.Sdf.ValueTypeNames
-    rest = prim.CreateAttribute("physics:restShapePoints", number.Point3fArray, False)
+    rest = prim.CreateAttribute(
+        "physics:restShapePoints", number.Point3fArray, False
+    )
     rest.Set(body.nodes_m.astype(np.float32))
     masses = prim.CreateAttribute("physics:masses", number.FloatArray, False)
     masses.Set(_cell_masses_kg(body, cells).astype(np.float32))
     _set_token(pxr, prim, "physics:masses:elementType", "tetrahedron")
-    grasped = prim.CreateAttribute(f"{ATTRIBUTE_NAMESPACE}:graspedPoints", number.IntArray)
+    grasped = prim.CreateAttribute(
+        f"{ATTRIBUTE_NAMESPACE}:graspedPoints", number.IntArray
+    )
     grasped.Set(np.flatnonzero(body.is_node_prescribed).astype(np.int32))
     names = _unique_prim_names([region.name for region in body.regions])
     pairs = zip(body.regions, names, strict=True)
-    materials = [_add_material(pxr, stage, region, name) for region, name in pairs]
-    _bind_material(pxr, prim, materials[int(np.argmax([len(each) for each in cells]))])
+    materials = [
+        _add_material(pxr, stage, region, name) for region, name in pairs
+    ]
+    _bind_material(
+        pxr, prim, materials[int(np.argmax([len(each) for each in cells]))]
+    )
     firsts = np.cumsum([0, *map(len, cells)])
     for k, material in enumerate(materials if len(cells) > 1 else ()):
         indices = pxr.Vt.IntArray(range(firsts[k], firsts[k + 1]))
         subset = pxr.UsdGeom.Subset.CreateGeomSubset(
-            mesh, names[k], pxr.UsdGeom.Tokens.tetrahedron, indices, "materialBind"
+            mesh,
+            names[k],
+            pxr.UsdGeom.Tokens.tetrahedron,
+            indices,
+            "materialBind",
         )
         _bind_material(pxr, subset.GetPrim(), material)
 
@@ -199,10 +240,14 @@ def _cell_masses_kg(body: IdentifiedBody, cells: list[Index]) -> Array:
     edges = [np.diff(body.nodes_m[each], axis=1) for each in cells]
     volumes = [np.abs(np.linalg.det(each)) / 6 for each in edges]
     pairs = zip(body.regions, volumes, strict=True)
-    return np.concatenate([region.density_kg_m3 * volume for region, volume in pairs])
+    return np.concatenate(
+        [region.density_kg_m3 * volume for region, volume in pairs]
+    )
 
 
-def _add_material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> Any:
+def _add_material(
+    pxr: Any, stage: Any, region: IdentifiedRegion, name: str
+) -> Any:
     """Add the material of a region to the stage under `name`, and return it."""
     material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{name}")
     prim = material.GetPrim()
@@ -214,14 +259,22 @@ def _add_material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> 
         f"{ATTRIBUTE_NAMESPACE}:gammaR_s": region.gamma_r_s,
         f"{ATTRIBUTE_NAMESPACE}:gammaM_1_s": region.gamma_m_1_s,
     }
-    values |= {f"{ATTRIBUTE_NAMESPACE}:{name}": value for name, value in region.constants.items()}
+    values |= {
+        f"{ATTRIBUTE_NAMESPACE}:{name}": value
+        for name, value in region.constants.items()
+    }
     number = pxr.Sdf.ValueTypeNames
     for name, value in values.items():
-        prim.CreateAttribute(name, number.Float, name.startswith(ATTRIBUTE_NAMESPACE)).Set(
-            float(value)
-        )
-    for name, text in (("material", region.material), ("damping", region.damping)):
-        prim.CreateAttribute(f"{ATTRIBUTE_NAMESPACE}:{name}", number.String).Set(text)
+        prim.CreateAttribute(
+            name, number.Float, name.startswith(ATTRIBUTE_NAMESPACE)
+        ).Set(float(value))
+    for name, text in (
+        ("material", region.material),
+        ("damping", region.damping),
+    ):
+        prim.CreateAttribute(
+            f"{ATTRIBUTE_NAMESPACE}:{name}", number.String
+        ).Set(text)
     return material
 
 
@@ -239,7 +292,12 @@ def _set_token(pxr: Any, prim: Any, name: str, text: str) -> None:
 
 
 def _add_gripper(
-    pxr: Any, stage: Any, number: int, grasp: Grasp, body: IdentifiedBody, start_positions_m: Array
+    pxr: Any,
+    stage: Any,
+    number: int,
+    grasp: Grasp,
+    body: IdentifiedBody,
+    start_positions_m: Array,
 ) -> None:
     """Add a kinematic rigid body that follows the poses of a grasp, and attach the grasped nodes to
     it.
@@ -248,7 +306,9 @@ def _add_gripper(
     """
     path = f"/World/Gripper_{number}"
     gripper = pxr.UsdGeom.Xform.Define(stage, path)
-    pxr.UsdPhysics.RigidBodyAPI.Apply(gripper.GetPrim()).CreateKinematicEnabledAttr(True)
+    pxr.UsdPhysics.RigidBodyAPI.Apply(
+        gripper.GetPrim()
+    ).CreateKinematicEnabledAttr(True)
     matrices, positions_m = grasp.poses.at(body.experiment.t_s)
     _set_poses(
         pxr,
@@ -261,7 +321,9 @@ def _add_gripper(
     prim = stage.DefinePrim(f"{path}/Grasp", "PhysicsAttachment")
     types = pxr.Sdf.ValueTypeNames
     for name, target in (("src0", "/World/Body/Mesh"), ("src1", path)):
-        prim.CreateRelationship(f"physics:{name}", False).SetTargets([pxr.Sdf.Path(target)])
+        prim.CreateRelationship(f"physics:{name}", False).SetTargets(
+            [pxr.Sdf.Path(target)]
+        )
     for name, text in (("type0", "point"), ("type1", "xform")):
         _set_token(pxr, prim, f"physics:{name}", text)
     local_m = (start_positions_m[nodes] - positions_m[0]) @ matrices[0]
@@ -272,7 +334,9 @@ def _add_gripper(
         prim.CreateAttribute(f"physics:{name}", kind, False).Set(values)
 
 
-def _set_poses(pxr: Any, prim: Any, positions_m: Array, rotations: Rotation, t_s: Array) -> None:
+def _set_poses(
+    pxr: Any, prim: Any, positions_m: Array, rotations: Rotation, t_s: Array
+) -> None:
     """Place a prim at positions (T, 3) and rotations at times (T,), by default as in the first row.
 
     With empty `t_s`, the only row holds for all time.
@@ -296,10 +360,16 @@ def _add_obstacle(
     frame = path
     if len(obstacle.poses.t_s) > 1:
         moving = pxr.UsdGeom.Xform.Define(stage, path)
-        pxr.UsdPhysics.RigidBodyAPI.Apply(moving.GetPrim()).CreateKinematicEnabledAttr(True)
+        pxr.UsdPhysics.RigidBodyAPI.Apply(
+            moving.GetPrim()
+        ).CreateKinematicEnabledAttr(True)
         matrices, places_m = obstacle.poses.at(t_s)
         _set_poses(
-            pxr, moving, positions_m=places_m, rotations=Rotation.from_matrix(matrices), t_s=t_s
+            pxr,
+            moving,
+            positions_m=places_m,
+            rotations=Rotation.from_matrix(matrices),
+            t_s=t_s,
         )
         place_m = shape.centre_m
         turn = shape.rotation
@@ -307,13 +377,21 @@ def _add_obstacle(
     else:
         place_m, turn = shape.pose_at(obstacle, body.start_s)
     kinds = {"box": "Cube"}
-    solid = getattr(pxr.UsdGeom, kinds.get(shape.kind, shape.kind.title())).Define(stage, frame)
+    solid = getattr(
+        pxr.UsdGeom, kinds.get(shape.kind, shape.kind.title())
+    ).Define(stage, frame)
     _set_poses(
-        pxr, solid, positions_m=place_m[None], rotations=Rotation.concatenate([turn]), t_s=t_s[:0]
+        pxr,
+        solid,
+        positions_m=place_m[None],
+        rotations=Rotation.concatenate([turn]),
+        t_s=t_s[:0],
     )
     if shape.kind == "box":
         solid.CreateSizeAttr(2.0)
-        solid.AddScaleOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Vec3d(*shape.size_m))
+        solid.AddScaleOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(
+            pxr.Gf.Vec3d(*shape.size_m)
+        )
     elif shape.kind != "plane":
         solid.CreateRadiusAttr(float(shape.size_m[0]))
     if shape.kind in ("plane", "cylinder", "capsule"):
@@ -322,9 +400,14 @@ def _add_obstacle(
         solid.CreateHeightAttr(2 * float(shape.size_m[1]))
     pxr.UsdPhysics.CollisionAPI.Apply(solid.GetPrim())
     solid.GetPrim().SetDisplayName(printable(obstacle.name))
-    material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{path.rpartition('/')[2]}")
+    material = pxr.UsdShade.Material.Define(
+        stage, f"/World/Materials/{path.rpartition('/')[2]}"
+    )
     rubbing = pxr.UsdPhysics.MaterialAPI.Apply(material.GetPrim())
-    for attribute in (rubbing.CreateStaticFrictionAttr, rubbing.CreateDynamicFrictionAttr):
+    for attribute in (
+        rubbing.CreateStaticFrictionAttr,
+        rubbing.CreateDynamicFrictionAttr,
+    ):
         attribute(float(obstacle.friction))
     _bind_material(pxr, solid.GetPrim(), material)
 
@@ -352,14 +435,18 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     try:
         newton: Any = import_module("newton")
     except ImportError as error:
-        raise InputError("install Newton to verify the export: pip install newton") from error
+        raise InputError(
+            "install Newton to verify the export: pip install newton"
+        ) from error
 
     builder = newton.ModelBuilder()
     contact = SharedContact.from_obstacles(faceted_obstacles(body))
     if body.obstacles:
         builder.default_particle_radius = contact.particle_radius_m
     # Its rigid bodies would be simulated too; what they hold stands still instead.
-    builder.add_usd(str(folder / STAGE_FILE), ignore_paths=["/World/Gripper_.*"])
+    builder.add_usd(
+        str(folder / STAGE_FILE), ignore_paths=["/World/Gripper_.*"]
+    )
     grasped = np.flatnonzero(body.is_node_prescribed)
     for k in grasped:
         builder.particle_mass[k] = 0.0
@@ -372,7 +459,9 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     pipeline = newton.CollisionPipeline(model)
     # What is touched stands still, and is nothing to solve for.
     solver = newton.solvers.SolverVBD(
-        model, iterations=SOLVER_ITERATIONS, integrate_with_external_rigid_solver=True
+        model,
+        iterations=SOLVER_ITERATIONS,
+        integrate_with_external_rigid_solver=True,
     )
     before: Any = model.state()
     after = model.state()

@@ -16,7 +16,12 @@ from ...runs.result_content import Result
 from ...step_counting import StepUnit, complete_steps, counted_phase
 from ..figure_style import RESOLUTION_DPI
 from ..replay import MotionRecord, damaged_run_refused, read_run
-from .confidence import Confidence, budget_picture, confidence_ellipses, correlation_matrix
+from .confidence import (
+    Confidence,
+    budget_picture,
+    confidence_ellipses,
+    correlation_matrix,
+)
 from .depth_comparison_picture import depth_picture
 from .field_intervals import field_picture
 from .mesh_pictures import elements_picture, mesh_picture
@@ -28,7 +33,9 @@ from .stress_strain import strain_picture
 
 
 def all_pictures(
-    replays: Sequence[MotionRecord], result: Result, truth: Mapping[str, float] | None = None
+    replays: Sequence[MotionRecord],
+    result: Result,
+    truth: Mapping[str, float] | None = None,
 ) -> dict[str, Figure]:
     """Return all pictures of a run except that of its Jacobian, by file name without ending.
 
@@ -40,8 +47,16 @@ def all_pictures(
     truth : mapping, optional
         True parameters by name, see `convergence`.
     """
-    names = [n for n, item in result.parameters.items() if not item.fixed and n in result.values]
-    pictures = {"convergence": convergence(result.history, names, truth)} if result.history else {}
+    names = [
+        n
+        for n, item in result.parameters.items()
+        if not item.fixed and n in result.values
+    ]
+    pictures = (
+        {"convergence": convergence(result.history, names, truth)}
+        if result.history
+        else {}
+    )
     if (scan := result.scan) is not None:
         pictures["scan"] = scan_picture(scan.young_pa, scan.misfit, scan.best)
     confidence = Confidence.from_result(result)
@@ -54,14 +69,20 @@ def all_pictures(
     if with_mesh:
         body = with_mesh[0]
         pictures["mesh"] = mesh_picture(body)
-        pictures["elements"] = elements_picture(body.undeformed_m, body.tetrahedra)
+        pictures["elements"] = elements_picture(
+            body.undeformed_m, body.tetrahedra
+        )
         for name, values in body.fields.items():
             pictures[f"field_{name}"] = field_picture(body, name, values)
-    drawn = (named for replay in replays for named in _experiment_pictures(replay))
+    drawn = (
+        named for replay in replays for named in _experiment_pictures(replay)
+    )
     return with_unique_names(chain(pictures.items(), drawn))
 
 
-def with_unique_names(pictures: Iterable[tuple[str, Figure]]) -> dict[str, Figure]:
+def with_unique_names(
+    pictures: Iterable[tuple[str, Figure]],
+) -> dict[str, Figure]:
     """Return pictures by file name; a number is appended to a name that another picture has
     already.
     """
@@ -69,7 +90,9 @@ def with_unique_names(pictures: Iterable[tuple[str, Figure]]) -> dict[str, Figur
     for text, figure in pictures:
         name = safe_name(text)
         numbered = (f"{name}_{k}" for k in count(2))
-        named[next(free for free in chain([name], numbered) if free not in named)] = figure
+        named[
+            next(free for free in chain([name], numbered) if free not in named)
+        ] = figure
     return named
 
 
@@ -83,26 +106,48 @@ def _experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
     if replay.strain is not None:
         for name, values in replay.readings.items():
             unit = replay.reading_units.get(name, "")
-            picture = strain_picture(replay.strain, replay.t_s, values, name, unit)
+            picture = strain_picture(
+                replay.strain, replay.t_s, values, name, unit
+            )
             yield f"{name.replace(' ', '_')}_{replay.name}", picture
         return
     if len(names):
         yield (
             f"tracks_{replay.name}",
-            marker_tracks(t_s, names, measured_m=measured, fitted_m=fitted, simulated_m=rolled_out),
+            marker_tracks(
+                t_s,
+                names,
+                measured_m=measured,
+                fitted_m=fitted,
+                simulated_m=rolled_out,
+            ),
         )
-        yield f"error_{replay.name}", marker_errors(t_s, measured, fitted, rolled_out)
+        yield (
+            f"error_{replay.name}",
+            marker_errors(t_s, measured, fitted, rolled_out),
+        )
     if len(names) and not replay.static:
-        yield f"spectrum_{replay.name}", spectrum_picture(t_s, measured, fitted, replay.natural_hz)
+        yield (
+            f"spectrum_{replay.name}",
+            spectrum_picture(t_s, measured, fitted, replay.natural_hz),
+        )
     for k, sensed in enumerate(replay.wrenches, start=1):
         which = "" if len(replay.wrenches) == 1 else f"_{k}"
-        yield f"wrench_{replay.name}{which}", sensor_picture(sensed, COMPONENTS, UNITS)
+        yield (
+            f"wrench_{replay.name}{which}",
+            sensor_picture(sensed, COMPONENTS, UNITS),
+        )
     for name, values in replay.readings.items():
         places = values.shape[1] // 3
-        names = [f"{name} {k + 1}" for k in range(places)] if places > 1 else [name]
+        names = (
+            [f"{name} {k + 1}" for k in range(places)] if places > 1 else [name]
+        )
         unit = replay.reading_units.get(name)
         units = [unit] * places if unit else []
-        yield f"reading_{replay.name}_{name}", sensor_picture(values, names, units)
+        yield (
+            f"reading_{replay.name}_{name}",
+            sensor_picture(values, names, units),
+        )
     for name, points in replay.visible_points.items():
         yield f"depth_{replay.name}_{name}", depth_picture(points)
     if replay.has_shapes:
@@ -115,11 +160,17 @@ def _infinities_as_nan(markers_m: Array | None) -> Array | None:
     """Return markers with NaN in place of infinities, where a method or simulation diverged; None
     for None.
     """
-    return None if markers_m is None else np.where(np.isfinite(markers_m), markers_m, np.nan)
+    return (
+        None
+        if markers_m is None
+        else np.where(np.isfinite(markers_m), markers_m, np.nan)
+    )
 
 
 def save_pictures(
-    folder: str | Path, pictures: Mapping[str, Figure], say: Callable[[str], None] | None = None
+    folder: str | Path,
+    pictures: Mapping[str, Figure],
+    say: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """Write each picture as <name>.png and return the files.
 
@@ -140,14 +191,18 @@ def save_pictures(
                 say(f"drawing picture {k} of {len(pictures)}: {file.name}")
             # Harder compression takes longer than drawing, for a tenth of the size.
             with replaced_file(file) as draft:
-                figure.savefig(draft, dpi=RESOLUTION_DPI, pil_kwargs={"compress_level": 2})
+                figure.savefig(
+                    draft, dpi=RESOLUTION_DPI, pil_kwargs={"compress_level": 2}
+                )
             complete_steps(StepUnit.PICTURE)
             files.append(file)
     return files
 
 
 def redraw_pictures(
-    run: str | Path, folder: str | Path, say: Callable[[str], None] | None = None
+    run: str | Path,
+    folder: str | Path,
+    say: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """Write the pictures of a run folder into `folder`, all but that of the Jacobian, and return
     the files.

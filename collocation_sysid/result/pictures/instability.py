@@ -10,7 +10,14 @@ from matplotlib.figure import Figure
 from ...program.loss_of_stability import StabilityLoss
 from ..figure_style import PAGE_MM, SMALL_PT
 from .projection import ParallelCamera
-from .scene import BodyDrawing, SheetView, aspect_ratio, draw_directions, draw_scale, sheet
+from .scene import (
+    BodyDrawing,
+    SheetView,
+    aspect_ratio,
+    draw_directions,
+    draw_scale,
+    sheet,
+)
 from .shapes import FIELD_COLOURS
 
 # Height of the title [mm].
@@ -30,23 +37,42 @@ def instability_picture(instability: StabilityLoss) -> Figure:
     stretches and wavelength as the title.
     """
     extent_m = float(np.ptp(instability.positions_m, axis=0).max())
-    shown_m = instability.positions_m + RELATIVE_AMPLITUDE * extent_m * instability.mode
-    camera = ParallelCamera.facing_motion(shown_m[None], np.array([0.0, 0.0, 1.0]))
+    shown_m = (
+        instability.positions_m
+        + RELATIVE_AMPLITUDE * extent_m * instability.mode
+    )
+    camera = ParallelCamera.facing_motion(
+        shown_m[None], np.array([0.0, 0.0, 1.0])
+    )
     aspect = aspect_ratio(camera, shown_m)
     width = PAGE_MM - 2 * MARGIN_MM
     height = min(width / aspect, MAX_BODY_HEIGHT_MM)
     figure, axes = sheet(PAGE_MM, HEAD_MM + height + FOOT_MM)
-    view = SheetView.fit_points(camera, shown_m, (width, height), (MARGIN_MM, FOOT_MM))
-    amplitude = np.linalg.norm(instability.mode, axis=1)[instability.faces].mean(axis=1)
-    colours = ScalarMappable(Normalize(0.0, 1.0), FIELD_COLOURS).to_rgba(amplitude)[:, :3]
+    view = SheetView.fit_points(
+        camera, shown_m, (width, height), (MARGIN_MM, FOOT_MM)
+    )
+    amplitude = np.linalg.norm(instability.mode, axis=1)[
+        instability.faces
+    ].mean(axis=1)
+    colours = ScalarMappable(Normalize(0.0, 1.0), FIELD_COLOURS).to_rgba(
+        amplitude
+    )[:, :3]
     none = np.zeros(len(shown_m), dtype=bool)
-    BodyDrawing(axes, view, instability.faces).update(shown_m, none, np.zeros((0, 3)), colours)
+    BodyDrawing(axes, view, instability.faces).update(
+        shown_m, none, np.zeros((0, 3)), colours
+    )
     title = (
         f"unstable mode: stretches {instability.smaller_stretch:.3g} "
         f"and {instability.larger_stretch:.3g}, "
         f"wavelength {1e3 * instability.wavelength_m:.3g} mm"
     )
-    axes.text(PAGE_MM / 2, HEAD_MM / 2 + height + FOOT_MM, title, ha="center", fontsize=SMALL_PT)
+    axes.text(
+        PAGE_MM / 2,
+        HEAD_MM / 2 + height + FOOT_MM,
+        title,
+        ha="center",
+        fontsize=SMALL_PT,
+    )
     draw_directions(axes, camera, (6.0, FOOT_MM))
     draw_scale(axes, view.mm_per_m, (MARGIN_MM, 3.5))
     return figure

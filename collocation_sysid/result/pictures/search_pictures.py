@@ -51,7 +51,9 @@ def convergence(
         True values by parameter, relative to which parameters are drawn; their final values by
         default.
     """
-    figure = framed_figure(COLUMN_MM, 132, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=4)
+    figure = framed_figure(
+        COLUMN_MM, 132, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=4
+    )
     heights = (1.0, 1.0, 1.0, 0.2, 1.4)  # a gap for the legend
     grid = figure.add_gridspec(5, 1, height_ratios=heights, hspace=0.12)
     panels = [figure.add_subplot(grid[row]) for row in (0, 1, 2, 4)]
@@ -65,11 +67,17 @@ def convergence(
     for axes, (label, values, colour) in zip(panels, curves, strict=False):
         for part in rungs:
             style: dict[str, Any] = {"ms": 2.5, "lw": LINE_PT, "color": colour}
-            axes.plot(numbers[part], _positive_or_nan(values[part]), "o-", **style)
+            axes.plot(
+                numbers[part], _positive_or_nan(values[part]), "o-", **style
+            )
         style_axes(axes, "", "", label)
         make_log_axis(axes)
     _mark_continuation_stages(panels[:3], history, rungs)
-    drawn = list(history[0].parameters) if names is None and history else list(names or ())
+    drawn = (
+        list(history[0].parameters)
+        if names is None and history
+        else list(names or ())
+    )
     _draw_parameters(panels[3], history, drawn, truth)
     panels[3].set_xlabel("iteration", fontsize=TEXT_PT)
     for axes in panels:
@@ -82,12 +90,20 @@ def convergence(
 def _continuation_stages(history: Sequence[Iteration]) -> list[slice]:
     """Return the ranges of iterations over which the same share of the timesteps was fitted."""
     shares = [iteration.share for iteration in history]
-    starts = [k for k in range(len(shares)) if k == 0 or shares[k] != shares[k - 1]]
-    return [slice(a, b) for a, b in pairwise([*starts, len(shares)])] if starts else []
+    starts = [
+        k for k in range(len(shares)) if k == 0 or shares[k] != shares[k - 1]
+    ]
+    return (
+        [slice(a, b) for a, b in pairwise([*starts, len(shares)])]
+        if starts
+        else []
+    )
 
 
 def _mark_continuation_stages(
-    panels: Sequence[Axes], history: Sequence[Iteration], stages: Sequence[slice]
+    panels: Sequence[Axes],
+    history: Sequence[Iteration],
+    stages: Sequence[slice],
 ) -> None:
     """Mark the iterations at which the fit takes in more timesteps; loss and error increase there.
 
@@ -105,9 +121,19 @@ def _mark_continuation_stages(
         if part.start:
             between = (history[part.start - 1].number + first.number) / 2
             for axes in panels:
-                axes.axvline(between, color=_STAGE_COLOUR, lw=0.8, ls=(0, (2, 2)), zorder=0.5)
-    shares = ", ".join(f"{100 * history[part.start].share:.3g}" for part in stages)
-    panels[0].set_title(f"continuation: {shares} % of the time steps in turn", fontsize=SMALL_PT)
+                axes.axvline(
+                    between,
+                    color=_STAGE_COLOUR,
+                    lw=0.8,
+                    ls=(0, (2, 2)),
+                    zorder=0.5,
+                )
+    shares = ", ".join(
+        f"{100 * history[part.start].share:.3g}" for part in stages
+    )
+    panels[0].set_title(
+        f"continuation: {shares} % of the time steps in turn", fontsize=SMALL_PT
+    )
 
 
 def _draw_parameters(
@@ -120,14 +146,24 @@ def _draw_parameters(
     axes.axhline(1.0, color=BLACK, lw=0.6)
     numbers = [iteration.number for iteration in history]
     for k, name in enumerate(names if history else ()):
-        values = np.array([iteration.parameters[name] for iteration in history], dtype=float)
+        values = np.array(
+            [iteration.parameters[name] for iteration in history], dtype=float
+        )
         symbol = symbol_as_mathtext(name)
         unit = unit_of(name)
         reference = values[-1] if truth is None else truth[name]
         label = f"{symbol} = {values[-1]:.4g} {unit}"
-        style = {"ms": 2.5, "lw": LINE_PT, "color": COLOUR_CYCLE[k % len(COLOUR_CYCLE)]}
+        style = {
+            "ms": 2.5,
+            "lw": LINE_PT,
+            "color": COLOUR_CYCLE[k % len(COLOUR_CYCLE)],
+        }
         axes.plot(
-            numbers, _positive_or_nan(values / (reference or 1.0)), "o-", label=label, **style
+            numbers,
+            _positive_or_nan(values / (reference or 1.0)),
+            "o-",
+            label=label,
+            **style,
         )
     style_axes(axes, "", "", f"θ / {'final θ' if truth is None else 'truth'}")
     make_log_axis(axes)
@@ -157,9 +193,19 @@ def scan_picture(young_pa: Array, misfit: Array, best: int) -> Figure:
     best : int
         Index of the modulus at which the solve starts.
     """
-    figure = framed_figure(COLUMN_MM, HEIGHT_MM, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=6)
+    figure = framed_figure(
+        COLUMN_MM, HEIGHT_MM, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=6
+    )
     axes = figure.subplots()
-    axes.plot(young_pa, misfit, "o-", ms=2.5, lw=LINE_PT, color=BLUE, label="simulated")
+    axes.plot(
+        young_pa,
+        misfit,
+        "o-",
+        ms=2.5,
+        lw=LINE_PT,
+        color=BLUE,
+        label="simulated",
+    )
     style_axes(axes, "", "Young's modulus E [Pa]", "misfit [σ]")
     axes.set_xscale("log")
     make_log_axis(axes)
@@ -170,6 +216,14 @@ def scan_picture(young_pa: Array, misfit: Array, best: int) -> Figure:
             young_pa[failed], foot, "x", ms=5, color=VERMILION, clip_on=False, zorder=3,
             label="simulation failed",
         )  # fmt: skip
-    axes.plot(young_pa[best], misfit[best], "D", ms=5, color=ORANGE, zorder=3, label="start")
+    axes.plot(
+        young_pa[best],
+        misfit[best],
+        "D",
+        ms=5,
+        color=ORANGE,
+        zorder=3,
+        label="start",
+    )
     add_legend_above(axes, columns=3)
     return figure

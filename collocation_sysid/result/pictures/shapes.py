@@ -50,9 +50,9 @@ BAR_MM = 2.5
 # Width of the colour bar with its labels [mm].
 BAR_ROOM_MM = 20.0
 # From pale to dark, on which markers and grasped nodes stand out; its darkest fifth is left out.
-FIELD_COLOURS = ListedColormap(colormaps["YlGnBu"](np.linspace(0.0, 0.8, 256))).with_extremes(
-    bad="0.85"
-)
+FIELD_COLOURS = ListedColormap(
+    colormaps["YlGnBu"](np.linspace(0.0, 0.8, 256))
+).with_extremes(bad="0.85")
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,12 +98,19 @@ def shapes_picture(
     measured_m = replay.measured_m
     assert positions_m is not None  # it was chosen among those that have some
     finite = np.flatnonzero(np.isfinite(positions_m).all(axis=(1, 2)))
-    shown = finite[np.unique(np.linspace(0, len(finite) - 1, count).astype(int))]
+    shown = finite[
+        np.unique(np.linspace(0, len(finite) - 1, count).astype(int))
+    ]
     surface_m = positions_m[:, np.unique(replay.surface)]
-    camera = camera or ParallelCamera.facing_motion(surface_m[finite], replay.up)
-    outlines_m = None if replay.obstacles_m is None else replay.obstacles_m[shown]
+    camera = camera or ParallelCamera.facing_motion(
+        surface_m[finite], replay.up
+    )
+    outlines_m = (
+        None if replay.obstacles_m is None else replay.obstacles_m[shown]
+    )
     extents_m = with_nearby_outlines(
-        np.concatenate([surface_m[shown], measured_m[shown]], axis=1), outlines_m
+        np.concatenate([surface_m[shown], measured_m[shown]], axis=1),
+        outlines_m,
     )
     places = camera.project(extents_m)
     lefts = np.nanmin(places[..., 0], axis=1)
@@ -112,14 +119,26 @@ def shapes_picture(
     high = float(np.nanmax(places[..., 1]))
     width = PAGE_MM - CORNER_MM - (BAR_ROOM_MM if field else 0.0)
     room = width - len(shown) * GAP_MM
-    scale = min(room / float((rights - lefts).sum()), MAX_BODY_HEIGHT_MM / (high - low))
+    scale = min(
+        room / float((rights - lefts).sum()), MAX_BODY_HEIGHT_MM / (high - low)
+    )
     gap = GAP_MM + (room - scale * float((rights - lefts).sum())) / len(shown)
     total = HEAD_MM + scale * (high - low) + FOOT_MM
     figure, axes = sheet(PAGE_MM, total)
-    colours = [None] * len(shown) if field is None else _draw_colour_bar(axes, field, shown)
+    colours = (
+        [None] * len(shown)
+        if field is None
+        else _draw_colour_bar(axes, field, shown)
+    )
     start = CORNER_MM + (gap - GAP_MM) / 2
-    for t, first, last, colour in zip(shown, lefts, rights, colours, strict=True):
-        view = SheetView(camera, scale, np.array([start - scale * first, FOOT_MM - scale * low]))
+    for t, first, last, colour in zip(
+        shown, lefts, rights, colours, strict=True
+    ):
+        view = SheetView(
+            camera,
+            scale,
+            np.array([start - scale * first, FOOT_MM - scale * low]),
+        )
         body = BodyDrawing(
             axes,
             view,
@@ -127,16 +146,28 @@ def shapes_picture(
             parts=replay.surface_parts,
             nodes=replay.surface_nodes,
         )
-        obstacles_m = None if replay.obstacles_m is None else replay.obstacles_m[t]
-        body.update(positions_m[t], replay.is_prescribed[t], measured_m[t], colour, obstacles_m)
+        obstacles_m = (
+            None if replay.obstacles_m is None else replay.obstacles_m[t]
+        )
+        body.update(
+            positions_m[t],
+            replay.is_prescribed[t],
+            measured_m[t],
+            colour,
+            obstacles_m,
+        )
         text = {"ha": "center", "va": "center", "fontsize": SMALL_PT}
         middle = start + scale * (last - first) / 2
         axes.text(middle, FOOT_MM / 2, f"{t_s[t] - t_s[0]:.3g} s", **text)
         start += scale * (last - first) + gap
     draw_directions(axes, camera, (7.5, FOOT_MM + 3.0))
     draw_scale(axes, scale, (2.0, total - 2.5))
-    marks = ("measured", "behind the body") if np.isfinite(measured_m).any() else ()
-    draw_legend(axes, legend_handles("grasped", *marks), (PAGE_MM * 0.3, total - 1.0))
+    marks = (
+        ("measured", "behind the body") if np.isfinite(measured_m).any() else ()
+    )
+    draw_legend(
+        axes, legend_handles("grasped", *marks), (PAGE_MM * 0.3, total - 1.0)
+    )
     return figure
 
 
@@ -147,9 +178,16 @@ def _draw_colour_bar(axes: Axes, field: SurfaceField, samples: Index) -> Array:
     values = field.values_at(samples)
     low = np.nanmin(values)
     high = np.nanmax(values)
-    scale = ScalarMappable(Normalize(0.0 if 0 <= low < high / 5 else low, high), FIELD_COLOURS)
+    scale = ScalarMappable(
+        Normalize(0.0 if 0 <= low < high / 5 else low, high), FIELD_COLOURS
+    )
     height = axes.get_ylim()[1]
-    place = (PAGE_MM - BAR_ROOM_MM + 2, FOOT_MM, BAR_MM, height - HEAD_MM - FOOT_MM)
+    place = (
+        PAGE_MM - BAR_ROOM_MM + 2,
+        FOOT_MM,
+        BAR_MM,
+        height - HEAD_MM - FOOT_MM,
+    )
     bar_axes = axes.inset_axes(place, transform=axes.transData)
     bar = axes.figure.colorbar(scale, cax=bar_axes, ticks=MaxNLocator(4))
     bar.outline.set_linewidth(0.4)
@@ -173,11 +211,14 @@ def contact_pictures(replay: MotionRecord) -> dict[str, Figure]:
         return {}
     camera = _camera_facing_weights(replay, positions_m, pressures_pa)
     fields = {
-        "pressure": SurfaceField("pressure [Pa]", lambda samples: pressures_pa[samples]),
+        "pressure": SurfaceField(
+            "pressure [Pa]", lambda samples: pressures_pa[samples]
+        ),
         "gap": SurfaceField("gap [mm]", lambda samples: 1e3 * gaps_m[samples]),
     }
     return {
-        name: shapes_picture(replay, SHOWN_SHAPES, field, camera) for name, field in fields.items()
+        name: shapes_picture(replay, SHOWN_SHAPES, field, camera)
+        for name, field in fields.items()
     }
 
 
@@ -202,10 +243,20 @@ def _camera_facing_weights(
         positions_m[there][:, np.unique(replay.surface)], replay.up
     )
     low = front.raised(-2 * ELEVATION_DEG)
-    views = [front, low, front.turned(180.0, replay.up), low.turned(180.0, replay.up)]
+    views = [
+        front,
+        low,
+        front.turned(180.0, replay.up),
+        low.turned(180.0, replay.up),
+    ]
     corners = positions_m[there][:, replay.surface]
-    normals = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
-    shown = [(np.maximum(normals @ view.axes[2], 0) * weights[there]).sum() for view in views]
+    normals = np.cross(
+        corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
+    )
+    shown = [
+        (np.maximum(normals @ view.axes[2], 0) * weights[there]).sum()
+        for view in views
+    ]
     return views[int(np.argmax(shown))]
 
 
@@ -219,7 +270,11 @@ MAX_SHAPES = 20
 
 
 def field_shapes(
-    replay: MotionRecord, body: Body, constants: Mapping[str, float], field: str | None, count: int
+    replay: MotionRecord,
+    body: Body,
+    constants: Mapping[str, float],
+    field: str | None,
+    count: int,
 ) -> Figure:
     """Draw `count` shapes of an experiment, coloured by a field of its elements.
 
@@ -244,7 +299,11 @@ def field_shapes(
     if field is not None and field not in FIELD_TITLES:
         expected = f"expected one of {', '.join(FIELD_TITLES)}{hint_at(field, list(FIELD_TITLES))}"
         raise InputError(f"no field {field!r}; {expected}")
-    coloured = None if field is None else _surface_field(replay, body, constants, field)
+    coloured = (
+        None
+        if field is None
+        else _surface_field(replay, body, constants, field)
+    )
     return shapes_picture(replay, count, coloured)
 
 

@@ -15,19 +15,30 @@ from typing import Any, ClassVar
 from ...array_types import Array
 from ...methods.initial_trajectories import initial_variables
 from ...methods.reduced_space import ReducedSpace
-from ...methods.stiffness_scan import SOFT_PA, start_problem, typical_constants, typical_parameters
+from ...methods.stiffness_scan import (
+    SOFT_PA,
+    start_problem,
+    typical_constants,
+    typical_parameters,
+)
 from ...model.schemes import as_scheme
 from ...problem import Problem
 from ...program.collocation import Collocation
 from ...program.contact_summary import contact_summaries_of_parts
 from ...program.stability import Instability, find_instabilities
 from ...serialisation import content
-from ...statistics.assessment import contact_concerns, rotation_step_concerns, stability_concerns
+from ...statistics.assessment import (
+    contact_concerns,
+    rotation_step_concerns,
+    stability_concerns,
+)
 from ...statistics.camera_misspecifications import camera_hypotheses
 from ...statistics.concerns import Concern
 from ...statistics.discretisation_error import MOST_SUBSTEPS
 from ...statistics.misspecification_hypothesis import Hypothesis, rank
-from ...statistics.modal_misspecifications import find_misspecifications_by_modes
+from ...statistics.modal_misspecifications import (
+    find_misspecifications_by_modes,
+)
 from ...statistics.placement_causes import placement_mistakes
 from ...statistics.plausibility import size_and_density_hypotheses
 from ...statistics.scale_identifiability import scale_concerns, static_concerns
@@ -43,8 +54,19 @@ from .body_check import (
 )
 from .cost import MethodCost, cost_concerns, cost_notes, method_costs, nonzeros
 from .derivatives import derivative_errors, shortened_problem
-from .measurements import MarkerCheck, RecordingCheck, check_recording, recording_concerns
-from .modes_check import ModeCheck, ModesCheck, check_modes, mode_concerns, mode_notes
+from .measurements import (
+    MarkerCheck,
+    RecordingCheck,
+    check_recording,
+    recording_concerns,
+)
+from .modes_check import (
+    ModeCheck,
+    ModesCheck,
+    check_modes,
+    mode_concerns,
+    mode_notes,
+)
 
 __all__ = [
     "BodyCheck",
@@ -155,12 +177,16 @@ class CheckResult(QuickCheck):
     @property
     def chosen_cost(self) -> MethodCost | None:
         """Cost of the chosen method; None if it is not known."""
-        return next((cost for cost in self.costs if cost.method == self.method), None)
+        return next(
+            (cost for cost in self.costs if cost.method == self.method), None
+        )
 
     @property
     def derivatives_agree(self) -> bool:
         """Whether both derivative checks pass."""
-        return max(self.jacobian_error, self.hessian_error) < DERIVATIVE_TOLERANCE
+        return (
+            max(self.jacobian_error, self.hessian_error) < DERIVATIVE_TOLERANCE
+        )
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -169,7 +195,9 @@ class CheckResult(QuickCheck):
 
     def as_dict(self) -> dict[str, Any]:
         """Return the findings as plain values for JSON and tables."""
-        return content(replace(self, causes=())) | {"causes": [c.as_dict() for c in self.causes]}
+        return content(replace(self, causes=())) | {
+            "causes": [c.as_dict() for c in self.causes]
+        }
 
 
 def quick_check(problem: Problem) -> QuickCheck:
@@ -181,7 +209,9 @@ def quick_check(problem: Problem) -> QuickCheck:
     return QuickCheck(**_quick_fields(replace(problem, parameters=usual), {}))
 
 
-def _quick_fields(problem: Problem, positions_m: Mapping[str, Array]) -> dict[str, Any]:
+def _quick_fields(
+    problem: Problem, positions_m: Mapping[str, Array]
+) -> dict[str, Any]:
     """Return the arguments of `QuickCheck` by name.
 
     Parameters
@@ -191,11 +221,15 @@ def _quick_fields(problem: Problem, positions_m: Mapping[str, Array]) -> dict[st
         Simulations at the guess, for those that have one.
     """
     bodies = _bodies(problem)
-    edges_m = {name: body.edges_m[1] for body in bodies for name in body.experiments}
+    edges_m = {
+        name: body.edges_m[1] for body in bodies for name in body.experiments
+    }
     experiments = problem.experiments
     return {
         "bodies": bodies,
-        "recordings": tuple(check_recording(e, positions_m.get(e.name)) for e in experiments),
+        "recordings": tuple(
+            check_recording(e, positions_m.get(e.name)) for e in experiments
+        ),
         "holds": tuple(
             grasp_check
             for e in experiments
@@ -206,7 +240,9 @@ def _quick_fields(problem: Problem, positions_m: Mapping[str, Array]) -> dict[st
 
 
 def check_problem(
-    problem: Problem, report_progress: Callable[[str], None] | None = None, full: bool = False
+    problem: Problem,
+    report_progress: Callable[[str], None] | None = None,
+    full: bool = False,
 ) -> CheckResult:
     """Check a problem: simulate it at the guess, compare derivatives, and look for likely mistakes.
 
@@ -230,7 +266,9 @@ def check_problem(
     collocation = problem.collocation()
     notes = []
     if problem.parameters.names_without_guess:
-        report_progress("searching for initial values, because no guess is given")
+        report_progress(
+            "searching for initial values, because no guess is given"
+        )
         collocation, scan = start_problem(collocation)
         problem = replace(problem, parameters=collocation.parameters)
         notes = [scan.sentence] if scan else []
@@ -238,7 +276,11 @@ def check_problem(
     started_s = time.perf_counter()
     first = shortened_problem(problem).collocation()
     first_z, start_notes = initial_variables(first)
-    total_s = (time.perf_counter() - started_s) * _grid_rows(collocation) / _grid_rows(first)
+    total_s = (
+        (time.perf_counter() - started_s)
+        * _grid_rows(collocation)
+        / _grid_rows(first)
+    )
     report_progress("comparing derivatives with differences")
     jacobian_error, hessian_error = derivative_errors(first, first_z)
     report_progress("estimating time and memory of the methods")
@@ -246,15 +288,25 @@ def check_problem(
     simulated = first
     z = first_z
     if full or total_s <= LONGEST_SIMULATION_S:
-        report_progress(f"simulating the recordings at the guess, about {max(1, round(total_s))} s")
+        report_progress(
+            f"simulating the recordings at the guess, about {max(1, round(total_s))} s"
+        )
         simulated = collocation
         (z, start_notes) = initial_variables(collocation)
     report_progress("computing natural modes and testing the description")
     causes = misspecification_hypotheses(problem)
-    fit_s = FIT_SIMULATIONS * total_s * min(1.0, CHECKED_SAMPLES / _grid_rows(collocation))
-    sensed = any(e.wrenches and e.markers.sample_count for e in problem.experiments)
+    fit_s = (
+        FIT_SIMULATIONS
+        * total_s
+        * min(1.0, CHECKED_SAMPLES / _grid_rows(collocation))
+    )
+    sensed = any(
+        e.wrenches and e.markers.sample_count for e in problem.experiments
+    )
     if sensed and not causes and (full or fit_s <= LONGEST_SIMULATION_S):
-        report_progress("comparing the wrenches with the prediction from the markers")
+        report_progress(
+            "comparing the wrenches with the prediction from the markers"
+        )
         causes = rank(wrench_mistakes(collocation))
     elif sensed and not causes:
         notes.append(
@@ -264,7 +316,9 @@ def check_problem(
     findings = CheckResult(
         **_simulated_fields(problem, simulated, z),
         timesteps=_grid_rows(collocation),
-        rms_at_guess_m=None if simulated is first else collocation.rms_marker_distance_m(z),
+        rms_at_guess_m=None
+        if simulated is first
+        else collocation.rms_marker_distance_m(z),
         motions=_natural_modes(problem, collocation),
         **program,
         jacobian_error=jacobian_error,
@@ -273,27 +327,40 @@ def check_problem(
     )
     # Nothing is said of contact by a body that was only carried.
     touching = (
-        () if start_notes else _contact_concerns(simulated, z, is_complete=simulated is not first)
+        ()
+        if start_notes
+        else _contact_concerns(simulated, z, is_complete=simulated is not first)
     )
     concerns = (
         *_concerns(problem, findings, find_instabilities(simulated, z)),
         *strain_stability_concerns(simulated.iterates(z)),
         *touching,
     )
-    notes += [*start_notes, *(each for m in findings.motions for each in mode_notes(m))]
-    notes += cost_notes(findings.chosen_cost, findings.costs) if findings.chosen_cost else []
+    notes += [
+        *start_notes,
+        *(each for m in findings.motions for each in mode_notes(m)),
+    ]
+    notes += (
+        cost_notes(findings.chosen_cost, findings.costs)
+        if findings.chosen_cost
+        else []
+    )
     if simulated is first:
         notes.append(
             "only the first samples of the recordings were simulated at the guess; check --full "
             f"simulates all of them, in about {total_s:.2g} s"
         )
-    notes += [SUBSTEPS_NOTE] * (problem.substeps == "auto" and bool(findings.motions))
+    notes += [SUBSTEPS_NOTE] * (
+        problem.substeps == "auto" and bool(findings.motions)
+    )
     findings = replace(findings, concerns=concerns)
     known = [note for note in problem.notes if note not in findings.warnings]
     return replace(findings, notes=(*known, *notes))
 
 
-def _simulated_fields(problem: Problem, collocation: Collocation, z: Array) -> dict[str, Any]:
+def _simulated_fields(
+    problem: Problem, collocation: Collocation, z: Array
+) -> dict[str, Any]:
     """Return the fields of `QuickCheck` and the totals of `CheckResult` for simulations at the
     guess.
 
@@ -302,10 +369,14 @@ def _simulated_fields(problem: Problem, collocation: Collocation, z: Array) -> d
     positions_m = {}
     for part in collocation.iterates(z):
         at_samples = part.x[part.segment.markers.sample_rows]
-        positions_m[part.segment.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
+        positions_m[part.segment.experiment.name] = at_samples.reshape(
+            len(at_samples), -1, 3
+        )
     shared_fields = _quick_fields(problem, positions_m)
     recordings = shared_fields["recordings"]
-    distances_m = [r.farthest_marker.distance_m for r in recordings if r.markers]
+    distances_m = [
+        r.farthest_marker.distance_m for r in recordings if r.markers
+    ]
     return shared_fields | {
         "experiments": len(recordings),
         "samples": sum(recording.samples for recording in recordings),
@@ -320,7 +391,10 @@ def _grid_rows(collocation: Collocation) -> int:
 
 
 def _program_fields(
-    problem: Problem, collocation: Collocation, first: Collocation, first_z: Array
+    problem: Problem,
+    collocation: Collocation,
+    first: Collocation,
+    first_z: Array,
 ) -> dict[str, Any]:
     """Return size of the program and cost of the methods, as fields of `CheckResult`.
 
@@ -337,10 +411,18 @@ def _program_fields(
     lifted = collocation.with_lifted_variables()
     jacobian, hessian = nonzeros(problem, lifted)
     # Reduced space as the file has it, whichever method is chosen.
-    named = (problem.solver(), problem.solver(ReducedSpace.name), ReducedSpace())
+    named = (
+        problem.solver(),
+        problem.solver(ReducedSpace.name),
+        ReducedSpace(),
+    )
     reduced = next(each for each in named if isinstance(each, ReducedSpace))
     method = problem.method
-    name = method if isinstance(method, str) else getattr(method, "name", repr(method))
+    name = (
+        method
+        if isinstance(method, str)
+        else getattr(method, "name", repr(method))
+    )
     counted = method_costs(
         collocation,
         first,
@@ -356,17 +438,26 @@ def _program_fields(
         "jacobian_nonzeros": jacobian,
         "hessian_nonzeros": hessian,
         "method": name,
-        "memory_mb": next((cost.memory_mb for cost in counted if cost.method == name), None),
+        "memory_mb": next(
+            (cost.memory_mb for cost in counted if cost.method == name), None
+        ),
         "costs": counted,
     }
 
 
-def _natural_modes(problem: Problem, collocation: Collocation) -> tuple[ModesCheck, ...]:
+def _natural_modes(
+    problem: Problem, collocation: Collocation
+) -> tuple[ModesCheck, ...]:
     """Return the natural modes at the guess of all fitted experiments that move."""
     scheme = as_scheme(collocation.scheme)
     guesses = problem.parameters.guesses
     return tuple(
-        check_modes(s.experiment, scheme, s.dynamics.step_s, s.body.theta_from_values(guesses))
+        check_modes(
+            s.experiment,
+            scheme,
+            s.dynamics.step_s,
+            s.body.theta_from_values(guesses),
+        )
         for s in collocation.transcriptions
         if not s.experiment.is_static
     )
@@ -385,30 +476,61 @@ def _concerns(
         *(cause.concern() for cause in findings.causes),
         *static_concerns(experiments, parameters),
         *scale_concerns(experiments, parameters),
-        *(each for body in bodies for each in _body_concerns(body, len(bodies) == 1)),
-        *(each for grasp_check in findings.holds for each in grasp_concerns(grasp_check)),
-        *(each for motion in findings.motions for each in mode_concerns(motion)),
+        *(
+            each
+            for body in bodies
+            for each in _body_concerns(body, len(bodies) == 1)
+        ),
+        *(
+            each
+            for grasp_check in findings.holds
+            for each in grasp_concerns(grasp_check)
+        ),
+        *(
+            each
+            for motion in findings.motions
+            for each in mode_concerns(motion)
+        ),
         *stability_concerns(unstable),
-        *(each for e in experiments for each in rotation_step_concerns(e, problem.first_substeps)),
-        *(c for r in findings.recordings for c in recording_concerns(r, body_of[r.experiment])),
+        *(
+            each
+            for e in experiments
+            for each in rotation_step_concerns(e, problem.first_substeps)
+        ),
+        *(
+            c
+            for r in findings.recordings
+            for c in recording_concerns(r, body_of[r.experiment])
+        ),
         *(cost_concerns(chosen, findings.costs) if chosen else ()),
     )
 
 
-def _contact_concerns(simulated: Collocation, z: Array, is_complete: bool) -> list[Concern]:
+def _contact_concerns(
+    simulated: Collocation, z: Array, is_complete: bool
+) -> list[Concern]:
     """Return concerns about contact at the guess.
 
     `is_complete` is false if only the first samples were simulated: then only about penetration at
     the start.
     """
-    concerns = contact_concerns(contact_summaries_of_parts(simulated.iterates(z)), AT_THE_GUESS)
-    return [each for each in concerns if is_complete or each.code == "contact/pressed"]
+    concerns = contact_concerns(
+        contact_summaries_of_parts(simulated.iterates(z)), AT_THE_GUESS
+    )
+    return [
+        each
+        for each in concerns
+        if is_complete or each.code == "contact/pressed"
+    ]
 
 
 def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
     """Return the finding of each body, with the names of its experiments."""
     guesses = problem.parameters.guesses
-    names = [tuple(e.name for e in problem.experiments if e.body is b) for b in problem.bodies]
+    names = [
+        tuple(e.name for e in problem.experiments if e.body is b)
+        for b in problem.bodies
+    ]
     specimens = {e.name for e in problem.experiments if e.specimen is not None}
     return tuple(
         check_body(
@@ -426,7 +548,9 @@ def _body_concerns(body: BodyCheck, alone: bool) -> tuple[Concern, ...]:
     experiments.
     """
     of = f"in the body of {', '.join(map(repr, body.experiments))}"
-    named = (replace(each, data={"of": of, **each.data}) for each in body.concerns)
+    named = (
+        replace(each, data={"of": of, **each.data}) for each in body.concerns
+    )
     return body.concerns if alone else tuple(named)
 
 
@@ -441,12 +565,22 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
         For a size or a density that no body can have.
     """
     constants = typical_constants(problem.parameters)
-    odd = (oddity for body in problem.bodies for oddity in size_and_density_hypotheses(body))
+    odd = (
+        oddity
+        for body in problem.bodies
+        for oddity in size_and_density_hypotheses(body)
+    )
     doubtful = (
         cause
         for e in problem.experiments
-        for cause in find_misspecifications_by_modes(e, constants, problem.huber)
+        for cause in find_misspecifications_by_modes(
+            e, constants, problem.huber
+        )
     )
-    blind = (cause for e in problem.experiments for cause in camera_hypotheses(e))
-    placed = (cause for e in problem.experiments for cause in placement_mistakes(e))
+    blind = (
+        cause for e in problem.experiments for cause in camera_hypotheses(e)
+    )
+    placed = (
+        cause for e in problem.experiments for cause in placement_mistakes(e)
+    )
     return (*odd, *rank((*placed, *blind, *doubtful)))

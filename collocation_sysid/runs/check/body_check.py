@@ -87,7 +87,12 @@ def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
     quality = mean_ratios(mesh.points_m, mesh.tetrahedra)
     longest = edge_lengths(mesh.points_m, mesh.tetrahedra).max(axis=1)
     return tuple(
-        ElementShape(int(e), float(quality[e]), float(longest[e] / heights[e]), float(longest[e]))
+        ElementShape(
+            int(e),
+            float(quality[e]),
+            float(longest[e] / heights[e]),
+            float(longest[e]),
+        )
         for e in np.argsort(quality, kind="stable")[:count]
     )
 
@@ -120,7 +125,9 @@ def element_concerns(
     """
     name = body.element.name
     needed = CELLS_ACROSS.get(body.element.name, 0.0)
-    poisson = max(engineering_constants(*lame)[1] for lame in body.lame(theta).values())
+    poisson = max(
+        engineering_constants(*lame)[1] for lame in body.lame(theta).values()
+    )
     limit = LOCKING_POISSON.get(name, np.inf)
     slender = shape.length_m > LEAST_SLENDERNESS * shape.thickness_m
     off, level = ("stiff", "low") if name == LINEAR else ("soft", "high")
@@ -170,7 +177,9 @@ def _covariance(mesh: TetMesh) -> Array:
 
 def _areas(triangles: Array) -> Array:
     """Return the areas (k,) [m²] of triangles given by their corners (k, 3, 3) [m]."""
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals = np.cross(
+        triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    )
     return np.linalg.norm(normals, axis=1) / 2
 
 
@@ -240,7 +249,11 @@ class BodyCheck:
 
 
 def check_body(
-    body: Body, theta: Array, experiments: tuple[str, ...], *, is_homogeneous: bool = False
+    body: Body,
+    theta: Array,
+    experiments: tuple[str, ...],
+    *,
+    is_homogeneous: bool = False,
 ) -> BodyCheck:
     """Return a summary of size, mesh and guess of a body, with concerns.
 
@@ -255,7 +268,11 @@ def check_body(
         Whether it is the cell of specimens, which has no discretisation error.
     """
     mesh = body.mesh
-    fields = {part.field_name: part.field.resolution for part in body.parts if part.field}
+    fields = {
+        part.field_name: part.field.resolution
+        for part in body.parts
+        if part.field
+    }
     quality = mesh.quality()
     worst = worst_elements(mesh)
     shape = slenderness(mesh)
@@ -275,7 +292,11 @@ def check_body(
         cells_across=shape.cells_across,
         guess=_constants_at_guess(body, theta),
         concerns=(
-            *(() if is_homogeneous else element_concerns(body, theta, shape, worst[0])),
+            *(
+                ()
+                if is_homogeneous
+                else element_concerns(body, theta, shape, worst[0])
+            ),
             *rest_stability_concerns(body, theta),
             *(() if is_homogeneous else _field_concerns(fields)),
         ),
@@ -299,7 +320,9 @@ def _rest_shape_change_m(body: Body, theta: Array) -> float:
         return 0.0
     if body.rest_shape_failure(theta) is not None:
         return float("nan")
-    change_m = body.inverse_equilibrium.solve(theta).positions_m - body.nodes.points_m
+    change_m = (
+        body.inverse_equilibrium.solve(theta).positions_m - body.nodes.points_m
+    )
     return float(np.linalg.norm(change_m, axis=1).max())
 
 
@@ -317,9 +340,16 @@ def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
     moduli = {}
     for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
         young, poisson = engineering_constants(*lame)
-        moduli |= {part.full_name("young_pa"): young, part.full_name("poisson"): poisson}
+        moduli |= {
+            part.full_name("young_pa"): young,
+            part.full_name("poisson"): poisson,
+        }
     constants = zip(body.constants, theta.tolist(), strict=True)
-    return moduli | {name: value for name, value in constants if not is_field_coefficient(name)}
+    return moduli | {
+        name: value
+        for name, value in constants
+        if not is_field_coefficient(name)
+    }
 
 
 # Distance from the box of the held nodes, in mean edges, below which it is by chance whether a node
@@ -362,17 +392,22 @@ class GraspCheck:
     axes: str = "xyz"
 
 
-def check_grasps(experiment: Experiment, mean_edge_m: float) -> tuple[GraspCheck, ...]:
+def check_grasps(
+    experiment: Experiment, mean_edge_m: float
+) -> tuple[GraspCheck, ...]:
     """Return a summary of the grasped nodes for each grasp of an experiment, see `GraspCheck`;
     `mean_edge_m` is the mean edge length of the mesh [m].
     """
     points_m = experiment.body.nodes.points_m
     return tuple(
-        _check_grasp(experiment.name, points_m, g, mean_edge_m) for g in experiment.body_grasps
+        _check_grasp(experiment.name, points_m, g, mean_edge_m)
+        for g in experiment.body_grasps
     )
 
 
-def _check_grasp(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -> GraspCheck:
+def _check_grasp(
+    name: str, points_m: Array, grasp: Grasp, mean_edge_m: float
+) -> GraspCheck:
     """Return number and bounding box of the nodes that a grasp prescribes, and how many nodes are
     so close to a face of the box that rounding may decide.
 
@@ -393,13 +428,19 @@ def _check_grasp(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -
     low = grasped_m.min(axis=0)
     high = grasped_m.max(axis=0)
     outside_m = np.concatenate([low - free_m, free_m - high], axis=1)
-    is_neighbour = outside_m.max(axis=1, initial=-np.inf) < NEIGHBOUR_EDGES * mean_edge_m
+    is_neighbour = (
+        outside_m.max(axis=1, initial=-np.inf) < NEIGHBOUR_EDGES * mean_edge_m
+    )
     # Behind faces of the box that the body goes on beyond, as far as the nearest held node.
     inner = (outside_m > 0).any(axis=0)
-    depth_m = np.concatenate([grasped_m - low, high - grasped_m], axis=1)[:, inner]
+    depth_m = np.concatenate([grasped_m - low, high - grasped_m], axis=1)[
+        :, inner
+    ]
     least_m = ROUND_OFF_EDGES * mean_edge_m
     reach_m = NEARLY_GRASPED_EDGES * mean_edge_m
-    slightly_outside = (outside_m > least_m) & (outside_m < reach_m) & is_neighbour[:, None]
+    slightly_outside = (
+        (outside_m > least_m) & (outside_m < reach_m) & is_neighbour[:, None]
+    )
     slightly_inside = (depth_m > least_m) & (depth_m < reach_m)
     return GraspCheck(
         name,
@@ -416,11 +457,14 @@ def _check_grasp(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -
 def grasp_sentence(grasp_check: GraspCheck) -> str:
     """Return number, share, bounding box [mm] and axes of the grasped nodes as text."""
     size = " × ".join(
-        f"{1e3 * (b - a):.4g}" for a, b in zip(grasp_check.low_m, grasp_check.high_m, strict=True)
+        f"{1e3 * (b - a):.4g}"
+        for a, b in zip(grasp_check.low_m, grasp_check.high_m, strict=True)
     )
     low = ", ".join(f"{1e3 * x:.4g}" for x in grasp_check.low_m)
     axes = (
-        "" if grasp_check.axes == "xyz" else f", held along {' and '.join(grasp_check.axes)} only"
+        ""
+        if grasp_check.axes == "xyz"
+        else f", held along {' and '.join(grasp_check.axes)} only"
     )
     nodes = f"{grasp_check.nodes} nodes, {grasp_check.share:.0%} of all"
     return f"{nodes}, in a box of {size} mm at ({low}) mm{axes}"
@@ -435,5 +479,9 @@ def grasp_concerns(grasp_check: GraspCheck) -> list[Concern]:
         "nearly_free": grasp_check.nearly_free,
     }
     return concern_if(
-        by_chance, False, "description/grasp", experiment=grasp_check.experiment, **counts
+        by_chance,
+        False,
+        "description/grasp",
+        experiment=grasp_check.experiment,
+        **counts,
     )

@@ -19,7 +19,11 @@ from ...program.collocation import Collocation
 from ...program.factorisation import Choice
 from ...program.sweep import Sweep
 from ...statistics.concerns import Concern
-from .derivatives import first_sample_count, shortened_experiment, shortened_problem
+from .derivatives import (
+    first_sample_count,
+    shortened_experiment,
+    shortened_problem,
+)
 
 # Memory per nonzero [bytes]: IPOPT with MUMPS, midpoint, 60 to 170 nodes and 80 to 100 steps.
 BYTES_PER_NONZERO = 280.0
@@ -27,7 +31,9 @@ BYTES_PER_NONZERO = 280.0
 SMALL_PROGRAM_VARIABLES = 50_000
 
 
-def require_memory(problem: Problem, collocation: Collocation, method: object) -> None:
+def require_memory(
+    problem: Problem, collocation: Collocation, method: object
+) -> None:
     """Raise an `InputError` if a solve needs more memory than this machine has.
 
     Small programs, other methods than interior point and reduced space, and machines of unknown
@@ -42,9 +48,15 @@ def require_memory(problem: Problem, collocation: Collocation, method: object) -
     if there_mb is None or collocation.variable_count < SMALL_PROGRAM_VARIABLES:
         return
     if isinstance(method, InteriorPoint):
-        needed_mb = interior_point_mb(sum(nonzeros(problem, collocation.with_lifted_variables())))
+        needed_mb = interior_point_mb(
+            sum(nonzeros(problem, collocation.with_lifted_variables()))
+        )
         fits = memory_mb(collocation) < there_mb
-        remedy = 'method = "reduced-space"' if fits else "a coarser mesh or a shorter window_s"
+        remedy = (
+            'method = "reduced-space"'
+            if fits
+            else "a coarser mesh or a shorter window_s"
+        )
     elif isinstance(method, ReducedSpace):
         needed_mb = memory_mb(collocation)
         remedy = "a coarser mesh, fewer substeps or a shorter window_s"
@@ -79,9 +91,15 @@ def nonzeros(problem: Problem, lifted: Collocation) -> tuple[int, int]:
     for k, experiment in enumerate(problem.experiments):
         if not experiment.validation:
             parts = list(short.experiments)
-            parts[k] = shortened_experiment(experiment, first_sample_count(experiment) + 1)
+            parts[k] = shortened_experiment(
+                experiment, first_sample_count(experiment) + 1
+            )
             more = _count_nonzeros(replace(problem, experiments=parts)) - least
-            total = total + max(0, len(experiment.t_s) - first_sample_count(experiment)) * more
+            total = (
+                total
+                + max(0, len(experiment.t_s) - first_sample_count(experiment))
+                * more
+            )
     return int(total[0]) + further[0], int(total[1]) + further[1]
 
 
@@ -127,7 +145,11 @@ class MethodCost:
 
 
 def method_costs(
-    collocation: Collocation, short: Collocation, z: Array, nonzeros: int, factorisation: Choice
+    collocation: Collocation,
+    short: Collocation,
+    z: Array,
+    nonzeros: int,
+    factorisation: Choice,
 ) -> tuple[MethodCost, ...]:
     """Return the estimated memory and time of reduced space and of interior point.
 
@@ -153,7 +175,10 @@ def method_costs(
         MethodCost(
             "interior-point",
             interior_point_mb(nonzeros),
-            TYPICAL_ITERATIONS * SECONDS_PER_NONZERO * nonzeros * width**TIMESTEP_POWER,
+            TYPICAL_ITERATIONS
+            * SECONDS_PER_NONZERO
+            * nonzeros
+            * width**TIMESTEP_POWER,
         ),
     )
 
@@ -164,7 +189,10 @@ def unknowns_of_a_timestep(collocation: Collocation) -> list[int]:
     """
     return [
         len(segment.free_dofs)
-        + sum(b.columns.stop - b.columns.start for b in segment.body.memory.branches)
+        + sum(
+            b.columns.stop - b.columns.start
+            for b in segment.body.memory.branches
+        )
         for segment in collocation.transcriptions
     ]
 
@@ -176,7 +204,10 @@ def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
     quickest = min(others, key=lambda cost: cost.time_s or np.inf)
     if chosen.time_s is None or quickest.time_s is None:
         return []
-    if chosen.time_s < LONG_SOLVE_S or quickest.time_s > LARGEST_TIME_SHARE * chosen.time_s:
+    if (
+        chosen.time_s < LONG_SOLVE_S
+        or quickest.time_s > LARGEST_TIME_SHARE * chosen.time_s
+    ):
         return []
     return [
         f'solver.method = "{quickest.method}" finds the same optimum much faster than '
@@ -184,7 +215,9 @@ def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
     ]
 
 
-def cost_concerns(chosen: MethodCost, others: Sequence[MethodCost]) -> list[Concern]:
+def cost_concerns(
+    chosen: MethodCost, others: Sequence[MethodCost]
+) -> list[Concern]:
     """Return a concern if the chosen method needs more memory than this machine has; none if that
     is unknown.
     """
@@ -192,13 +225,25 @@ def cost_concerns(chosen: MethodCost, others: Sequence[MethodCost]) -> list[Conc
     if available is None or chosen.memory_mb < available:
         return []
     fitting = [cost for cost in others if cost.memory_mb < available]
-    remedy = f'set solver.method = "{fitting[0].method}"' if fitting else "shorten window_s"
+    remedy = (
+        f'set solver.method = "{fitting[0].method}"'
+        if fitting
+        else "shorten window_s"
+    )
     sizes = {"needed_gb": chosen.memory_mb / 1e3, "there_gb": available / 1e3}
-    return [Concern("memory/short", data={"method": chosen.method, **sizes, "remedy": remedy})]
+    return [
+        Concern(
+            "memory/short",
+            data={"method": chosen.method, **sizes, "remedy": remedy},
+        )
+    ]
 
 
 def _estimated_sweeps_s(
-    collocation: Collocation, short: Collocation, z: Array, factorisation: Choice
+    collocation: Collocation,
+    short: Collocation,
+    z: Array,
+    factorisation: Choice,
 ) -> float | None:
     """Return the estimated time of all sweeps of a solve [s], from one timed sweep over the first
     rows of each experiment.
@@ -207,7 +252,9 @@ def _estimated_sweeps_s(
     start.
     """
     total = 0.0
-    for segment, part in zip(collocation.transcriptions, short.iterates(z), strict=True):
+    for segment, part in zip(
+        collocation.transcriptions, short.iterates(z), strict=True
+    ):
         rows = min(TIMED_ROWS, len(part.x))
         setting = part.equations
         solver = Sweep(part.segment, rows, factorisation=factorisation)

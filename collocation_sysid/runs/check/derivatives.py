@@ -39,7 +39,10 @@ def first_sample_count(experiment: Experiment) -> int:
 
 def shortened_problem(problem: Problem) -> Problem:
     """Return the problem with a few first samples of every experiment."""
-    short = tuple(shortened_experiment(e, first_sample_count(e)) for e in problem.experiments)
+    short = tuple(
+        shortened_experiment(e, first_sample_count(e))
+        for e in problem.experiments
+    )
     return replace(problem, experiments=short)
 
 
@@ -56,7 +59,9 @@ def shortened_experiment(experiment: Experiment, samples: int) -> Experiment:
         Least number of samples.
     """
     fewest = 1 if experiment.is_static else FEWEST_SHARED_SAMPLES
-    samples, depths = until_all_cameras_see(experiment.depths, experiment.t_s, samples, fewest)
+    samples, depths = until_all_cameras_see(
+        experiment.depths, experiment.t_s, samples, fewest
+    )
     markers = experiment.markers
     here = slice(samples)
     tracks = markers.positions_m[here]
@@ -65,12 +70,17 @@ def shortened_experiment(experiment: Experiment, samples: int) -> Experiment:
     markers = replace(markers, t_s=markers.t_s[here], positions_m=tracks)
     t_s = experiment.t_s[here]
     grasps = [
-        replace(g, wrench=_shortened_wrench(g.wrench, t_s, fewest)) for g in experiment.grasps
+        replace(g, wrench=_shortened_wrench(g.wrench, t_s, fewest))
+        for g in experiment.grasps
     ]
-    return replace(experiment, t_s=t_s, markers=markers, grasps=grasps, depths=depths)
+    return replace(
+        experiment, t_s=t_s, markers=markers, grasps=grasps, depths=depths
+    )
 
 
-def _shortened_wrench(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench | None:
+def _shortened_wrench(
+    wrench: Wrench | None, t_s: Array, fewest: int
+) -> Wrench | None:
     """Return a wrench within the times (T,); None if it has fewer than `fewest` samples there."""
     if wrench is None:
         return None
@@ -80,7 +90,9 @@ def _shortened_wrench(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench 
     return replace(wrench, t_s=wrench.t_s[here], values=wrench.values[here])
 
 
-def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]:
+def derivative_errors(
+    collocation: Collocation, z: Array
+) -> tuple[float, float]:
     """Return the largest relative errors of the first and the second derivatives.
 
     Exact derivatives along a random direction are compared with fourth-order central differences at
@@ -106,8 +118,12 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
     step = _difference_step(collocation)
     program = collocation.with_lifted_variables()
     plain = collocation
-    if program.has_lifted_variables:  # methods use these without memory and wrenches as variables
-        of_slopes = _slope_error(plain.objective, plain.gradient, z=z, rng=rng, step=step)
+    if (
+        program.has_lifted_variables
+    ):  # methods use these without memory and wrenches as variables
+        of_slopes = _slope_error(
+            plain.objective, plain.gradient, z=z, rng=rng, step=step
+        )
         if plain.has_eliminated_histories:
             forces = rng.normal(size=plain.constraint_count)
             through = partial(plain.jacobian_vjp, multipliers=forces)
@@ -123,15 +139,25 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
     multipliers = rng.normal(size=collocation.constraint_count)
 
     def lagrangian_gradient(at: Array) -> Array:
-        return collocation.gradient(at) + collocation.jacobian(at).T @ multipliers
+        return (
+            collocation.gradient(at) + collocation.jacobian(at).T @ multipliers
+        )
 
     hessian = collocation.hessian(point, 1.0, multipliers)
     slope = collocation.jacobian(point) @ direction
     first = _deviation(
-        collocation.constraint_values, slope, point=point, direction=direction, step=step
+        collocation.constraint_values,
+        slope,
+        point=point,
+        direction=direction,
+        step=step,
     )
     second = _deviation(
-        lagrangian_gradient, hessian @ direction, point=point, direction=direction, step=step
+        lagrangian_gradient,
+        hessian @ direction,
+        point=point,
+        direction=direction,
+        step=step,
     )
     return max(first, of_slopes), second
 
@@ -140,30 +166,50 @@ def _difference_step(collocation: Collocation) -> float:
     """Return the step of the differences: `STEP`, or less if the gap range in which a contact
     begins is narrow.
     """
-    touching = (t for s in collocation.transcriptions for t in contact_terms(s.experiment))
+    touching = (
+        t
+        for s in collocation.transcriptions
+        for t in contact_terms(s.experiment)
+    )
     return min(
-        (STEP, *(STEP_PER_CONTACT_WIDTH * term.law_of_contact.largest_width_m for term in touching))
+        (
+            STEP,
+            *(
+                STEP_PER_CONTACT_WIDTH * term.law_of_contact.largest_width_m
+                for term in touching
+            ),
+        )
     )
 
 
-def _slope_error(function, gradient, z: Array, rng: np.random.Generator, step: float) -> float:
+def _slope_error(
+    function, gradient, z: Array, rng: np.random.Generator, step: float
+) -> float:
     """Return the relative error of a gradient along a random direction, at a point near z, with
     central differences of `function`.
     """
     point = z + 1e-3 * rng.normal(size=len(z))
     direction = rng.normal(size=len(z))
     return _deviation(
-        function, gradient(point) @ direction, point=point, direction=direction, step=step
+        function,
+        gradient(point) @ direction,
+        point=point,
+        direction=direction,
+        step=step,
     )
 
 
-def _deviation(function, exact: Array, point: Array, direction: Array, step: float) -> float:
+def _deviation(
+    function, exact: Array, point: Array, direction: Array, step: float
+) -> float:
     """Return the largest deviation of `exact` from fourth-order central differences of `function`
     along `direction` at `point`, relative to the largest entry of `exact`.
     """
     after, before, two_after, two_before = (
         function(point + k * step * direction) for k in (1, -1, 2, -2)
     )
-    differences = (8 * (after - before) - (two_after - two_before)) / (12 * step)
+    differences = (8 * (after - before) - (two_after - two_before)) / (
+        12 * step
+    )
     largest = max(float(np.abs(exact).max()), np.finfo(float).tiny)
     return float(np.abs(differences - exact).max()) / largest

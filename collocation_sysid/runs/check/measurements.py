@@ -90,7 +90,9 @@ class RecordingCheck:
         return max(self.markers, key=lambda marker: marker.missing)
 
 
-def check_recording(experiment: Experiment, positions_m: Array | None) -> RecordingCheck:
+def check_recording(
+    experiment: Experiment, positions_m: Array | None
+) -> RecordingCheck:
     """Return a summary of the measurements of an experiment.
 
     Parameters
@@ -103,7 +105,9 @@ def check_recording(experiment: Experiment, positions_m: Array | None) -> Record
     miss = np.zeros((0, len(markers.names)))
     if positions_m is not None:
         measured_m = markers.positions_m[: len(positions_m)]
-        miss = np.linalg.norm(markers.predict_positions(positions_m) - measured_m, axis=2)
+        miss = np.linalg.norm(
+            markers.predict_positions(positions_m) - measured_m, axis=2
+        )
     findings = []
     missing = markers.missing_counts
     for k, name in enumerate(markers.names):
@@ -132,34 +136,58 @@ def check_recording(experiment: Experiment, positions_m: Array | None) -> Record
         instruments=(
             *["the wrench"] * bool(experiment.wrenches),
             *(gauge.name for gauge in experiment.readings),
-            *(f"{sum(map(len, d.clouds)):,} points of '{d.name}'" for d in experiment.depths),
+            *(
+                f"{sum(map(len, d.clouds)):,} points of '{d.name}'"
+                for d in experiment.depths
+            ),
         ),
         air_density_kg_m3=experiment.air_density_kg_m3,
-        test="" if experiment.specimen is None else f"{experiment.specimen.test} specimen",
+        test=""
+        if experiment.specimen is None
+        else f"{experiment.specimen.test} specimen",
     )
 
 
-def recording_concerns(recording: RecordingCheck, body: BodyCheck) -> list[Concern]:
+def recording_concerns(
+    recording: RecordingCheck, body: BodyCheck
+) -> list[Concern]:
     """Return concerns about the markers of a recording; each names the worst marker only."""
     if not recording.markers:
         return []
 
-    def of(marker: MarkerCheck, distance_m: float | None = 0.0) -> dict[str, Any]:
+    def of(
+        marker: MarkerCheck, distance_m: float | None = 0.0
+    ) -> dict[str, Any]:
         by_mm = 1e3 * (distance_m or 0.0)
         frames = recording.frames
         named = {"marker": marker.name, "experiment": recording.experiment}
-        return named | {"by_mm": by_mm, "missing": marker.missing, "frames": frames}
+        return named | {
+            "by_mm": by_mm,
+            "missing": marker.missing,
+            "frames": frames,
+        }
 
     farthest = recording.farthest_marker
     most_missing = recording.most_missing_marker
-    worst = max(recording.markers, key=lambda marker: marker.start_miss_m or 0.0)
+    worst = max(
+        recording.markers, key=lambda marker: marker.start_miss_m or 0.0
+    )
     unseen = most_missing.samples == 0
-    missing = not unseen and most_missing.missing > LARGEST_MISSING_SHARE * recording.frames
-    astray = (worst.start_miss_m or 0.0) > LARGEST_START_MISS_DIAGONALS * body.diagonal_m
+    missing = (
+        not unseen
+        and most_missing.missing > LARGEST_MISSING_SHARE * recording.frames
+    )
+    astray = (
+        worst.start_miss_m or 0.0
+    ) > LARGEST_START_MISS_DIAGONALS * body.diagonal_m
     off = farthest.distance_m > LARGEST_DISTANCE_EDGES * body.edges_m[1]
     return [
-        *concern_if(off, False, "markers/off", **of(farthest, farthest.distance_m)),
+        *concern_if(
+            off, False, "markers/off", **of(farthest, farthest.distance_m)
+        ),
         *concern_if(unseen, False, "markers/unseen", **of(most_missing)),
         *concern_if(missing, False, "markers/missing", **of(most_missing)),
-        *concern_if(astray, False, "markers/astray", **of(worst, worst.start_miss_m)),
+        *concern_if(
+            astray, False, "markers/astray", **of(worst, worst.start_miss_m)
+        ),
     ]

@@ -13,7 +13,11 @@ from numpy.typing import NDArray
 from ...array_types import Array
 from ...errors import SimulationError
 from ...model.forces import Forces
-from ...model.numerical_damping import PERIOD_ERROR, numerical_mode, substeps_needed
+from ...model.numerical_damping import (
+    PERIOD_ERROR,
+    numerical_mode,
+    substeps_needed,
+)
 from ...model.schemes import Scheme
 from ...program.initial_equilibrium import equilibrium
 from ...program.natural_modes import Modes, natural_modes
@@ -97,7 +101,9 @@ class ModesCheck:
         return self.modes[0] if self.modes else None
 
 
-def check_modes(experiment: Experiment, scheme: Scheme, step_s: float, theta: Array) -> ModesCheck:
+def check_modes(
+    experiment: Experiment, scheme: Scheme, step_s: float, theta: Array
+) -> ModesCheck:
     """Return the natural modes of an experiment about the sample with fewest prescribed dofs, and
     the errors of the scheme.
 
@@ -119,14 +125,18 @@ def check_modes(experiment: Experiment, scheme: Scheme, step_s: float, theta: Ar
     time_s = float(experiment.t_s[least])
     x, about = _reference_state(experiment, is_prescribed[least], time_s, theta)
     free = np.flatnonzero(~is_prescribed[least])
-    modes = natural_modes(Forces.from_experiment(experiment, time_s, theta), x, free, MODE_COUNT)
+    modes = natural_modes(
+        Forces.from_experiment(experiment, time_s, theta), x, free, MODE_COUNT
+    )
     findings = _mode_findings(modes, experiment, scheme, step_s)
     needed = None
     if findings:
         omega = float(modes.angular_frequencies_rad_s[0])
         limit = _damping_limit(findings[0])
         ratio = _oscillating_damping_ratio(findings[0].damping_ratio)
-        needed = substeps_needed(scheme, omega, experiment.timestep_s, limit, damping_ratio=ratio)
+        needed = substeps_needed(
+            scheme, omega, experiment.timestep_s, limit, damping_ratio=ratio
+        )
     return ModesCheck(
         experiment.name,
         about,
@@ -140,7 +150,10 @@ def check_modes(experiment: Experiment, scheme: Scheme, step_s: float, theta: Ar
 
 
 def _reference_state(
-    experiment: Experiment, is_prescribed: NDArray[np.bool_], time_s: float, theta: Array
+    experiment: Experiment,
+    is_prescribed: NDArray[np.bool_],
+    time_s: float,
+    theta: Array,
 ) -> tuple[Array, str]:
     """Return node positions (n, 3) [m] about which the body oscillates, and the name of this state.
 
@@ -149,7 +162,9 @@ def _reference_state(
     if is_prescribed.any():
         try:
             solver = NewtonSolver(experiment, prescribed=is_prescribed)
-            return equilibrium(experiment, theta, time_s, solver=solver), "rest state"
+            return equilibrium(
+                experiment, theta, time_s, solver=solver
+            ), "rest state"
         except SimulationError:
             pass
     return experiment.rigid_positions([time_s])[0], "undeformed shape"
@@ -162,17 +177,22 @@ def _mode_findings(
     in period and damping, for each mode, lowest first.
     """
     findings = []
-    for frequency, ratio in zip(modes.frequencies_hz, modes.damping_ratios, strict=True):
+    for frequency, ratio in zip(
+        modes.frequencies_hz, modes.damping_ratios, strict=True
+    ):
         omega = 2 * np.pi * frequency
         undamped = numerical_mode(scheme, omega, step_s)
-        damped = numerical_mode(scheme, omega, step_s, _oscillating_damping_ratio(float(ratio)))
+        damped = numerical_mode(
+            scheme, omega, step_s, _oscillating_damping_ratio(float(ratio))
+        )
         findings.append(
             ModeCheck(
                 float(frequency),
                 float(1 / frequency / experiment.timestep_s),
                 steps_per_period=float(1 / frequency / step_s),
                 damping_ratio=float(ratio),
-                numerical_damping_ratio=round(damped.damping_ratio, ROUNDING) + 0.0,  # no −0
+                numerical_damping_ratio=round(damped.damping_ratio, ROUNDING)
+                + 0.0,  # no −0
                 period_error=undamped.period_error,
             )
         )
@@ -208,8 +228,16 @@ def mode_concerns(motion: ModesCheck) -> list[Concern]:
     duration_data = {"duration_s": motion.duration_s}
     return [
         *_grid_concerns(motion, mode),
-        *concern_if(samples < FEW_SAMPLES, False, "information/rate", **first, **rate_data),
-        *concern_if(is_short, False, "information/short", **first, **duration_data),
+        *concern_if(
+            samples < FEW_SAMPLES,
+            False,
+            "information/rate",
+            **first,
+            **rate_data,
+        ),
+        *concern_if(
+            is_short, False, "information/short", **first, **duration_data
+        ),
     ]
 
 
@@ -222,9 +250,17 @@ def _grid_concerns(motion: ModesCheck, mode: ModeCheck) -> list[Concern]:
     if abs(added) > _damping_limit(mode):
         remedy = _step_remedy(motion)
         if motion.scheme != UNDAMPED:
-            or_finer = "" if motion.substeps_needed is None else f", or {_substeps_setting(motion)}"
+            or_finer = (
+                ""
+                if motion.substeps_needed is None
+                else f", or {_substeps_setting(motion)}"
+            )
             remedy = f'set transcription.scheme = "{UNDAMPED}"{or_finer}'
-        grid = {"scheme": motion.scheme, "step_ms": 1e3 * motion.timestep_s, "ratio": abs(added)}
+        grid = {
+            "scheme": motion.scheme,
+            "step_ms": 1e3 * motion.timestep_s,
+            "ratio": abs(added),
+        }
         code = "scheme/adds" if added > 0 else "scheme/takes"
         return [Concern(code, data=first | grid | {"remedy": remedy})]
     steps = {

@@ -22,7 +22,10 @@ class Assembly:
 
     def track_ratio_to_casadi_map(self, measured: dict) -> float:
         """How many times longer the same expressions take through casadi.Function.map."""
-        return measured["jacobian"]["casadi_map_ms"] / measured["jacobian"]["simd_1_ms"]
+        return (
+            measured["jacobian"]["casadi_map_ms"]
+            / measured["jacobian"]["simd_1_ms"]
+        )
 
 
 class Contact:
@@ -50,7 +53,10 @@ class Sensitivities:
     def setup(self) -> None:
         """Start at the guess."""
         collocation = Problem.read(PROBLEM).collocation()
-        shapes = [s.experiment.rigid_positions(s.dynamics.t_s) for s in collocation.transcriptions]
+        shapes = [
+            s.experiment.rigid_positions(s.dynamics.t_s)
+            for s in collocation.transcriptions
+        ]
         z = collocation.pack(collocation.parameters.guess_q, shapes)
         self.part = next(iter(collocation.iterates(z)))
 
