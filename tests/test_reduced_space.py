@@ -420,6 +420,18 @@ def test_curvature_joins_the_triangle_unless_that_is_indefinite(rng):
     assert with_curvature(fit, -100 * np.eye(4)) is fit
 
 
+def test_curvature_that_rounding_makes_indefinite_is_left_out():
+    """B is positive semidefinite, and many times the least curvature of SᵀS."""
+    rng = np.random.default_rng(0)
+    for _ in range(3000):
+        triangle = np.triu(rng.normal(size=(4, 4)))
+        triangle *= np.logspace(0, -rng.integers(3, 11), 4)[:, None]
+        slopes = rng.normal(size=(4, 2))
+        curvature = slopes @ slopes.T * 10 ** rng.uniform(0, 4)
+        fit = SquareRootInformation(np.column_stack([triangle, np.ones(4)]))
+        assert np.isfinite(with_curvature(fit, curvature).jacobian).all()
+
+
 # History and timing
 
 

@@ -68,8 +68,9 @@ def with_curvature(
 ) -> SquareRootInformation:
     """Return a least-squares problem with the normal matrix SᵀS + B instead of SᵀS.
 
-    The problem is returned unchanged if B is zero, S is rank-deficient, or B reduces the curvature
-    too much (`LARGEST_SHARE`).
+    The problem is returned unchanged if B is zero, S is rank-deficient, B reduces the curvature too
+    much (`LARGEST_SHARE`), or B is so much larger than SᵀS that rounding makes their sum
+    indefinite.
 
     Parameters
     ----------
@@ -90,7 +91,10 @@ def with_curvature(
     relative = (relative + relative.T) / 2
     if np.linalg.eigvalsh(relative)[0] < -LARGEST_SHARE:
         return fit
-    factor = np.linalg.cholesky(np.eye(len(curvature)) + relative)
+    try:
+        factor = np.linalg.cholesky(np.eye(len(curvature)) + relative)
+    except np.linalg.LinAlgError:
+        return fit
     right = solve_triangular(factor, right, lower=True)
     return SquareRootInformation(np.column_stack([factor.T @ triangle, right]))
 
