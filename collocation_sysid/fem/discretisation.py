@@ -596,13 +596,19 @@ def _with_field_columns(
 ) -> Index:
     """Return the positions (E, …) of derivatives by θ and by the logarithm of each cell.
 
+    The logarithm follows the last constant. For "theta_theta" the result has the rows of a square
+    matrix of order `constants` + 1, one after the other; for other outputs it is `places`, then
+    `own`.
+
     Parameters
     ----------
     places : (E, any)
-        Positions of derivatives by θ.
+        Positions of derivatives by θ; for "theta_theta" (E, constants²), row by row.
     own : (E, any)
-        Positions of derivatives by the logarithm, one set for each cell.
+        Positions of derivatives by the logarithm, one set for each cell. For "theta_theta"
+        (E, 2 constants + 1): the last row of the matrix, then its last column without the corner.
     output : str
+        Name of the output of the kernel.
     constants : int
         Number of constants of the points.
     """

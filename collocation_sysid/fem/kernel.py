@@ -213,8 +213,21 @@ def from_lower_triangle(matrix: ca.SX) -> ca.SX:
 def _coupled(
     output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX
 ) -> ca.MX:
-    """Return an output of an element with the contribution of the coupling between points, see the
-    module; unchanged for the contraction "none".
+    """Return an output of an element with the contribution of the coupling between its points.
+
+    The docstring of the module defines A, C and D.
+
+    Parameters
+    ----------
+    output : MX
+        Sum over the points, without the coupling.
+    coupling : MX
+        C (m, k) for the contraction "nodes", D (m, m) for "pairs"; ignored for "none".
+    how : Contraction
+        Contraction of the output. "nodes" adds A C, stacked column by column; "pairs" adds the
+        lower triangle of A D Aᵀ; for "none" the output is returned as it is.
+    vectors : MX
+        Summed node vectors A (3·nodes, m), one in each column.
     """
     if how == "none":
         return output

@@ -116,7 +116,9 @@ class BodyPart:
 
     @cached_property
     def constants(self) -> tuple[Constant, ...]:
-        """Constants of material, damping law, memory, mass and field, in the order of θ."""
+        """Constants of the part in the order of θ: of the material, of the damping law, of the
+        Prony branches, γ_m (always), the density if it is a parameter, and those of the field.
+        """
         memory = [
             constant for branch in self.prony for constant in branch.constants
         ]
@@ -285,12 +287,14 @@ def _densities(
     claimed : sequence of arrays of int
         Cells of each region.
     density_kg_m3, mass_kg : float or None
-        Density of the rest, or mass of the complete body; exactly one of them is a number.
+        Density of the rest, or mass of the complete body; exactly one of them is a number. The mass
+        without that of the regions with a density of their own is spread over the other cells.
 
     Raises
     ------
     InputError
-        If none or both are given, or a density is not positive.
+        If none or both are given, if a density is not positive, if the regions alone have at least
+        the given mass, or if a mass is given and every cell has a density of its own.
     """
     if (density_kg_m3 is None) == (mass_kg is None):
         raise InputError("give exactly one of density_kg_m3 and mass_kg")

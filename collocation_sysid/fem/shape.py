@@ -301,8 +301,15 @@ def _triangle_rule() -> tuple[Array, Array]:
 
 
 def _triangle_shape_functions(points: Array, nodes: int) -> tuple[Array, Array]:
-    """Return shape functions (q, k) of a triangle with 3 or 6 nodes, and their derivatives (q, k,
-    2).
+    """Return shape functions (q, k) of a triangle and their derivatives (q, k, 2) by ξ and η.
+
+    Parameters
+    ----------
+    points : (q, 2)
+        Coordinates ξ and η: the barycentric coordinates of the second and the third corner.
+    nodes : int
+        Number k of nodes: 3 corners, or 6 with the mid nodes of the edges from the first corner to
+        the second, from the second to the third, and from the third to the first.
     """
     xi, eta = points.T
     corner_slopes = np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])

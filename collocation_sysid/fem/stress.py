@@ -264,8 +264,17 @@ class StressEvaluator:
         theta: Array,
         out: Array | None = None,
     ) -> Array:
-        """Return values at points (T, width) of a kernel, added to `out` in place if it is
-        given.
+        """Return values at points (T, width) of a kernel, added to `out` in place if it is given.
+
+        Parameters
+        ----------
+        name : str
+            Kernel in `KERNELS`.
+        fields : list of (T, 3n)
+            Node fields.
+        theta : (k,)
+        out : (T, width), optional
+            Array to add to; zeros by default.
         """
         out = np.zeros((len(fields[0]), self.width)) if out is None else out
         return self._evaluate_all_parts(name, fields, theta, out)
@@ -273,7 +282,18 @@ class StressEvaluator:
     def _evaluate_at_nodes(
         self, name: str, fields: list[Array], theta: Array, point_data: Array
     ) -> Array:
-        """Return node values (T, 3n) of a kernel."""
+        """Return node values (T, 3n) of a kernel.
+
+        Parameters
+        ----------
+        name : str
+            Kernel in `KERNELS`.
+        fields : list of (T, 3n)
+            Node fields.
+        theta : (k,)
+        point_data : (T, width)
+            Data of the points: H or weights.
+        """
         return self._evaluate_all_parts(
             name,
             fields,
@@ -290,8 +310,20 @@ class StressEvaluator:
         out: Array,
         point_data: Array | None = None,
     ) -> Array:
-        """Add the results of a kernel for all parts with memory to `out`, in place, and return
-        it.
+        """Add the results of a kernel for all parts with memory to `out`, in place, and return it.
+
+        Parameters
+        ----------
+        name : str
+            Kernel in `KERNELS`.
+        fields : list of (T, 3n)
+            Node fields: positions, and further vectors if the kernel has them.
+        theta : (k,)
+            Constants θ of the complete body.
+        out : (T, values of the kernel)
+            Array to add to; parts without memory do not change it.
+        point_data : (T, width), optional
+            Data of the points: H or weights. None for kernels that read none.
         """
         for number, part in enumerate(self.body.parts):
             if part.prony:

@@ -27,14 +27,19 @@ def recording_from_log(
     """Return the experiment with the poses, markers and samples of all rows, from the first frame
     on.
 
-    None if there are too few, or if markers were measured between samples.
+    Samples of a custom sensor or wrench replace its stated series; if fewer than three are within
+    the rows, or all are NaN, the sensor is left out. Missing markers are NaN.
+
+    None if there are fewer than three sample times or no measured marker, or if markers were
+    measured between samples.
 
     Parameters
     ----------
     model : StreamingModel
     intake : FrameBuffer
+        Buffer with the samples that still wait for rows, which are included.
     log : sequence of LoggedRow
-        All rows, with their samples.
+        All rows, substeps included, with their samples.
     """
     experiment = model.experiment
     at_samples = log[:: model.substeps]

@@ -539,14 +539,18 @@ class LiveEstimator:
     def _add_samples(
         self, readings: Sequence[Sample], squares: list[Array], rows: int = 0
     ) -> list[str]:
-        """Add samples to the first pass and to the log, without outliers, which are counted; return
-        notes. Without a pass nothing is added.
+        """Add samples to the first pass and to the log, and return notes on outliers.
+
+        Outliers among the markers are counted and become NaN. Without a pass nothing is added; if
+        the pass has failed, all samples are added to the log alone, as they are.
 
         Parameters
         ----------
         readings : sequence of Sample
-        squares : list
-            Squared marker residuals [m²] of the frame; extended in place.
+            Samples after the last row of the log.
+        squares : list of array
+            Squared residuals [m²] of the markers, those without NaN; an array is appended for each
+            marker sample, in place.
         rows : int
             Number of rows computed since the row after which the samples are evaluated.
         """
@@ -722,13 +726,15 @@ class LiveEstimator:
         """Return the largest distance of p from some points, in the standard errors of a pass; 0
         without points.
 
-        Only material parameters count, not those of the recording.
+        It is the largest absolute difference of a single material parameter over its standard
+        error; parameters of the recording do not count.
 
         Parameters
         ----------
         track : WindowPass
             Pass whose standard errors are used.
         p : (P,)
+            Parameters, not transformed.
         points : sequence of (P,)
             Points in transformed parameters, see `StreamingModel.transformed`.
         """
@@ -787,8 +793,15 @@ class LiveEstimator:
     def _estimates_and_trust(
         self, t_s: float
     ) -> tuple[Mapping[str, Estimate], Assessment]:
-        """Return estimates by name and the verdict at the time t_s; without a successful pass the
-        estimates have no intervals.
+        """Return estimates by name and the verdict at the time t_s [s].
+
+        Without a successful first pass the estimates are the values at the current p without
+        standard errors and intervals, and without coefficients of fields, and the only concern is
+        the reason. Otherwise the concerns are those of the data and of the estimates; a pose that
+        is missing too long and a search that goes on add one.
+
+        Calls with a successful pass are counted in `counts`, and every `SCATTER_INTERVAL_FRAMES`
+        such calls the scatter of the residuals, `scatter`, is computed again.
         """
         code = ""
         if self.first_pass is None:
@@ -823,7 +836,17 @@ class LiveEstimator:
     def _estimates_at(
         self, known: SquareRootInformation, p: Array
     ) -> dict[str, Estimate]:
-        """Return the estimates with intervals from given information, at p."""
+        """Return estimates with intervals by name, without the coefficients of fields.
+
+        Their variances are scaled by `variance_factor` with the present scatter of the residuals.
+
+        Parameters
+        ----------
+        known : SquareRootInformation
+            Information in transformed parameters, including the priors.
+        p : (P,)
+            Parameters, not transformed; those within `AT_BOUND` of a bound count as at it.
+        """
         collocation = self.model.collocation
         nq = self.model.collocation.nq
         transformed = self.model.transformed(p)

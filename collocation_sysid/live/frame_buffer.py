@@ -242,7 +242,18 @@ class FrameBuffer:
     def _add_pose(
         self, t_s: float, positions_m: Array, quaternions: Array
     ) -> None:
-        """Store a pose, with the sign of its quaternion nearest to the previous one."""
+        """Store a pose, with the sign of each quaternion nearest to the previous one.
+
+        The time of the first pose becomes `start_s`.
+
+        Parameters
+        ----------
+        t_s : float
+            Time [s], later than that of the previous pose.
+        positions_m : (G, 3)
+        quaternions : (G, 4)
+            Unit quaternions x y z w of the moving grasps.
+        """
         if self._poses:
             before = self._poses[-1][2]
             signs = np.where(

@@ -67,20 +67,24 @@ class Frame:
 def parse_pose(
     pose: Pose | None, grasp_numbers: Sequence[int] | Index
 ) -> tuple[Array, Array] | None:
-    """Return positions (G, 3) and quaternions (G, 4) of the moving grasps; None if one is missing.
+    """Return positions (G, 3) [m] and unit quaternions (G, 4) of the moving grasps, x y z w; None
+    if the pose or that of a grasp is missing.
 
     Parameters
     ----------
     pose : Pose, mapping, sequence or None
-        4×4 matrix, or (position, quaternion x y z w), or a mapping with these keys; for several
-        grasps by number, or in the order of `grasp_numbers`.
+        Pose of the only moving grasp: a 4×4 matrix, a tuple (position, quaternion), or a mapping
+        with the keys "position_m" and "quaternion_xyzw". For several grasps a sequence of poses in
+        the order of `grasp_numbers`. For any number of grasps a mapping of their numbers, as text
+        such as "1", to poses.
+        Entries that are None, and numbers that the mapping omits, are missing.
     grasp_numbers : sequence of int
-        Numbers of the grasps, counted from 1.
+        Numbers of the G moving grasps, counted from 1.
 
     Raises
     ------
     InputError
-        If the value is not a pose.
+        If a value is not a pose, or for an unknown grasp or a wrong number of poses.
     """
     if pose is None:
         return None
@@ -266,20 +270,26 @@ def parse_wrenches(
 def _parse_samples(
     samples: Any, what: str, count: int, t_s: float, alternative_count: int = 0
 ) -> Iterator[tuple[float, Array]]:
-    """Yield time and values of the samples of one instrument; missing samples are skipped.
+    """Yield time [s] and values of the samples of one instrument; missing samples are skipped.
 
     Parameters
     ----------
     samples : samples
-        Values, a mapping with ``t_s`` and ``values``, or a list of such mappings.
+        Values, a mapping with exactly the keys ``t_s`` and ``values``, or a list of such mappings.
+        Values are a sequence, or a number if `count` is 1; None is a missing sample.
     what : str
         Name of the instrument for messages.
     count : int
         Number of values.
     t_s : float
-        Time of samples without a time.
+        Time of samples without a time [s].
     alternative_count : int
         Second admissible number of values; 0 for none.
+
+    Raises
+    ------
+    InputError
+        For other keys, a time that is not finite, or values that are not as many numbers.
     """
     several = isinstance(samples, Sequence) and any(
         isinstance(s, Mapping) for s in samples
@@ -311,12 +321,13 @@ def _parse_samples(
 
 
 def _parse_array(raw_values: Any, shape: tuple[int, ...]) -> Array:
-    """Return an array of floats of the given shape; None becomes NaN.
+    """Return an array of floats of the given shape; entries that are None become NaN.
 
     Raises
     ------
     InputError
-        For anything else, another shape, or infinite numbers.
+        For anything else, another shape (None in place of an array, too), or magnitudes beyond
+        `LARGEST_NUMBER`.
     """
     size = " × ".join(map(str, shape))
     try:
@@ -456,7 +467,11 @@ class FrameReader:
         )
 
     def _pose_columns(self, number: int) -> list[str]:
-        """Return the column names of the pose of a grasp, by its number."""
+        """Return the seven column names of the pose of a grasp, by its number.
+
+        They are those in `POSE`; if several grasps move, each begins with the number and a dot,
+        such as "2.x_m".
+        """
         before = "" if len(self.grasps) == 1 else f"{number}."
         return [before + name for name in POSE]
 

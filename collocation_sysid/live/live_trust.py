@@ -83,12 +83,17 @@ def variance_factor(
     """Return the factor of all variances, and the half width of 95 % intervals in standard
     deviations.
 
+    The factor is 1, and the half width 1.96, unless the loss is larger than chance explains
+    (χ² test at `TEST_LEVEL`): then they are the loss over the degrees of freedom, and the quantile
+    of Student's t. In both cases the factor is multiplied by (1 + a)/(1 − a) with the
+    autocorrelation a of the residuals.
+
     Parameters
     ----------
     known : SquareRootInformation
-        Information, including the priors.
+        Information in transformed parameters, including the priors.
     p : (P,)
-        Estimate.
+        Estimate in transformed parameters.
     parameter_count : float
         Number of fitted parameters.
     scatter : ResidualScatter

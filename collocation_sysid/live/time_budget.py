@@ -59,8 +59,16 @@ class TimeBudget:
         return 1 + int(min(spare_s / self.more_s, 1e6)) if self.more_s else 1
 
     def record_steps(self, rows: int, took_s: float) -> None:
-        """Raise `delay`, in place, if `rows` time steps took longer than expected; took_s is their
-        time [s].
+        """Raise `delay`, in place, to the ratio of measured to expected time of some time steps.
+
+        A smaller ratio changes nothing, nor does an unknown expected time.
+
+        Parameters
+        ----------
+        rows : int
+            Number of time steps that were computed together.
+        took_s : float
+            Their measured time [s].
         """
         expected_s = self.first_s + (rows - 1) * self.more_s
         if expected_s:

@@ -63,8 +63,8 @@ class WindowPass:
     Parameters
     ----------
     model : StreamingModel
-    linearisation_point : (P,)
-        Linearisation point.
+    p : (P,)
+        Linearisation point, parameters that are not transformed.
     prior : SquareRootInformation
         Information of the samples before the window.
     block_rows : int
@@ -114,7 +114,7 @@ class WindowPass:
 
     @property
     def linearisation_point(self) -> Array:
-        """Parameters of the current linearisation point (P,)."""
+        """Parameters of the current linearisation point (P,), not transformed."""
         return self.sweep.p
 
     @property
@@ -166,7 +166,12 @@ class WindowPass:
         return len(computed)
 
     def relinearise_at(self, p: Array) -> None:
-        """Continue with another linearisation point; previous rows keep theirs."""
+        """Continue at another linearisation point p (P,), not transformed; previous rows keep
+        theirs.
+
+        The information so far is kept, and the state after the last row is moved to p along its
+        columns. Rows from here on are linearised at p.
+        """
         self.sweep = StreamingSweep(
             self.model,
             p,

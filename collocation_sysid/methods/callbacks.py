@@ -221,8 +221,18 @@ class NlpFunctions:
         return made
 
     def _evaluate(self, inputs: list[Array], outputs: dict[str, Array]) -> None:
-        """Write the requested outputs at the inputs to `outputs`, arrays by name, in place; the
-        first input is z.
+        """Write the requested outputs to `outputs`, in place.
+
+        Parameters
+        ----------
+        inputs : list of array
+            z and CasADi's parameters p, which are ignored. For outputs of the Lagrangian also the
+            weight w and the multipliers y, which may be empty, see `_weights`; without them these
+            outputs are not written.
+        outputs : dict of str to array
+            Arrays to overwrite, by the name of the output, see the class: "f" (1,), "grad_f"
+            (variables,), "g" (constraints,), "grad_l" (variables,), and the values of the nonzero
+            entries of "jac_g", "triu_hess" and "hess".
         """
         collocation = self.collocation
         z = inputs[0]
@@ -253,7 +263,16 @@ class NlpFunctions:
         self, inputs: list[Array], outputs: list[Array | None]
     ) -> None:
         """Write the directional derivative of the Lagrangian's gradient to the only output, in
-        place, unless that is None; the inputs are in CasADi's order.
+        place.
+
+        Parameters
+        ----------
+        inputs : list of array
+            In CasADi's order: z, p, w and y, the gradient there, then the direction of each of the
+            four. Those of p and the gradient are ignored; the direction of z may be empty, for
+            zero.
+        outputs : list of one (variables,) array or None
+            Array to overwrite; nothing is done for None.
         """
         z, _, weight, multipliers, _, by_z, _, by_weight, by_multipliers = (
             inputs

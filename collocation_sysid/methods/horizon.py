@@ -202,6 +202,10 @@ class Horizon:
         """Run a function of `trajectory_sweeps` for every experiment, and return the iterate of the
         joined results.
 
+        The fit of the iterate, and its products of residuals with previous slopes, are sums over
+        the experiments, the priors of the collocation and, if the horizon has one, its own prior
+        about the guess. The times of the sweeps are added to the stopwatch.
+
         Parameters
         ----------
         p : (np,) array
@@ -313,7 +317,13 @@ class Horizon:
         return self.workers.fetch(summaries)
 
     def row_counts(self, trajectories: Sequence[Any]) -> list[int]:
-        """Return the number of rows of each trajectory."""
+        """Return the number of rows of each trajectory.
+
+        Parameters
+        ----------
+        trajectories : sequence
+            One for each experiment, as the workers store them, see `first_rows`.
+        """
         return self.workers.fetch(
             self.workers.map_experiments(_row_count, trajectories)
         )
@@ -321,7 +331,16 @@ class Horizon:
     def first_rows(
         self, trajectories: Sequence[Any], counts: Sequence[int]
     ) -> list[Array]:
-        """Return the first `counts[i]` rows of each trajectory i, as arrays (counts[i], 3n) [m]."""
+        """Return the first `counts[i]` rows of each trajectory i, as arrays (counts[i], 3n) [m].
+
+        Parameters
+        ----------
+        trajectories : sequence
+            One for each experiment, as the workers store them: results of sweeps or simulations, or
+            arrays of positions.
+        counts : sequence of int
+            Number of rows for each experiment; a shorter trajectory is returned completely.
+        """
         return self.workers.fetch(
             self.workers.map_experiments(_first_rows, trajectories, counts)
         )

@@ -215,9 +215,10 @@ def _run(
     Returns
     -------
     tuple
-        Variables, multipliers, return status of the solver, and number of iterations. Variables are
-        NaN and multipliers empty if the solver failed; the status is "left behind" if it was
-        abandoned.
+        Variables, multipliers of the constraints, return status of the solver, and number of
+        iterations. If the solver raised a `RuntimeError`, variables are NaN, multipliers empty, the
+        status is the last line of the error's message, and the number is 0. The same holds if it
+        was abandoned, with the status "left behind".
     """
     lower, upper = bounds
     arguments = {"x0": start, "lbx": lower, "ubx": upper, "lbg": 0, "ubg": 0}

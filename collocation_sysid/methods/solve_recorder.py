@@ -130,7 +130,11 @@ class Recorder:
             return Status.INTERRUPTED, Status.INTERRUPTED.sentence
 
     def add_variables(self, number: int, z: Array, loss: float) -> None:
-        """Evaluate the problem at variables z and add the result to the history.
+        """Evaluate the problem at variables z, and add the result to the history, see `add`.
+
+        The entry contains the parameters, the root mean square distance of the markers [m], the
+        largest residual of the equations of motion [N] and the time since the recorder was made
+        [s].
 
         Parameters
         ----------

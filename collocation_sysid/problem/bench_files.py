@@ -133,10 +133,27 @@ def add_displacement(
     grasp: Grasp,
     rest_length_m: float | None,
 ) -> None:
-    """Add the translations [m] of a grasp at the times of the table, in place, as
-    `read_displacement` reads them.
+    """Add the translations of a grasp at the times of the table, in place, as `read_displacement`
+    reads them.
 
-    If `rest_length_m` is not None, the strain, translation over this length [m], is added instead.
+    They are those of the poses, from the undeformed place, times the sign of the layout. The
+    columns are those that the layout names; if it names none, the strain if `rest_length_m` is
+    given, else the displacement along the layout's axis, or along the axes of the grasp's `zero` if
+    these are others.
+
+    Parameters
+    ----------
+    table : BenchTable
+    layout : DisplacementSection
+    grasp : Grasp
+    rest_length_m : float or None
+        Undeformed length [m] over which the displacement along the axis is the strain; None if the
+        table has no strain.
+
+    Raises
+    ------
+    InputError
+        If the table already has a column of that name with other values.
     """
     shifts_m = layout.sign * grasp.poses.at(table.t_s)[1]
     displacement_m = shifts_m[:, "xyz".index(layout.axis)]

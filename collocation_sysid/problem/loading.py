@@ -300,7 +300,18 @@ def _locate_in_table(
 ) -> Iterator[None]:
     """Context that adds file and table to errors that have no file.
 
-    Messages begin with `odd`, warnings on the body that may explain the error.
+    Each `InputError` is replaced by a new one. Errors of another file keep it; an error of the
+    air's density is located in the table `environment` of this file.
+
+    Parameters
+    ----------
+    path : Path
+        File of the problem.
+    table : str
+        Name of the table, or a description such as "experiment 'a'"; the key of the error follows.
+    odd : sequence of str
+        Warnings on the body that may explain the error; the message of every error begins with
+        them.
     """
     try:
         yield

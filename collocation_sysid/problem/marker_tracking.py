@@ -61,7 +61,15 @@ def transform_to_body_frame(
 ) -> tuple[MarkerTable, list[str]]:
     """Return the tracks moved rigidly so that the template fits, and notes on the residuals.
 
-    The tracks are unchanged if there is no template.
+    The fit compares the template with the mean positions of its markers within
+    `template_window_s`, and the same motion is applied to all tracks at all times. Without template
+    the tracks are returned as they are, without notes.
+
+    Parameters
+    ----------
+    markers : MarkersSection
+    table : MarkerTable
+        Tracks in the camera's frame; not changed.
 
     Raises
     ------

@@ -94,7 +94,9 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
 
 
 def _depth(content: Any) -> int:
-    """Return the number of nested levels of tables and lists, at most `DEEPEST` + 1."""
+    """Return the number of nested levels of a table or list, itself included; at most
+    `DEEPEST` + 1.
+    """
     level = [content]
     depth = 0
     while level and depth <= DEEPEST:
@@ -271,7 +273,21 @@ def _item_key(place: Any, part: str, key: str) -> str | int:
 
 
 def _parse_value(text: str, key: str) -> Any:
-    """Return a value in TOML syntax; words without quotes are strings."""
+    """Return a value in TOML syntax; words without quotes are strings.
+
+    Parameters
+    ----------
+    text : str
+        Value as typed.
+    key : str
+        Its dotted key, for messages.
+
+    Raises
+    ------
+    InputError
+        If a list, table or quoted string is not valid, or the value is nested too deeply or has too
+        many digits.
+    """
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:

@@ -322,11 +322,26 @@ class RecordingReader:
         )
 
     def _wrench(self, section: WrenchSection, key: str, t_s: Array) -> Wrench:
-        """Return the measured wrench within the times t_s of the experiment [s], and note how many
+        """Return the measured wrench within the times t_s of the experiment, and note how many
         samples are used.
 
         If a simulation has no file, the wrench is zero at t_s. Of equilibria without markers, only
-        measurements at the times t_s are used, if there are any.
+        measurements at the times t_s are used, if there are any. Stated sigmas are divided by the
+        section's `symmetry`.
+
+        Parameters
+        ----------
+        section : WrenchSection
+        key : str
+            Dotted key of the section, for messages.
+        t_s : (N,) array
+            Times of the experiment [s].
+
+        Raises
+        ------
+        InputError
+            If the file is missing in a solve or cannot be read, or if fewer than three of its
+            samples (one for equilibria) are within the times of the experiment.
         """
         name = self.section.file_of(section)
         arguments: dict[str, Any] = declared_in(section, Wrench, key)
@@ -554,12 +569,17 @@ class RecordingReader:
         """Return the tracks to fit, without those of the gripper alone.
 
         They have no columns if the experiment has no markers. If a simulation has no file, they are
-        zero at `_sample_times`.
+        zero. In both cases the times are those of `_sample_times`.
+
+        Parameters
+        ----------
+        poses : sequence of PoseSequence
+            Poses of the grasps; only their times are used, where no marker file gives the times.
 
         Raises
         ------
         InputError
-            If a marker without a file has no `reference_m`.
+            If a marker without a file has no `reference_m`, or `_sample_times` finds too few times.
         """
         if not self.section.has_markers:
             times = self._sample_times(poses)
@@ -766,6 +786,16 @@ class RecordingReader:
     def _markers(self, t_s: Array, table: MarkerTable) -> Markers:
         """Return the markers at the times t_s; positions on the body are NaN where they are to be
         estimated.
+
+        The standard deviation of a marker is its sigma_m over the square root of its weight, which
+        is 1 unless stated. If the experiment has no markers, the result has none.
+
+        Parameters
+        ----------
+        t_s : (N,) array
+            Times of the samples [s].
+        table : MarkerTable
+            Tracks at these times.
 
         Raises
         ------

@@ -576,8 +576,17 @@ def with_experiment_defaults(content: Any) -> Any:
 def _known_defaults(
     shared: dict[str, Any], table: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the defaults of an experiment: all, or of a specimen beside recordings those that
-    specimens know.
+    """Return the defaults for the table of an experiment.
+
+    All defaults are returned, unless the table has the kind "specimen" and the defaults do not:
+    then they are for recordings too, and only the keys that specimens know are returned.
+
+    Parameters
+    ----------
+    shared : dict
+        Defaults for all experiments; not changed.
+    table : dict
+        Table of one experiment, as in the file.
     """
     if table.get("kind") != "specimen" or shared.get("kind") == "specimen":
         return shared

@@ -122,7 +122,16 @@ class SpecimenReader:
         )
 
     def _rows(self, table: SpecimenTable) -> Index:
-        """Return the indices of the rows to use; all rows of a simulation."""
+        """Return the indices (k,) of the rows to use; all rows of a simulation.
+
+        Otherwise these are the rows within `window_s`, without the first `skip_cycles` cycles of
+        the strain; of these every `every`-th, from the first one on.
+
+        Raises
+        ------
+        InputError
+            If no sample is within `window_s`, or there are no cycles after those to skip.
+        """
         section = self.section
         rows = np.arange(len(table.t_s))
         if self.simulation:
@@ -141,7 +150,9 @@ class SpecimenReader:
         return rows[:: section.every]
 
     def _sigma_pa(self) -> float:
-        """Return the standard deviation of the noise of the stress [Pa]."""
+        """Return the standard deviation of the noise of the stress [Pa]: the stated one, or else
+        that of the force over the undeformed area.
+        """
         section = self.section
         if section.sigma_pa is not None:
             return section.sigma_pa

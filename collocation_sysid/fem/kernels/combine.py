@@ -110,7 +110,14 @@ def compile_combiner(plan: CombinationPlan) -> Combiner:
 
 
 def _emit() -> Any:
-    """Return the LLVM module of the compiled loop over tasks."""
+    """Return the LLVM module of the function `combine`, a compiled loop over tasks.
+
+    Its arguments are the first task and the end of the tasks, the row length (`stride`) of a and b,
+    the arrays of a `CombinationPlan` (tasks, coefficients, targets, sources), a, b and the values,
+    which are changed in place. A task reads one row of a and one of b:
+    values[offset + targets] = α a[row, sources] + β b[row, sources], or is increased by that. The
+    values must not overlap with any other array.
+    """
     from llvmlite import ir
 
     from .jit import DOUBLES, I32S, I64, for_range

@@ -94,7 +94,18 @@ class SkylineFactorisation:
         self._solve = _compile("solve", 1)
 
     def allocate(self, sides: int) -> FactorMemory:
-        """Return memory for the sides of a matrix: one for a symmetric matrix, otherwise two."""
+        """Return memory, filled with zeros, for a factorisation of one matrix.
+
+        Parameters
+        ----------
+        sides : int
+            1 for a symmetric matrix, otherwise 2.
+
+        Returns
+        -------
+        FactorMemory
+            Sides (sides, n, width), aligned with cache lines, and results (2, n + width).
+        """
         array_size = sides * math.prod(self.shape)
         size, width = self.shape
         memory = np.zeros(array_size + LINE_BYTES // 8)

@@ -131,7 +131,23 @@ def minimise_levenberg_marquardt(
 
 @dataclass(frozen=True, eq=False)
 class _MeritPoint:
-    """Merit function with its derivatives at z; the matrix is overwritten by the next point's."""
+    """Merit function with its derivatives at z; the Jacobian is overwritten by the next point's.
+
+    Attributes
+    ----------
+    z : (variables,) array
+        Variables.
+    value : float
+        Merit m.
+    rows : (constraints,) array
+        Constraints g.
+    jacobian : sparse array (constraints, variables)
+        ∂g/∂z, in memory that all points share.
+    gradient : (variables,) array
+        ∂m/∂z.
+    projected : (variables,) array
+        The same with zeros for constant variables and at active bounds.
+    """
 
     z: Array
     value: float
@@ -142,7 +158,11 @@ class _MeritPoint:
 
     @classmethod
     def evaluate(cls, merit: MeritFunction, z: Array) -> _MeritPoint:
-        """Return the merit function and its derivatives at z."""
+        """Return the merit function, the constraints and their Jacobian, and ∂m/∂z at z
+        (variables,).
+
+        The Jacobian of the point that was evaluated before is overwritten.
+        """
         rows, jacobian = merit.problem.constraints_and_jacobian(z)
         gradient = merit.gradient(z, rows, jacobian)
         projected = merit.problem.project_gradient(z, gradient)

@@ -386,15 +386,18 @@ class _PenaltySolve:
         )
 
     def _minimise(self) -> Stage:
-        """Minimise the merit of the present stage from the last iterate, which is updated, and
-        return the stage with its result.
+        """Minimise the merit of the present stage from the last iterate, and return the stage with
+        its result.
 
-        The tolerance is larger where ρ or the curvature of the loss makes rounding dominate.
+        Variables, gradient and number of iterations are updated with every iterate. The history
+        gets an entry now and then, and one for the last iterate. The tolerance is larger where ρ or
+        the curvature of the loss makes rounding dominate. A stage that reaches `inner_iterations`
+        ends without an error; its `is_minimum` is False.
 
         Raises
         ------
         SearchEnded
-            If a limit of iterations or time is reached.
+            If the limit of the iterations of all stages, or that of the time, is reached.
         """
         stage = self.stage
         options = self.options
