@@ -210,7 +210,9 @@ def _options_from_values(kind: type[T], values: Mapping[str, Any]) -> T:
 def _typed_fields(kind: type) -> list[tuple[str, Any, Any, tuple[Any, ...]]]:
     """Return name, default, type and annotations of each field, those of a class before its bases'.
 
-    A type that allows None is replaced by the type without None.
+    The annotations are those of an Annotated type, which are separated from it. In a union, each
+    Annotated member is replaced by its type, and None stays. The default is `dataclasses.MISSING`
+    for a field that is required.
     """
     hints = get_type_hints(kind, include_extras=True)
     defaults = {field.name: field.default for field in fields(kind)}  # type: ignore[arg-type]

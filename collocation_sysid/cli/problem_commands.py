@@ -87,7 +87,7 @@ class SolveCommand(ProblemOptions, OutputOptions):
     "solve finer.toml --start runs/coarse",
 )
 def solve(options: SolveCommand) -> None:
-    """Identify the parameters and write a run folder.
+    """Identify the parameters and write a run folder, runs/NAME by default.
 
     Parameters need no guess: a scan over the stiffness finds initial values. --start begins with
     the result of an earlier run instead, also one with another mesh or time step.
@@ -96,6 +96,9 @@ def solve(options: SolveCommand) -> None:
 
     Options of a method are set in its table of the problem file, such as [solver.reduced-space], or
     with --set, as in --set solver.reduced-space.tolerance=1e-6. The command methods lists them.
+
+    The exit code is 0 if the search converged, 1 if it did not, or if the verdict is doubtful with
+    --strict, 2 for bad input, and 130 after an interrupt.
     """
     from ..result.run_sections import run_summary
     from ..result.solve_progress import SolveProgress
@@ -269,7 +272,11 @@ def check(options: CheckCommand) -> None:
     guess follow. If simulating the complete recordings takes more than ten seconds, only their
     first samples are simulated.
 
-    For each depth camera, a picture shows the first image and the undeformed body.
+    For each depth camera, a picture shows the first image and the undeformed body. The pictures are
+    written into runs/NAME_check by default, but not with --json.
+
+    The exit code is 0, and 1 if derivatives disagree or the description is probably wrong, 2 for
+    bad input.
     """
     from ..result.check_sections import full_check_tables, quick_check_tables
     from ..result.solve_progress import SolveProgress

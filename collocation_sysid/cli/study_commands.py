@@ -219,7 +219,10 @@ class SweepCommand(StudyOptions):
     "sweep problem.toml --over parameters.mu_pa.guess=50:5000:log:9",
 )
 def sweep(options: SweepCommand) -> None:
-    """Solve the problem for every combination of the values of some keys."""
+    """Solve the problem for every combination of the values of some keys.
+
+    Finished runs are kept in the output folder: the same command resumes the study.
+    """
     method = _single_method(options.method)
     over = parse_varied_keys(options.over)
     overrides = options.set_ or ()
@@ -255,6 +258,11 @@ def _run_study(
 ) -> None:
     """Execute the runs that are not finished, write tables and plots, and print the tables.
 
+    The folder is `options.out`, by default runs/NAME-KIND. With `options.dry_run` the planned runs
+    are only listed, with those that are finished marked, and nothing is written. Runs that fail do
+    not end the study: they are in the tables. Without any record no tables are
+    written.
+
     Parameters
     ----------
     kind : {METHOD_STUDY, MODEL_STUDY, SWEEP_STUDY}
@@ -268,6 +276,8 @@ def _run_study(
     ------
     typer.Exit
         After an interrupt, with a message; finished runs are kept.
+    InputError
+        If the folder cannot be made or written in.
     """
     from ..plan.study_page import (
         load_report,

@@ -192,7 +192,15 @@ def _cut_to_poses(
 def _cut_to_window(
     table: MarkerTable, window_s: tuple[float, float]
 ) -> MarkerTable:
-    """Return the samples within a window; an `InputError` if there are none."""
+    """Return the samples within a window, its first and last time [s] included.
+
+    Times count as inside up to `STEP_TOLERANCE` median intervals beyond it.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
     first_s, last_s = window_s
     steps = np.diff(table.t_s)
     slack_s = STEP_TOLERANCE * float(np.median(steps)) if steps.size else 0.0
@@ -252,15 +260,18 @@ def _poses_on_grid(
 ) -> PoseSequence | None:
     """Return poses whose samples at the marker times are moved onto the grid.
 
-    None if a marker time within the span of the poses has no pose.
+    Samples between these are moved by the interpolated shift. Samples before the first marker time
+    are left out if a pose exists at that time, and samples after the last one likewise. Positions
+    and rotations stay. A single pose, and poses with fewer than two marker times within their span,
+    are returned unchanged; None if a marker time within the span has no pose within `_tolerance_s`.
 
     Parameters
     ----------
     poses : PoseSequence
     t_s : (T,) array
-        Marker times as recorded.
+        Marker times as recorded [s].
     grid : (T,) array
-        The same times without rounding.
+        The same times without rounding [s].
     """
     if len(poses.t_s) == 1:
         return poses
@@ -291,6 +302,9 @@ def _poses_on_grid(
 def _tolerance_s(poses: PoseSequence, t_s: Array) -> float:
     """Return the largest time difference at which a pose and a marker sample count as simultaneous
     [s].
+
+    It is `STEP_TOLERANCE` times the median interval of the marker times `t_s` (T,) [s], which is 0
+    for a single one, plus half the `printed_rounding_s` of the markers' and of the poses' times.
     """
     step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
     return STEP_TOLERANCE * step_s + 0.5 * (

@@ -495,8 +495,11 @@ class Experiment:
 
     @property
     def place_sigma_m(self) -> Array:
-        """Prior standard deviation (M,) of each marker's place [m]; zero where the place is exact,
-        the diagonal of the body where no place is given.
+        """Prior standard deviation (M,) of each marker's place [m].
+
+        It is that of the marker, if `markers.places_sigma_m` gives one, and else the
+        `marker_offset_m` of the nuisance parameters; zero where the place is exact. Where no place
+        is given it is the diagonal of the body.
         """
         markers = self.markers
         usual = self.nuisance.marker_offset_m or 0.0

@@ -206,7 +206,7 @@ def free_rigid_motions(
     points_m: Array, is_prescribed: NDArray[np.bool_]
 ) -> list[str]:
     """Return the rigid motions that these prescribed coordinates leave free, in words; empty if
-    none.
+    none, and one entry for all motions together if nothing is prescribed.
 
     Parameters
     ----------

@@ -135,8 +135,10 @@ def _label_chooser(
 ) -> LabelChooser:
     """Return the function that picks the requested markers from the labels in a file.
 
-    It raises an `InputError` if labels or names repeat, if a label of `renamed` or a name is not
-    there, or if nothing is chosen.
+    It returns their indices: in the order of the file if `names` is None, else in that of `names`.
+    Labels that the file excludes, such as unlabelled markers, are picked only if they are renamed
+    or requested by name. It raises an `InputError` if labels or names repeat, if a label of
+    `renamed` or a name is not there, or if nothing is chosen.
 
     Parameters
     ----------

@@ -126,8 +126,11 @@ def _read_columns(grid: TextTable, places: Iterable[int]) -> Array:
 
 
 def _with_column_names(table: TextTable) -> TextTable:
-    """Return a table with eight columns whose names are numbers with the usual names of poses, and
-    the numbers as its first row; other tables unchanged.
+    """Return a table without a line of names with the names of poses.
+
+    These are t_s, x, y, z and q0 to q3, whose order is stated elsewhere. A table has no names if it
+    has eight columns, all named by numbers: these become its first row. Any other table is returned
+    unchanged.
     """
     if len(table.columns) != 8 or not all(map(is_number, table.columns)):
         return table

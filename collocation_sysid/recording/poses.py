@@ -164,7 +164,13 @@ class PoseSequence:
         """Return the poses at the times `t_s` (k,).
 
         Up to half a sample before the first and after the last pose is allowed: "smooth" and
-        "linear" continue the motion of the end interval there, "hold" repeats the end pose.
+        "linear" continue the motion of the end interval there, "hold" repeats the end pose. A
+        single pose holds at all times.
+
+        Parameters
+        ----------
+        t_s : (k,) array or float
+            Times [s]; a number counts as one time.
 
         Returns
         -------
@@ -175,7 +181,7 @@ class PoseSequence:
         Raises
         ------
         InputError
-            If a time lies outside the sequence.
+            If a time lies further outside a sequence of several poses.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         if len(self.t_s) == 1:

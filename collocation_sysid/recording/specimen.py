@@ -198,7 +198,11 @@ class Specimen:
 
     @property
     def deformation(self) -> HomogeneousDeformation:
-        """Components of the deformation gradient that the test prescribes."""
+        """Kind of deformation of the test, with the components of F that it prescribes.
+
+        With `length_m` and `area_m2` it has also the area over the length of the specimen, which
+        the compliance of the test bench needs.
+        """
         deformation = DEFORMATIONS[self.test]
         if self.length_m is None or self.area_m2 is None:
             return deformation

@@ -239,9 +239,11 @@ def _simulate(
     parameters: Mapping[str, float],
     report: Callable[[float], None] | None = None,
 ) -> Trajectory:
-    """Simulate a recording with its nuisance parameters φ (k,) and the parameters of the problem.
+    """Simulate a recording with its nuisance parameters φ (k,) and the values of the parameters.
 
-    `report` is called with the completed share, from 0 to 1.
+    Integrator and step are those of `problem.rollout`: Newmark's scheme by default, and a finer
+    step than in the fit. `parameters` are in SI units by name. `report` is called with the
+    completed share, from 0 to 1.
 
     Raises
     ------

@@ -187,9 +187,12 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
 
 
 def _field_result(estimate: FieldEstimate) -> FieldResult:
-    """Return the summary of a field: its resolution, range of values and number of determined
-    modes. If the covariance is not finite, the share of the determined volume and the number of
-    modes are None.
+    """Return the summary of a field.
+
+    It has its resolution, the range of its values, the share of the volume and the number of modes
+    that the data determine, and the logarithm of the evidence of each correlation length of the
+    field relative to the chosen one. If a standard deviation is not finite, share and number are
+    None, and there is no evidence.
     """
     modes = estimate.modes
     volumes_m3 = estimate.modes.volumes_m3
@@ -433,8 +436,11 @@ def _place_sentences(places: Mapping[str, MarkerPlace]) -> Iterator[str]:
 def _nuisance_sentences(
     part: ExperimentIterate, answer: SolvedProblem
 ) -> Iterator[str]:
-    """Yield a sentence on each kind of nuisance parameter but the places, with the estimate and its
+    """Yield sentences on the nuisance parameters of an experiment but the places, with estimate and
     prior.
+
+    By `NuisanceRow.by`, a kind has a sentence on its longest vector, on the value farthest from its
+    prior, or on each of its values.
     """
     nuisance = part.segment.nuisance
     values = part.phi * nuisance.scales

@@ -201,7 +201,10 @@ class SolvedProblem:
 
     @cached_property
     def optimum(self) -> dict[str, Estimate]:
-        """Estimates at the optimum of the discretised problem, with statistical intervals."""
+        """Parameters and derived moduli at the optimum of the discretised problem, by name.
+
+        They have statistical intervals where `uncertainty` has; the others have a value alone.
+        """
         bars = self.uncertainty
         known = {} if bars is None else {**bars.estimates, **bars.derived}
         values = self.solution.parameters | self.derived

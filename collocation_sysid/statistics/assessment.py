@@ -474,7 +474,7 @@ def outline_concerns(camera: str, distances_px: Array) -> list[Concern]:
 
 
 def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
-    """Return a concern if a time shift is large for its prior, although it is estimated.
+    """Return a concern if a time shift is above `LATE` standard deviations of its prior.
 
     Parameters
     ----------

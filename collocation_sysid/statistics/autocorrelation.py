@@ -483,7 +483,10 @@ def _autoregression_of(block: ResidualBlock, autocovariance: Array) -> Array:
 
 
 def _mean_sample_count(present: NDArray[np.bool_]) -> float:
-    """Return the mean number of samples of the channels that have any."""
+    """Return the mean number of samples of the channels that have any; 0 if none has.
+
+    `present` (T, 3M) is whether each channel is measured in each sample.
+    """
     return float(present.sum() / max(1, present.any(axis=0).sum()))
 
 
@@ -613,8 +616,17 @@ def _innovations(
 
 
 def _channel_covariance(residual: Array, present: NDArray[np.bool_]) -> Array:
-    """Return the covariance (3M, 3M) of channels over samples that both have, made positive
-    semidefinite.
+    """Return the covariance (3M, 3M) of channels about zero over samples that both have.
+
+    It is made positive semidefinite if samples are missing, and zero for a pair without a common
+    sample before that.
+
+    Parameters
+    ----------
+    residual : (T, 3M) array
+        Residuals of the channels, zero where missing.
+    present : (T, 3M) bool
+        Whether each channel is measured in each sample.
     """
     counts = present.T.astype(float) @ present
     covariance = residual.T @ residual / np.maximum(counts, 1)

@@ -66,7 +66,11 @@ class _EffectColumns(SweepColumns):
         residual: Array | None,
         free: Index,
     ) -> tuple[Array, Array]:
-        """Return R (k, free, c) and F_R (k, 3n, c), see `SweepColumns.right_hand_sides`."""
+        """Return R (k, free, c) and F_R (k, 3n, c) [N], copies of the stored changes of these rows.
+
+        The arguments are those of `SweepColumns.right_hand_sides`; `at`, `acceleration` and
+        `residual` are not used.
+        """
         return self.rows_n[rows][:, free].copy(), self.forces_n[rows].copy()
 
 
@@ -201,6 +205,10 @@ def changed_residuals(
 ) -> ResidualChanges:
     """Return the changes of the residuals by some assumptions, each off by its standard deviation.
 
+    An assumption with several components has a change for each of them, in the order of
+    `assumptions`. A change is zero where the assumption has no effect, as in experiments of
+    homogeneous specimens that it does not concern.
+
     Parameters
     ----------
     collocation : Collocation
@@ -208,7 +216,7 @@ def changed_residuals(
     z : (variables,) array
         Variables that satisfy the equations of motion.
     assumptions : sequence of (Assumption, float)
-        Assumptions with their standard deviations.
+        Assumptions with their standard deviations, in the unit of each.
     surface_correlation : float
         Correlation length of the surface's error over the longest extent of the body.
     """

@@ -206,17 +206,23 @@ class _Extrapolation:
     def from_values(
         cls, x: Sequence[float], order: float, least: float
     ) -> _Extrapolation:
-        """Extrapolate values at steps or edge lengths halved repeatedly; a single value has no
-        change.
+        """Extrapolate values at steps or edge lengths halved repeatedly.
+
+        A single value has no change and no uncertainty. Two values are extrapolated by the
+        theoretical order; the uncertainty includes the limit of the lowest order on one side, and
+        twice the extrapolated remainder on the other. Three or more are extrapolated by the order
+        that the last three show, at most the theoretical one, with 1.25 times the remainder as
+        uncertainty on both sides. If they do not converge by order ½ at least, the last value is
+        the limit, and the largest change is the uncertainty.
 
         Parameters
         ----------
-        x : sequence of float
-            Values in the coordinate of the estimate.
+        x : (levels,) sequence of float
+            Values in the coordinate of the estimate, the coarsest first.
         order : float
             Theoretical order.
         least : float
-            Lowest order that is considered.
+            Lowest order that is considered if there are two values.
         """
         changes = np.diff(x)
         if not len(changes):

@@ -160,8 +160,11 @@ class FieldEstimate:
 
     @property
     def identified_modes(self) -> int:
-        """Number of independent modes whose variance the data halve at least, compared with
+        """Number of independent modes whose variance the data at least halve, compared with
         the prior.
+
+        It counts the eigenvalues of `covariance`, of which the prior is the identity, below
+        `LEAST_DETERMINED_SHARE`. The number means nothing if the covariance is not finite.
         """
         known = np.linalg.eigvalsh(np.nan_to_num(self.covariance, nan=1.0))
         return int((known < LEAST_DETERMINED_SHARE).sum())

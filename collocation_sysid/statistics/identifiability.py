@@ -119,13 +119,19 @@ def _combination_sentence(
 ) -> str:
     """Return the sentence about one combination of confounded parameters.
 
+    It states the combination as a product of powers, the largest of them 1, and the factor of its
+    95 % interval; of two parameters also their correlation. If the value of a parameter is not
+    above 0, it only states that one combination is determined.
+
     Parameters
     ----------
     uncertainty : Uncertainty
-    members : array of int
+    members : (k,) array of int
         Indices of the parameters.
-    eigenvalue, vector : float, array
-        Eigenvalue and eigenvector of their correlation.
+    eigenvalue : float
+        Small eigenvalue of the correlation of all parameters, 0 or above.
+    vector : (k,) array
+        Components of its eigenvector at the members.
     """
     names = [uncertainty.names[k] for k in members]
     deviations = np.sqrt(np.diag(uncertainty.covariance))[members]

@@ -37,7 +37,20 @@ from ..program.sweep import Sweep
 def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
     """Return the sensitivities dx/dp of each experiment at z, (N, 3n, m) [m per unit of p].
 
-    Prescribed dofs have zeros, and so has x_0 unless it follows as an equilibrium.
+    The m parameters p are q and those φ of the experiment that change its motion, in the order of
+    `Transcription.dynamic_parameters`. Prescribed dofs have zeros, and so has x_0 unless it follows
+    as an equilibrium.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    z : (variables,) array
+        Variables that satisfy the equations of motion.
+
+    Returns
+    -------
+    list of (N, 3n, m) arrays
+        Sensitivities at the N grid times of each experiment.
 
     Raises
     ------

@@ -503,12 +503,16 @@ def _best_assignment(
     """Return the assignment (M,) of markers to those of the sample before, and the factor by which
     it is nearer than no exchange.
 
+    Element k of the assignment is the index in `before_m` of marker k of `now_m`. The factor is the
+    ratio of root-sum-square distances of the exchanged markers, without and with the exchange; it
+    is 1 if nothing is exchanged. Distances below the noise count as the noise.
+
     Parameters
     ----------
     before_m, now_m : (M, 3) arrays
-        Positions at both samples [m]; a common shift does not matter.
+        Positions at both samples [m], all present; a common shift does not matter.
     sigma_m : (M,) array
-        Standard deviation of each marker [m].
+        Standard deviation of each marker [m], which gives the noise.
     """
     same = np.arange(len(now_m))
     if len(now_m) < 2:

@@ -417,6 +417,10 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
     about the middle of the grasps; obstacles keep their size and are moved so that they first touch
     the body as before, see `size_effect.obstacle_shifts_m`. Contact areas grow by s², and a contact
     stiffness that is not stated falls by s, as it follows the edges of the mesh.
+
+    Buoyancy and the mass of moved air grow by s³, and drag by s². The own mass grows by s³ unless
+    the mass of the body is declared, when it stays. For a mesh made under gravity, the weight
+    during the scan relative to the stiffness grows by s, or falls by s² if the mass is declared.
     """
     larger = 1 + SMALL
     smaller = 1 - SMALL

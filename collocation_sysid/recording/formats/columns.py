@@ -244,14 +244,16 @@ def _find_columns(
 def _column_named_by_user(
     grid: TextTable, quantity: Quantity, name: str
 ) -> tuple[int, float]:
-    """Return index and factor to SI of the column that the user names for a quantity; the unit is
-    in `name` or in the name of the column.
+    """Return index and factor to SI of the column that the user names for a quantity.
+
+    The unit is in the name of the column or else behind it in `name`, as in "Load (N)"; a quantity
+    that is `unitless` needs none.
 
     Raises
     ------
     InputError
-        If the column does not exist or exists twice, or its unit is missing or of another
-        dimension.
+        If the column does not exist or exists twice, its unit is missing or of another dimension,
+        or it is named as a strain or stress of the deformed specimen where the undeformed is meant.
     """
     bare, unit_of_user = name_and_unit(name)
     column = name if name in grid.columns else bare

@@ -145,6 +145,8 @@ class Header:
     ) -> None:
         """Raise an `InputError` if the number stated by a key differs from `count`.
 
+        A key that is blank or missing passes; a statement that is no number above 0 does not.
+
         Parameters
         ----------
         key : str

@@ -81,7 +81,10 @@ def shortened_experiment(experiment: Experiment, samples: int) -> Experiment:
 def _shortened_wrench(
     wrench: Wrench | None, t_s: Array, fewest: int
 ) -> Wrench | None:
-    """Return a wrench within the times (T,); None if it has fewer than `fewest` samples there."""
+    """Return the samples of a wrench from the first to the last of the times `t_s` (T,) [s].
+
+    None if there is no wrench, or fewer than `fewest` samples or no measured component there.
+    """
     if wrench is None:
         return None
     here = (wrench.t_s >= t_s[0]) & (wrench.t_s <= t_s[-1])

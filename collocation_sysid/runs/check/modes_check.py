@@ -242,8 +242,10 @@ def mode_concerns(motion: ModesCheck) -> list[Concern]:
 
 
 def _grid_concerns(motion: ModesCheck, mode: ModeCheck) -> list[Concern]:
-    """Return a concern if the scheme changes the damping too much, or has too few steps per
-    period.
+    """Return at most one concern about the scheme and the step at the first mode `mode`.
+
+    It is that the scheme adds or takes too much damping; otherwise, that there are fewer than
+    `FEW_STEPS` steps per period. The list is empty if neither is the case.
     """
     first = _first_mode_data(motion, mode)
     added = mode.numerical_damping_ratio
