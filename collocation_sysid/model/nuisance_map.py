@@ -296,13 +296,16 @@ class NuisanceMap:
     def indices_of_rows(
         self, *rows: NuisanceRow, component: int | None = None
     ) -> Index:
-        """Return the indices in φ of some rows, of all components or of one.
+        """Return the indices in φ of some rows, of all components or of one, ascending.
+
+        Their order is that of φ, whatever the order of `rows`. Rows that are not estimated have no
+        entries, so that the result may be empty.
 
         Parameters
         ----------
         *rows : NuisanceRow
         component : int, optional
-            Index of the component.
+            Number of the instance, such as the index of a camera; None for all.
         """
         return self._indices_where(
             lambda e: e.row in rows and component in (None, e.number)

@@ -148,7 +148,11 @@ class Pointwise(ForceTerm):
         return since_s, (since_s == 0).astype(float)
 
     def _inputs_at(self, states: States) -> _LawInputs:
-        """Return the inputs and data of the law at states, at those points that can act."""
+        """Return the inputs and data of the law at states, at those points that can act.
+
+        The inputs u = (y, ẏ, c, h_{k−1}) are (…, T, i): without ẏ if the law does not depend on
+        it, and with zeros for h_{k−1} if there is no `previous_state`. The data are (d, T, i).
+        """
         chosen, y = self.active_points(states)
         constants = self.constants(states)
         velocities = (
@@ -238,8 +242,20 @@ class Pointwise(ForceTerm):
         states: States,
         weights: Array,
     ) -> None:
-        """Add the derivatives of Σ weights · F + Σ `variable_weights` · h to a curvature, in place,
-        at the entries and input columns `places`; the weights are (T, 3n).
+        """Add the derivatives of Σ weights · F + Σ `variable_weights` · h to a curvature, in place.
+
+        Second derivatives are by positions, velocities and the constants of the law, first ones by
+        the constants. Those by h_{k−1} are left to `mixed_second_derivatives`.
+
+        Parameters
+        ----------
+        curvature : SecondDerivatives
+            Derivatives at T states, changed in place.
+        places : AssemblyIndices
+            Entries of the points' matrices, and columns of the constants among all inputs.
+        states : States
+        weights : (T, 3n)
+            Weights of the forces; those of h are this force's `variable_weights`.
         """
         evaluated = self._inputs_at(states)
         points = self.points
@@ -287,7 +303,11 @@ class Pointwise(ForceTerm):
 
     def _weights(self, here: _LawInputs, weights: Array) -> Array:
         """Return the weights (d + n, T, i) of the values of the law: of the forces on y, then of
-        h.
+        the n internal variables h.
+
+        The weights (T, 3n) of the nodal forces are interpolated to the chosen points and
+        multiplied by `factor`; those of h are `variable_weights`, zero if that is None. Without
+        internal variables the result is (d, T, i).
         """
         force_weights = self.factor * self.points.vectors(weights, here.chosen)
         if not self.internal_variable_count:

@@ -124,6 +124,8 @@ class RecursionTrajectory:
     ) -> RecursionTrajectory:
         """Run the recursion from the start along a signal.
 
+        At the start h_{k−1} is zero and s_{k−1} is s_0.
+
         Parameters
         ----------
         recursion : Recursion

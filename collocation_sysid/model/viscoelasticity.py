@@ -240,8 +240,10 @@ class MemoryHistory:
         return self.body.memory
 
     def past_at(self, rows: slice) -> MemoryInput:
-        """Return the memory's contribution to the forces at the evaluations `rows`: overstress of
-        earlier stresses, stiffening, and its derivatives.
+        """Return the memory's contribution to the forces at the evaluations `rows`, in new arrays.
+
+        The overstress is H = Σ m_{k−1}, the stiffening of each part Σ c_k of its branches, with
+        first and second derivatives by θ.
         """
         past = self.memory.relaxed(len(self.xi[rows]))
         fades = self.fading

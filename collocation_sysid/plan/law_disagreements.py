@@ -84,6 +84,10 @@ class Disagreement:
 def find_disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
     """Return the moduli and damping coefficients whose estimates differ notably between models.
 
+    Compared are Young's modulus, Poisson's ratio and damping coefficients, also of regions, that
+    all models have with positive estimates. They differ notably if the largest estimate is more
+    than `LEAST_DISAGREEMENT_RATIO` times the smallest.
+
     Parameters
     ----------
     rows : sequence of Row

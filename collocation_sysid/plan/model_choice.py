@@ -283,7 +283,11 @@ def advice(rows: Sequence[Row]) -> str:
 
 
 def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
-    """Return the estimates in which the models that predict as well as the best disagree."""
+    """Return the estimates in which the models that predict as well as the best disagree.
+
+    Models predict as well as the best within `SURE` standard errors. Empty if no row is chosen, or
+    if the chosen one has no prediction error ("log_ratio" is None).
+    """
     chosen = next((row for row in rows if row["chosen"]), None)
     if chosen is None or chosen["log_ratio"] is None:
         return []
@@ -421,8 +425,13 @@ class Evidence:
     independent: float
 
     def criterion(self, independent: float) -> float:
-        """Return Akaike's criterion for an equivalent number of measurements, equal for all
-        compared models.
+        """Return Akaike's criterion N ln(misfit) + prior + 2 · fitted; smaller is better.
+
+        Parameters
+        ----------
+        independent : float
+            Equivalent number N of independent measurements, equal for all compared models; it
+            replaces this fit's own.
         """
         return (
             independent * float(np.log(self.misfit))
@@ -432,7 +441,11 @@ class Evidence:
 
 
 def evidence_from_fit(fit: LinearisedFit) -> Evidence:
-    """Return the evidence of a model from its linearised fit at the solution."""
+    """Return the evidence of a model from its linearised fit at the solution.
+
+    The equivalent number of independent measurements follows from the correlation of the residuals
+    of each block; it is the number of measurements if the residuals are zero up to rounding.
+    """
     factored = factorise_information(fit)
     rounding = ROUNDING**2 * fit.measurement_count
     independent = float(fit.measurement_count)

@@ -363,9 +363,21 @@ def _law_changes(
 def _with_material(
     parameters: Mapping[str, Any], material: str, region: str | None
 ) -> dict[str, Any]:
-    """Return the parameters for a body with another material in all parts, or in one region.
+    """Return a copy of a problem's `[parameters]` for a body with another material.
 
-    A part with its own constants keeps constants of its own; the others share theirs.
+    A part with its own constants keeps constants of its own; the others share theirs. Constants
+    that the new material does not have are left out. Those that it needs are added with a guess of
+    the same shear modulus, or for a scan if that is unknown.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Table by parameter name, such as "mu_pa" or "tip.mu_pa"; not modified.
+    material : str
+        Name in `MATERIALS`.
+    region : str or None
+        Region that gets the material, or None for all parts. Without elastic constants of its own
+        it shares those of the body that the material has; other constants are its own.
     """
     of_any = {c.name for each in MATERIALS.values() for c in each.constants} | {
         *ELASTIC
@@ -385,7 +397,19 @@ def _with_material(
 def _with_part_material(
     parameters: Mapping[str, Any], prefix: str, material: str, of_any: set[str]
 ) -> dict[str, Any]:
-    """Return the parameters with another material in the part whose constants have this prefix."""
+    """Return the parameters with another material in the part whose constants have this prefix.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Table by parameter name; not modified.
+    prefix : str
+        Region with a dot, such as "tip."; empty for the constants that parts share.
+    material : str
+        Name in `MATERIALS`.
+    of_any : set of str
+        Names of the constants of all materials, without regions.
+    """
     own = [constant.name for constant in MATERIALS[material].constants]
     possible = {*own, *elastic_names(MATERIALS[material])}
     mine = {prefix + name for name in of_any}
@@ -452,8 +476,10 @@ def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
 
 
 def _starting_guess(name: str, shear_pa: float | None) -> dict[str, Any]:
-    """Return the table of a constant: with a guess that gives the shear modulus `shear_pa`, or
+    """Return the table of a constant: with a guess that gives the shear modulus `shear_pa` [Pa], or
     empty, for a scan, if that is None or the constant has no usual value.
+
+    A constant whose usual value is zero also gets a typical size, `LESS` times the shear modulus.
     """
     if shear_pa is None:
         return {}

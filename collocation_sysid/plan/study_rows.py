@@ -275,7 +275,24 @@ def method_rows(rows: Sequence[Row]) -> list[Row]:
 
 
 def _method_summary(method: str, rows: Sequence[Row]) -> Row:
-    """Return the summary of the runs of one method."""
+    """Return the summary of the runs of one method.
+
+    Runs with the status "missing" are not counted.
+
+    Parameters
+    ----------
+    method : str
+        Name for the summary.
+    rows : sequence of dict
+        Rows of this method's runs, at least one.
+
+    Returns
+    -------
+    dict
+        Numbers of "runs", "converged" and "successes"; "success_rate", None without runs, with its
+        95 % interval from "success_low" to "success_high"; and the medians of the relative errors
+        and of the columns that have a median, None if no run has a value.
+    """
     done = [row for row in rows if row["status"] != "missing"]
     successes = sum(row["success"] for row in done)
     low, high = wilson_interval(successes, len(done))

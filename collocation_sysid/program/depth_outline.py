@@ -490,6 +490,13 @@ def _planes(
         Nuisance parameters.
     sample : int
         Index of the image.
+
+    Returns
+    -------
+    dict
+        "normals" (P, 3), unit vectors in the world, away from the body; "points" (P, 3), points of
+        the planes in the camera's frame [m]; and "pixel_m" (P,), the width of a pixel along the
+        normal at the stated depth [m].
     """
     tangents_px = np.column_stack([-outwards[:, 1], outwards[:, 0]])
     at, before, after, outside = _concatenated_rays(

@@ -436,7 +436,10 @@ class Factoriser:
 
     @cached_property
     def _supernodal_size(self) -> int:
-        """Number of floating-point numbers in a supernodal factor."""
+        """Number of floating-point numbers in a supernodal factor.
+
+        If the pool is empty, the matrix is analysed, and the solver is added to the pool.
+        """
         if not self._pool:
             self._pool.append(self._pardiso())
         return self._pool[-1].factor_size

@@ -153,7 +153,16 @@ class GraspReactions:
         return GraspReactions(GraspForces(force, slopes), *others)
 
     def set_poses(self, first: int, poses: Sequence[Poses]) -> None:
-        """Store the poses of consecutive rows from the index `first` on, in place."""
+        """Store the poses of consecutive rows, in place.
+
+        Parameters
+        ----------
+        first : int
+            Index of the first of these rows in the template.
+        poses : sequence of sequences
+            For each row the poses of all G grasps, each a rotation (3, 3) and a translation (3,)
+            [m].
+        """
         rows = slice(first, first + len(poses))
         self.rotations[rows] = [[turn for turn, _ in each] for each in poses]
         self.shifts[rows] = [[shift for _, shift in each] for each in poses]
@@ -161,12 +170,15 @@ class GraspReactions:
     def apply_correction(self, here: slice, moved: Array) -> None:
         """Add the Newton correction to the forces of `here` and store the sensitivities, in place.
 
+        The correction of the forces is column 0 of `forces.changes`, which is zero afterwards.
+
         Parameters
         ----------
         here : slice
             Rows that have just been solved.
         moved : (rows, g, 1 + m)
-            Newton correction (column 0) and sensitivities of the sensed dofs.
+            Newton correction (column 0, not used) and sensitivities of the positions of the sensed
+            dofs.
         """
         self.forces.force[here] += self.forces.changes[here, :, 0]
         self.forces.changes[here, :, 0] = 0.0
@@ -203,17 +215,30 @@ class GraspReactions:
         """Return the reactions at some time steps with derivatives, and the wrenches of the
         sensors.
 
+        Forces, sensitivities and poses are those that this object has stored; nothing is changed.
+
         Parameters
         ----------
         sensors : sequence of Sensor
+            At least one; all with the same sensed dofs.
         setting : EquationsAtParameters
-            Equations of motion at the linearisation point.
+            Equations of motion at the linearisation point; the masses are those of time 0.
         x : (known, g)
-            Positions of the sensed dofs in the first rows of the template [m].
+            Positions of the sensed dofs in the first rows of the template [m], from which the
+            accelerations follow.
         weights : (w, s)
-            Stencil matrices of the template; s includes the time step.
+            Stencil matrices (rows, rows) of the template, of forces and positions; s includes the
+            time step.
         rows : (n,) int
-            Consecutive rows at which the reactions become available.
+            Consecutive rows at which the reactions become available. The reactions belong to the
+            rows `DELAY_STEPS` before; poses are needed from one row before to one after these.
+
+        Returns
+        -------
+        ReactionForces
+            Reactions and positions (n, g) of the sensed dofs, and their sensitivities (n, g, m).
+        list of StreamedWrench
+            In the order of the sensors.
         """
         dynamics = setting.dynamics
         channel, _ = sensors[0]

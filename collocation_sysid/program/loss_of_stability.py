@@ -134,7 +134,11 @@ def explain_failure(
 
 
 def specimen_message(experiment: Experiment, time_s: float) -> str:
-    """Return the message for a specimen that has no stable equilibrium at a time [s]."""
+    """Return the message for a specimen that has no stable equilibrium at a time [s].
+
+    It states the test and the strain at that time, interpolated linearly between samples. The
+    experiment must be that of a specimen.
+    """
     assert experiment.specimen is not None
     strain, _ = specimen_strains(experiment)
     value = float(np.interp(time_s, experiment.t_s, strain))

@@ -83,7 +83,14 @@ class MotionJacobian:
         return np.maximum(starts, -1) if first_row else starts
 
     def _blocks(self) -> list[BandBlock]:
-        """Return the blocks of ∂c_t/∂x_{t−lag}, with the terms that fill them."""
+        """Return the blocks of ∂c_t/∂x_{t−lag}, from lag 0 on, with the terms that fill them.
+
+        The terms are derivatives of the forces; their coefficients contain the factor `length_m` /
+        `force_n`.
+        A block without terms has only the diagonal of the free dofs, for the inertia. Block 0 also
+        has the diagonal of prescribed dofs that are constrained; these rows have constants only,
+        which are written afterwards.
+        """
         rows, columns, source = self.pattern.full
         place = np.full(self.pattern.size, -1)
         moving = np.zeros(self.pattern.size, dtype=bool)

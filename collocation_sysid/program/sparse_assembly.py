@@ -156,10 +156,11 @@ class SparseAssembly:
         Parameters
         ----------
         values : array
-            All values, overwritten; the initial values may be stored in them already, see
-            `allocate`.
+            All values, overwritten. If `initial_positions` is None, the first of them must contain
+            the initial values already and are kept, see `allocate`; the others are set to zero.
         initial : array
-            Values of the initial structure.
+            Values of the initial structure; only their number is used if `initial_positions` is
+            None.
         groups : sequence of arrays
             Values of each group; duplicates are added up.
         """

@@ -602,6 +602,9 @@ class Transcription:
     def bounds(self) -> tuple[Array, Array]:
         """Return lower and upper bounds (N, 3n) of the positions [m], equal where a value
         is prescribed.
+
+        Free positions have infinite bounds; so have prescribed ones if `has_constraints_of_grasps`.
+        Unless the start is an equilibrium, all dofs of the first time are prescribed.
         """
         lower = np.full((self.grid_times, self.dof_count), -np.inf)
         upper = np.full((self.grid_times, self.dof_count), np.inf)

@@ -592,9 +592,17 @@ def _in_moved_frame(offset: ca.SX, data: ca.SX) -> ca.SX:
     Parameters
     ----------
     offset : (6,) SX
-        Rotation vector [rad] and translation [m].
+        Rotation vector [rad], of `cayley_rotation`, and translation [m] of the grasp, along axes of
+        the world.
     data : (18,) SX
-        Axes, force, torque and reference point.
+        Axes (3, 3) of the frame before the offset, row by row, whose columns are its directions in
+        the world; force [N], torque [N m] and the sensor's point [m] along these axes. The point is
+        from the origin of the grasp, about which the frame rotates.
+
+    Returns
+    -------
+    (6,) SX
+        Force and torque about the moved point, along the rotated axes.
     """
     turn, shift = ca.vertsplit(offset, 3)
     axes, force, torque, point = ca.vertsplit(data, [0, 9, 12, 15, 18])

@@ -131,7 +131,12 @@ def _rest_shape(body: BodyCheck) -> str:
 
 
 def _motion_section(findings: CheckResult) -> list[Shown]:
-    """Return the table of natural modes; empty if all experiments are static."""
+    """Return the table of natural modes; empty if all experiments are static.
+
+    The table has the lowest modes, at most `SHOWN_MODES`, of the first recording that is not
+    static. If there are others, a line with the first mode [Hz] of each follows, at most
+    `SHOWN_RECORDINGS`.
+    """
     if not findings.motions:  # equilibria only
         return []
     motion, *others = findings.motions

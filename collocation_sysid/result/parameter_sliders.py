@@ -245,7 +245,8 @@ class ParameterSliders:
     def update(self) -> None:
         """Simulate with the values of the sliders, and show the result.
 
-        If the simulation fails, the message says why, and the last picture stays.
+        The simulation is stored in `simulation`. If it fails with an InputError or a
+        SimulationError, `simulation` is None, the message says why, and the last picture stays.
         """
         self.message.value = "simulating"
         try:
@@ -269,7 +270,11 @@ class ParameterSliders:
             self.update()
 
     def _misfit_text(self, simulation: ForwardSimulation) -> str:
-        """Return the differences from the measurements in a sentence."""
+        """Return the RMS differences from the measurements in words, separated by semicolons.
+
+        They are of markers [mm], also the largest, forces [N], custom sensors and depth cameras
+        [mm]; without any measurement the text says so.
+        """
         texts = []
         if len(self._experiment.markers.names):
             rms_mm = number(1e3 * simulation.rms_m, 3)

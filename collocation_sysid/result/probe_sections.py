@@ -99,9 +99,9 @@ def is_routine(result: Result) -> bool:
 def is_deeper_check_worthwhile(result: Result) -> bool:
     """Return whether `solve --probe` may explain the concerns of the verdict.
 
-    It may if the residuals, a prediction or a routine probe contradict the model, error bars exist,
-    and nothing else has to be corrected first. A wide combined interval does not count, because its
-    budget already says what to measure.
+    It may if the residuals, a prediction or a routine probe contradict the model, a budget exists,
+    a deeper check has not been made yet, and nothing else has to be corrected first. A wide
+    combined interval does not count, because its budget already says what to measure.
     """
     concerns = result.trust.concerns
     if not result.budget or not is_routine(result):
@@ -154,8 +154,9 @@ def _change_text(move: EstimateChange, value: float) -> str:
 def _conclusions(result: Result) -> Iterator[str]:
     """Yield sentences on the significant probes, or that there is none.
 
-    First come windows and recordings that disagree with the rest, then relaxed assumptions, then
-    the most important assumption that the data do not determine.
+    First come windows and recordings that disagree with the rest, then relaxed assumptions: the one
+    that reduces χ² most, and the others as alternatives. After a deeper check the most important
+    assumption that the data do not determine follows.
     """
     significant = [probe for probe in result.probes if probe.sentences]
     relaxed = sorted(

@@ -540,8 +540,8 @@ def read_run(folder: str | Path) -> tuple[Result, list[MotionRecord]]:
 
 
 def run_headline(result: Result) -> str:
-    """Return Young's moduli, each with its combined standard uncertainty if known, and the verdict,
-    as one line of text.
+    """Return Young's moduli [Pa], each with its combined standard uncertainty if known, and the
+    verdict, as one line of text; the verdict alone if there are no moduli.
     """
     moduli = {
         symbol_of(n): each

@@ -296,7 +296,23 @@ def _write_specimen(
     rng: np.random.Generator,
     recipe: Recipe,
 ) -> None:
-    """Write the table of a specimen with simulated stresses and noise; see `_write_tables`."""
+    """Write the table of a specimen with simulated stresses and noise; see `_write_tables`.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Experiment of a specimen.
+    section : SpecimenSection or None
+        Table whose layout the file gets; None for the columns of the test's default layout.
+    trajectory : Trajectory
+        The simulated motion; only its custom sensor values are used.
+    file : Path
+        File that is written, replacing an existing one.
+    rng : Generator
+        Source of the noise; its state advances.
+    recipe : Recipe
+        Its `noise_own` is the noise in multiples of the stresses' sigma.
+    """
     assert experiment.specimen is not None
     values = {}
     for gauge, read in zip(

@@ -139,7 +139,12 @@ def write_design(
 
 
 def design_json(design: Design) -> dict[str, Any]:
-    """Return the content of design.json."""
+    """Return the content of design.json, in types that JSON has.
+
+    The keys are "schema", "experiment", "duration_s", "samples", "criterion", "recordings_count",
+    "before" and "after" (error bars; "before" may be None, see `Design`), "limits" (each with the
+    share that the motion uses), "limits_reached", "search" and "motion".
+    """
     search = design.best
     limits = design.limits
     return {
@@ -275,6 +280,9 @@ def _designed_table(table: dict[str, Any]) -> dict[str, Any]:
 def _designed_wrench(wrench: dict[str, Any]) -> dict[str, Any]:
     """Return a copy of a wrench's table that reads the file of the design, in newtons and for the
     modelled part of the body.
+
+    The keys of the original file (`OF_TABLE`), among them its columns and "symmetry", are left out;
+    `sigma_n` and `sigma_nm` are divided by "symmetry".
     """
     parts = wrench.get("symmetry", 1)
     sigmas = {

@@ -615,7 +615,15 @@ class LinearRecording:
 
 
 def _pulse_poses(recording: FutureRecording, heights: Array) -> PoseSequence:
-    """Return poses with a pulse of each coordinate, of given heights (6,) in metres and radians."""
+    """Return one sequence of poses at `pose_times_s`, with a pulse of all coordinates at once.
+
+    Parameters
+    ----------
+    recording : FutureRecording
+    heights : (6,)
+        Heights of the pulse in translation [m] and rotation vector [rad]; zero for coordinates
+        without one. The pulse is a cubic B-spline of four timesteps, highest at sample `CENTRE`.
+    """
     t_s = recording.pose_times_s
     since = t_s / recording.template.timestep_s - CENTRE
     share = np.nan_to_num(np.asarray(PULSE(since), dtype=np.float64))

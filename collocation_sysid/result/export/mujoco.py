@@ -187,8 +187,11 @@ def _node_xml(body: IdentifiedBody) -> str:
 
 
 def _flex_xml(body: IdentifiedBody) -> str:
-    """Return the XML of a flex for each region: node positions relative to their bodies, and
-    elements.
+    """Return the XML of a flex for each region: node positions [m] relative to their bodies, linear
+    elements, elastic constants, damping, and contact with obstacles only.
+
+    Bodies are named "node0", …, except those of grasped nodes, "grasp0", …, whose positions are
+    those in the undeformed body. The thickness of the skin follows the mean edge of the mesh.
     """
     names = np.array(
         [f"node{n}" for n in range(len(body.nodes_m))], dtype=object
@@ -215,7 +218,7 @@ def _flex_xml(body: IdentifiedBody) -> str:
 
 
 def _mean_edge_m(body: IdentifiedBody) -> float:
-    """Return the mean edge length of the mesh."""
+    """Return the mean edge length of the undeformed mesh [m]."""
     ends = body.body.nodes_m[body.body.mesh.edges]
     return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
 
@@ -399,9 +402,18 @@ def _set_grasp_state(
     time_and_step_s: tuple[float, float],
 ) -> None:
     """Set pose and velocity of the bodies that carry grasped nodes, and the pose of obstacles, in
-    `data`.
+    `data`, in place.
 
-    `time_and_step_s` is the time and the timestep [s]; velocities lead to the pose one step later.
+    Grasped bodies are free: entries k of `qpos` and `qvel`. Obstacles are mocap bodies: only
+    `mocap_pos` and `mocap_quat`. After the last sample they stay at its pose.
+
+    Parameters
+    ----------
+    body : IdentifiedBody
+    mujoco : module
+    data : MjData
+    time_and_step_s : (float, float)
+        Time and timestep [s]; velocities lead to the pose one step later.
     """
     t_s, step_s = time_and_step_s
     last_s = float(body.experiment.t_s[-1])

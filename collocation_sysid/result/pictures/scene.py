@@ -126,7 +126,10 @@ def aspect_ratio(camera: ParallelCamera, points_m: Array) -> float:
 def _projected_extent(
     camera: ParallelCamera, points_m: Array
 ) -> tuple[Array, Array]:
-    """Return the lower left and the upper right corner (2,) [m] of points (…, 3) in the picture."""
+    """Return the lower left and the upper right corner (2,) [m] of points (…, 3) in the picture.
+
+    Points that are NaN are left out.
+    """
     places = camera.project(points_m).reshape(-1, 2)
     return np.nanmin(places, axis=0), np.nanmax(places, axis=0)
 
