@@ -47,7 +47,10 @@ def load_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
                 with archive.open(member) as content:
                     name = member.filename.removesuffix(".npy")
                     _require_size(
-                        content, member.file_size, member.compress_size, name
+                        content,
+                        member.file_size,
+                        compressed=member.compress_size,
+                        name=name,
                     )
     with np.load(path, allow_pickle=False) as stored:
         return {name: np.asarray(stored[name]) for name in stored.files}
@@ -65,7 +68,7 @@ def load_array(path: str | Path) -> NDArray[Any]:
     """
     size = Path(path).stat().st_size
     with Path(path).open("rb") as content:
-        _require_size(content, size, size, "")
+        _require_size(content, size, compressed=size, name="")
     return np.load(path, allow_pickle=False)
 
 

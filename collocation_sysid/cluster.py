@@ -39,7 +39,7 @@ def connected(scheduler: Any) -> Iterator[Any]:
             f"found {scheduler!r}, where no scheduler answers ({error}); expected an "
             "address such as tcp://10.0.0.5:8786",
             None,
-            "--scheduler",
+            where="--scheduler",
         ) from error
     # What it logs of a scheduler that was lost is said by the one message of the command.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
@@ -67,6 +67,6 @@ def distributed() -> Any:
             "a scheduler needs dask.distributed: pip install 'collocation-sysid[cluster]', or "
             "leave it out to run on this machine's cores",
             None,
-            "--scheduler",
+            where="--scheduler",
         )
     return import_module("distributed")

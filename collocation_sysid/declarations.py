@@ -155,7 +155,7 @@ def keys_of(kind: type) -> Iterator[tuple[str, Key]]:
         if isinstance(form, Key):
             yield each.name, form
         elif form is not None:
-            yield each.name, Key(each.name, form, each.metadata["read"])
+            yield each.name, Key(each.name, form, read=each.metadata["read"])
 
 
 def attributes(kind: type) -> dict[str, tuple[str, str]]:

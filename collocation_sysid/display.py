@@ -215,7 +215,7 @@ def labelled(title: str, rows: dict[str, str]) -> Table:
     return Table(
         title,
         (),
-        tuple((f"  {name} ", text) for name, text in rows.items()),
+        rows=tuple((f"  {name} ", text) for name, text in rows.items()),
         texts=1,
     )
 
@@ -266,7 +266,7 @@ def _on_terminal(part: Shown) -> RenderableType:
             rows = tuple(
                 (what, f"{value} ({note})") for what, value, note in part.items
             )
-            return TerminalTable(Table("", (), rows, texts=1))
+            return TerminalTable(Table("", (), rows=rows, texts=1))
         case Picture():
             return _text(f"{part.caption} {part.file}")
         case Listing():

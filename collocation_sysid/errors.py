@@ -94,7 +94,7 @@ class InputError(ValueError):
     ) -> InputError:
         """Return a copy of the error with file and key filled in where they are missing."""
         return InputError(
-            self.message, self.source or source, self.where or where
+            self.message, self.source or source, where=self.where or where
         )
 
 
@@ -126,7 +126,7 @@ def require_among(
         expected = (
             f"expected {count} of {', '.join(names)}{hint_at(name, names)}"
         )
-        raise InputError(f"found {name!r}; {expected}", source, where)
+        raise InputError(f"found {name!r}; {expected}", source, where=where)
 
 
 @contextmanager

@@ -57,7 +57,9 @@ def require_regular(path: str | Path, where: str | None = None) -> None:
         return
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         kind = "a pipe" if stat.S_ISFIFO(mode) else "a device or socket"
-        raise InputError(f"is {kind}; expected a regular file", path, where)
+        raise InputError(
+            f"is {kind}; expected a regular file", path, where=where
+        )
 
 
 def is_own(folder: Path, file: Path) -> bool:
@@ -95,7 +97,9 @@ def require_run_folder(path: Path) -> None:
         Naming the folder of the file if that is a run folder.
     """
     if path.is_file():
-        raise _file_instead_of_folder(path, "a run folder", RESULT_FILE)
+        raise _file_instead_of_folder(
+            path, "a run folder", expected_file=RESULT_FILE
+        )
 
 
 def _file_instead_of_folder(
@@ -125,7 +129,9 @@ def read_json(file: Path, what: str) -> dict[str, Any]:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except NotADirectoryError:
-        raise _file_instead_of_folder(file.parent, what, file.name) from None
+        raise _file_instead_of_folder(
+            file.parent, what, expected_file=file.name
+        ) from None
     except FileNotFoundError:
         raise InputError(
             f"this is not {what}: it has no {file.name}", file.parent
@@ -222,7 +228,7 @@ def naming(target: Path, draft: Path) -> Iterator[None]:
     except InputError as error:
         if error.source is None or not Path(error.source).is_relative_to(draft):
             raise
-        raise InputError(error.message, target, error.where) from error
+        raise InputError(error.message, target, where=error.where) from error
 
 
 def reason(error: BaseException) -> str:

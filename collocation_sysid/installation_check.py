@@ -265,7 +265,7 @@ def required_packages() -> Iterator[Dependency]:
     try:
         requirements = sorted(_requirements(""), key=lambda each: each.name)
     except ImportError:
-        yield Dependency("packaging", None, "", False)
+        yield Dependency("packaging", None, required="", is_suitable=False)
         return
     yield from map(_dependency, requirements)
 
@@ -281,7 +281,9 @@ def optional_packages() -> Iterator[Extra]:
     for name in sorted(set(names) - set(DEVELOPMENT_EXTRAS)):
         packages = map(_dependency, _requirements(name))
         missing = sorted(each.name for each in packages if not each.is_suitable)
-        yield Extra(name, tuple(missing), f'pip install "{PACKAGE}[{name}]"')
+        yield Extra(
+            name, tuple(missing), install=f'pip install "{PACKAGE}[{name}]"'
+        )
 
 
 def _requirements(extra: str) -> Iterator[Requirement]:
@@ -432,7 +434,7 @@ def _self_test_unless_missing(dependencies: Sequence[Dependency]) -> SelfTest:
     missing = [each.name for each in dependencies if each.installed is None]
     if missing:
         return SelfTest(
-            False, f"not attempted: {', '.join(missing)} missing", 0.0
+            False, f"not attempted: {', '.join(missing)} missing", time_s=0.0
         )
     began_s = time.perf_counter()
     try:
@@ -440,7 +442,7 @@ def _self_test_unless_missing(dependencies: Sequence[Dependency]) -> SelfTest:
     except Exception as error:  # any failure is a finding of this report
         message = f"{type(error).__name__}: {error}"
         is_passed = False
-    return SelfTest(is_passed, message, time.perf_counter() - began_s)
+    return SelfTest(is_passed, message, time_s=time.perf_counter() - began_s)
 
 
 def _identify_small_body() -> tuple[str, bool]:

@@ -125,7 +125,11 @@ class Run(SolvedProblem):
         replay = experiment_named(replays(self), experiment)
         bodies = {each.name: each.body for each in self.problem.experiments}
         return field_shapes(
-            replay, bodies[replay.name], self.parameters, field, count
+            replay,
+            bodies[replay.name],
+            constants=self.parameters,
+            field=field,
+            count=count,
         )
 
     def interactive(self, experiment: str | None = None) -> Widget:
@@ -248,14 +252,19 @@ def run(
     answer = Run(problem, solution, {}, None)
     missing = "the result has no error bars and was not checked by a forward simulation"
     try:
-        answer, fit = _checked(problem, answer.solution, say)
+        answer, fit = _checked(problem, answer.solution, say=say)
         missing = (
             "the steps after the error bars were skipped: a finer time step, and causes "
             "of the misfit"
         )
         if problem.substeps == "auto":
             answer, fit = _fine_enough(
-                answer, fit, problem.solver(method), watch, say, scheduler
+                answer,
+                fit,
+                solver=problem.solver(method),
+                watch=watch,
+                say=say,
+                scheduler=scheduler,
             )
         substeps = answer.solution.collocation.substeps
         refits = (
@@ -266,14 +275,19 @@ def run(
         of_tests = one_kind_notes(problem.experiments, problem.parameters)
         answer = replace(answer, notes=(*refits, *of_tests, *answer.notes))
         if answer.uncertainty is not None and fit is not None:
-            profiles = _profiles(answer, fit, say)
+            profiles = _profiles(answer, fit, say=say)
             changes = _changes(answer, say)
-            sources = _sources(answer, fit, answer.uncertainty, changes)
+            sources = _sources(
+                answer, fit, known=answer.uncertainty, changes=changes
+            )
             answer = replace(
                 answer, profiles=profiles, systematic_effects=sources
             )
             answer = replace(
-                answer, probes=_probes(answer, fit, changes, say, deep=probe)
+                answer,
+                probes=_probes(
+                    answer, fit, changes=changes, say=say, deep=probe
+                ),
             )
         if not seek_causes or answer.solution.status is Status.INTERRUPTED:
             return timed(answer)
@@ -309,7 +323,9 @@ def _checked(
             fit = linearise_fit(solution.collocation, solution.z)
         say("computing the effect of noise of the poses")
         with counted_phase(StepUnit.TIME_STEP, rows):
-            fit, noises = with_pose_noise(fit, solution.collocation, solution.z)
+            fit, noises = with_pose_noise(
+                fit, solution.collocation, z=solution.z
+            )
     except SimulationError as error:
         return Run(
             problem,
@@ -324,14 +340,16 @@ def _checked(
     parameters = solution.collocation.parameters
     try:
         uncertainty = uncertainty_from_fit(
-            fit, parameters, solution.q, problem.uncertainty
+            fit, parameters, q=solution.q, error_model=problem.uncertainty
         )
     except InputError as error:
         raise error.located(problem.path) from error
     answer = replace(
         answer, uncertainty=uncertainty, notes=tuple(n.message for n in noises)
     )
-    error = step_error(problem, solution, fit, rollouts, answer.optimum)
+    error = step_error(
+        problem, solution, fit=fit, rollouts=rollouts, estimates=answer.optimum
+    )
     return replace(answer, refinement=error), fit
 
 
@@ -343,7 +361,7 @@ def _changes(answer: Run, say: Log) -> ResidualChanges:
     # One sweep for the assumptions, and one for the nuisance parameters that are not estimated.
     with counted_phase(StepUnit.TIME_STEP, 2 * _row_count(solution)):
         return changes_of_assumptions(
-            solution.collocation, solution.z, deviations
+            solution.collocation, solution.z, deviations=deviations
         )
 
 
@@ -395,7 +413,9 @@ def _probes(
         statistical=answer.optimum,
         budget=answer.budget,
         deviations=deviations,
-        changes=probed_changes(collocation, z, deviations, changes),
+        changes=probed_changes(
+            collocation, z, deviations=deviations, changes=changes
+        ),
     )
     if not deep:
         return routine_probes_with_steps(solved_fit)
@@ -412,7 +432,10 @@ def _profiles(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
         try:
             profiles.append(
                 profile_of_solution(
-                    answer.solution, fit, answer.uncertainty, name
+                    answer.solution,
+                    fit,
+                    uncertainty=answer.uncertainty,
+                    name=name,
                 )
             )
         except InputError as error:
@@ -468,7 +491,7 @@ def _fine_enough(
     p, _ = first.collocation.unpack(first.z)
     p = np.where(fit.at_bound, again.guess_p, p)
     try:
-        require_memory(problem, again, solver)
+        require_memory(problem, again, method=solver)
         positions, failure = simulate_trajectories(again, p)
         if failure is not None:
             raise failure
@@ -476,8 +499,8 @@ def _fine_enough(
             finer = solve_with_renewed_correspondences(
                 with_workers(solver, workers),
                 again,
-                watch,
-                again.pack(p, positions),
+                watch=watch,
+                start=again.pack(p, positions),
             )
         message = finer.message
     except (InputError, SimulationError) as error:
@@ -494,4 +517,4 @@ def _fine_enough(
         else ""
     )
     reason = f"{why}; therefore it was solved again with {substeps}{most}"
-    return _checked(problem, finer.after(first, reason), say)
+    return _checked(problem, finer.after(first, reason), say=say)

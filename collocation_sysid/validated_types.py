@@ -122,12 +122,12 @@ def _refusal(name: str, value: Any, fault: Mapping[str, Any]) -> InputError:
             name = f"{name}.{part}"
             value = value[part]
     if fault["type"] == "value_error":
-        return InputError(str(fault["ctx"]["error"]), None, name)
+        return InputError(str(fault["ctx"]["error"]), None, where=name)
     choices = re.findall(
         "'(.*?)'",
         fault["ctx"]["expected"] if "literal" in fault["type"] else "",
     )
     hint = hint_at(str(value), choices)
     return InputError(
-        f"found {value!r}; expected {expected(fault)}{hint}", None, name
+        f"found {value!r}; expected {expected(fault)}{hint}", None, where=name
     )

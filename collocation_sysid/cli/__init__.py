@@ -223,16 +223,16 @@ def _run_command() -> None:
     try:
         _root_command()(prog_name="collocation-sysid")
     except InputError as error:
-        _exit_with_error("error", error, EXIT_BAD_INPUT)
+        _exit_with_error("error", error, code=EXIT_BAD_INPUT)
     except OSError as error:
         where = error.filename or "standard output, or a temporary file"
         _exit_with_error(
             "error",
             InputError(error.strerror or str(error), where),
-            EXIT_BAD_INPUT,
+            code=EXIT_BAD_INPUT,
         )
     except SimulationError as error:
-        _exit_with_error("simulation failed", error, EXIT_NOT_CONVERGED)
+        _exit_with_error("simulation failed", error, code=EXIT_NOT_CONVERGED)
     finally:
         restore()
 

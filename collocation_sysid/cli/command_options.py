@@ -147,7 +147,9 @@ def _typer_parameters(kind: type) -> Iterator[inspect.Parameter]:
                 None,
             )
             if isinstance(info, OptionInfo):
-                info.param_decls = _option_names(name, default, written)
+                info.param_decls = _option_names(
+                    name, default, type_text=written
+                )
         yield inspect.Parameter(
             name,
             inspect.Parameter.KEYWORD_ONLY,
@@ -202,8 +204,10 @@ def _options_from_values(kind: type[T], values: Mapping[str, Any]) -> T:
         if error.where not in fields_:
             raise
         written = attributes(kind).get(error.where, ("", ""))[0]
-        names = _option_names(error.where, fields_[error.where], written)
-        raise InputError(error.message, None, names[0]) from error
+        names = _option_names(
+            error.where, fields_[error.where], type_text=written
+        )
+        raise InputError(error.message, None, where=names[0]) from error
 
 
 @cache

@@ -90,14 +90,14 @@ def design(options: DesignCommand) -> None:
         else tuple(n.strip() for n in options.for_.split(","))
     )
     criterion = DesignCriterion(
-        cast("Kind", options.criterion), names, cast("Over", options.over)
+        cast("Kind", options.criterion), names, over=cast("Over", options.over)
     )
     limits = Limits.read(options.limits)
     problem = options.read_problem(simulation=not options.add)
     require_possible(folder)
     require_replaceable(folder, marker_file=DESIGN_FILE, content_word="design")
     with DesignProgress(
-        error_console, options.search.evaluations, options.quiet
+        error_console, options.search.evaluations, quiet=options.quiet
     ) as progress:
         try:
             answer = designed(
@@ -114,6 +114,8 @@ def design(options: DesignCommand) -> None:
         except InputError as error:
             key = error.where in Limits.model_fields and error.source is None
             raise (error.located(options.limits) if key else error) from error
-        write_design(answer, folder, options.film, progress.show_activity)
+        write_design(
+            answer, folder, with_film=options.film, say=progress.show_activity
+        )
     options.print_result(design_json(answer), design_summary(answer, folder))
     raise typer.Exit(EXIT_INTERRUPTED if answer.best.is_interrupted else 0)

@@ -101,7 +101,7 @@ def installation_sections(report: InstallationReport) -> list[Shown]:
         Table(
             "Required packages",
             (),
-            tuple(
+            rows=tuple(
                 (
                     f"  {each.name} ",
                     each.installed or "missing",

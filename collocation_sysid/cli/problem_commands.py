@@ -111,7 +111,7 @@ def solve(options: SolveCommand) -> None:
     require_replaceable(folder)
     with ExitStack() as until_shown:
         with SolveProgress(
-            error_console, problem, options.verbose, options.quiet
+            error_console, problem, verbose=options.verbose, quiet=options.quiet
         ) as progress:
             finished = run(
                 problem,
@@ -129,15 +129,15 @@ def solve(options: SolveCommand) -> None:
         with SolveProgress(
             error_console,
             None,
-            options.verbose,
-            options.quiet,
-            "writing the run folder",
+            verbose=options.verbose,
+            quiet=options.quiet,
+            activity="writing the run folder",
         ):
             finished.save(folder, pictures=False)
         if not options.as_json:
             print_result(f"written to {folder}")
     result = (
-        _draw_pictures(finished, folder, options)
+        _draw_pictures(finished, folder, options=options)
         if options.pictures
         else finished.result
     )
@@ -168,7 +168,7 @@ def _draw_pictures(
         with SolveProgress(
             error_console, verbose=options.verbose, quiet=options.quiet
         ) as progress:
-            return draw_run(finished, folder, progress.say)
+            return draw_run(finished, folder, report=progress.say)
     except KeyboardInterrupt:
         again = shlex.join(["collocation-sysid", "plot", str(folder)])
         message = f"interrupted: the result is kept in {folder}, but some pictures are missing"
@@ -212,7 +212,10 @@ def simulate(options: SimulateCommand) -> None:
     ) as progress:
         try:
             written = write_data(
-                problem, options.out, options.recipe, progress.share
+                problem,
+                options.out,
+                recipe=options.recipe,
+                progress=progress.share,
             )
         except SimulationError as error:
             if error.stability_loss is not None:
@@ -289,7 +292,7 @@ def check(options: CheckCommand) -> None:
             options.out or Path("runs") / f"{run_name(options.problem)}_check",
         )
     with SolveProgress(error_console, quiet=options.quiet) as progress:
-        findings = check_problem(problem, progress.say, options.full)
+        findings = check_problem(problem, progress.say, full=options.full)
     options.print_result(findings.as_dict(), full_check_tables(findings))
     good = findings.derivatives_agree and not findings.causes
     raise typer.Exit(0 if good else EXIT_NOT_CONVERGED)

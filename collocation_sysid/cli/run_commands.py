@@ -65,7 +65,10 @@ def refine(options: RefineCommand) -> None:
 
     try:
         refinement, result = refine_run(
-            options.run_folder, options.levels, options.allow_code, say
+            options.run_folder,
+            options.levels,
+            allow_code=options.allow_code,
+            say=say,
         )
     except KeyboardInterrupt:
         raise interruption_exit(
@@ -120,7 +123,7 @@ def export(options: ExportCommand) -> None:
     from ..result.export.rerun_recording import TARGET as RECORDING
 
     destination = parse_destination(
-        options.to, MAIN_FILES, options.run_folder, options.out
+        options.to, MAIN_FILES, run_folder=options.run_folder, out=options.out
     )
     if destination.format_name == RECORDING:
         _export_recording(options, destination)
@@ -147,9 +150,11 @@ def _export_body(
         options.run_folder, options.experiment, options.allow_code
     )
     with destination.export_folder() as folder:
-        exported = write_export(body, name, folder)
+        exported = write_export(body, name, folder=folder)
         destination.place_files(folder, target.main_file)
-        compared = verify_export(body, name, folder) if options.verify else []
+        compared = (
+            verify_export(body, name, folder=folder) if options.verify else []
+        )
     if options.as_json:
         report = {
             "folder": str(destination.folder),
@@ -188,11 +193,13 @@ def _export_recording(
         raise InputError(
             "a recording for a viewer has no predictions to verify; leave out --verify",
             None,
-            "--verify",
+            where="--verify",
         )
     destination.require_possible()
     with destination.export_folder() as folder:
-        missing = write_rerun(options.run_folder, folder, options.experiment)
+        missing = write_rerun(
+            options.run_folder, folder, experiment=options.experiment
+        )
         destination.place_files(folder, RECORDING_FILE)
     if options.as_json:
         report = {
@@ -223,7 +230,7 @@ def plot(options: PlotCommand) -> None:
     folder = options.out or options.run_folder
     require_possible(folder)
     with SolveProgress(error_console, quiet=options.quiet) as progress:
-        files = redraw_pictures(options.run_folder, folder, progress.say)
+        files = redraw_pictures(options.run_folder, folder, say=progress.say)
     for file in files:
         typer.echo(file)
 
@@ -349,4 +356,6 @@ def view(options: ViewCommand) -> None:
         opened(run, field or DEFAULT_FIELD, options.experiment)
         return
     require_possible(html.parent)
-    typer.echo(export_page(run, html, options.experiment, field))
+    typer.echo(
+        export_page(run, html, experiment=options.experiment, field=field)
+    )

@@ -71,11 +71,13 @@ def completion_script(shell: str, root: Any) -> str:
     values = named_values()
     commands = [
         _completed_command(
-            root.get_command(context, name), context, values.get(name, {})
+            root.get_command(context, name),
+            context,
+            values=values.get(name, {}),
         )
         for name in root.list_commands(context)
     ]
-    return SCRIPTS[shell](commands, _options(root, context, {}))
+    return SCRIPTS[shell](commands, _options(root, context, values={}))
 
 
 def named_values() -> dict[str, dict[str, tuple[str, ...]]]:
@@ -101,11 +103,13 @@ def _completed_command(
         for p in command.get_params(context)
         if p.param_type_name == "argument"
     ]
-    known = (_values(argument, context, values) for argument in arguments)
+    known = (
+        _values(argument, context, values=values) for argument in arguments
+    )
     return CompletedCommand(
         name=command.name,
         description=_summary(command.help or ""),
-        options=_options(command, context, values),
+        options=_options(command, context, values=values),
         arguments=tuple(value for each in known for value in each),
     )
 
@@ -118,7 +122,11 @@ def _options(
     for parameter in command.get_params(context):
         if parameter.param_type_name != "option" or parameter.hidden:
             continue
-        known = () if parameter.is_flag else _values(parameter, context, values)
+        known = (
+            ()
+            if parameter.is_flag
+            else _values(parameter, context, values=values)
+        )
         for names in filter(None, (parameter.opts, parameter.secondary_opts)):
             options.append(
                 CompletedOption(

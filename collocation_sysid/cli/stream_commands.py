@@ -110,9 +110,9 @@ def live(options: LiveCommand) -> None:
     reader = FrameReader(
         estimator.model.moving_grasps + 1,
         estimator.names,
-        source,
-        estimator.model.experiment.readings,
-        estimator.model.wrenches,
+        source=source,
+        gauges=estimator.model.experiment.readings,
+        wrenches=estimator.model.wrenches,
     )
     bad = 0
     with without_garbage_of_startup():

@@ -99,7 +99,9 @@ def compare_methods(options: CompareMethodsCommand) -> None:
     methods = parse_methods(options.methods)
     problem = options.read_problem()
     free = [item.name for item in problem.parameters.free]
-    truth = read_truth(options.truth or (), problem.parameters.names, free)
+    truth = read_truth(
+        options.truth or (), problem.parameters.names, needed=free
+    )
     planned = plan_comparison(
         problem,
         methods,
@@ -111,7 +113,7 @@ def compare_methods(options: CompareMethodsCommand) -> None:
     _run_study(
         METHOD_STUDY,
         options,
-        planned,
+        planned=planned,
         yardstick=SuccessCriterion(truth, options.within),
     )
 
@@ -194,7 +196,7 @@ def compare_models(options: CompareModelsCommand) -> None:
     planned = plan_models(
         problem, variants, method=method, allow_code=options.allow_code
     )
-    _run_study(MODEL_STUDY, options, planned)
+    _run_study(MODEL_STUDY, options, planned=planned)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,11 +229,15 @@ def sweep(options: SweepCommand) -> None:
     over = parse_varied_keys(options.over)
     overrides = options.set_ or ()
     planned = plan_sweep(
-        options.problem, over, overrides, method, options.allow_code
+        options.problem,
+        over,
+        overrides=overrides,
+        method=method,
+        allow_code=options.allow_code,
     )
     # A missing file would fail every run.
     Problem.read(options.problem, planned[0].overrides, options.allow_code)
-    _run_study(SWEEP_STUDY, options, planned)
+    _run_study(SWEEP_STUDY, options, planned=planned)
 
 
 def _single_method(text: str | None) -> str | None:
@@ -246,7 +252,9 @@ def _single_method(text: str | None) -> str | None:
         return None
     method, *others = parse_methods(text, "--method")
     if others:
-        raise InputError(f"found {text}; expected one method", None, "--method")
+        raise InputError(
+            f"found {text}; expected one method", None, where="--method"
+        )
     return method
 
 
@@ -312,13 +320,19 @@ def _run_study(
     is_complete = True
     try:
         with StudyProgress(
-            error_console, remaining, len(planned), options.quiet
+            error_console, remaining, total=len(planned), quiet=options.quiet
         ) as progress:
-            run_all(remaining, store, limits, progress.count_run)
+            run_all(
+                remaining, store, options=limits, on_record=progress.count_run
+            )
     except KeyboardInterrupt:
         is_complete = False
     report = load_report(
-        f"{STUDY_TITLES[kind]}: {name}", kind, planned, store, yardstick
+        f"{STUDY_TITLES[kind]}: {name}",
+        kind,
+        planned=planned,
+        store=store,
+        yardstick=yardstick,
     )
     if report.records:
         write_report(report, folder)

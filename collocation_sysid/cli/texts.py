@@ -116,7 +116,7 @@ def explain(options: ExplainCommand) -> None:
             Table(
                 "",
                 ("topic", ""),
-                tuple((each, page_title(each)) for each in page_files()),
+                rows=tuple((each, page_title(each)) for each in page_files()),
                 texts=1,
             )
         )
@@ -174,7 +174,7 @@ def log(options: LogCommand) -> None:
     what = (
         ["", "In place of a file name write:", *addresses] if addresses else []
     )
-    print_result([Table("", heads, rows, names=2, texts=1), *what])
+    print_result([Table("", heads, rows=rows, names=2, texts=1), *what])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,7 +214,7 @@ def new(options: NewCommand) -> None:
         raise InputError(
             "found --kind and --dataset; expected one of them",
             None,
-            "--dataset",
+            where="--dataset",
         )
     if options.dataset is not None:
         file, *data = copy_dataset(options.dataset, folder)
@@ -248,7 +248,7 @@ def _methods_table() -> Table:
     return Table(
         "",
         ("method", ""),
-        tuple((name, method_summary(name)) for name in METHODS),
+        rows=tuple((name, method_summary(name)) for name in METHODS),
         texts=1,
     )
 
@@ -267,7 +267,9 @@ def _options_table(method: str) -> list[Shown]:
                 f"{_allowed_values_text(option)}\n{option['description']}",
             )
         )
-    table = Table("", ("option", "default", ""), tuple(rows), names=2, texts=1)
+    table = Table(
+        "", ("option", "default", ""), rows=tuple(rows), names=2, texts=1
+    )
     return [
         method_summary(method),
         "",

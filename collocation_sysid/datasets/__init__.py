@@ -71,7 +71,7 @@ def kawabata_1981(
         _rubber(
             "kawabata_1981",
             test,
-            material,
+            material=material,
             test=test,
             sigma_pa=KAWABATA_SIGMA_PA,
             largest_stretch=largest_stretch,
@@ -104,7 +104,7 @@ def treloar_1944(
         _rubber(
             "treloar_1944",
             "uniaxial",
-            material,
+            material=material,
             test="uniaxial",
             sigma_pa=TRELOAR_SIGMA_PA,
             largest_stretch=largest_stretch,
@@ -135,7 +135,7 @@ def diani(
         _rubber(
             "diani",
             direction,
-            material,
+            material=material,
             test="uniaxial",
             sigma_pa=DIANI_SIGMA_PA,
             largest_stretch=largest_stretch,

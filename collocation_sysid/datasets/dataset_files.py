@@ -115,7 +115,7 @@ def copy_dataset(name: str, folder: Path) -> list[Path]:
         if copy.exists():
             raise InputError("it is there already; choose another name", copy)
     for file, copy in copies.items():
-        _copy_file(file, copy, url or SCHEMA_FILE)
+        _copy_file(file, copy, schema=url or SCHEMA_FILE)
     for file in schema:
         write_text_file(file, schema_text())
     return [*copies.values(), *schema]

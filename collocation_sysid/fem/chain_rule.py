@@ -118,7 +118,9 @@ class ChainRule:
         for function in self.functions:
             if indices := function.indices_in([expression]):
                 symbols += map(function.symbol, indices)
-                rates.append(self._rates(function, indices, by, direction))
+                rates.append(
+                    self._rates(function, indices, by=by, direction=direction)
+                )
         return ca.jtimes(expression, ca.vertcat(*symbols), ca.vertcat(*rates))
 
     def rates(self, by: ca.SX, direction: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -128,7 +130,7 @@ class ChainRule:
         """
         symbols = [function.symbol() for function in self.functions]
         rates = [
-            self._rates(function, [()], by, direction)
+            self._rates(function, [()], by=by, direction=direction)
             for function in self.functions
         ]
         return ca.vertcat(ca.SX(0, 1), *symbols), ca.vertcat(

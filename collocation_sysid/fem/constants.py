@@ -71,37 +71,71 @@ class Constant:
 
 # Default bounds of a stiffness [Pa]: softer than any gel, stiffer than any rubber.
 STIFFNESS = (1.0, 1e9)
-LAMBDA = Constant("lambda_pa", "λ", "first Lamé parameter", STIFFNESS)
-MU = Constant("mu_pa", "μ", "shear modulus", STIFFNESS)
-KAPPA = Constant("kappa_pa", "κ", "bulk modulus", (1.0, 1e10))
-YOUNG = Constant("young_pa", "E", "Young's modulus", STIFFNESS)
+LAMBDA = Constant(
+    "lambda_pa", "λ", meaning="first Lamé parameter", bounds=STIFFNESS
+)
+MU = Constant("mu_pa", "μ", meaning="shear modulus", bounds=STIFFNESS)
+KAPPA = Constant("kappa_pa", "κ", meaning="bulk modulus", bounds=(1.0, 1e10))
+YOUNG = Constant("young_pa", "E", meaning="Young's modulus", bounds=STIFFNESS)
 POISSON = Constant(
-    "poisson", "ν", "Poisson's ratio", (1e-3, 0.495), "linear", 0.1, 0.3, 0.5
+    "poisson",
+    "ν",
+    meaning="Poisson's ratio",
+    bounds=(1e-3, 0.495),
+    scale="linear",
+    typical=0.1,
+    usual=0.3,
+    below=0.5,
 )
 GAMMA_R = Constant(
     "gamma_r_s",
     "γ_r",
-    "stiffness-proportional damping",
-    (1e-7, 10.0),
+    meaning="stiffness-proportional damping",
+    bounds=(1e-7, 10.0),
     usual=3e-3,
 )
 GAMMA_M = Constant(
-    "gamma_m_1_s", "γ_m", "mass-proportional damping", (1e-4, 1e4), usual=0.3
+    "gamma_m_1_s",
+    "γ_m",
+    meaning="mass-proportional damping",
+    bounds=(1e-4, 1e4),
+    usual=0.3,
 )
 C10 = Constant(
-    "c10_pa", "C₁₀", "half the shear modulus, or a part of it", STIFFNESS
+    "c10_pa",
+    "C₁₀",
+    meaning="half the shear modulus, or a part of it",
+    bounds=STIFFNESS,
 )
-C01 = Constant("c01_pa", "C₀₁", "factor of the second invariant", STIFFNESS)
-C20 = Constant("c20_pa", "C₂₀", "factor of (Ī₁ − 3)²", (-1e9, 1e9), "linear")
-C30 = Constant("c30_pa", "C₃₀", "factor of (Ī₁ − 3)³", (-1e9, 1e9), "linear")
+C01 = Constant(
+    "c01_pa", "C₀₁", meaning="factor of the second invariant", bounds=STIFFNESS
+)
+C20 = Constant(
+    "c20_pa",
+    "C₂₀",
+    meaning="factor of (Ī₁ − 3)²",
+    bounds=(-1e9, 1e9),
+    scale="linear",
+)
+C30 = Constant(
+    "c30_pa",
+    "C₃₀",
+    meaning="factor of (Ī₁ − 3)³",
+    bounds=(-1e9, 1e9),
+    scale="linear",
+)
 GENT_LIMIT = Constant(
-    "gent_limit", "J_m", "largest Ī₁ − 3", (1e-2, 1e4), usual=50.0
+    "gent_limit",
+    "J_m",
+    meaning="largest Ī₁ − 3",
+    bounds=(1e-2, 1e4),
+    usual=50.0,
 )
 CHAIN_STRETCH = Constant(
     "chain_stretch",
     "λ_m",
-    "stretch at which the chains lock",
-    (1.01, 100.0),
+    meaning="stretch at which the chains lock",
+    bounds=(1.01, 100.0),
     usual=5.0,
 )
 # Most terms of a law in powers of the stretches, see `ogden`.
@@ -113,15 +147,18 @@ _SUBSCRIPTS = "₁₂₃₄"
 # as in Ogden's own constants of rubber.
 MU_TERMS = (
     Constant(
-        "mu_1_pa", "μ₁", "factor of the first power of the stretches", STIFFNESS
+        "mu_1_pa",
+        "μ₁",
+        meaning="factor of the first power of the stretches",
+        bounds=STIFFNESS,
     ),
     *(
         Constant(
             f"mu_{p}_pa",
             f"μ{_SUBSCRIPTS[p - 1]}",
-            "factor of a power",
-            (-1e9, 1e9),
-            "linear",
+            meaning="factor of a power",
+            bounds=(-1e9, 1e9),
+            scale="linear",
         )
         for p in range(2, MOST_TERMS + 1)
     ),
@@ -132,10 +169,10 @@ ALPHA_TERMS = tuple(
     Constant(
         f"alpha_{p}",
         f"α{_SUBSCRIPTS[p - 1]}",
-        "exponent of the stretches",
+        meaning="exponent of the stretches",
         # The first exponent has the sign of μ₁, which is positive.
-        (0.1 if p == 1 else -25.0, 25.0),
-        "linear",
+        bounds=(0.1 if p == 1 else -25.0, 25.0),
+        scale="linear",
         typical=1.0,
         usual=usual,
         below=LARGEST_EXPONENT,
@@ -148,9 +185,9 @@ BETA_TERMS = tuple(
     Constant(
         f"beta_{p}",
         f"β{_SUBSCRIPTS[p - 1]}",
-        "compressibility of a power, ν/(1 − 2ν)",
-        (0.0, 50.0),
-        "linear",
+        meaning="compressibility of a power, ν/(1 − 2ν)",
+        bounds=(0.0, 50.0),
+        scale="linear",
         typical=0.2,
         usual=0.75,
         at_least=-0.33,
@@ -162,40 +199,50 @@ BETA_TERMS = tuple(
 USUAL_SHARES = (1.0, 0.1, -0.1, -0.05)
 # Constants of a branch of the memory, preceded by the name of the branch: ``prony_1.share``.
 SHARE = Constant(
-    "share", "g", "stiffness that relaxes, relative to the long-term one",
-    (0.0, 20.0), "linear", 0.1, 0.1, at_least=0.0,
+    "share", "g", meaning="stiffness that relaxes, relative to the long-term one",
+    bounds=(0.0, 20.0), scale="linear", typical=0.1, usual=0.1, at_least=0.0,
 )  # fmt: skip
-TAU = Constant("tau_s", "τ", "relaxation time", (1e-4, 1e3), usual=0.3)
-DENSITY = Constant("density_kg_m3", "ρ", "density", (1.0, 1e5))
+TAU = Constant(
+    "tau_s", "τ", meaning="relaxation time", bounds=(1e-4, 1e3), usual=0.3
+)
+DENSITY = Constant("density_kg_m3", "ρ", meaning="density", bounds=(1.0, 1e5))
 # Total mass, which replaces the densities of all parts; their ratios are kept.
-MASS = Constant("mass_kg", "m", "mass of the whole body", (1e-6, 1e3))
+MASS = Constant(
+    "mass_kg", "m", meaning="mass of the whole body", bounds=(1e-6, 1e3)
+)
 # Friction coefficient of an obstacle, preceded by the obstacle's name: ``table_friction``.
 FRICTION = Constant(
     "friction",
     "friction",
-    "coefficient of friction",
-    (0.0, 2.0),
-    "linear",
-    0.1,
-    0.3,
+    meaning="coefficient of friction",
+    bounds=(0.0, 2.0),
+    scale="linear",
+    typical=0.1,
+    usual=0.3,
     at_least=0.0,
 )
 # Coefficient of a shape of a field, see `spatial_field`; names are field_1, field_2, ….
 MODE = Constant(
-    "field", "", "coefficient of a shape", (-1e3, 1e3), "linear", 1.0, 0.0
+    "field",
+    "",
+    meaning="coefficient of a shape",
+    bounds=(-1e3, 1e3),
+    scale="linear",
+    typical=1.0,
+    usual=0.0,
 )
 # Contrast of a field with prior "two-phase", see `two_phase`; 1 in a body of one material.
 CONTRAST = Constant(
     "contrast",
     "contrast",
-    "ratio of inclusion to surroundings",
-    (0.02, 50.0),
+    meaning="ratio of inclusion to surroundings",
+    bounds=(0.02, 50.0),
     usual=1.0,
 )
 INSTANTANEOUS = Constant(
     "instantaneous_young_pa",
     "E₀",
-    "instantaneous Young's modulus, before relaxation",
+    meaning="instantaneous Young's modulus, before relaxation",
 )
 
 # The constants that have a symbol, by name: what tables and pictures look up.

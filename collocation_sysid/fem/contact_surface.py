@@ -92,7 +92,7 @@ class ContactSurface:
         points = ForcePoints(
             np.repeat(nodes, count, axis=0),
             np.tile(mix, (len(faces), 1, 1)),
-            len(body.nodes_m),
+            node_count=len(body.nodes_m),
         )
         in_part = [
             np.isin(triangles, body.mesh.tetrahedra[p.cells]).all(axis=1)

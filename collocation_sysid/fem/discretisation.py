@@ -101,7 +101,7 @@ class Discretisation(ConstantsModel):
         self.cells: Index = self.nodes.cells
         self.threads = threads or available_threads()
         self.geometry = reference_geometry(
-            self.nodes_m, self.cells, self.element
+            self.nodes_m, self.cells, element=self.element
         )
         self._evaluators: dict[str, list[Evaluator]] = {}
         self._choice = EvaluatorChoice(evaluator)
@@ -244,7 +244,7 @@ class Discretisation(ConstantsModel):
             if part.stress_field is not None:
                 cells, _ = self.part_elements(part)
                 assemblies[number] = FieldAssembly(
-                    part.stress_field, dofs_of(cells), self.pattern.size
+                    part.stress_field, dofs_of(cells), size=self.pattern.size
                 )
         return assemblies
 
@@ -299,8 +299,8 @@ class Discretisation(ConstantsModel):
         return MemoryLayout(
             self.parts,
             first_indices,
-            self.geometry.shape[1],
-            len(self.constants),
+            points_per_element=self.geometry.shape[1],
+            constant_count=len(self.constants),
         )
 
     @cached_property
@@ -553,8 +553,8 @@ class Discretisation(ConstantsModel):
                 positions[output] = _with_field_columns(
                     positions[output],
                     field_positions,
-                    output,
-                    part.point_constant_count,
+                    output=output,
+                    constants=part.point_constant_count,
                 )
         destinations = np.hstack(list(positions.values()))
         internal_columns = np.zeros(

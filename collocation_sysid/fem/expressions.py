@@ -192,7 +192,7 @@ def kernel_from_outputs(
     With mean dilatation (`point.stretches`) it is an averaging kernel, see `mean_dilatation`.
     """
     if point.stretches:
-        return averaging_kernel(name, point, outputs)
+        return averaging_kernel(name, point, outputs=outputs)
     pieces: Pieces = {}
     for key, terms in outputs.items():
         summands = [
@@ -207,7 +207,9 @@ def kernel_from_outputs(
         ]
         pieces[key] = terms[0].contraction, sum(summands[1:], summands[0])
     last = point.make_phase(name, pieces)
-    return ElementKernel(last.pieces, tuple(point.fields), last.contractions)
+    return ElementKernel(
+        last.pieces, tuple(point.fields), contractions=last.contractions
+    )
 
 
 def _energy(point: QuadraturePoint, law: PointLaw) -> ca.SX:
@@ -233,7 +235,7 @@ def _potential(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     elastic energy, damping potential and, with memory, the energy of the overstress.
     """
     energy = _energy(point, law)
-    damped = energy + _damping_potential(point, law, energy)
+    damped = energy + _damping_potential(point, law, energy=energy)
     if not law.has_memory:
         return damped
     return damped + point.theta[-1] * energy + memory_energy(point)
@@ -323,7 +325,9 @@ def energy_kernel(element: Element, law: PointLaw) -> ElementKernel:
     """Return the kernel of the elastic energy Ψ [J]."""
     point = quadrature_point(element, law, "x", internal_variable_count=0)
     return kernel_from_outputs(
-        "energy", point, {"energy": (Derivative(_energy(point, law), ()),)}
+        "energy",
+        point,
+        outputs={"energy": (Derivative(_energy(point, law), ()),)},
     )
 
 
@@ -341,7 +345,7 @@ def force_kernel(element: Element, law: PointLaw) -> ElementKernel:
                 known=stress,
             ),
         )
-    return kernel_from_outputs("force", point, {"force": force})
+    return kernel_from_outputs("force", point, outputs={"force": force})
 
 
 @lru_cache(CACHED_KERNELS)
@@ -368,7 +372,7 @@ def linearisation_kernel(element: Element, law: PointLaw) -> ElementKernel:
         by_theta = ca.jacobian(stress, point.differentiated_constants)
         outputs["force"] += (Derivative(half_power, ("v",), known=stress),)
         outputs["by_position"] += (
-            Derivative(half_power, ("v", "x"), "symmetric", slope),
+            Derivative(half_power, ("v", "x"), part="symmetric", known=slope),
         )
         outputs["by_velocity"] += (
             Derivative(half_power, ("v", "v"), known=by_rate),
@@ -377,9 +381,9 @@ def linearisation_kernel(element: Element, law: PointLaw) -> ElementKernel:
             Derivative(half_power, ("v", "theta"), known=by_theta),
         )
         outputs["by_position_skew"] = (
-            Derivative(half_power, ("v", "x"), "skew", slope),
+            Derivative(half_power, ("v", "x"), part="skew", known=slope),
         )
-    return kernel_from_outputs("linearisation", point, outputs)
+    return kernel_from_outputs("linearisation", point, outputs=outputs)
 
 
 @lru_cache(CACHED_KERNELS)
@@ -402,7 +406,9 @@ def curvature_kernel(element: Element, law: PointLaw) -> ElementKernel:
         power += ca.dot(point.internal_variables[6:], second_piola(point, law))
     if damping := _damping(point, law):
         power -= ca.dot(damping[0], point.weighted_material_gradient)
-    mixed = Derivative(power, ("x", "v"), "symmetric" if damping else "whole")
+    mixed = Derivative(
+        power, ("x", "v"), part="symmetric" if damping else "whole"
+    )
     outputs: Outputs = {
         "position_position": (Derivative(power, ("x", "x")),),
         "position_velocity": (mixed,),
@@ -413,7 +419,7 @@ def curvature_kernel(element: Element, law: PointLaw) -> ElementKernel:
     }
     if damping:
         outputs["position_velocity_skew"] = (replace(mixed, part="skew"),)
-    return kernel_from_outputs("curvature", point, outputs)
+    return kernel_from_outputs("curvature", point, outputs=outputs)
 
 
 KERNELS: dict[str, Callable[[Element, PointLaw], ElementKernel]] = {

@@ -63,7 +63,7 @@ class Phase:
         ]
         gradients = node_gradients(inputs[names.index("geometry")], self.nodes)
         outputs = [
-            _contracted(piece, how, gradients)
+            _contracted(piece, how, gradients=gradients)
             for piece, how in zip(
                 sx.call(inputs), self.contractions.values(), strict=True
             )

@@ -143,8 +143,10 @@ class Material:
         values = ca.SX.sym("values", len(self.constants))
         gradient = ca.reshape(F, 3, 3)
         rule = self.chain_rule(gradient, values)
-        psi = self.psi_in(rule, gradient, values)
-        return ca.Function("lame", [values], [lame_constants(psi, F, rule)])
+        psi = self.psi_in(rule, gradient, values=values)
+        return ca.Function(
+            "lame", [values], [lame_constants(psi, F, rule=rule)]
+        )
 
     def _check_at_rest(self) -> None:
         """Raise an `InputError` unless energy and stress vanish at F = I."""
@@ -325,7 +327,9 @@ def _arguments(energy: Energy) -> list[str]:
 # Built without `Material.from_energy`, whose check would slow down every start; the tests check
 # them.
 MATERIALS: dict[str, Material] = {
-    name: Material(name, energy, tuple(map(constant_named, _arguments(energy))))
+    name: Material(
+        name, energy, constants=tuple(map(constant_named, _arguments(energy)))
+    )
     for name, energy in {
         "neo-hookean": neo_hookean,
         "stable-neo-hookean": stable_neo_hookean,
@@ -341,7 +345,7 @@ MATERIALS |= {
     f"{name}-{terms}": Material(
         f"{name}-{terms}",
         energy(terms),
-        tuple(map(constant_named, energy(terms).names)),
+        constants=tuple(map(constant_named, energy(terms).names)),
     )
     for name, energy in (("ogden", ogden), ("hyperfoam", hyperfoam))
     for terms in range(1, MOST_TERMS + 1)
@@ -360,7 +364,7 @@ def as_material(material: str | Energy | Material) -> Material:
     if isinstance(material, Material):
         return material
     return (
-        _look_up("material", material, MATERIALS)
+        _look_up("material", material, table=MATERIALS)
         if isinstance(material, str)
         else Material.from_energy(material)
     )
@@ -482,7 +486,7 @@ DAMPINGS: dict[str, DampingLaw] = {
     "kelvin-voigt": DampingLaw("kelvin-voigt", (GAMMA_R,), stress=kelvin_voigt),
     "material": DampingLaw("material", (GAMMA_R,), stress=material_form),
     "rayleigh": DampingLaw(
-        "rayleigh", (GAMMA_R,), rayleigh, accepts_symbols=True
+        "rayleigh", (GAMMA_R,), potential=rayleigh, accepts_symbols=True
     ),
 }
 
@@ -498,7 +502,7 @@ def as_damping(damping: str | DampingLaw) -> DampingLaw:
     return (
         damping
         if isinstance(damping, DampingLaw)
-        else _look_up("damping", damping, DAMPINGS)
+        else _look_up("damping", damping, table=DAMPINGS)
     )
 
 

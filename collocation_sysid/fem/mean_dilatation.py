@@ -100,7 +100,9 @@ def averaging_kernel(
         contractions={key: last.contractions[key] for key in output_pieces},
         previous_phases=tuple(previous_phases),
         coupled={key: last.contractions[key] for key in coupled},
-        coupling=_coupling(shape, chains, outputs, order) if order else None,
+        coupling=_coupling(shape, chains, outputs=outputs, order=order)
+        if order
+        else None,
     )
 
 
@@ -278,10 +280,10 @@ class _ScalarDerivatives:
         alpha, beta = nodal
         weights = ca.SX.sym("weights", shape.count)
         by_s, _ = _logarithm_derivatives(
-            shape.volumes, shape.volume, self.slopes
+            shape.volumes, shape.volume, weights=self.slopes
         )
         by_own, second_by_own = _logarithm_derivatives(
-            shape.own_volumes, point.mesh_volume, self.by_stretch
+            shape.own_volumes, point.mesh_volume, weights=self.by_stretch
         )
         second_volumes = ca.jacobian(
             ca.gradient(
@@ -305,7 +307,7 @@ class _ScalarDerivatives:
         by_own, _ = _logarithm_derivatives(
             self.shape.own_volumes,
             self.shape.point.mesh_volume,
-            self.by_stretch,
+            weights=self.by_stretch,
         )
         return ca.vertcat(
             ca.SX.eye(9), -by_own @ self.shape.volume_derivative(field)
@@ -382,7 +384,7 @@ def _coupling(
         for term in terms:
             chain = chains[id(term.scalar)]
             by_s, second_of_logarithm = _logarithm_derivatives(
-                shape.volumes, shape.volume, chain.slopes
+                shape.volumes, shape.volume, weights=chain.slopes
             )
             if term.contraction == "nodes":
                 relation = shape.relation_to_x(term.by[0])

@@ -111,10 +111,10 @@ class TetMesh:
         raw_points = checked_points(points_m)
         elements = checked_tetrahedra(tetrahedra, len(raw_points))
         arrays = checked_arrays(
-            point_arrays or {}, len(raw_points), "point", "nodes"
+            point_arrays or {}, len(raw_points), kind="point", of="nodes"
         )
         element_arrays = checked_arrays(
-            cell_arrays or {}, len(elements), "cell", "elements"
+            cell_arrays or {}, len(elements), kind="cell", of="elements"
         )
         points, elements, used, notes = clean_mesh(raw_points, elements)
         new_index = np.full(len(raw_points), -1)
@@ -222,7 +222,12 @@ class TetMesh:
             triangles = surface[1]
         try:
             return cls(
-                *tetrahedralize_surface(points, triangles, edge_length_m, cache)
+                *tetrahedralize_surface(
+                    points,
+                    triangles,
+                    edge_length_m=edge_length_m,
+                    cache_dir=cache,
+                )
             )
         except InputError as error:
             raise error.located(path) from error.__cause__

@@ -220,7 +220,7 @@ def _read_with_meshio(path: str | Path) -> Iterator[MeshContent]:
     try:
         content = read_content(path)
     except InputError as error:
-        raise _unreadable_error("read", error.message, path) from error
+        raise _unreadable_error("read", error.message, path=path) from error
     with _as_input_error(path, "read"):
         yield content
 
@@ -258,7 +258,7 @@ def _as_input_error(path: str | Path, done: str) -> Iterator[None]:
             " ".join(captured.getvalue().split())
             or f"{type(error).__name__}: {error}"
         )
-        raise _unreadable_error(done, reason, path) from error
+        raise _unreadable_error(done, reason, path=path) from error
 
 
 def _unreadable_error(done: str, reason: str, path: str | Path) -> InputError:

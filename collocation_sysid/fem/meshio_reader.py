@@ -129,7 +129,7 @@ def read_content(path: str | Path) -> MeshContent:
     return MeshContent(
         points=arrays["points"],
         cells=[
-            CellBlock(kind, dim, arrays[key])
+            CellBlock(kind, dim, data=arrays[key])
             for kind, dim, key in head["cells"]
         ],
         point_data={name: arrays[key] for name, key in head["point_data"]},
@@ -187,7 +187,8 @@ def _read_in_process(path: str | Path) -> MeshContent:
     return MeshContent(
         points=np.asarray(mesh.points),
         cells=[
-            CellBlock(block.type, block.dim, block.data) for block in mesh.cells
+            CellBlock(block.type, block.dim, data=block.data)
+            for block in mesh.cells
         ],
         point_data=mesh.point_data,
         field_data=mesh.field_data,

@@ -38,7 +38,7 @@ class SymmetricPattern:
         row = np.repeat(dofs, dofs.shape[1], axis=1).ravel()
         column = np.tile(dofs, dofs.shape[1]).ravel()
         lower = row >= column
-        return cls.from_entries(row[lower], column[lower], nodes)
+        return cls.from_entries(row[lower], column[lower], nodes=nodes)
 
     @classmethod
     def from_entries(

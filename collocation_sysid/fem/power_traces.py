@@ -111,8 +111,8 @@ class PowerTraces:
         opposite = _product(factor, lambda index: even(index) - odd(index))
         for doubling in range(DOUBLINGS):
             square = _exponent_partials(4**doubling * s**2, alpha)
-            doubled_excess = _doubled(excess, opposite, square)
-            opposite = _doubled(opposite, excess, square)
+            doubled_excess = _doubled(excess, opposite, square=square)
+            opposite = _doubled(opposite, excess, square=square)
             excess = doubled_excess
         return cache(lambda index: excess(index) / 4)
 

@@ -123,7 +123,8 @@ def refine_body(body: Body) -> Body:
         regions=regions,
         prony=rest.prony,
         forces=[
-            _refined_force(placed, mesh, body) for placed in body.placed_forces
+            _refined_force(placed, mesh, body=body)
+            for placed in body.placed_forces
         ],
         rest_shape=_refined_rest_shape(body, mesh),
         evaluator=body.evaluator,

@@ -221,7 +221,7 @@ def parts_from_regions(
             "the field applies to the cells outside all regions, but there are none; expected "
             "the field of a region"
         )
-    parts = [_with_field(remainder, field, mesh)] if rest.size else []
+    parts = [_with_field(remainder, field, mesh=mesh)] if rest.size else []
     for region, cells, density in zip(
         regions, claimed, densities[1:], strict=True
     ):
@@ -249,7 +249,7 @@ def parts_from_regions(
                 prony=memory,
                 has_own_density=has_own,
             )
-            parts.append(_with_field(part, region.field, mesh))
+            parts.append(_with_field(part, region.field, mesh=mesh))
         except InputError as error:
             raise error.located(None, f"region '{region.name}'") from error
     mass = sum(
@@ -303,7 +303,7 @@ def _densities(
             raise InputError(
                 "density_kg_m3 must be positive",
                 None,
-                f"region '{region.name}'",
+                where=f"region '{region.name}'",
             )
     if density_kg_m3 is None:
         volumes = [float(mesh.volumes_m3[cells].sum()) for cells in claimed]
@@ -464,11 +464,11 @@ class ConstantsModel:
             find_source(
                 part.name,
                 part.material,
-                part.constants[
+                others=part.constants[
                     len(part.material.constants) : len(part.constants)
                     - len(part.field_constants)
                 ],
-                known,
+                known=known,
             )
             for part in self.parts
         ]
@@ -547,7 +547,7 @@ class ConstantsModel:
                 raise InputError(
                     "no value is given of this constant of a force or friction",
                     None,
-                    name,
+                    where=name,
                 )
             theta.append(values[name])
         return theta

@@ -279,7 +279,7 @@ def _part_forces(
     ratios = np.linalg.det(G)
     mean = np.einsum("eq,eq->e", shares, ratios)
     point_gradients = G.reshape(count * points, 9).T
-    function = _point_stress(material, averages, slopes)
+    function = _point_stress(material, averages, slopes=slopes)
     outputs = function(
         point_gradients, np.repeat(mean, points)[None], constants
     )
@@ -294,7 +294,7 @@ def _part_forces(
     ).reshape(count, size)
     if not slopes:
         empty = np.zeros((0, size, 0))
-        return _PartForces(dofs, force, empty, empty)
+        return _PartForces(dofs, force, by_position=empty, by_theta=empty)
     by_G = outputs[1].reshape(9, count, points, 9).transpose(1, 2, 0, 3)
     by_G = by_G.reshape(count, points, 3, 3, 3, 3)
     by_X = np.einsum("eqjilk,eqbl->eqjibk", by_G, shape_slopes, optimize=True)
@@ -322,8 +322,8 @@ def _part_forces(
     return _PartForces(
         dofs,
         force,
-        matrices.reshape(count, size, size),
-        columns.reshape(count, size, -1),
+        by_position=matrices.reshape(count, size, size),
+        by_theta=columns.reshape(count, size, -1),
     )
 
 
@@ -604,7 +604,11 @@ class InverseEquilibrium:
         """
         weight = self._weight_n(theta)
         start = self._predict(theta)
-        x = None if start is None else self._newton(start, theta, weight)
+        x = (
+            None
+            if start is None
+            else self._newton(start, theta, weight_n=weight)
+        )
         if x is None:
             x = self._solve_with_load_steps(theta, weight)
         force = self._assemble_forces(x, theta, slopes=True)
@@ -650,7 +654,7 @@ class InverseEquilibrium:
         step = 1.0
         for _ in range(OPTIONS.load_steps):
             share = min(1.0, share_reached + step)
-            solution = self._newton(x, theta, share * weight_n)
+            solution = self._newton(x, theta, weight_n=share * weight_n)
             if solution is None:
                 step /= 2
                 if step < 0.5**OPTIONS.halvings:
@@ -754,8 +758,8 @@ class InverseEquilibrium:
             part_forces = _part_forces(
                 cells,
                 geometry,
-                positions_m,
-                theta[start : start + elastic],
+                positions_m=positions_m,
+                constants=theta[start : start + elastic],
                 material=part.material,
                 averages=body.element.mean_dilatation,
                 slopes=slopes,
@@ -778,7 +782,7 @@ class InverseEquilibrium:
                 by_theta[:, places[start + number]] += np.bincount(
                     dofs.ravel(), values, size
                 )
-        return _AssembledForces(force, by_position, by_theta)
+        return _AssembledForces(force, by_position, by_theta=by_theta)
 
     def _failure_message(self, theta: Array, reached: float) -> str:
         """Return the message for a solve at θ that reached only the fraction `reached` of the

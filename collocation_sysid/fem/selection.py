@@ -41,19 +41,21 @@ class _PositionSelection:
         return _indices_or_error(
             self._contains(nodes.points_m),
             nodes.mesh,
-            str(self),
-            "nodes" + hint,
+            what=str(self),
+            of="nodes" + hint,
         )
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Return the indices of the selected cells, sorted."""
         return _indices_or_error(
-            self._contains(mesh.centres_m), mesh, str(self), OF_CELLS
+            self._contains(mesh.centres_m), mesh, what=str(self), of=OF_CELLS
         )
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected rows of `mesh.surface`, sorted."""
-        return _select_faces(self._contains(mesh.points_m), mesh, str(self))
+        return _select_faces(
+            self._contains(mesh.points_m), mesh, what=str(self)
+        )
 
     def _contains(self, points_m: np.ndarray) -> np.ndarray:
         """Return the mask of the points inside."""
@@ -184,7 +186,7 @@ class Face(_PositionSelection):
                 Face("top")._contains(points_m)
                 | Face("bottom")._contains(points_m)
             )
-        return _indices_or_error(mask, nodes.mesh, str(self))
+        return _indices_or_error(mask, nodes.mesh, what=str(self))
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Raise an `InputError`: a face of the body contains no cells."""
@@ -264,7 +266,7 @@ class Indices:
                 "its ends are)"
             )
         chosen = nodes.with_mid_nodes(np.isin(mesh.file_index, requested))
-        return _indices_or_error(chosen, mesh, "an empty list of indices")
+        return _indices_or_error(chosen, mesh, what="an empty list of indices")
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Return the indices of the selected cells, sorted.
@@ -283,7 +285,7 @@ class Indices:
             )
         chosen = np.isin(np.arange(count), self.indices)
         return _indices_or_error(
-            chosen, mesh, "an empty list of indices", OF_CELLS
+            chosen, mesh, what="an empty list of indices", of=OF_CELLS
         )
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
@@ -297,7 +299,7 @@ class Indices:
         """
         nodes = self.resolve(ElementNodes.corners(mesh))
         chosen = np.isin(np.arange(len(mesh.points_m)), nodes)
-        return _select_faces(chosen, mesh, "the list of indices")
+        return _select_faces(chosen, mesh, what="the list of indices")
 
 
 @dataclass(frozen=True)
@@ -328,9 +330,11 @@ class Named:
         """
         what = f'point array "{self.name}"'
         mask = self._mask(
-            nodes.mesh.point_arrays, len(nodes.mesh.points_m), what
+            nodes.mesh.point_arrays, len(nodes.mesh.points_m), what=what
         )
-        return _indices_or_error(nodes.with_mid_nodes(mask), nodes.mesh, what)
+        return _indices_or_error(
+            nodes.with_mid_nodes(mask), nodes.mesh, what=what
+        )
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Return the indices of the cells whose value in the cell array is 1, sorted.
@@ -342,8 +346,8 @@ class Named:
             none is true.
         """
         what = f'cell array "{self.name}"'
-        mask = self._mask(mesh.cell_arrays, len(mesh.tetrahedra), what)
-        return _indices_or_error(mask, mesh, what, OF_CELLS)
+        mask = self._mask(mesh.cell_arrays, len(mesh.tetrahedra), what=what)
+        return _indices_or_error(mask, mesh, what=what, of=OF_CELLS)
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected rows of `mesh.surface`, sorted.
@@ -359,8 +363,10 @@ class Named:
         if self.name not in mesh.face_sets:
             what = f'point array "{self.name}"'
             count = len(mesh.points_m)
-            mask = self._mask(mesh.point_arrays, count, what, "group of faces")
-            return _select_faces(mask, mesh, what)
+            mask = self._mask(
+                mesh.point_arrays, count, what=what, lacking="group of faces"
+            )
+            return _select_faces(mask, mesh, what=what)
         faces = np.unique(np.sort(mesh.face_sets[self.name], axis=1), axis=0)
         rows = rows_of_faces(faces, mesh.surface)
         if inner := int((rows < 0).sum()):
@@ -448,7 +454,7 @@ def _select_faces(
     return _indices_or_error(
         mask,
         mesh,
-        what,
+        what=what,
         missed="holds no face of the boundary with all its corners",
     )
 

@@ -180,7 +180,7 @@ class EnclosedVolume:
         return (
             self
             if is_same
-            else EnclosedVolume(self.faces, self.node_count, apex_m)
+            else EnclosedVolume(self.faces, self.node_count, apex_m=apex_m)
         )
 
     @cached_property

@@ -150,7 +150,7 @@ class Laplacian:
                 f"modes is {count}; expected at most {size - 3}, with {size} nodes"
             )
         geometry = reference_geometry(
-            mesh.points_m[nodes], local_nodes, ELEMENTS["tet4"]
+            mesh.points_m[nodes], local_nodes, element=ELEMENTS["tet4"]
         )[:, 0]
         slopes = geometry[:, :-1].reshape(-1, 4, 3)
         volumes = geometry[:, -1]

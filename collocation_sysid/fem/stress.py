@@ -114,7 +114,7 @@ def stress_kernel(name: str, element: Element, law: PointLaw) -> ElementKernel:
             point, stretches=(), point_data=ca.SX(0, 1), scaled_indices=()
         )
     phase = point.make_phase(name, {name: (contraction, piece)})
-    return ElementKernel(phase.pieces, fields, phase.contractions)
+    return ElementKernel(phase.pieces, fields, contractions=phase.contractions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +150,7 @@ class StressEvaluator:
 
     def stress(self, x: Array, theta: Array) -> Array:
         """Return S (T, width) [Pa] at positions x (T, 3n) and constants θ."""
-        return self._evaluate_at_points("stress", [x], theta)
+        return self._evaluate_at_points("stress", [x], theta=theta)
 
     def stress_theta_derivatives(
         self, x: Array, theta: Array, theta_q: Array
@@ -207,22 +207,26 @@ class StressEvaluator:
         given.
         """
         return self._evaluate_at_points(
-            "stress_along", [x, direction], theta, out
+            "stress_along", [x, direction], theta=theta, out=out
         )
 
     def stress_vjp(self, x: Array, weights: Array, theta: Array) -> Array:
         """Return (∂S/∂x)ᵀ weights (T, 3n), for weights (T, width)."""
-        return self._evaluate_at_nodes("pulled", [x], theta, weights)
+        return self._evaluate_at_nodes(
+            "pulled", [x], theta=theta, point_data=weights
+        )
 
     def memory_force(self, x: Array, overstress: Array, theta: Array) -> Array:
         """Return f_H (T, 3n) [N], which is linear in H (`overstress`, (T, width))."""
-        return self._evaluate_at_nodes("carried_force", [x], theta, overstress)
+        return self._evaluate_at_nodes(
+            "carried_force", [x], theta=theta, point_data=overstress
+        )
 
     def memory_force_vjp(
         self, x: Array, direction: Array, theta: Array
     ) -> Array:
         """Return (∂f_H/∂H)ᵀ direction (T, width), for a direction (T, 3n)."""
-        return self._evaluate_at_points("against", [x, direction], theta)
+        return self._evaluate_at_points("against", [x, direction], theta=theta)
 
     @cached_property
     def jacobian_entries(self) -> JacobianEntries:
@@ -255,7 +259,7 @@ class StressEvaluator:
         `jacobian_entries`.
         """
         out = np.zeros((len(x), len(self.jacobian_entries.points)))
-        return self._evaluate_all_parts(name, [x], theta, out)
+        return self._evaluate_all_parts(name, [x], theta=theta, out=out)
 
     def _evaluate_at_points(
         self,
@@ -277,7 +281,7 @@ class StressEvaluator:
             Array to add to; zeros by default.
         """
         out = np.zeros((len(fields[0]), self.width)) if out is None else out
-        return self._evaluate_all_parts(name, fields, theta, out)
+        return self._evaluate_all_parts(name, fields, theta=theta, out=out)
 
     def _evaluate_at_nodes(
         self, name: str, fields: list[Array], theta: Array, point_data: Array
@@ -397,7 +401,7 @@ class StressEvaluator:
         body = self.body
         part = body.parts[number]
         places = body.memory.part_columns(number)
-        kernel = stress_kernel(name, body.element, body.law(number))
+        kernel = stress_kernel(name, body.element, law=body.law(number))
         points = body.geometry.shape[1]
         cells = np.repeat(body.cells[part.cells], points, axis=0)
         geometry = body.geometry[part.cells].reshape(len(cells), 1, -1)

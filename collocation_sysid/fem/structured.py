@@ -135,7 +135,7 @@ def _require_element_limit(elements: float) -> None:
         raise InputError(
             f"makes {elements:.3g} elements; expected at most {_MOST_ELEMENTS:,}: a larger length",
             None,
-            "edge_length_m",
+            where="edge_length_m",
         )
 
 

@@ -78,10 +78,10 @@ def tetrahedralize_surface(
     """
     points, faces = merge_coincident(*_checked_surface(points_m, triangles))
     _require_closed(faces)
-    _require_suitable_edge_length(points, faces, edge_length_m)
+    _require_suitable_edge_length(points, faces, edge_length_m=edge_length_m)
     mesher = _pytetwild_version()
     if cache_dir is None:
-        return _run_ftetwild(points, faces, edge_length_m)
+        return _run_ftetwild(points, faces, edge_length_m=edge_length_m)
     digest = hashlib.sha256(
         f"{mesher} {_RECIPE} {float(edge_length_m)!r} {points.shape}".encode()
     )
@@ -93,9 +93,9 @@ def tetrahedralize_surface(
         with replaced_file(cached) as draft:
             # A mesh that is refused must not be kept.
             nodes, tetrahedra, *_ = clean_mesh(
-                *_run_ftetwild(points, faces, edge_length_m)
+                *_run_ftetwild(points, faces, edge_length_m=edge_length_m)
             )
-            write_tetrahedra(draft, nodes, tetrahedra)
+            write_tetrahedra(draft, nodes, tetrahedra=tetrahedra)
     nodes, tetrahedra, *_ = read_tetrahedra(cached)
     return nodes, tetrahedra
 

@@ -297,10 +297,13 @@ class LiveEstimator:
         tracks = parse_markers(markers, self.names)
         gauges = self.model.experiment.readings
         instrument_samples = parse_custom_readings(
-            readings, gauges, parse_time(t_s)
+            readings, gauges, t_s=parse_time(t_s)
         )
         instrument_samples += parse_wrenches(
-            wrench, self.model.wrenches, len(gauges), parse_time(t_s)
+            wrench,
+            self.model.wrenches,
+            instruments_before=len(gauges),
+            t_s=parse_time(t_s),
         )
         return self.process_frame(
             Frame(
@@ -349,11 +352,11 @@ class LiveEstimator:
             self._relinearise_if_moved(
                 self.first_pass,
                 self.first_pass,
-                began,
-                RELINEARISE_DISTANCE_FIRST,
+                began=began,
+                distance=RELINEARISE_DISTANCE_FIRST,
             )
         self.budget.frame_s = self.clock() - before
-        done = self._repeat_rows(began, notes, caught_up)
+        done = self._repeat_rows(began, notes, done=caught_up)
         before = self.clock()
         self._drop_old_rows()
         squared_distances = np.concatenate([*squares, np.zeros(0)])
@@ -407,7 +410,9 @@ class LiveEstimator:
                 name: batch_run.estimates[name] for name in last.estimates
             }
             unassessed = Assessment.from_concerns(
-                data_concerns(ResidualScatter(), self.counts, self.samples)
+                data_concerns(
+                    ResidualScatter(), self.counts, samples=self.samples
+                )
             )
             trust = batch_run.trust.combined_with(unassessed)
             last = replace(last, marker_rms_m=batch_run.solution.rms_m)
@@ -429,7 +434,7 @@ class LiveEstimator:
         recording = (
             None
             if track.prior.row_count
-            else recording_from_log(self.model, self.intake, self.log)
+            else recording_from_log(self.model, self.intake, log=self.log)
         )
         try:
             return (
@@ -533,7 +538,7 @@ class LiveEstimator:
             ]
         for k, row in enumerate(rows[:done], 1):
             self.log.append(LoggedRow(row.poses, []))
-            notes += self._add_samples(row.samples, squares, done - k)
+            notes += self._add_samples(row.samples, squares, rows=done - k)
         return done, notes
 
     def _add_samples(
@@ -621,7 +626,12 @@ class LiveEstimator:
         no_markers = np.full((len(self.names), 3), np.nan)
         no_markers[0] = 0.0
         try:
-            trial = WindowPass(self.model, self.p, self.prior, self._block_rows)
+            trial = WindowPass(
+                self.model,
+                self.p,
+                prior=self.prior,
+                block_rows=self._block_rows,
+            )
             row = LoggedRow(moving_poses, [Sample(0.0, no_markers)])
             for _ in range(self.model.template_rows + 2):
                 trial.repeat_rows([row])
@@ -672,7 +682,9 @@ class LiveEstimator:
                     + position
                 ).ravel()
             ]
-        track = WindowPass(model, self.p, self.prior, self._block_rows)
+        track = WindowPass(
+            model, self.p, prior=self.prior, block_rows=self._block_rows
+        )
         track.add_rows([row.poses], guesses)
         marker_samples = [
             reading.values for reading in row.samples if not reading.instrument
@@ -690,7 +702,12 @@ class LiveEstimator:
             places = self.model.collocation.guess_p[model.collocation.nq :]
             self.p = np.concatenate([self.p[: model.collocation.nq], places])
             self.prior = SquareRootInformation.empty(self.model.parameter_count)
-            track = WindowPass(self.model, self.p, self.prior, self._block_rows)
+            track = WindowPass(
+                self.model,
+                self.p,
+                prior=self.prior,
+                block_rows=self._block_rows,
+            )
             track.add_rows([row.poses], guesses)
         self.first_pass = track
         self._combined = CombinedPasses.from_passes(track, None)
@@ -717,7 +734,7 @@ class LiveEstimator:
         if self.first_pass is None or self.first_pass.has_failed:
             return np.inf
         return self._largest_distance(
-            self.first_pass, self.p, self._combined.points
+            self.first_pass, self.p, points=self._combined.points
         )
 
     def _largest_distance(
@@ -812,7 +829,7 @@ class LiveEstimator:
             code = "solve/grasp-lost"
         elif self.search is not None:
             code = "solve/seeking"
-        grave = concern_if(bool(code), True, code)
+        grave = concern_if(bool(code), True, code=code)
         if self.first_pass is None or self.first_pass.has_failed:
             values = self.model.collocation.parameters.values(
                 self.p[: self.model.collocation.nq]
@@ -829,7 +846,7 @@ class LiveEstimator:
             )
         self.counts["looked"] += 1
         estimates = self._estimates_at(self._combined.information, self.p)
-        grave += data_concerns(self.scatter, self.counts, self.samples)
+        grave += data_concerns(self.scatter, self.counts, samples=self.samples)
         grave += estimate_concerns(estimates, self.linearisation_distance)
         return estimates, Assessment.from_concerns(grave)
 
@@ -852,7 +869,10 @@ class LiveEstimator:
         transformed = self.model.transformed(p)
         parameter_count = self.model.parameter_count
         factor, quantile = variance_factor(
-            known, transformed, parameter_count, self.scatter
+            known,
+            transformed,
+            parameter_count=parameter_count,
+            scatter=self.scatter,
         )
         rates = self.model.transformation_derivatives(transformed)[:nq]
         of_q = factor * known.covariance()[:nq, :nq] / np.outer(rates, rates)
@@ -903,7 +923,10 @@ class LiveEstimator:
                 break
             if not done and again.base is not None:
                 self._relinearise_if_moved(
-                    self.first_pass, again, began, RELINEARISE_DISTANCE
+                    self.first_pass,
+                    again,
+                    began=began,
+                    distance=RELINEARISE_DISTANCE,
                 )
             affordable = min(
                 self._affordable_rows(done, self.clock() - began),
@@ -911,7 +934,7 @@ class LiveEstimator:
             )
             if not affordable:
                 break
-            done += self._advance_second_pass(again, affordable, notes)
+            done += self._advance_second_pass(again, affordable, notes=notes)
         return done
 
     def _catch_up(self, began: float, notes: list[str]) -> int:
@@ -929,7 +952,7 @@ class LiveEstimator:
             self._affordable_rows(0, elapsed_s + self.budget.frame_s),
         ):
             return 0
-        return self._advance_second_pass(again, lag, notes)
+        return self._advance_second_pass(again, lag, notes=notes)
 
     def _advance_second_pass(
         self, again: WindowPass, count: int, notes: list[str]
@@ -955,7 +978,7 @@ class LiveEstimator:
         elif (
             again.has_failed or again.rows == len(self.log)
         ) and self.first_pass is not None:
-            self._accept_or_reject(self.first_pass, again, notes)
+            self._accept_or_reject(self.first_pass, again, notes=notes)
         return again.rows - first_row
 
     def _affordable_rows(self, done: int, elapsed_s: float) -> int:
@@ -1004,7 +1027,9 @@ class LiveEstimator:
         else:
             p = self._next_linearisation_point(track)
             if (
-                self._largest_distance(track, p, track.linearisation_points)
+                self._largest_distance(
+                    track, p, points=track.linearisation_points
+                )
                 <= REPEAT_DISTANCE
                 and not track.sweep.needs_another_pass
             ):
@@ -1041,7 +1066,8 @@ class LiveEstimator:
         if (
             pass_to_move.rows
             < pass_to_move.last_relinearised_row + self.model.rows_per_chunk
-            or self._largest_distance(track, self.p, current_point) <= distance
+            or self._largest_distance(track, self.p, points=current_point)
+            <= distance
         ):
             return
         before = self.clock()
@@ -1050,7 +1076,7 @@ class LiveEstimator:
         ):
             return
         p = self._next_linearisation_point(track)
-        if self._largest_distance(track, p, current_point) > distance:
+        if self._largest_distance(track, p, points=current_point) > distance:
             pass_to_move.relinearise_at(p)
             self.budget.record_relinearisation(self.clock() - before)
 
@@ -1070,7 +1096,9 @@ class LiveEstimator:
         is_within_trust_region = (
             track.last_relinearised_row
             and self._largest_distance(
-                track, track.linearisation_point, again.linearisation_points
+                track,
+                track.linearisation_point,
+                points=again.linearisation_points,
             )
             <= REPEAT_DISTANCE
         )

@@ -122,7 +122,9 @@ def _parse_single_pose(pose: Pose) -> tuple[Array, Array]:
     if isinstance(pose, tuple) and len(pose) == 2:
         position = _parse_array(pose[0], (3,))
         quaternion = _parse_array(pose[1], (4,))
-        fault = first_pose_fault(np.zeros(1), position[None], quaternion[None])
+        fault = first_pose_fault(
+            np.zeros(1), position[None], quaternions_xyzw=quaternion[None]
+        )
         if fault is not None:
             raise InputError(fault[1].replace(" at t_s = 0", ""))
         return position, quaternion / np.linalg.norm(quaternion)
@@ -205,7 +207,7 @@ def parse_custom_readings(
         what = f"the reading '{name}'"
         collected += [
             (number + 1, *sample)
-            for sample in _parse_samples(samples, what, count, t_s)
+            for sample in _parse_samples(samples, what, count=count, t_s=t_s)
         ]
     return tuple(collected)
 
@@ -255,7 +257,7 @@ def parse_wrenches(
         measured = wrenches[int(name)].measured_components
         what = f"the wrench of grasp {name}"
         for at_s, values in _parse_samples(
-            samples, what, len(measured), t_s, alternative_count=3
+            samples, what, count=len(measured), t_s=t_s, alternative_count=3
         ):
             wrench_values = np.where(
                 measured, np.pad(values, (0, 6 - len(values))), np.nan
@@ -415,9 +417,11 @@ class FrameReader:
         t_s = parse_time(json_object["t_s"])
         wrench = json_object.get("wrench")
         samples = parse_custom_readings(
-            json_object.get("readings"), self.gauges, t_s
+            json_object.get("readings"), self.gauges, t_s=t_s
         )
-        samples += parse_wrenches(wrench, self.wrenches, len(self.gauges), t_s)
+        samples += parse_wrenches(
+            wrench, self.wrenches, instruments_before=len(self.gauges), t_s=t_s
+        )
         return Frame(
             t_s,
             pose,
@@ -462,7 +466,7 @@ class FrameReader:
         return Frame(
             t_s,
             pose,
-            parse_markers(tracks, self.names),
+            tracks_m=parse_markers(tracks, self.names),
             instrument_samples=tuple(instrument_samples),
         )
 

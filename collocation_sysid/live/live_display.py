@@ -85,7 +85,10 @@ def display_of(updates: Sequence[LiveUpdate]) -> list[Shown]:
         f"t = {last.t_s:.2f} s   marker error {millimetres(last.marker_rms_m)} RMS   latency "
         f"{1e3 * last.latency_s:.1f} ms",
         Table(
-            "", ("", "estimate", "±", "unit", "history"), tuple(rows), names=5
+            "",
+            ("", "estimate", "±", "unit", "history"),
+            rows=tuple(rows),
+            names=5,
         ),
         verdict_section(last.trust, max_reasons=SHOWN_REASONS),
     ]
@@ -110,7 +113,7 @@ def require_gif(file: Path) -> None:
     """Raise an `InputError` unless the file is a GIF."""
     if file.suffix.lower() != ".gif":
         raise InputError(
-            f"found '{file.suffix}'; expected .gif", file, "--film"
+            f"found '{file.suffix}'; expected .gif", file, where="--film"
         )
 
 
@@ -176,7 +179,7 @@ def _draw_parameter(
     axes.set_ylim(low - margin, high + margin)
     unit = unit_of(name)
     label = symbol_as_mathtext(name) + (f" [{unit}]" if unit else "")
-    style_axes(axes, "", "t [s]" if k == count - 1 else "", label)
+    style_axes(axes, "", xlabel="t [s]" if k == count - 1 else "", ylabel=label)
     styles = ((BLUE, "-"), (ORANGE, "--"), (ORANGE, "--"))
     lines = [
         axes.plot([], [], style, color=colour)[0] for colour, style in styles

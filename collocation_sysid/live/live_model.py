@@ -50,7 +50,7 @@ def _only_experiment(problem: Problem) -> Experiment:
             f"{len(fitted)} experiments are fitted; a live estimate has one, expected the others "
             "to be removed or validation = true",
             problem.path,
-            "experiment",
+            where="experiment",
         )
     (experiment,) = fitted
     for feature, is_present, expected in _unsupported_features(experiment):
@@ -58,7 +58,7 @@ def _only_experiment(problem: Problem) -> Experiment:
             where = f"experiment '{experiment.name}'"
             message = f"live estimates do not support {feature}"
             raise InputError(
-                f"{message}; expected {expected}", problem.path, where
+                f"{message}; expected {expected}", problem.path, where=where
             )
     return experiment
 

@@ -129,22 +129,22 @@ def data_concerns(
         *concern_if(
             scatter.rms > MISFIT,
             scatter.rms > GROSS_MISFIT,
-            "noise/larger",
+            code="noise/larger",
             **size,
         ),
         *concern_if(
             scatter.lag1 > PERSISTENT,
             False,
-            "residuals/persist",
+            code="residuals/persist",
             autocorrelation=scatter.lag1,
         ),
         *concern_if(
             outlier_share > WILD,
             outlier_share > HARDLY_TAME,
-            "residuals/far",
+            code="residuals/far",
             percent=100 * outlier_share,
         ),
-        *concern_if(restarts > 0, False, "solve/anew", times=times),
+        *concern_if(restarts > 0, False, code="solve/anew", times=times),
     ]
 
 
@@ -160,16 +160,20 @@ def estimate_concerns(
         Distance of the estimate from the linearisation point, in standard errors.
     """
     concerns = concern_if(
-        distance > LARGEST_SETTLED_DISTANCE, False, "solve/moves"
+        distance > LARGEST_SETTLED_DISTANCE, False, code="solve/moves"
     )
     for name, estimate in estimates.items():
         if estimate.at_bound:
             concerns += concern_if(
-                True, False, "information/at-bound", name=name
+                True, False, code="information/at-bound", name=name
             )
         elif estimate.reason is not None:
             reason = estimate.reason
             concerns += concern_if(
-                True, False, "information/not-yet", name=name, reason=reason
+                True,
+                False,
+                code="information/not-yet",
+                name=name,
+                reason=reason,
             )
     return concerns

@@ -120,7 +120,7 @@ def frames_of_recording(
         yield Frame(
             float(t_s),
             (positions_m, quaternions),
-            tracks_m,
+            tracks_m=tracks_m,
             instrument_samples=frame_samples,
         )
 

@@ -52,7 +52,7 @@ def require_method(name: str, option: str) -> None:
     """
     if name not in METHODS:
         if (reason := refusal_reason(name)) is not None:
-            raise InputError(reason, None, option)
+            raise InputError(reason, None, where=option)
         require_among(name, METHODS, where=option)
 
 

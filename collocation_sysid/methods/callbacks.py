@@ -255,9 +255,9 @@ class NlpFunctions:
         if "triu_hess" in outputs:
             self._upper_values(z, weight, multipliers, outputs["triu_hess"])
         if "hess" in outputs:
-            outputs["hess"][:] = self._upper_triangle(z, weight, multipliers)[
-                self._full[1]
-            ]
+            outputs["hess"][:] = self._upper_triangle(
+                z, weight, multipliers=multipliers
+            )[self._full[1]]
 
     def _forward(
         self, inputs: list[Array], outputs: list[Array | None]
@@ -456,7 +456,9 @@ class IterationMonitor(ca.Callback):
             self.best = (z, multipliers)
         recorder = self.recorder
         loss = float(value[0]) / self.program.loss_scale
-        variables = convert_variables(z, self.program, recorder.collocation)
+        variables = convert_variables(
+            z, self.program, target=recorder.collocation
+        )
         number = recorder.history[-1].number + 1 if recorder.history else 0
         self.lines += 1
         recorder.add_variables(number, variables, loss)

@@ -77,7 +77,9 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
         z = relaxed.with_lifted_variables().pack(
             *solution.collocation.unpack(solution.z)
         )
-        relaxed = _relax(first.collocation, obstacles_by_experiment, share)
+        relaxed = _relax(
+            first.collocation, obstacles_by_experiment, share=share
+        )
         solution = replace(
             solve(relaxed, z).after(solution, ""), notes=first.notes
         )

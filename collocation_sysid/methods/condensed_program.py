@@ -572,7 +572,7 @@ class CondensedCollocation(Collocation):
         if multipliers is not None:
             multipliers = self.complete_multipliers(z, loss_weight, multipliers)
         complete_values = self._complete_hessian(
-            self.complete_variables(z), loss_weight, multipliers
+            self.complete_variables(z), loss_weight, multipliers=multipliers
         )
         values[layout.targets[0]] = complete_values[layout.remaining]
         parts = zip(

@@ -85,8 +85,10 @@ class Continuation(Options):
         name = options.pop("method", InteriorPoint.name)
         if name not in STAGES:
             known = f"expected one of {', '.join(STAGES)}{hint_at(str(name), STAGES)}"
-            raise InputError(f"found {name!r}; {known}", None, "stage.method")
-        return method_from_options(STAGES[name], options, "stage")
+            raise InputError(
+                f"found {name!r}; {known}", None, where="stage.method"
+            )
+        return method_from_options(STAGES[name], options, key="stage")
 
     def __call__(
         self,
@@ -100,7 +102,7 @@ class Continuation(Options):
         was interrupted or refused; the notes contain the result of each part.
         """
         climb = _ContinuationState(
-            self.method, Recorder(self.name, collocation, watch)
+            self.method, Recorder(self.name, collocation, watch=watch)
         )
         if start is not None:
             climb.known = collocation.unpack(start)
@@ -127,7 +129,7 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
     )
     fewest = 1 if experiment.is_static else FEWEST_SHARED_SAMPLES
     stop, depths = until_all_cameras_see(
-        experiment.depths, experiment.t_s, stop, fewest
+        experiment.depths, experiment.t_s, count=stop, fewest=fewest
     )
     shorter = replace(
         markers, t_s=markers.t_s[:stop], positions_m=markers.positions_m[:stop]
@@ -260,6 +262,8 @@ def _continue_variables(
     """
     parts = collocation.iterates_at(p, positions)
     known, _ = simulate_trajectories(
-        collocation, p, [part.x[: part.segment.grid_times] for part in parts]
+        collocation,
+        p,
+        known_rows=[part.x[: part.segment.grid_times] for part in parts],
     )
     return complete_variables(collocation, p, known)

@@ -329,7 +329,7 @@ def _require_package(client: Any) -> set[str]:
 
 def _refusal(message: str) -> InputError:
     """Return an error that refers to the option --scheduler."""
-    return InputError(message, None, "--scheduler")
+    return InputError(message, None, where="--scheduler")
 
 
 def _require_workers(threads: dict[str, int]) -> None:

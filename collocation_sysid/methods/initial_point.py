@@ -107,7 +107,7 @@ def compute_initial_point(
         )
     else:
         note = f"initial point: the method reduced-space found none ({coarse.message.rstrip('.')})"
-    return InitialPoint(coarse, is_usable, is_close, note)
+    return InitialPoint(coarse, is_usable, is_close=is_close, note=note)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +154,7 @@ def adjoint_multipliers(
         if isinstance(program, CondensedCollocation)
         else program
     )
-    variables = convert_variables(z, collocation, complete_program)
+    variables = convert_variables(z, collocation, target=complete_program)
     constraints = np.zeros(complete_program.constraint_count)
     constraints[: len(of_motion)] = of_motion
     gradient = complete_program.gradient(variables)
@@ -166,7 +166,7 @@ def adjoint_multipliers(
         constraints[-added:] = -spla.spsolve(lifted_jacobian, slope[-added:])
     if isinstance(program, CondensedCollocation):
         constraints = constraints[program.remaining_rows]
-        variables = convert_variables(z, collocation, program)
+        variables = convert_variables(z, collocation, target=program)
         gradient = program.gradient(variables)
         jacobian = program.jacobian(variables)
     lower, upper = program.bounds()

@@ -166,8 +166,8 @@ def continue_trajectory(
     return continue_simulation(
         iterate.segment.experiment,
         iterate.equations.dynamics.truncated_to(rows),
-        iterate.x if len(iterate.x) else None,
-        options,
+        known=iterate.x if len(iterate.x) else None,
+        options=options,
         stopwatch=stopwatch,
         approximate_solution=guess,
     )

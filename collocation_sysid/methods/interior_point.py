@@ -213,7 +213,7 @@ class InteriorPoint(Options):
         start : (variables,) array or None
             Initial variables; None for those of the options.
         """
-        recorder = Recorder(self.name, collocation, watch)
+        recorder = Recorder(self.name, collocation, watch=watch)
         if self.initial == "simulation":
             return self._solve_by_ipopt(recorder, start)
         initial = compute_initial_point(
@@ -238,7 +238,7 @@ class InteriorPoint(Options):
         if not initial.is_usable:
             return self._solve_by_ipopt(recorder, start)
         recorder.collocation = coarse.collocation
-        solution = self._solve_by_ipopt(recorder, coarse.z, initial)
+        solution = self._solve_by_ipopt(recorder, coarse.z, initial=initial)
         return replace(
             solution, evaluations=solution.evaluations + coarse.evaluations
         )
@@ -266,7 +266,7 @@ class InteriorPoint(Options):
             program = condense(recorder.collocation.with_lifted_variables())
             if initial is not None and initial.is_close:
                 multipliers = adjoint_multipliers(
-                    program, recorder.collocation, initial.coarse.z
+                    program, recorder.collocation, z=initial.coarse.z
                 )
             is_warm = multipliers is not None
             hessian = _DampedHessian(

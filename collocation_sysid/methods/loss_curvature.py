@@ -146,10 +146,10 @@ def exact_curvature(
     """
     projected = [each.x + each.tangent.step for each in iterate.trajectories]
     z = collocation.pack(iterate.p, projected)
-    multipliers = constraint_multipliers(collocation, z, stopwatch)
+    multipliers = constraint_multipliers(collocation, z, stopwatch=stopwatch)
     directions = np.column_stack(
         [
-            _tangent_direction(collocation, iterate, k)
+            _tangent_direction(collocation, iterate, k=k)
             for k in range(len(iterate.p))
         ]
     )

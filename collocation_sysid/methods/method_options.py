@@ -43,12 +43,14 @@ def method_from_options(
         if name not in known:
             has = f"it has {', '.join(known)}{hint_at(name, known)}"
             raise InputError(
-                f"{kind.name!r} has no option {name!r}; {has}", None, key
+                f"{kind.name!r} has no option {name!r}; {has}", None, where=key
             )
     try:
         return kind(**options)
     except InputError as error:
-        raise InputError(error.message, None, f"{key}.{error.where}") from error
+        raise InputError(
+            error.message, None, where=f"{key}.{error.where}"
+        ) from error
 
 
 # Fewest samples, or rows of a grid, of a first part.

@@ -95,15 +95,15 @@ def solve(
     )
     with watch.building():
         start = recorder.initial_variables(start)
-        functions = NlpFunctions(program, hessian, errors)
-        monitor = IterationMonitor(recorder, program, errors)
+        functions = NlpFunctions(program, hessian, errors=errors)
+        monitor = IterationMonitor(recorder, program, errors=errors)
         options = {
             **_COMMON,
             "iteration_callback": monitor,
             **settings(functions),
         }
-        solver = _create_solver(plugin, functions, options)
-    initial_variables = convert_variables(start, collocation, program)
+        solver = _create_solver(plugin, functions, settings=options)
+    initial_variables = convert_variables(start, collocation, target=program)
     z, multipliers, return_status, count = _run(
         solver,
         program.bounds(),
@@ -136,7 +136,7 @@ def solve(
     problem_multipliers = complete_multipliers(program, z, multipliers)[
         : collocation.constraint_count
     ]
-    problem_variables = convert_variables(z, program, collocation)
+    problem_variables = convert_variables(z, program, target=collocation)
     status = judge(status, problem_variables, problem_multipliers)
     message = (
         f"{status.sentence} ({NAMES.get(plugin, plugin)}: {return_status})"
@@ -182,7 +182,7 @@ def _create_solver(
         )
         name = NAMES.get(plugin, plugin)
         raise InputError(
-            f"{name} cannot be set up: {reason}", None, "solver"
+            f"{name} cannot be set up: {reason}", None, where="solver"
         ) from error
 
 

@@ -366,10 +366,12 @@ class ReducedSearch:
             if (
                 trial is not None
                 and is_better
-                and self._is_better_for_cameras(horizon, point, trial)
+                and self._is_better_for_cameras(horizon, point, trial=trial)
             ):
                 if is_last and length <= LOCAL:
-                    curvature = self._update_curvature(curvature, point, trial)
+                    curvature = self._update_curvature(
+                        curvature, point, after=trial
+                    )
                 point = self._accept(horizon, trial)
                 rejections = 0
                 previous = length
@@ -401,9 +403,9 @@ class ReducedSearch:
         """
         if self.options.hessian == "exact":
             return exact_curvature(
-                self.collocation, after, self.recorder.stopwatch
+                self.collocation, after, stopwatch=self.recorder.stopwatch
             )
-        return secant_update(curvature, previous, after)
+        return secant_update(curvature, previous, after=after)
 
     def _step_length(self, step: Array) -> float:
         """Return the largest change of a parameter relative to `reach`."""
@@ -575,7 +577,7 @@ class ReducedSearch:
         if collocation is self.collocation or self.reassociations >= REREADINGS:
             return point
         self.reassociations += 1
-        self._set_collocation(horizon, collocation, p)
+        self._set_collocation(horizon, collocation, p=p)
         return after if is_camera_trial else horizon.reassociate(p, point)
 
     def _is_better_for_cameras(
@@ -601,7 +603,7 @@ class ReducedSearch:
         measurements = self.collocation.measurement_count
         each = after.loss / max(1, measurements)
         before_each = point.loss / max(1, before.measurement_count)
-        self._set_collocation(horizon, before, point.p)
+        self._set_collocation(horizon, before, p=point.p)
         return (
             measurements >= LEAST_VISIBLE_SHARE * self.most_measurements
             and each <= EQUAL_MISFIT_RATIO * before_each

@@ -90,8 +90,8 @@ class ReducedSpace(SearchOptions):
                     "'gauss-newton' with a scheduler"
                 )
         workers = workers or LocalExecutor(collocation.threads)
-        recorder = Recorder(self.name, collocation, watch)
-        search = ReducedSearch(self, recorder, start, workers)
+        recorder = Recorder(self.name, collocation, watch=watch)
+        search = ReducedSearch(self, recorder, start=start, workers=workers)
         status, message = recorder.run_search(search.run)
         collocation = recorder.collocation
         try:
@@ -111,7 +111,7 @@ class ReducedSpace(SearchOptions):
             trajectories is not None and [len(x) for x in trajectories] == rows
         )
         recorder.notes += _notes(
-            collocation, search.indefinite_steps, z, status
+            collocation, search.indefinite_steps, z=z, status=status
         )
         multipliers = (
             None if is_complete else np.zeros(collocation.constraint_count)

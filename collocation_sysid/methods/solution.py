@@ -599,7 +599,7 @@ def constraint_multipliers(
         segment.is_grasp_constraint.any()
         for segment in collocation.transcriptions
     ):
-        _set_grasp_multipliers(collocation, z, multipliers)
+        _set_grasp_multipliers(collocation, z, multipliers=multipliers)
     return multipliers
 
 

@@ -144,7 +144,7 @@ def start_problem(
     reason = f"the body cannot be simulated at the guess ({failure})"
     if failure is None:
         reason = "at the guess, the simulation is farther from the measurements than an undeformed body"
-    result = rescue(collocation, reason, is_complete)
+    result = rescue(collocation, reason, is_complete=is_complete)
     if result is None:
         return collocation, None  # the method will tell what it needs
     if failure is None and misfit <= result.misfit[result.best]:
@@ -169,7 +169,9 @@ def rescue(
     if not _has_free_modulus(collocation):
         return None
     try:
-        return scan_stiffness(without_guesses(collocation), reason, is_complete)
+        return scan_stiffness(
+            without_guesses(collocation), reason, is_complete=is_complete
+        )
     except InputError:
         return None
 
@@ -221,7 +223,7 @@ def scan_stiffness(
             f"{len(young_pa)} stiffnesses from E = {young_pa[-1]:.3g} to {young_pa[0]:.3g} Pa "
             f"({trial.failure}); check grasp, mass and units, or give guesses",
             None,
-            "parameters",
+            where="parameters",
         )
     best = int(np.flatnonzero(young_pa == candidates[0])[0])
     start = typical_parameters(collocation.parameters, candidates[0])
@@ -292,7 +294,7 @@ def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
         poisson = guesses.get(
             f"{region}{dot}poisson", guesses.get("poisson", 0.3)
         )
-        usual = usual_value(item.name, young_pa, poisson)
+        usual = usual_value(item.name, young_pa, poisson=poisson)
         if item.prior is not None:
             usual = item.prior[0]
         assert usual is not None  # by `parameter`

@@ -192,7 +192,7 @@ def sweep(
     SimulationError
         If a time step is singular or not finite, or a node has no mass.
     """
-    part = _iterate(transcription, p, trajectory_positions(trajectory))
+    part = _iterate(transcription, p, x=trajectory_positions(trajectory))
     dynamics = part.equations.dynamics
     if (massless := dynamics.body.mass_problem(dynamics.theta)) is not None:
         raise SimulationError(massless, float(dynamics.t_s[0]))
@@ -243,7 +243,7 @@ def sweep_after_step(
         If a time step is singular or not finite.
     """
     part = _iterate(
-        transcription, p, extrapolate(transcription, previous, step)
+        transcription, p, x=extrapolate(transcription, previous, step)
     )
     dynamics = part.equations.dynamics
     x = part.x
@@ -286,7 +286,7 @@ def reassociate(
         Sweep at p.
     """
     return _sweep_result(
-        _iterate(transcription, p, sweep_result.x),
+        _iterate(transcription, p, x=sweep_result.x),
         huber,
         tangent=sweep_result.tangent,
         previous=None,
@@ -334,7 +334,7 @@ def simulate_rows(
     part = _iterate(
         transcription,
         p,
-        np.zeros((0, transcription.dof_count))
+        x=np.zeros((0, transcription.dof_count))
         if known_rows is None
         else trajectory_positions(known_rows),
     )
@@ -346,14 +346,16 @@ def simulate_rows(
         stopwatch=solver.stopwatch,
         guess=guess_positions,
     )
-    return SimulationResult(x, failure, solver.stopwatch.read_and_reset())
+    return SimulationResult(
+        x, failure, times_s=solver.stopwatch.read_and_reset()
+    )
 
 
 def fit_summary(transcription: Transcription, p: Array, x: Array) -> FitSummary:
     """Return the fit of positions x (rows, 3n) [m] at the experiment's parameters p (k,), with
     residuals of the equations of motion evaluated at x.
     """
-    part = _iterate(transcription, p, x)
+    part = _iterate(transcription, p, x=x)
     return FitSummary.from_iterate(
         part, x, float(np.abs(part.residual_n).max())
     )
@@ -364,7 +366,7 @@ def _iterate(
 ) -> ExperimentIterate:
     """Return the experiment at parameters p (k,) and positions x (rows, 3n)."""
     return ExperimentIterate(
-        transcription, p[: transcription.nq], p[transcription.nq :], x
+        transcription, p[: transcription.nq], phi=p[transcription.nq :], x=x
     )
 
 
@@ -429,4 +431,4 @@ def _sweep_result(
         ),
         times_s=times_s,
     )
-    return SweepResult(iterate.x, tangent, slope, report)
+    return SweepResult(iterate.x, tangent, slope=slope, report=report)

@@ -296,7 +296,7 @@ class ContactLaw:
         return GeneratedFunction(
             self.force_expression,
             3 * VECTORS_PER_POINT + moving + len(self.constant_columns),
-            DATA_COUNT,
+            data_size=DATA_COUNT,
             is_compiled=True,
         )
 
@@ -334,7 +334,7 @@ class ContactLaw:
         return GeneratedFunction(
             force,
             3 * moving,
-            9 * moving + len(self.constant_columns) + DATA_COUNT,
+            data_size=9 * moving + len(self.constant_columns) + DATA_COUNT,
             is_compiled=True,
         )
 
@@ -346,7 +346,7 @@ class ContactLaw:
         return GeneratedFunction(
             self._complementarity_expression,
             3 * VECTORS_PER_POINT + len(self.constant_columns) + 1,
-            DATA_COUNT,
+            data_size=DATA_COUNT,
             is_compiled=True,
         )
 
@@ -368,12 +368,14 @@ class ContactLaw:
             self.to_obstacle_frame(inputs[: 3 * VECTORS_PER_POINT])[0]
         )
         residual = b + gap - ca.sqrt((b - gap) ** 2 + 4 * data[1])
-        return ca.vertcat(self.force_expression(inputs, data, b), residual)
+        return ca.vertcat(
+            self.force_expression(inputs, data, scaled_pressure=b), residual
+        )
 
     @cached_property
     def scaled_pressure_function(self) -> GeneratedFunction:
         """Expression of b of the gap."""
-        return GeneratedFunction(self.scaled_pressure, 1, DATA_COUNT)
+        return GeneratedFunction(self.scaled_pressure, 1, data_size=DATA_COUNT)
 
     def force_expression(
         self, u: ca.SX, data: ca.SX, scaled_pressure: ca.SX | None = None
@@ -390,7 +392,9 @@ class ContactLaw:
         scaled_pressure : SX, optional
             Given b; that of the gap by default.
         """
-        place, axes, slope, normal_n = self._normal(u, data, scaled_pressure)
+        place, axes, slope, normal_n = self._normal(
+            u, data, pressing=scaled_pressure
+        )
         # The forces on the ends of the axes follow from the coordinates of the point in these axes.
         push = normal_n * slope
         force = ca.vertcat(
@@ -398,7 +402,9 @@ class ContactLaw:
         )
         if not self.obstacle.has_friction:
             return force
-        _, friction, _ = self._friction(u, place, axes @ slope, normal_n)
+        _, friction, _ = self._friction(
+            u, place, slope=axes @ slope, normal_n=normal_n
+        )
         return force + ca.vertcat(
             friction, -ca.vec(friction @ (place / self._frame_size_m).T)
         )
@@ -500,7 +506,7 @@ class ContactLaw:
         def friction_values(u: ca.SX, data: ca.SX) -> ca.SX:
             place, axes, slope, normal_n = self._normal(u, data, pressing=None)
             limit_n, friction, tangential = self._friction(
-                u, place, axes @ slope, normal_n
+                u, place, slope=axes @ slope, normal_n=normal_n
             )
             slips = ca.sumsqr(tangential) > (SLIP_THRESHOLD * self.slip) ** 2
             return ca.vertcat(
@@ -511,7 +517,9 @@ class ContactLaw:
             )
 
         return GeneratedFunction(
-            friction_values, self.force_function.input_size, DATA_COUNT
+            friction_values,
+            self.force_function.input_size,
+            data_size=DATA_COUNT,
         )
 
 

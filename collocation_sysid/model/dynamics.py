@@ -387,7 +387,9 @@ class Dynamics:
             Indices of the rows; by default all from `first_row` on.
         """
         rows = slice(self.first_row, self.row_count) if rows is None else rows
-        return insert_histories(self.forces.at_times(rows), histories, rows)
+        return insert_histories(
+            self.forces.at_times(rows), histories, rows=rows
+        )
 
     def combine(self, table: Array, rows: Array) -> Array:
         """Return Σ_i table[t, i] rows[t − i] for every t, for `row_count` (N, …)."""
@@ -630,7 +632,9 @@ class StencilRow:
         by_position_skew, by_velocity_skew : (m,) or (0,)
             Lower triangles of the skew parts of G and C; empty where there is no such part.
         """
-        return -self.w[0] * self.skew(0, by_position_skew, by_velocity_skew)
+        return -self.w[0] * self.skew(
+            0, by_position_skew, by_velocity_skew=by_velocity_skew
+        )
 
     def skew(
         self, lag: int, by_position_skew: Array, by_velocity_skew: Array

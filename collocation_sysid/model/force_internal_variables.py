@@ -129,7 +129,7 @@ class ForceHistory:
         """State after the last evaluation."""
         last = slice(len(self.xi) - 1, None)
         return ForcePreviousState(
-            self.number, self.term_at(last), self.internal_variables(last)
+            self.number, self.term_at(last), after=self.internal_variables(last)
         )
 
     def derivatives(self, rows: slice) -> LawDerivatives:
@@ -202,7 +202,7 @@ class ForceHistory:
         known : array, optional
             Columns after those evaluations; 0 by default.
         """
-        return ForceForwardColumns(self, by_p, done, known)
+        return ForceForwardColumns(self, by_p, done=done, known=known)
 
     def adjoint(self) -> ForceAdjoint:
         """Return an iterator of the weights μ backward in time, see `ForceAdjoint`."""

@@ -432,7 +432,9 @@ class Forces:
         (`uses_increments`) get a nonzero ν. The states of the weight are also those of the body.
         """
         size = self.body.pattern.size
-        moving = States(xi.reshape(-1, size), nu.reshape(-1, size), self.theta)
+        moving = States(
+            xi.reshape(-1, size), nu.reshape(-1, size), theta=self.theta
+        )
         resting = (
             replace(moving, nu=np.zeros_like(moving.nu))
             if self.is_static

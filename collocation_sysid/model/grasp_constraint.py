@@ -84,7 +84,7 @@ class GraspConstraint:
             self._direct_derivatives @ phi[self.nuisance.motion_indices]
         )
         by_phi[np.isnan(positions)] = 0.0
-        return PrescribedDisplacements(self.dofs, positions, by_phi)
+        return PrescribedDisplacements(self.dofs, positions, by_phi=by_phi)
 
     def displaced_nodes(self, phi: Array) -> tuple[Array, Array]:
         """Return for each grasped dof the place H X of its node (g, 3) [m], with the hand–eye
@@ -246,7 +246,7 @@ class GraspConstraint:
         return PrescribedDisplacements(
             self.dofs,
             goals_m[:, self.dofs],
-            np.zeros((len(goals_m), len(self.dofs), 0)),
+            by_phi=np.zeros((len(goals_m), len(self.dofs), 0)),
         )
 
     @cached_property

@@ -110,7 +110,9 @@ class Inputs:
     def _functions(self) -> list[GeneratedFunction]:
         """Expressions of the groups with derivatives, in the order of `groups`."""
         return [
-            GeneratedFunction(e.expression, self.parameter_count, len(e.data))
+            GeneratedFunction(
+                e.expression, self.parameter_count, data_size=len(e.data)
+            )
             for e in self.groups
         ]
 
@@ -188,7 +190,7 @@ def inputs_from_experiment(
                 - smooth_ramp(since_s / interval_s)
             )
 
-        return Input(1, change, evaluated_s[None] - timed.declared_s)
+        return Input(1, change, data=evaluated_s[None] - timed.declared_s)
 
     def amplitude(number: int, actuator: Actuator) -> Input:
         """Return the input of the amplitude of a tendon or pressure."""
@@ -204,11 +206,13 @@ def inputs_from_experiment(
             )
             return actuator.calibrated_amplitude(data, *calibration)
 
-        return Input(1, driven, actuator.input_data(evaluated_s))
+        return Input(1, driven, data=actuator.input_data(evaluated_s))
 
-    groups = [Input(len(experiment.body.constants), theta, no_data)]
+    groups = [Input(len(experiment.body.constants), theta, data=no_data)]
     if len(nuisance.gravity_indices):
-        groups.append(Input(3, gravity, no_data, is_coupled_to_state=False))
+        groups.append(
+            Input(3, gravity, data=no_data, is_coupled_to_state=False)
+        )
     joining = zip(
         nuisance.indices_of_rows(JOINING).tolist(),
         nuisance.timed_loads,
@@ -219,4 +223,6 @@ def inputs_from_experiment(
         amplitude(k, actuator)
         for k, actuator in enumerate(experiment.actuators)
     ]
-    return Inputs(groups, nq + len(nuisance.motion_indices), len(evaluated_s))
+    return Inputs(
+        groups, nq + len(nuisance.motion_indices), time_count=len(evaluated_s)
+    )

@@ -482,7 +482,7 @@ class NuisanceMap:
         """
         motion = self.grasp_motion_matrix(phi)
         return tuple(
-            self._with_grasp(k, grasp, motion, phi)
+            self._with_grasp(k, grasp, motion=motion, phi=phi)
             for k, grasp in enumerate(grasps)
         )
 
@@ -696,7 +696,7 @@ def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
         ):
             for row in applicable:
                 for axis, name, unit, sigma in _component_axes(
-                    experiment, row, number
+                    experiment, row, number=number
                 ):
                     label = row.label.format(which=component_name, axis=name)
                     yield NuisanceEntry(

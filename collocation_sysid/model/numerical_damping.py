@@ -71,7 +71,7 @@ def numerical_mode(
             f"damping_ratio = {damping_ratio:g}, expected 0 <= damping_ratio < 1"
         )
     h = angular_frequency_rad_s * timestep_s
-    z = principal_root(scheme.regular, h, damping_ratio)
+    z = principal_root(scheme.regular, h, damping_ratio=damping_ratio)
     rate = -float(np.log(abs(z)))
     angle = float(np.angle(z))
     exact = h * float(np.sqrt(1 - damping_ratio**2))
@@ -139,7 +139,10 @@ def substeps_needed(
         """Return whether damping and period error are within the limits with this many substeps."""
         mode, damped = (
             numerical_mode(
-                scheme, angular_frequency_rad_s, timestep_s / substeps, ratio
+                scheme,
+                angular_frequency_rad_s,
+                timestep_s=timestep_s / substeps,
+                damping_ratio=ratio,
             )
             for ratio in (0.0, damping_ratio)
         )

@@ -145,7 +145,7 @@ class Parameter:
                 f"lower = {self.lower:g}, upper = {self.upper:g}, expected "
                 f"{'0 < ' if self.scale == 'log' else _lower_limit_text(least)}lower < upper",
                 None,
-                self.name,
+                where=self.name,
             )
         if (
             self.guess is not None
@@ -154,7 +154,7 @@ class Parameter:
             raise InputError(
                 f"guess = {self.guess:g}, expected a value within [{self.lower:g}, {self.upper:g}]",
                 None,
-                self.name,
+                where=self.name,
             )
         self._require_below_limit(self.upper, "upper")
         if self.prior is not None and not (
@@ -163,7 +163,7 @@ class Parameter:
             raise InputError(
                 f"prior = {self.prior}, expected positive mean and deviation",
                 None,
-                self.name,
+                where=self.name,
             )
 
     def _check_fixed(self) -> None:
@@ -180,7 +180,7 @@ class Parameter:
                 "a number" if least == -np.inf else f"a number >= {least:g}"
             )
             raise InputError(
-                f"fixed = {value:g}, expected {expected}", None, self.name
+                f"fixed = {value:g}, expected {expected}", None, where=self.name
             )
         self._require_below_limit(value, "fixed")
 
@@ -203,7 +203,7 @@ class Parameter:
             raise InputError(
                 f"{what} = {value:g}, expected less than {limit:g}{why}",
                 None,
-                self.name,
+                where=self.name,
             )
 
     def to_coordinate(self, value: float) -> float:
@@ -267,7 +267,7 @@ def complete_parameter(
         raise InputError(
             "there is no guess, and no usual value of it is known; expected guess = a value",
             None,
-            name,
+            where=name,
         )
     # The size of a modulus without a guess follows from the scan.
     size = np.nan if is_modulus(name) else 0.0
@@ -279,7 +279,7 @@ def complete_parameter(
             f"{statement} of a linear parameter does not determine its scale; expected typical, "
             "the size of its changes in a step",
             None,
-            name,
+            where=name,
         )
     try:
         return Parameter(
@@ -287,10 +287,10 @@ def complete_parameter(
             None
             if user_statement.guess is None
             else float(user_statement.guess),
-            low
+            lower=low
             if user_statement.lower is None
             else float(user_statement.lower),
-            high
+            upper=high
             if user_statement.upper is None
             else float(user_statement.upper),
             prior=(0.0, 1.0)
@@ -306,7 +306,7 @@ def complete_parameter(
         ):
             raise
         message = f"{error.message}; where lower or upper is not given, these bounds are assumed"
-        raise InputError(message, None, name) from error
+        raise InputError(message, None, where=name) from error
 
 
 @dataclass(frozen=True)
@@ -329,7 +329,9 @@ class Parameters:
         object.__setattr__(self, "items", tuple(self.items))
         for name, count in Counter(self.names).items():
             if count > 1:
-                raise InputError("given twice, expected one value", None, name)
+                raise InputError(
+                    "given twice, expected one value", None, where=name
+                )
         rooted = [item.name for item in self.items if item.tied is None]
         for item in self.items:
             if item.tied is not None and item.tied.to not in rooted:
@@ -337,7 +339,7 @@ class Parameters:
                     f"tied to {item.tied.to!r}, expected a parameter that is estimated or fixed: "
                     f"{', '.join(rooted)}{hint_at(item.tied.to, rooted)}",
                     None,
-                    item.name,
+                    where=item.name,
                 )
 
     def __repr__(self) -> str:
@@ -576,7 +578,7 @@ class Parameters:
                         "unknown key; expected one of "
                         f"{', '.join(PARAMETER_KEYS)}{hint_at(key, PARAMETER_KEYS)}",
                         None,
-                        name,
+                        where=name,
                     )
                 expected = ", ".join(
                     dict.fromkeys(n for body in bodies for n in body.constants)
@@ -584,7 +586,7 @@ class Parameters:
                 raise InputError(
                     f"no such parameter; the model's are {expected}{hint_at(name, known)}",
                     None,
-                    name,
+                    where=name,
                 )
         used = {name for body in bodies for name in body.used_names(self.names)}
         used |= {item.tied.to for item in self.items if item.tied is not None}
@@ -594,7 +596,7 @@ class Parameters:
                     "no part of the model uses it, because every region has its own value; "
                     "remove it",
                     None,
-                    name,
+                    where=name,
                 )
         for item in self.items:
             stiff = without_region(item.name) in ("mu_pa", "young_pa")
@@ -605,7 +607,7 @@ class Parameters:
             ):
                 what = "a stiffness" if stiff else "a density"
                 raise InputError(
-                    f"fixed = 0, expected {what} above 0", None, item.name
+                    f"fixed = 0, expected {what} above 0", None, where=item.name
                 )
 
 
@@ -615,7 +617,7 @@ def _guess(item: Parameter) -> float:
         raise InputError(
             "it has no guess; expected guess = a value here (solve and check find one)",
             None,
-            item.name,
+            where=item.name,
         )
     return item.guess
 
@@ -687,11 +689,13 @@ class ThetaMap:
         names = self.parameters.names
         body = self.body
         derived_names, _ = _derived_moduli(
-            names, body, self.expression(ca.SX.sym("q", self._theta.input_size))
+            names,
+            body,
+            theta=self.expression(ca.SX.sym("q", self._theta.input_size)),
         )
 
         def values(q: ca.SX, _: ca.SX) -> ca.SX:
-            return _derived_moduli(names, body, self.expression(q))[1]
+            return _derived_moduli(names, body, theta=self.expression(q))[1]
 
         return derived_names, GeneratedFunction(
             values, self._theta.input_size, data_size=0

@@ -173,7 +173,7 @@ class Pointwise(ForceTerm):
         return _LawInputs(
             chosen,
             u,
-            np.broadcast_to(data, (len(data), *y.shape[1:])),
+            data=np.broadcast_to(data, (len(data), *y.shape[1:])),
             velocity_offset=len(y),
             constants_offset=len(y)
             * (2 if self.is_nonlinear_in_velocity else 1),
@@ -548,7 +548,7 @@ def law_function(force: NodeForce, dofs: int) -> GeneratedFunction:
     return GeneratedFunction(
         force.expression,
         force.input_size(dofs),
-        CONTEXT_SIZE,
+        data_size=CONTEXT_SIZE,
         is_compiled=force.is_compiled,
     )
 

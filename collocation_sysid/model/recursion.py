@@ -71,7 +71,7 @@ class Recursion:
             return self.expression(before, now, last, constants, data)
 
         return GeneratedFunction(
-            expression, self.input_offsets[-1], self.data_size
+            expression, self.input_offsets[-1], data_size=self.data_size
         )
 
     def linear_coefficients(self, constants: ca.SX, data: ca.SX) -> ca.SX:

@@ -100,10 +100,13 @@ class Scheme:
 
 STATIC = Stencil(p=(1.0,), q=(0.0,), w=(1.0,), s=(0.0,))
 # Scheme of static experiments: every sample is an equilibrium, independent of the others.
-QUASI_STATIC = Scheme("quasi-static", 1, STATIC, ())
+QUASI_STATIC = Scheme("quasi-static", 1, regular=STATIC, start=())
 # Scheme of static experiments with friction: ν is the displacement since the previous sample.
 SLIDING = Scheme(
-    "sliding", 1, Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(0.0,)), ()
+    "sliding",
+    1,
+    regular=Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(0.0,)),
+    start=(),
 )
 
 BACKWARD_EULER = Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(1.0, -2.0, 1.0))
@@ -117,14 +120,14 @@ _BDF2_VELOCITY = (1.5, -2.0, 0.5)
 SCHEMES: dict[str, Scheme] = {
     # The scheme of the paper. It damps a mode of angular frequency ω with the ratio ωΔt/2.
     "backward-euler": Scheme(
-        "backward-euler", 1, BACKWARD_EULER, (_FIRST_STEP,)
+        "backward-euler", 1, regular=BACKWARD_EULER, start=(_FIRST_STEP,)
     ),
     # Variational midpoint rule (Marsden & West 2001, sec. 2.6): no numerical damping.
     "midpoint": Scheme(
         "midpoint",
         2,
-        MIDPOINT,
-        (
+        regular=MIDPOINT,
+        start=(
             Stencil(
                 p=(0.5, 0.5), q=(1.0, -1.0), w=(0.5,), s=(1.0, -1.0), r=-1.0
             ),
@@ -135,13 +138,13 @@ SCHEMES: dict[str, Scheme] = {
     "bdf2": Scheme(
         "bdf2",
         2,
-        Stencil(
+        regular=Stencil(
             p=(1.0,),
             q=_BDF2_VELOCITY,
             w=(1.0,),
             s=(9 / 4, -24 / 4, 22 / 4, -8 / 4, 1 / 4),
         ),
-        (
+        start=(
             _FIRST_STEP,
             Stencil(
                 p=(1.0,),

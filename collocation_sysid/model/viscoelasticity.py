@@ -85,7 +85,9 @@ def _overstress(
     )
 
 
-OVERSTRESS = Recursion(_overstress, 1, 1, 2, 3)
+OVERSTRESS = Recursion(
+    _overstress, 1, signal_size=1, constant_count=2, data_size=3
+)
 
 
 def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
@@ -97,8 +99,8 @@ def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
     )
 
 
-COEFFICIENTS = GeneratedFunction(_coefficients, 2, 3)
-STIFFENING = GeneratedFunction(_stiffening, 2, 3)
+COEFFICIENTS = GeneratedFunction(_coefficients, 2, data_size=3)
+STIFFENING = GeneratedFunction(_stiffening, 2, data_size=3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +298,7 @@ class MemoryHistory:
             Columns after those evaluations; 0 by default.
         """
         return MemoryForwardColumns(
-            self, by_p(0)[: len(self.theta)], done, known
+            self, by_p(0)[: len(self.theta)], done=done, known=known
         )
 
     def adjoint(self) -> MemoryAdjoint:
@@ -310,7 +312,9 @@ class MemoryHistory:
         overstress = self.previous_variables[-1] + c * self.memory.to_branches(
             self.stress[-1]
         )
-        return MemoryState(self.body, self.theta, self.stress[-1], overstress)
+        return MemoryState(
+            self.body, self.theta, stress=self.stress[-1], overstress=overstress
+        )
 
     @property
     def recursion_residuals(self) -> Array:
@@ -522,7 +526,9 @@ class MemoryState:
         overstress = previous + memory.repeat_over_points(
             c
         ) * memory.to_branches(stress)
-        return MemoryState(self.body, self.theta, stress, overstress)
+        return MemoryState(
+            self.body, self.theta, stress=stress, overstress=overstress
+        )
 
     def _after_interval(self, interval_s: float) -> tuple[Array, Array]:
         """Return e Q − c S (all branches,) [Pa] of the overstress Q and the stress S, and the
@@ -530,7 +536,7 @@ class MemoryState:
         """
         memory = self.body.memory
         share, tau_s = self.theta[[(b.share, b.tau) for b in memory.branches]].T
-        e, c = fading_coefficients(share, tau_s, interval_s)
+        e, c = fading_coefficients(share, tau_s, spacing_s=interval_s)
         borne = memory.to_branches(self.stress)
         return memory.repeat_over_points(
             e

@@ -143,8 +143,8 @@ class Weight(ForceTerm):
         mass = DofMasses(
             _own_kg(body),
             _as_constant_view(tied),
-            air_kg,
-            ADDED_MASS_SHARE * air_kg,
+            displaced_kg=air_kg,
+            added_kg=ADDED_MASS_SHARE * air_kg,
         )
         applied = _as_constant_view(applied.reshape(len(applied), -1))
         return cls(
@@ -161,7 +161,9 @@ class Weight(ForceTerm):
         """Return the weight of a body without gravity, loads and air, at one time."""
         nothing = np.zeros((1, body.pattern.size))
         no_air_kg = nothing[0]
-        mass = DofMasses(_own_kg(body), nothing, no_air_kg, no_air_kg)
+        mass = DofMasses(
+            _own_kg(body), nothing, displaced_kg=no_air_kg, added_kg=no_air_kg
+        )
         return cls(body, mass, np.zeros(3), nothing, False, *_no_loads(nothing))
 
     def with_theta(self, theta: Theta) -> Self:

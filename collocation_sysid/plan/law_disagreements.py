@@ -111,7 +111,9 @@ def find_disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
                 estimates.values()
             ):
                 result.append(
-                    _disagreement(name, estimates, chosen["budget"].get(name))
+                    _disagreement(
+                        name, estimates, budget_line=chosen["budget"].get(name)
+                    )
                 )
     return result
 
@@ -173,4 +175,4 @@ def law_table(differences: Sequence[Disagreement]) -> Table:
             )
         )
     heads = ("", *laws, "spread", "combined interval", "including the law")
-    return Table("Estimates by material law", heads, tuple(rows))
+    return Table("Estimates by material law", heads, rows=tuple(rows))

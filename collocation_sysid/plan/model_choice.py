@@ -177,7 +177,7 @@ def _add_ratios(rows: Sequence[Row]) -> None:
             for name in names
         ]
         row["log_ratio"] = log(row["held_out_rms"] / best["held_out_rms"])
-        row["log_ratio_error"] = _log_ratio_error(row, best, logs)
+        row["log_ratio_error"] = _log_ratio_error(row, best, logs=logs)
 
 
 def _log_ratio_error(row: Row, best: Row, logs: Sequence[float]) -> float:
@@ -537,12 +537,14 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
             return record | {"converged": False, "status": str(error)}
         return record | {
             "evidence": asdict(evidence_from_fit(fit)),
-            "budget": _budget_record(problem, solution, fit),
+            "budget": _budget_record(problem, solution, fit=fit),
         }
     experiment = next(e for e in known.experiments if e.name == test_name)
     # With the scheme that was fitted: what is compared are models, not integrators.
     rollout = simulate_experiment(
-        replace(known, rollout=RolloutOptions("scheme")), experiment, solution
+        replace(known, rollout=RolloutOptions("scheme")),
+        experiment,
+        solution=solution,
     )
     if not isinstance(rollout, ForwardSimulation):
         return record | {"prediction": None, "failure": rollout}
@@ -550,7 +552,9 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
         e for e in problem.experiments if e.name == test_name
     )
     return record | {
-        "prediction": _prediction_error(complete_experiment, rollout, start_s)
+        "prediction": _prediction_error(
+            complete_experiment, rollout, start_s=start_s
+        )
     }
 
 
@@ -564,9 +568,11 @@ def _budget_record(
     options = problem.uncertainty
     parameters = solution.collocation.parameters
     try:
-        known = uncertainty_from_fit(fit, parameters, solution.q, options)
+        known = uncertainty_from_fit(
+            fit, parameters, q=solution.q, error_model=options
+        )
         changes = changes_of_assumptions(
-            solution.collocation, solution.z, options.considered
+            solution.collocation, solution.z, deviations=options.considered
         )
     except (InputError, SimulationError):
         return {}  # without error bars there is none

@@ -66,7 +66,7 @@ def parse_materials(text: str) -> tuple[str, ...]:
     InputError
         For an unknown name, with the most similar known one.
     """
-    return _parse_names(text, MATERIALS, "--materials")
+    return _parse_names(text, MATERIALS, option="--materials")
 
 
 def parse_dampings(text: str) -> tuple[str, ...]:
@@ -77,7 +77,7 @@ def parse_dampings(text: str) -> tuple[str, ...]:
     InputError
         For an unknown name, with the most similar known one.
     """
-    return _parse_names(text, DAMPINGS, "--damping")
+    return _parse_names(text, DAMPINGS, option="--damping")
 
 
 def _parse_names(
@@ -113,7 +113,7 @@ def parse_branches(text: str) -> tuple[int, ...]:
     if not items or len(counts) < len(items) or max(counts) > MOST_BRANCHES:
         expected = f"whole numbers up to {MOST_BRANCHES}, such as 0,1,2"
         raise InputError(
-            f"found {text!r}; expected {expected}", None, "--prony"
+            f"found {text!r}; expected {expected}", None, where="--prony"
         )
     return tuple(dict.fromkeys(counts))
 
@@ -177,7 +177,7 @@ def models(
             f"found the model {compared[0].label} alone; expected two or more to compare, such as "
             f"{example}",
             None,
-            option,
+            where=option,
         )
     return compared
 
@@ -214,7 +214,7 @@ def variants(
     file, _ = read_problem_file(path, overrides)
     content = file.model_dump(mode="json", exclude_unset=True)
     body = content["object"]
-    _require_region(body, region, bool(branches), path)
+    _require_region(body, region, branches=bool(branches), path=path)
     varied = []
     for material, damping, count in product(
         materials or (None,), dampings or (None,), branches or (None,)
@@ -224,14 +224,14 @@ def variants(
         parameters = content["parameters"]
         if material is not None:
             label.append(material)
-            changes |= _law_changes(body, {"material": material}, region)
-            parameters = _with_material(parameters, material, region)
+            changes |= _law_changes(body, {"material": material}, region=region)
+            parameters = _with_material(parameters, material, region=region)
         if damping is not None:
             label.append(damping)
             laws = {"damping": damping} | (
                 {} if material is None else {"material": material}
             )
-            changes |= _law_changes(body, laws, region)
+            changes |= _law_changes(body, laws, region=region)
             for name in DAMPING_ASSUMPTIONS:
                 changes[f"uncertainty.assumptions.{name}"] = "none"
         if count is not None:
@@ -247,18 +247,22 @@ def variants(
                 t for t in body.get("prony", []) if t.get("region") != region
             ]
             tables = _branch_tables(
-                own, count, {t["name"] for t in others}, region
+                own, count, others={t["name"] for t in others}, region=region
             )
             if tables or body.get("prony"):
                 changes["object.prony"] = [*others, *tables]
             old = [each["name"] for each in own]
-            parameters = _with_memory(parameters, old, tables, times_s)
+            parameters = _with_memory(
+                parameters, old, tables=tables, times_s=times_s
+            )
         changes["parameters"] = parameters
         settings = tuple(
             f"{key}={as_inline_toml(value)}" for key, value in changes.items()
         )
         label_text = f"{region}: " * (region is not None) + ", ".join(label)
-        varied.append(ModelVariant(label_text, (*overrides, *settings), path))
+        varied.append(
+            ModelVariant(label_text, (*overrides, *settings), path=path)
+        )
     return varied
 
 
@@ -284,13 +288,15 @@ def file_variants(
     paths = [Path(str(problem.path)) for problem in problems]
     if len({path.resolve() for path in paths}) < len(paths):
         raise InputError(
-            "this file is given twice; expected another", paths[-1], "--with"
+            "this file is given twice; expected another",
+            paths[-1],
+            where="--with",
         )
     stems = [path.stem for path in paths]
     distinct = len(set(stems)) == len(stems)
     return [
         ModelVariant(
-            path.stem if distinct else str(path), tuple(overrides), path
+            path.stem if distinct else str(path), tuple(overrides), path=path
         )
         for path in paths
     ]
@@ -320,9 +326,9 @@ def _require_region(
     names = [each["name"] for each in body.get("region", [])]
     if region is not None and not names:
         message = f"found {region!r}; expected none: it has no regions"
-        raise InputError(message, path, "--region")
+        raise InputError(message, path, where="--region")
     if region is not None:
-        require_among(region, names, path, "--region")
+        require_among(region, names, source=path, where="--region")
     owners = {each.get("region") for each in body.get("prony", [])}
     if branches and owners - {region}:
         other_region = next(iter(owners - {region}))
@@ -339,7 +345,7 @@ def _require_region(
         raise InputError(
             f"found branches of {whose}; expected {expected}",
             path,
-            "object.prony",
+            where="object.prony",
         )
 
 
@@ -390,7 +396,9 @@ def _with_material(
     if region is not None:
         fronts = {f"{region}."}
     for front in sorted(fronts):  # what is shared is first
-        parameters = _with_part_material(parameters, front, material, of_any)
+        parameters = _with_part_material(
+            parameters, front, material=material, of_any=of_any
+        )
     return dict(parameters)
 
 
@@ -483,7 +491,9 @@ def _starting_guess(name: str, shear_pa: float | None) -> dict[str, Any]:
     """
     if shear_pa is None:
         return {}
-    usual = usual_value(name, 2 * (1 + USUAL_POISSON) * shear_pa, USUAL_POISSON)
+    usual = usual_value(
+        name, 2 * (1 + USUAL_POISSON) * shear_pa, poisson=USUAL_POISSON
+    )
     if usual is None:
         return {}
     return (

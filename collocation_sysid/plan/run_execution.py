@@ -77,7 +77,7 @@ def execute(
     while attempts <= retries:
         attempts += 1
         began = time.monotonic()
-        record = _attempt(planned, time_limit_s, is_stopped)
+        record = _attempt(planned, time_limit_s, stopped=is_stopped)
         record["wall_s"] = time.monotonic() - began
         if record["outcome"] != CRASHED:
             break
@@ -109,7 +109,12 @@ def _attempt(
                 start_new_session=True,  # Ctrl-C is for the study, which decides
             )
             try:
-                interruption = _watch(process, planned, time_limit_s, stopped)
+                interruption = _watch(
+                    process,
+                    planned,
+                    time_limit_s=time_limit_s,
+                    is_stopped=stopped,
+                )
             finally:
                 process.kill()
                 process.wait()
@@ -269,7 +274,7 @@ class RunOptions(Options):
                 "the scheduler has workers of its own; state either a scheduler or a number of "
                 "workers",
                 None,
-                "workers",
+                where="workers",
             )
 
 
@@ -328,7 +333,7 @@ def run_all(
         futures = {pool.submit(run): run for run in planned}
         try:
             for future in as_completed(futures):
-                record = _result_record(future, futures[future], options)
+                record = _result_record(future, futures[future], limits=options)
                 if record["outcome"] != STOPPED:
                     store.save(record)
                     on_record(record, pool.worker_count)
@@ -371,7 +376,7 @@ def _thread_executor(limits: RunOptions) -> Iterator[RunExecutor]:
                 execute, run.as_dict(), limits.time_limit_s, stop.is_set
             )
 
-        yield RunExecutor(submit, worker_count, stop.set)
+        yield RunExecutor(submit, worker_count, stop=stop.set)
 
 
 @contextmanager
@@ -391,7 +396,7 @@ def _cluster_executor(limits: RunOptions) -> Iterator[RunExecutor]:
                 )
 
             yield RunExecutor(
-                submit, max(1, sum(client.nthreads().values())), stop.set
+                submit, max(1, sum(client.nthreads().values())), stop=stop.set
             )
 
 
@@ -399,4 +404,6 @@ def _execute_on_worker(
     planned: dict[str, Any], time_limit_s: float | None, flag: str
 ) -> Record:
     """Execute a run on a worker until the event named `flag` is set, and return its record."""
-    return execute(planned, time_limit_s, distributed().Event(flag).is_set)
+    return execute(
+        planned, time_limit_s, is_stopped=distributed().Event(flag).is_set
+    )

@@ -51,7 +51,7 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
         )
         test_name = planned.get("test_name")
         if test_name is not None:
-            fit = fit_record(problem, planned["method"], test_name)
+            fit = fit_record(problem, planned["method"], test_name=test_name)
             return {"outcome": FINISHED, "message": fit["status"], "model": fit}
         finished = run(problem, planned["method"])
         return {

@@ -40,7 +40,7 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
         raise InputError(
             f"found no name; expected some of {', '.join(METHODS)}",
             None,
-            option,
+            where=option,
         )
     for name in names:
         require_method(name, option)
@@ -74,13 +74,13 @@ def read_truth(
     for item in sources:
         source, table = _truth_table(item)
         for name, value in table.items():
-            require_among(name, known_names, source, "--truth")
-            truth[name] = _positive_value(name, value, source)
+            require_among(name, known_names, source=source, where="--truth")
+            truth[name] = _positive_value(name, value, source=source)
     if missing := [name for name in needed if sources and name not in truth]:
         raise InputError(
             f"{', '.join(missing)} missing; expected the true value of every estimated parameter",
             None,
-            "--truth",
+            where="--truth",
         )
     return truth
 
@@ -110,16 +110,18 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
             "there is no such file; expected a TOML file of true values, or name=value such as "
             "mu_pa=300",
             path,
-            "--truth",
+            where="--truth",
         ) from None
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {error}", path, "--truth") from error
+        raise InputError(
+            f"cannot be read: {error}", path, where="--truth"
+        ) from error
     table = content.get("parameters", content)
     if not isinstance(table, Mapping):
         raise InputError(
             "parameters is not a table; expected true values by name",
             path,
-            "--truth",
+            where="--truth",
         )
     return path, table
 
@@ -137,7 +139,7 @@ def _positive_value(name: str, value: Any, source: Path | None) -> float:
         raise InputError(
             f"found {name} = {quoted}; expected a positive number",
             source,
-            "--truth",
+            where="--truth",
         )
     return number
 
@@ -166,13 +168,13 @@ def parse_varied_keys(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
                 f"found {text!r}; expected key=values such as parameters.mu_pa.guess="
                 "50:5000:log:9 or transcription.substeps=1,2,4",
                 None,
-                "--over",
+                where="--over",
             )
         if key in over:
             raise InputError(
                 f"{key} is given twice; put its values in one list",
                 None,
-                "--over",
+                where="--over",
             )
         ranged = ":" in values and not values.startswith(('"', "'", "[", "{"))
         over[key] = tuple(
@@ -180,9 +182,11 @@ def parse_varied_keys(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
         )
     if not over:
         raise InputError(
-            "missing; expected at least one key to sweep over", None, "--over"
+            "missing; expected at least one key to sweep over",
+            None,
+            where="--over",
         )
-    require_few(math.prod(map(len, over.values())), "--over", "runs")
+    require_few(math.prod(map(len, over.values())), "--over", noun="runs")
     return over
 
 
@@ -203,7 +207,7 @@ def require_few(count: int, option: str, noun: str) -> None:
         raise InputError(
             f"asks for {number} {noun}; expected at most {MOST_RUNS:,}",
             None,
-            option,
+            where=option,
         )
 
 
@@ -225,20 +229,20 @@ def _range_values(key: str, text: str) -> Iterable[str]:
         raise InputError(
             f"found {text} for {key}; expected first:last:count or first:last:log:count, {RANGE}",
             None,
-            "--over",
+            where="--over",
         ) from None
-    require_few(number, "--over", f"values of {key}")
+    require_few(number, "--over", noun=f"values of {key}")
     if spacing not in ("log", "lin", "linear"):
         raise InputError(
             f"found the spacing {spacing!r} for {key}; expected log or linear, {RANGE}",
             None,
-            "--over",
+            where="--over",
         )
     if spacing == "log" and not (low > 0 and high > 0):
         raise InputError(
             f"found {text} for {key}; a logarithmic range needs ends above 0",
             None,
-            "--over",
+            where="--over",
         )
     spaced = np.geomspace if spacing == "log" else np.linspace
     # Without the rounding errors of their computation.

@@ -89,7 +89,7 @@ class StudyReport:
         if self.kind == MODEL_STUDY:
             return model_rows(self.planned, self.records)
         return [
-            run_row(run, self.records.get(run.key), self.yardstick)
+            run_row(run, self.records.get(run.key), yardstick=self.yardstick)
             for run in self.planned
         ]
 
@@ -215,7 +215,7 @@ def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
         )
         for number, run in enumerate(planned, start=1)
     )
-    return Table("", ("", "run", "guess", ""), rows, names=4)
+    return Table("", ("", "run", "guess", ""), rows=rows, names=4)
 
 
 # Files --------------------------------------------------------------------------------------------
@@ -240,7 +240,9 @@ def write_report(report: StudyReport, folder: Path) -> None:
     if report.kind == MODEL_STUDY:
         figures = {}
     elif report.kind == METHOD_STUDY:
-        figures = comparison_plots(rows, report.records, report.yardstick)
+        figures = comparison_plots(
+            rows, report.records, yardstick=report.yardstick
+        )
     else:
         figures = sweep_plots(rows, list(report.planned[0].varied_values))
     for name, figure in figures.items():
@@ -342,19 +344,22 @@ def comparison_views(summaries: Sequence[Row]) -> list[Table]:
         cost.remove("evaluations")
     return [
         _table_view(
-            "Success", {"method": _text_cell("method")}, success, summaries
+            "Success",
+            {"method": _text_cell("method")},
+            number_columns=success,
+            rows=summaries,
         ),
         _table_view(
             "Quality",
             {"method": _text_cell("method")},
-            _number_cells(*quality),
-            summaries,
+            number_columns=_number_cells(*quality),
+            rows=summaries,
         ),
         _table_view(
             "Cost",
             {"method": _text_cell("method")},
-            _number_cells(*cost),
-            summaries,
+            number_columns=_number_cells(*cost),
+            rows=summaries,
         ),
     ]
 
@@ -370,7 +375,7 @@ def run_view(rows: Sequence[Row]) -> Table:
         "rms_m", "rollout_rms_m", "iterations", "total_s"
     )
     ordered = sorted(rows, key=lambda row: row["start"])
-    view = _table_view("Runs", names, cells, ordered)
+    view = _table_view("Runs", names, number_columns=cells, rows=ordered)
     return replace(view, heads=tuple(map(_in_words, view.heads)))
 
 
@@ -428,8 +433,15 @@ def sweep_views(rows: Sequence[Row], varied_keys: Sequence[str]) -> list[Table]:
     )
     quality = {"status": _text_cell("status"), **number_columns}
     return [
-        _table_view("Estimates ± standard error", places, estimates, rows),
-        _table_view("Quality and cost", places, quality, rows),
+        _table_view(
+            "Estimates ± standard error",
+            places,
+            number_columns=estimates,
+            rows=rows,
+        ),
+        _table_view(
+            "Quality and cost", places, number_columns=quality, rows=rows
+        ),
     ]
 
 
@@ -437,10 +449,10 @@ def model_views(rows: Sequence[Row]) -> list[Table]:
     """Return tables of fit, prediction and small-strain moduli of every model."""
     factor, unit = display_unit(rows[0]["unit"])
     number_columns: dict[str, Cell] = {
-        "free": _number_cell("free", 1, "d"),
-        f"fit {unit}": _number_cell("rms", factor, ".3g"),
-        "ΔAIC": _number_cell("delta_aic", 1, ".1f"),
-        f"held out {unit}": _number_cell("held_out_rms", factor, ".3g"),
+        "free": _number_cell("free", 1, form="d"),
+        f"fit {unit}": _number_cell("rms", factor, form=".3g"),
+        "ΔAIC": _number_cell("delta_aic", 1, form=".1f"),
+        f"held out {unit}": _number_cell("held_out_rms", factor, form=".3g"),
         "relative to best": lambda row: _ratio_text(row),
         "total s": _number_cell("total_s"),
     }
@@ -448,15 +460,19 @@ def model_views(rows: Sequence[Row]) -> list[Table]:
     names = dict.fromkeys(name for row in rows for name in row["parameters"])
     for name in names:
         moduli[symbol_with_unit(name)] = _number_cell(
-            name, 1, ".4g", "parameters"
+            name, 1, form=".4g", among="parameters"
         )
     model = {
         "": lambda row: "→" if row["chosen"] else "",
         "model": _text_cell("model"),
     }
-    views = [_table_view("Models", model, number_columns, rows)]
+    views = [
+        _table_view("Models", model, number_columns=number_columns, rows=rows)
+    ]
     test_columns = {
-        f"'{n}' {unit}": _number_cell(n, factor, ".3g", "predictions")
+        f"'{n}' {unit}": _number_cell(
+            n, factor, form=".3g", among="predictions"
+        )
         for n in dict.fromkeys(n for r in rows for n in r["predictions"])
     }
     if len(test_columns) > 1:
@@ -464,14 +480,17 @@ def model_views(rows: Sequence[Row]) -> list[Table]:
             _table_view(
                 "Recordings held out",
                 {"model": _text_cell("model")},
-                test_columns,
-                rows,
+                number_columns=test_columns,
+                rows=rows,
             )
         )
     return [
         *views,
         _transposed_view(
-            "Parameters", {"model": _text_cell("model")}, moduli, rows
+            "Parameters",
+            {"model": _text_cell("model")},
+            cells=moduli,
+            rows=rows,
         ),
     ]
 
@@ -498,7 +517,7 @@ def _transposed_view(
     lines = tuple(
         (head, *(cell(row) for row in rows)) for head, cell in cells.items()
     )
-    return Table(title, ("", *(name(row) for row in rows)), lines)
+    return Table(title, ("", *(name(row) for row in rows)), rows=lines)
 
 
 def _ratio_text(row: Row) -> str:
@@ -523,7 +542,7 @@ def _table_view(
     """
     columns = {**names, **number_columns}
     cells = tuple(tuple(cell(row) for cell in columns.values()) for row in rows)
-    return Table(title, tuple(columns), cells, len(names))
+    return Table(title, tuple(columns), rows=cells, names=len(names))
 
 
 def _text_cell(name: str) -> Cell:

@@ -132,7 +132,7 @@ class Starts(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_few(self.starts, "starts", "starts")
+        require_few(self.starts, "starts", noun="starts")
 
     def overrides(
         self, problem: Problem, truth: Mapping[str, float], start: int
@@ -165,7 +165,7 @@ class Starts(Options):
                     "has neither a guess nor a true value around which initial guesses could be "
                     "distributed; expected one, or --starts 1",
                     problem.path,
-                    f"parameters.{item.name}",
+                    where=f"parameters.{item.name}",
                 )
             inside = float(
                 np.clip(centre * self.spread**exponent, item.lower, item.upper)
@@ -225,7 +225,13 @@ def plan_comparison(
         file, _ = read_problem_file(problem.path, start_overrides)
         details = {"start": start, "allow_code": allow_code}
         planned += [
-            _planned_run(problem.path, file, method, start_overrides, **details)
+            _planned_run(
+                problem.path,
+                file,
+                method=method,
+                overrides=start_overrides,
+                **details,
+            )
             for method in methods
         ]
     return planned
@@ -270,10 +276,12 @@ def plan_sweep(
             file, _ = read_problem_file(path, run_overrides)
         except InputError as error:
             where = "--over" if error.source == "--set" else error.source
-            raise InputError(error.message, where, error.where) from error
+            raise InputError(error.message, where, where=error.where) from error
         details = {"varied_values": varied_values, "allow_code": allow_code}
         planned.append(
-            _planned_run(path, file, method, run_overrides, **details)
+            _planned_run(
+                path, file, method=method, overrides=run_overrides, **details
+            )
         )
     return planned
 
@@ -328,7 +336,11 @@ def plan_models(
             details |= {"allow_code": allow_code}
             planned.append(
                 _planned_run(
-                    variant.path, file, method, variant.overrides, **details
+                    variant.path,
+                    file,
+                    method=method,
+                    overrides=variant.overrides,
+                    **details,
                 )
             )
     return planned
@@ -389,7 +401,7 @@ def _planned_run(
     return PlannedRun(
         key,
         str(path.resolve()),
-        method,
+        method=method,
         overrides=tuple(overrides),
         guess=guess,
         **more,

@@ -88,9 +88,11 @@ def comparison_plots(
     ]
     if centre and len({row["start"] for row in done}) > 1:
         figures["success"] = success_by_distance(
-            done, centre, bool(yardstick.truth)
+            done, centre, is_truth_known=bool(yardstick.truth)
         )
-        figures["basins"] = basins(done, centre, bool(yardstick.truth))
+        figures["basins"] = basins(
+            done, centre, is_truth_known=bool(yardstick.truth)
+        )
     return figures
 
 
@@ -137,12 +139,12 @@ def convergence_in_time(
                     alpha=max(0.2, len(runs) ** -0.5),
                     **style,
                 )
-    style_axes(panels[0], "Loss", "time [s]", "Σ (residual / σ)²")
+    style_axes(panels[0], "Loss", xlabel="time [s]", ylabel="Σ (residual / σ)²")
     style_axes(
         panels[1],
         "Violation of the equations of motion",
-        "time [s]",
-        "largest residual [N]",
+        xlabel="time [s]",
+        ylabel="largest residual [N]",
     )
     for axes in panels:
         make_log_axis(axes)
@@ -201,7 +203,10 @@ def success_by_distance(
         )  # fmt: skip
     title = f"Success over distance from the {'true values' if is_truth_known else 'best estimate'}"
     style_axes(
-        axes, title, "factor by which the worst guess is wrong", "success [%]"
+        axes,
+        title,
+        xlabel="factor by which the worst guess is wrong",
+        ylabel="success [%]",
     )
     axes.set_xscale("log")
     axes.set_xticks(edges, [f"{edge:.2g}" for edge in edges])
@@ -252,8 +257,8 @@ def basins(
             style_axes(
                 axes,
                 method if axes is line[0] else "",
-                "",
-                symbol_as_mathtext(second),
+                xlabel="",
+                ylabel=symbol_as_mathtext(second),
             )
     for axes, (first, _) in zip(panels[-1], pairs, strict=True):
         axes.set_xlabel(symbol_as_mathtext(first), fontsize=TEXT_PT)
@@ -310,7 +315,7 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
             if axis == 0
             else ""
         )
-        style_axes(axes, title, "time [s]", f"{letter} [mm]")
+        style_axes(axes, title, xlabel="time [s]", ylabel=f"{letter} [mm]")
         axes.yaxis.set_major_locator(MaxNLocator(5))
     for method, (colour, runs) in _by_method(rows).items():
         best = best_run(runs)
@@ -363,7 +368,7 @@ def estimates_against(
         places, texts = _axis_positions([row[key] for row in rows])
         for line, name in zip(panels, names, strict=True):
             for label, colour, shift, chosen in _groups(
-                rows, varied_keys, key, shorts
+                rows, varied_keys, key=key, shorts=shorts
             ):
                 _draw_estimates(
                     line[column],
@@ -378,8 +383,8 @@ def estimates_against(
             style_axes(
                 line[column],
                 "",
-                "",
-                "" if column else symbol_as_mathtext(name) + unit,
+                xlabel="",
+                ylabel="" if column else symbol_as_mathtext(name) + unit,
             )
         bottom = panels[-1, column]
         bottom.set_xlabel(shorts[key], fontsize=TEXT_PT)

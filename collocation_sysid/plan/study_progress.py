@@ -83,7 +83,7 @@ class StudyProgress(Watched):
         remaining_s = remaining_time_s(
             [run.method for run in self._waiting.values()],
             self._walls,
-            worker_count,
+            worker_count=worker_count,
         )
         return (
             ""

@@ -65,38 +65,46 @@ COLUMNS = {
     "rms_m": NumberColumn(
         "markers mm",
         "markers, RMS [mm]",
-        1e3,
+        factor=1e3,
         from_result=lambda r: r.fit.rms_m,
     ),
     "violation_n": NumberColumn(
         "violation N",
         "equations of motion violated by [N]",
-        1,
-        ".1e",
-        lambda r: r.dynamics.max_violation_n,
+        factor=1,
+        form=".1e",
+        from_result=lambda r: r.dynamics.max_violation_n,
     ),
     "violation_relative": NumberColumn(
         "relative",
         "of the largest force",
-        1,
-        ".1e",
-        lambda r: r.dynamics.max_violation_relative,
+        factor=1,
+        form=".1e",
+        from_result=lambda r: r.dynamics.max_violation_relative,
     ),
     "rollout_rms_m": NumberColumn(
         "forward mm",
         "forward simulation, RMS [mm]",
-        1e3,
+        factor=1e3,
         from_result=lambda r: r.rollout.rms_m,
     ),
     "rollout_max_m": NumberColumn(
         from_result=lambda r: r.rollout.max_m, has_median=False
     ),
-    "tip_max_m": NumberColumn("tip mm", "tip, at most [mm]", 1e3),
+    "tip_max_m": NumberColumn("tip mm", "tip, at most [mm]", factor=1e3),
     "iterations": NumberColumn(
-        "iter.", "iterations", 1, ".4g", lambda r: r.iterations
+        "iter.",
+        "iterations",
+        factor=1,
+        form=".4g",
+        from_result=lambda r: r.iterations,
     ),
     "evaluations": NumberColumn(
-        "evals", "evaluations", 1, ".4g", lambda r: r.evaluations
+        "evals",
+        "evaluations",
+        factor=1,
+        form=".4g",
+        from_result=lambda r: r.evaluations,
     ),
     "build_s": NumberColumn(
         "build s", "set-up [s]", from_result=lambda r: r.timing_s.build
@@ -186,7 +194,7 @@ def run_row(
     result: Result | None = read(Result | None, record.get("result"))
     is_timeout = record["outcome"] == TIMEOUT
     converged = result is not None and result.converged and not is_timeout
-    parameters = _parameter_columns(run, result, yardstick.truth)
+    parameters = _parameter_columns(run, result, truth=yardstick.truth)
     errors = [
         parameters[f"error_{name}"]
         for name in run.guess

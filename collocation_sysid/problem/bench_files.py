@@ -248,7 +248,10 @@ def bench_tables(
             name = table_name(section, layout)
             table = tables.setdefault(name, BenchTable(grasp.poses.t_s, time))
             add_displacement(
-                table, layout, grasp, strain_length_m(layout, experiment.body)
+                table,
+                layout,
+                grasp=grasp,
+                rest_length_m=strain_length_m(layout, experiment.body),
             )
     measured = iter(wrenches)
     for declared, grasp in moved:
@@ -257,5 +260,5 @@ def bench_tables(
             table = tables.setdefault(
                 table_name(section, sensed), BenchTable(at_s, time)
             )
-            add_wrench(table, sensed, at_s, next(measured))
+            add_wrench(table, sensed, at_s=at_s, wrench=next(measured))
     return tables

@@ -183,7 +183,7 @@ class CodeLoader:
                 "--allow-code (allow_code=True from Python) if you trust it"
             )
             raise InputError(message, where=key.rpartition(".")[0])
-        file = existing_file(self.folder, name, key)
+        file = existing_file(self.folder, name, key=key)
         try:
             names = runpy.run_path(str(file))
         except (Exception, SystemExit) as error:

@@ -81,7 +81,9 @@ def problem_arguments(
     with _locate_in_table(path, "object"):
         cells = SpecimenCells(file.object, code)
         if file.recordings:
-            body, size = _load_object(file, folder, code, simulation, say)
+            body, size = _load_object(
+                file, folder, code=code, simulation=simulation, say=say
+            )
             mesh_warnings = [
                 oddity.message for oddity in size_and_density_hypotheses(body)
             ]
@@ -103,7 +105,7 @@ def problem_arguments(
             specimen_reader = SpecimenReader(
                 section,
                 folder,
-                cells.body_for(section.test),
+                body=cells.body_for(section.test),
                 simulation=simulation,
             )
             with _locate_in_table(path, f"experiment '{section.name}'"):
@@ -114,16 +116,16 @@ def problem_arguments(
         reader = RecordingReader(
             section,
             folder,
-            body,
-            parameters,
-            simulation,
-            code,
-            file.environment.air_density_kg_m3,
+            body=body,
+            parameters=parameters,
+            simulation=simulation,
+            code=code,
+            air_density_kg_m3=file.environment.air_density_kg_m3,
             size=size,
             say=say,
         )
         with _locate_in_table(
-            path, f"experiment '{section.name}'", mesh_warnings
+            path, f"experiment '{section.name}'", odd=mesh_warnings
         ):
             experiments.append(reader.read())
         notes += reader.notes
@@ -140,7 +142,7 @@ def problem_arguments(
         "uncertainty": UncertaintyOptions(**file.uncertainty.model_dump()),
         "title": file.title,
         "notes": notes,
-        "origin": Origin(path, text, _named_files(file, folder)),
+        "origin": Origin(path, text, files=_named_files(file, folder)),
     }
 
 
@@ -169,7 +171,7 @@ def _load_object(
     )
     require_feasible(replace(size, substeps=1), None if generated else say)
     body = _load_body(
-        with_guessed_densities(file.object, file.parameters), mesh, code
+        with_guessed_densities(file.object, file.parameters), mesh, code=code
     )
     return body.with_free_densities(
         body.parts_with_free_density(file.parameters)
@@ -234,7 +236,10 @@ def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
         return count_box_elements(section.box_m, length_m)
     if (shape := section.cylinder) is not None:
         return count_cylinder_elements(
-            shape.diameter_m, shape.height_m, length_m, quarter=shape.quarter
+            shape.diameter_m,
+            shape.height_m,
+            edge_length_m=length_m,
+            quarter=shape.quarter,
         )
     return None
 
@@ -327,7 +332,7 @@ def _locate_in_table(
             source = path
             where = separator.join(part for part in (table, inner) if part)
         raise InputError(
-            "; ".join([*odd, error.message]), source, where
+            "; ".join([*odd, error.message]), source, where=where
         ) from error
 
 
@@ -343,12 +348,12 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
         If a file is missing or unusable.
     """
     if section.mesh is not None:
-        file = existing_file(folder, section.mesh, "mesh")
+        file = existing_file(folder, section.mesh, key="mesh")
         return TetMesh.read(file, section.length_unit)
     assert section.edge_length_m is not None  # by the schema
     if section.surface is None:
         return _generate_mesh(section, section.edge_length_m)
-    surface = existing_file(folder, section.surface, "surface")
+    surface = existing_file(folder, section.surface, key="surface")
     cache = folder / ".meshes"
     return TetMesh.from_surface(
         surface, section.edge_length_m, section.length_unit, cache
@@ -363,7 +368,7 @@ def _generate_mesh(section: ObjectSection, edge_length_m: float) -> TetMesh:
         return cylinder_of_edge(
             shape.diameter_m,
             shape.height_m,
-            edge_length_m,
+            edge_length_m=edge_length_m,
             quarter=shape.quarter,
         )
     return box_of_edge(section.box_m or (0.0, 0.0, 0.0), edge_length_m)
@@ -392,7 +397,7 @@ def _lengths_checked(section: ObjectSection) -> Iterator[None]:
         message = (
             f"found {length_m:g} m; expected at most {largest_m:g} m, {likely}"
         )
-        raise InputError(message, None, key) from error
+        raise InputError(message, None, where=key) from error
 
 
 def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
@@ -410,18 +415,18 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
         return (
             None
             if section is None
-            else Field(**declared_in(section, Field, where))
+            else Field(**declared_in(section, Field, where=where))
         )
 
     regions = [
         Region(
             region.name,
             selection_from_section(region.cells),
-            material(region.material, f"region.{k}.material"),
-            region.density_kg_m3,
-            region.damping,
-            branches(region.name) or None,
-            field(region.field, f"region.{k}.field"),
+            material=material(region.material, f"region.{k}.material"),
+            density_kg_m3=region.density_kg_m3,
+            damping=region.damping,
+            prony=branches(region.name) or None,
+            field=field(region.field, f"region.{k}.field"),
         )
         for k, region in enumerate(section.region)
     ]

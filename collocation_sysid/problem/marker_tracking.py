@@ -79,7 +79,7 @@ def transform_to_body_frame(
     if markers.template_m is None or markers.template_window_s is None:
         return table, []
     fit = align_to_template(
-        table, markers.template_m, markers.template_window_s
+        table, markers.template_m, window_s=markers.template_window_s
     )
     names = list(markers.template_m)
     residuals_m = fit.residual_m
@@ -123,7 +123,9 @@ def poses_from_markers(
     reference_m = np.array([grasp.markers[name] for name in names])
     tracks = table.positions_m[:, [table.names.index(name) for name in names]]
     fit = fit_poses(
-        reference_m, tracks, [grasp.weights.get(name, 1.0) for name in names]
+        reference_m,
+        tracks,
+        weights=[grasp.weights.get(name, 1.0) for name in names],
     )
     poses = replace(fit.poses(table.t_s), interpolation=grasp.interpolation)
     first_s, last_s = window_s or (-np.inf, np.inf)
@@ -140,10 +142,10 @@ def poses_from_markers(
             _rigidity_note(
                 names,
                 reference_m,
-                tracks,
-                table.t_s,
-                residual_m,
-                grasp.max_residual_m,
+                tracks=tracks,
+                t_s=table.t_s,
+                residual_m=residual_m,
+                max_residual_m=grasp.max_residual_m,
             )
         )
     return poses, notes

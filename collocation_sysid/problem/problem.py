@@ -176,7 +176,12 @@ class Problem:
 
         path = Path(path)
         contents = problem_arguments(
-            path, overrides, allow_code, simulation, folder, say
+            path,
+            overrides,
+            allow_code=allow_code,
+            simulation=simulation,
+            folder=folder,
+            say=say,
         )
         with located(path):
             return cls(**contents)
@@ -268,10 +273,10 @@ class Problem:
         return Collocation(
             self.experiments,
             self.parameters,
-            self.scheme,
-            self.first_substeps,
-            self.explicit_grasps,
-            self.huber,
+            scheme=self.scheme,
+            substeps=self.first_substeps,
+            has_grasp_constraints=self.explicit_grasps,
+            huber=self.huber,
         )
 
     def solver(self, method: str | Method | None = None) -> Method:

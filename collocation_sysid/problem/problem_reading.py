@@ -64,7 +64,7 @@ def read_problem_file(
     try:
         return ProblemFile.model_validate(content), text
     except ValidationError as error:
-        raise explain_validation_error(error, content, path) from error
+        raise explain_validation_error(error, content, path=path) from error
 
 
 def parse_toml(text: str, path: Path) -> dict[str, Any]:
@@ -85,7 +85,7 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
             raise RecursionError
         return content
     except tomllib.TOMLDecodeError as error:
-        raise _bad_syntax(str(error), text, path) from error
+        raise _bad_syntax(str(error), text, path=path) from error
     except (
         RecursionError,
         ValueError,
@@ -166,7 +166,7 @@ def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
     number = int(matched[1])
     line = excerpt(text.splitlines()[number - 1].strip())
     return InputError(
-        f"not valid TOML: {reason} in: {line}", path, f"line {number}"
+        f"not valid TOML: {reason} in: {line}", path, where=f"line {number}"
     )
 
 
@@ -200,7 +200,7 @@ def _apply_override(content: dict[str, Any], override: str) -> None:
     shared: Any = content.get("experiment_defaults")
     *leading, last = _join_dotted_names(content, parts)
     for depth, part in enumerate(leading):
-        item: Any = _item_key(table, part, key)
+        item: Any = _item_key(table, part, key=key)
         if isinstance(table, dict):
             # An experiment gets a default of its own, a part of which is to be overridden.
             has_default = (
@@ -215,7 +215,7 @@ def _apply_override(content: dict[str, Any], override: str) -> None:
                 else {},
             )
         table = table[item]
-    item = _item_key(table, last, key)
+    item = _item_key(table, last, key=key)
     table[item] = _parse_value(value, key)
 
 

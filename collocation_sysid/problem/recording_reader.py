@@ -128,7 +128,8 @@ class RecordingReader:
             [*map(self._poses, range(len(section.moved_sections)))]
         )
         grasps = [
-            self._grasp(k, sequence, t_s) for k, sequence in enumerate(poses)
+            self._grasp(k, sequence, t_s=t_s)
+            for k, sequence in enumerate(poses)
         ]
         if len(prescribed_dofs(grasps)) == 3 * (n := len(self.body.nodes_m)):
             message = (
@@ -138,7 +139,7 @@ class RecordingReader:
             raise InputError(message, where="grasp")
         loads: dict[str, Any] = {
             name: [
-                self._from_table(kind, word, k)
+                self._from_table(kind, word, k=k)
                 for k in range(len(getattr(section, word)))
             ]
             for name, word, kind in LOADS
@@ -149,7 +150,7 @@ class RecordingReader:
             t_s=t_s,
             grasps=grasps,
             readings=[
-                self._custom_sensor(k, each, t_s)
+                self._custom_sensor(k, each, t_s=t_s)
                 for k, each in enumerate(section.reading)
             ],
             depths=[self._depth(k, t_s) for k in range(len(section.depth))],
@@ -158,7 +159,7 @@ class RecordingReader:
                 section.nuisance, self.code.nuisance_row
             ),
             air_density_kg_m3=self.air_density_kg_m3,
-            **declared_in(section, Experiment, ""),
+            **declared_in(section, Experiment, where=""),
             **loads,
         )
         if section.has_markers and not self.simulation:
@@ -192,7 +193,7 @@ class RecordingReader:
         """Return the path of a file; raise `InputError` if none is named or it does not exist."""
         if name is None:
             raise InputError(f"missing; expected {what}", where=key)
-        return existing_file(self.folder, name, key)
+        return existing_file(self.folder, name, key=key)
 
     def _table_file(self, table: TableSection, key: str) -> Path:
         """Return the existing file of a displacement or a wrench: its own, else that of the
@@ -202,7 +203,7 @@ class RecordingReader:
         return self._require_existing(
             self.section.file_of(table),
             key,
-            "a file here, or a file of the experiment",
+            what="a file here, or a file of the experiment",
         )
 
     @property
@@ -247,9 +248,11 @@ class RecordingReader:
             return PoseSequence.fixed()
         else:
             file = existing_file(
-                self.folder, grasp.poses, self._grasp_key(k, "poses")
+                self.folder, grasp.poses, key=self._grasp_key(k, "poses")
             )
-            poses = read_poses(file, grasp.quaternion, grasp.length_unit)
+            poses = read_poses(
+                file, grasp.quaternion, length_unit=grasp.length_unit
+            )
         if (transform := grasp.gripper_to_body) is not None:
             with located(where=self._grasp_key(k, "gripper_to_body")):
                 transform_pose = PoseSequence(
@@ -270,11 +273,11 @@ class RecordingReader:
             message = "there are no tracks to fit the poses to; expected markers.file, or poses"
             raise InputError(message, where=key)
         _require_known_markers(
-            grasp.markers or (), self._marker_tracks.names, key
+            grasp.markers or (), self._marker_tracks.names, key=key
         )
         with located(where=key):
             poses, notes = poses_from_markers(
-                grasp, self._marker_tracks, self.section.window_s
+                grasp, self._marker_tracks, window_s=self.section.window_s
             )
         self._add_notes(*(f"{key}: {note}" for note in notes))
         return poses
@@ -288,16 +291,18 @@ class RecordingReader:
         if (table := section.displacement) is not None:
             file = self._table_file(table, self._grasp_key(k, "displacement"))
             rest_m = strain_length_m(table, self.body)
-            zero = displaced_axes(file, table.columns, table.axis, rest_m)
+            zero = displaced_axes(
+                file, table.columns, axis=table.axis, length_m=rest_m
+            )
         is_obstacle = isinstance(section, ObstacleSection)
         kind, word = (Obstacle, "force") if is_obstacle else (Grasp, "wrench")
         number = k + 1 - len(self.section.grasp_list)
         defaults = {"name": f"obstacle {number}"} if is_obstacle else {}
         arguments: dict[str, Any] = defaults | declared_in(
-            section, kind, self._grasp_key(k)
+            section, kind, where=self._grasp_key(k)
         )
         wrench = section.wrench and self._wrench(
-            section.wrench, self._grasp_key(k, word), t_s
+            section.wrench, self._grasp_key(k, word), t_s=t_s
         )
         with located(where=self._grasp_key(k)):
             grasp = kind(**arguments, poses=poses, zero=zero, wrench=wrench)
@@ -344,7 +349,7 @@ class RecordingReader:
             samples (one for equilibria) are within the times of the experiment.
         """
         name = self.section.file_of(section)
-        arguments: dict[str, Any] = declared_in(section, Wrench, key)
+        arguments: dict[str, Any] = declared_in(section, Wrench, where=key)
         for sigma in {"sigma_n", "sigma_nm"} & arguments.keys():
             arguments[sigma] /= section.symmetry
         with located(where=key):
@@ -356,7 +361,7 @@ class RecordingReader:
                 )
             at_s, values = self._read_wrench(section, key)
             is_used = is_within_experiment(
-                at_s, t_s, str(name), self._is_static
+                at_s, t_s, name=str(name), is_static=self._is_static
             )
             if self._is_static and not self.section.has_markers:
                 # Between equilibria it would be read off their chord, unless all of it is.
@@ -380,7 +385,7 @@ class RecordingReader:
         key = f"reading.{k}"
         arguments: dict[str, Any] = {
             "name": section.name,
-            **declared_in(section, Gauge, key),
+            **declared_in(section, Gauge, where=key),
         }
         _, arguments["expression"] = self.code.function(
             section.code, section.function, f"{key}.code"
@@ -398,7 +403,7 @@ class RecordingReader:
                 file, section.columns
             )
             is_used = is_within_experiment(
-                at_s, t_s, str(section.file), self._is_static
+                at_s, t_s, name=str(section.file), is_static=self._is_static
             )
             self._add_notes(
                 f"{section.file}: {is_used.sum()} of {len(at_s)} samples are used"
@@ -419,10 +424,17 @@ class RecordingReader:
         section = self.section.depth[k]
         file = self.folder / section.file
         if not file.is_dir():
-            file = existing_file(self.folder, section.file, f"depth.{k}.file")
+            file = existing_file(
+                self.folder, section.file, key=f"depth.{k}.file"
+            )
         unit_m = METRES_PER_UNIT[section.length_unit]
         declared_keys = section.camera.model_fields_set
-        depth_file = read_depth(file, section.count_m, unit_m, declared_keys)
+        depth_file = read_depth(
+            file,
+            section.count_m,
+            length_m=unit_m,
+            known_camera_fields=declared_keys,
+        )
         count = len(depth_file.images_m) or len(depth_file.clouds_m)
         t_s = section.t_s if section.t_s is not None else depth_file.t_s
         if t_s is None and count > 1 and not self._is_static:
@@ -450,11 +462,11 @@ class RecordingReader:
             name: getattr(depth_file, name) for name in names
         }
         camera_arguments |= declared_in(
-            section.camera, DepthCamera, f"{where}.camera"
+            section.camera, DepthCamera, where=f"{where}.camera"
         )
         if section.camera.poses is not None:
             file = existing_file(
-                self.folder, section.camera.poses, f"{where}.camera.poses"
+                self.folder, section.camera.poses, key=f"{where}.camera.poses"
             )
             camera_arguments["poses"] = read_poses(file)
         with located(where=f"{where}.camera"):
@@ -467,7 +479,7 @@ class RecordingReader:
             )
         with located(where=where):
             is_used = is_within_experiment(
-                at_s, t_s, section.file, self._is_static
+                at_s, t_s, name=section.file, is_static=self._is_static
             )
             used = np.flatnonzero(is_used).tolist()
             clouds = (
@@ -485,7 +497,7 @@ class RecordingReader:
                 images.append(image if number in outlined else None)
             arguments = {
                 "name": section.name,
-                **declared_in(section, Depth, where),
+                **declared_in(section, Depth, where=where),
             }
             depth = Depth(
                 t_s=at_s[is_used],
@@ -526,7 +538,7 @@ class RecordingReader:
             if "name" in type(table).model_fields
             else {}
         )
-        arguments = defaults | declared_in(table, kind, where)
+        arguments = defaults | declared_in(table, kind, where=where)
         for name, key in keys_of(kind):
             if (
                 key.constant
@@ -534,7 +546,7 @@ class RecordingReader:
                 and (file_name := getattr(table, key.name))
             ):
                 file = existing_file(
-                    self.folder, file_name, f"{where}.{key.name}"
+                    self.folder, file_name, key=f"{where}.{key.name}"
                 )
                 arguments[name], arguments[key.constant] = key.read(file)
         with located(where=f"{where}.nodes" if "nodes" in arguments else where):
@@ -553,12 +565,12 @@ class RecordingReader:
         if not self.section.has_markers or not self._must_read(markers.file):
             return None
         file = self._require_existing(
-            markers.file, "markers.file", "a file of marker tracks"
+            markers.file, "markers.file", what="a file of marker tracks"
         )
         table = read_marker_tracks(self.section, file)
         self._add_notes(*(f"{markers.file}: {note}" for note in table.notes))
         _require_known_markers(
-            markers.template_m or (), table.names, "markers.template_m"
+            markers.template_m or (), table.names, key="markers.template_m"
         )
         with located(where="markers.template_m"):
             table, notes = transform_to_body_frame(markers, table)
@@ -672,7 +684,9 @@ class RecordingReader:
         markers = self.section.markers
         for key in ("reference_m", "reference_sigma_m", "sigma_m", "weights"):
             if isinstance(by_name := getattr(markers, key), dict):
-                _require_known_markers(by_name, table.names, f"markers.{key}")
+                _require_known_markers(
+                    by_name, table.names, key=f"markers.{key}"
+                )
         unweighted = [
             name for name in table.names if markers.weights.get(name) == 0
         ]
@@ -737,7 +751,10 @@ class RecordingReader:
         ):
             if name is not None and len(t_s) and not static:
                 require_determined_motion(
-                    sequence, t_s, interval_s, self.folder / name
+                    sequence,
+                    t_s,
+                    interval_s=interval_s,
+                    file=self.folder / name,
                 )
         rate_hz = section.resample_hz
         # The files that a simulation writes are thinned when they are read.
@@ -762,11 +779,11 @@ class RecordingReader:
             aligned = align(
                 poses,
                 table,
-                section.window_s,
-                rate_hz,
-                every,
-                grasp_intervals_s,
-                static,
+                window_s=section.window_s,
+                resample_hz=rate_hz,
+                every=every,
+                grasp_intervals_s=grasp_intervals_s,
+                static=static,
             )
         except InputError as error:
             files = dict.fromkeys(
@@ -806,7 +823,7 @@ class RecordingReader:
             return Markers.none(t_s)
         section = self.section.markers
         names = table.names
-        sigma_m = _by_marker(section.sigma_m, names, np.nan)
+        sigma_m = _by_marker(section.sigma_m, names, default=np.nan)
         known_m = section.reference_sigma_m
         if np.isnan(sigma_m).any():
             missing_name = names[int(np.isnan(sigma_m).argmax())]
@@ -814,18 +831,20 @@ class RecordingReader:
                 f"no value for {missing_name!r}; expected one for every marker"
             )
             raise InputError(message, where="markers.sigma_m")
-        arguments: dict[str, Any] = declared_in(section, Markers, "markers")
+        arguments: dict[str, Any] = declared_in(
+            section, Markers, where="markers"
+        )
         return Markers(
             t_s,
             table.positions_m,
-            sigma_m / np.sqrt(_by_marker(section.weights, names, 1.0)),
+            sigma_m / np.sqrt(_by_marker(section.weights, names, default=1.0)),
             names,
             places_m=np.array(
                 [section.reference_m.get(name, [np.nan] * 3) for name in names]
             ),
             places_sigma_m=None
             if known_m is None
-            else _by_marker(known_m, names, np.nan),
+            else _by_marker(known_m, names, default=np.nan),
             **arguments,
         )
 

@@ -159,15 +159,15 @@ def _method_from_table(method: str, table: Any) -> Any:
     where = f"solver.{method}"
     if not isinstance(table, Mapping):
         raise InputError(
-            f"found {table!r}; expected a table of options", None, where
+            f"found {table!r}; expected a table of options", None, where=where
         )
     for name in table:
         owners = _methods_with(name)
         if owners and method not in owners:
             owned = f"{name} is an option of {', '.join(owners)}"
             has = f"{method} has {', '.join(OPTIONS[method])}"
-            raise InputError(f"{owned}; {has}", None, where)
-    return method_from_options(METHODS[method], table, where)
+            raise InputError(f"{owned}; {has}", None, where=where)
+    return method_from_options(METHODS[method], table, key=where)
 
 
 def _methods_with(option: str) -> list[str]:

@@ -63,7 +63,7 @@ class SpecimenReader:
             Names the file and line, or the key within the experiment's table.
         """
         section = self.section
-        file = existing_file(self.folder, section.file, "file")
+        file = existing_file(self.folder, section.file, key="file")
         table = read_specimen(
             file,
             layout_from_section(

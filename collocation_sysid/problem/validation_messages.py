@@ -43,14 +43,16 @@ def explain_validation_error(
     fault = next(
         (f for f in faults if f["type"] == "extra_forbidden"), faults[0]
     )
-    message = _fault_message(fault, with_experiment_defaults(content), root)
-    where = _fault_location(fault, content, root)
-    others = {_fault_location(other, content, root) for other in faults} - {
-        where
-    }
+    message = _fault_message(
+        fault, with_experiment_defaults(content), root=root
+    )
+    where = _fault_location(fault, content, root=root)
+    others = {
+        _fault_location(other, content, root=root) for other in faults
+    } - {where}
     if others:
         message += f" (and {len(others)} more mistakes)"
-    return InputError(message, path, where or None)
+    return InputError(message, path, where=where or None)
 
 
 def _fault_key(fault: Fault, root: type[BaseModel]) -> list[Part]:

@@ -141,7 +141,9 @@ class BlockBand:
             [slab.top_positions + starts[t] for t, slab in enumerate(kinds)]
         )
         self._kinds = kinds
-        self._fill = make_combiner(_make_plan(kinds, starts[:-1], count, adds))
+        self._fill = make_combiner(
+            _make_plan(kinds, starts[:-1], count=count, adds=adds)
+        )
 
     def positions(
         self, times: Index, offset: int, rows: Index, columns: Index
@@ -186,7 +188,7 @@ class BlockBand:
         run_in_slices(
             lambda start, stop: self._fill(start, stop, a, b, values),
             len(self._kinds),
-            threads if len(self._kinds) > 4 * threads else 1,
+            threads=threads if len(self._kinds) > 4 * threads else 1,
         )
 
 
@@ -492,10 +494,12 @@ def skew_block_band(
             block,
             lower_positions=block.full_positions,
             terms=[
-                BlockTerm(t.shift, t.a, t.b if by_velocity else 0.0 * t.b)
+                BlockTerm(t.shift, t.a, b=t.b if by_velocity else 0.0 * t.b)
                 for t in block.terms
             ],
         )
         for block in blocks
     ]
-    return BlockBand(columns, row_starts, own, top_rows, adds=True)
+    return BlockBand(
+        columns, row_starts, blocks=own, top_rows=top_rows, adds=True
+    )

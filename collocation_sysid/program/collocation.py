@@ -165,7 +165,7 @@ class Collocation:
             raise InputError(
                 f"huber = {self.huber:g}, expected a positive number",
                 None,
-                "solver",
+                where="solver",
             )
         self.parameters.require_constants_of(
             {id(s.body): s.body for s in self.transcriptions}.values()
@@ -214,7 +214,7 @@ class Collocation:
         return lift_variables(
             self.transcriptions,
             self.phi_columns.start,
-            LiftedOffsets(self.phi_columns.stop, last.row),
+            offsets=LiftedOffsets(self.phi_columns.stop, last.row),
         )
 
     def with_lifted_variables(self) -> Collocation:
@@ -372,7 +372,10 @@ class Collocation:
         """
         return [
             ExperimentIterate(
-                segment, p[: self.nq], p[segment.nuisance_indices.indices], x
+                segment,
+                p[: self.nq],
+                phi=p[segment.nuisance_indices.indices],
+                x=x,
             )
             for segment, x in zip(self.transcriptions, positions, strict=True)
         ]
@@ -452,7 +455,7 @@ class Collocation:
         ):
             return self, p
         return self._with_associations(
-            [chart for chart, _ in updates], p, [phi for _, phi in updates]
+            [chart for chart, _ in updates], p, phis=[phi for _, phi in updates]
         )
 
     def place_unknown_markers(
@@ -480,7 +483,7 @@ class Collocation:
             for part in self.iterates_at(p, positions)
         ]
         return self._with_associations(
-            [chart for chart, _ in updates], p, [phi for _, phi in updates]
+            [chart for chart, _ in updates], p, phis=[phi for _, phi in updates]
         )
 
     def with_marker_places(self, places_m: Sequence[Array]) -> Collocation:
@@ -496,7 +499,7 @@ class Collocation:
             for s, c in zip(self.transcriptions, charts, strict=True)
         ]
         return self._with_associations(
-            charts, self.guess_p, [s.guess_phi for s in segments]
+            charts, self.guess_p, phis=[s.guess_phi for s in segments]
         )[0]
 
     def _with_associations(

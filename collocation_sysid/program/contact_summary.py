@@ -126,7 +126,7 @@ def friction_summaries(
         if not contact.is_nonlinear_in_velocity:
             continue
         rows = (
-            States(a[None], v[None], dynamics.theta)
+            States(a[None], v[None], theta=dynamics.theta)
             for a, v in zip(xi, nu, strict=True)
         )
         sums = np.concatenate(
@@ -154,7 +154,7 @@ def contact_summaries_of_parts(
     """
     for part in iterates:
         t_s = part.equations.dynamics.t_s[: len(part.x)]
-        yield from contact_summaries(part.segment.experiment, part.x, t_s)
+        yield from contact_summaries(part.segment.experiment, part.x, t_s=t_s)
 
 
 def contact_summaries(

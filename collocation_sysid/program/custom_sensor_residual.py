@@ -138,7 +138,7 @@ class CustomSensorResidual(MeasurementResidual):
             len(self.observable_s),
         )
         times = neighbouring_times(
-            self.observable_s, self.t_s + TIME_TOLERANCE_S, used
+            self.observable_s, self.t_s + TIME_TOLERANCE_S, count=used
         )
         each = np.arange(self.observable.vector_count)
         places = (
@@ -312,6 +312,12 @@ def observed_points(
     body = experiment.body
     points = np.asarray(sensor.points_m)
     names = [f"{sensor.name} {k + 1}" for k in range(len(points))]
-    placement = place_markers(points, body.nodes.points_m, body, names=names)
+    placement = place_markers(
+        points, body.nodes.points_m, body=body, names=names
+    )
     chart = MarkerAssociation.from_exact_places(body, placement, points)
-    return PointPositions(np.arange(rows), chart, np.full((len(points), 3), -1))
+    return PointPositions(
+        np.arange(rows),
+        chart,
+        coordinate_parameters=np.full((len(points), 3), -1),
+    )

@@ -144,7 +144,7 @@ class DepthCameraModel:
 
         def expression(own: ca.SX, data: ca.SX) -> ca.SX:
             values = self.nuisance.values_by_row(own, self.parameter_indices)
-            return self.corrected_expression(data[:3], data[3:], values)
+            return self.corrected_expression(data[:3], data[3:], values=values)
 
         return GeneratedFunction(
             expression, len(self.parameter_indices), data_size=6

@@ -129,7 +129,8 @@ class SurfaceComparison:
             Nuisance parameters.
         """
         shapes_m = residual.surface_shapes(
-            _positions_at_observable(residual, t_s, positions_m), phi
+            _positions_at_observable(residual, t_s, positions_m=positions_m),
+            phi,
         )
         view = residual.correspondences.camera
         body = residual.correspondences.body

@@ -109,7 +109,7 @@ class Outline:
             points = None
             if image_m is not None:
                 points = _outline_points(
-                    camera, surface, shape_m, phi=phi, sample=sample
+                    camera, surface, shape_m=shape_m, phi=phi, sample=sample
                 )
             if image_m is None or points is None:
                 edges.append(_no_edges(corners))
@@ -118,7 +118,7 @@ class Outline:
                 _edges(
                     camera,
                     points,
-                    image_m,
+                    image_m=image_m,
                     phi=phi,
                     gate_m=gate_m,
                     sample=sample,
@@ -359,7 +359,7 @@ def _edges(
     shown = _classify_pixels(
         image_m,
         across,
-        points.depth_m[:, None],
+        depth_m=points.depth_m[:, None],
         gate_m=gate_m,
         is_missing_empty=empty,
     )
@@ -372,7 +372,7 @@ def _edges(
     here = _classify_pixels(
         image_m,
         points.pixels,
-        points.depth_m,
+        depth_m=points.depth_m,
         gate_m=gate_m,
         is_missing_empty=empty,
     )

@@ -100,8 +100,8 @@ class DepthResidual(MeasurementResidual):
         placement = Placement(
             nodes[:, None],
             np.ones((count, 1)),
-            none,
-            len(correspondences.body.nodes_m),
+            distance_m=none,
+            node_count=len(correspondences.body.nodes_m),
         )
         chart = MarkerAssociation.from_exact_places(
             correspondences.body, placement, points_m
@@ -109,7 +109,9 @@ class DepthResidual(MeasurementResidual):
         samples, points = correspondences.is_compared.shape
         return cls(
             observable=PointPositions(
-                np.arange(len(at_s)), chart, np.full((count, 3), -1)
+                np.arange(len(at_s)),
+                chart,
+                coordinate_parameters=np.full((count, 3), -1),
             ),
             nuisance=nuisance,
             huber=HUBER if huber is None else huber,
@@ -153,7 +155,7 @@ class DepthResidual(MeasurementResidual):
             return nearest[:, None]
         used = min(NEIGHBOURS, len(self.observable_s))
         return neighbouring_times(
-            self.observable_s, self.t_s + TIME_TOLERANCE_S, used
+            self.observable_s, self.t_s + TIME_TOLERANCE_S, count=used
         )
 
     @cached_property
@@ -343,8 +345,8 @@ class DepthResidual(MeasurementResidual):
         return PooledResiduals(
             tuple(f"{name} {k + 1}" for k in range(count)),
             np.full(count, self.sigmas[0]),
-            (counts > 0).reshape(len(counts), count, GROUP),
-            places,
+            is_compared=(counts > 0).reshape(len(counts), count, GROUP),
+            places_m=places,
         )
 
     def pool_values(self, values: Array) -> Array:

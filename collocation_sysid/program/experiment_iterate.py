@@ -77,7 +77,7 @@ class ExperimentIterate:
     @cached_property
     def observation(self) -> Observation:
         """Evaluation of the observables of this experiment."""
-        return Observation(self.segment, self.equations, self.phi)
+        return Observation(self.segment, self.equations, phi=self.phi)
 
     @cached_property
     def motion(self) -> ObservedMotion:

@@ -155,7 +155,10 @@ class ExpressionPattern:
         ]
         size = recursion.state_size + recursion.input_offsets[-1]
         return cls.from_arrays(
-            GeneratedFunction(gap, size, recursion.data_size), data, parts, rows
+            GeneratedFunction(gap, size, data_size=recursion.data_size),
+            data,
+            parts,
+            rows,
         )
 
     def _input_values(self, z: Array) -> Array:

@@ -273,7 +273,7 @@ class Factoriser:
         cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto"
     ) -> Factoriser:
         """Return the analysis of a pattern; the last few are cached."""
-        return _cached_analysis(pattern, free.tobytes(), choice)
+        return _cached_analysis(pattern, free.tobytes(), choice=choice)
 
     @cached_property
     def is_banded(self) -> bool:
@@ -369,7 +369,7 @@ class Factoriser:
             If the matrix is singular or not finite.
         """
         skew = skew if skew.any() else NONE
-        skyline_factor = self._factorise_in_skyline(values, skew, buffer)
+        skyline_factor = self._factorise_in_skyline(values, skew, buffer=buffer)
         if skyline_factor:
             return skyline_factor
         if not (np.isfinite(values).all() and np.isfinite(skew).all()):
@@ -377,7 +377,7 @@ class Factoriser:
                 "the matrix has entries that are not finite"
             )
         definite = (
-            self._factorise_in_skyline(values, NONE, buffer)
+            self._factorise_in_skyline(values, NONE, buffer=buffer)
             if skew.size
             else None
         ) or self._factorise_definite(values)
@@ -399,7 +399,9 @@ class Factoriser:
 
         entries = self._signs * skew[self._full_source]
         return _RefinedFactor(
-            definite, self._sparse_matrix(entries), complete_factor
+            definite,
+            self._sparse_matrix(entries),
+            factorise_complete=complete_factor,
         )
 
     def _factorise_definite(self, values: Array) -> Factor | None:
@@ -525,7 +527,7 @@ class Factoriser:
                     *matrix(k), buffers[k] if buffers else None
                 )
 
-        run_in_slices(run, count, threads)
+        run_in_slices(run, count, threads=threads)
         return [factors[k] for k in range(count)]
 
     def _sparse_matrix(self, entries: Array) -> sp.csc_array:
@@ -576,4 +578,6 @@ def _cached_analysis(
     pattern: SymmetricPattern, free: bytes, choice: Choice
 ) -> Factoriser:
     """Return the analysis of a pattern; `free` are the bytes of an array of int64."""
-    return Factoriser(pattern, np.frombuffer(free, dtype=np.int64), choice)
+    return Factoriser(
+        pattern, np.frombuffer(free, dtype=np.int64), choice=choice
+    )

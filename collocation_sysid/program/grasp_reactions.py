@@ -200,8 +200,8 @@ class GraspReactions:
         return GraspReactions(
             grasp_forces,
             self.position_columns * grown,
-            self.rotations.copy(),
-            self.shifts.copy(),
+            rotations=self.rotations.copy(),
+            shifts=self.shifts.copy(),
         )
 
     def wrenches(
@@ -269,5 +269,5 @@ class GraspReactions:
             for channel, grasp in sensors
         ]
         return ReactionForces(
-            reaction, x[at], by, position_slopes[at]
+            reaction, x[at], reaction_by=by, position_by=position_slopes[at]
         ), channels

@@ -117,7 +117,7 @@ def _solve_equilibrium(
             goals_m
             if share == 1
             else _partial_displacement(
-                experiment, without_contact, at_s, share
+                experiment, without_contact, time_s=at_s, share=share
             ).ravel()
         )
         return solver.solve(
@@ -131,11 +131,18 @@ def _solve_equilibrium(
     guess = shape.ravel() if start is None and experiment.obstacles else start
     try:
         return follow_path(
-            solve, without_contact.ravel(), solver.options.max_halvings, guess
+            solve,
+            without_contact.ravel(),
+            halvings=solver.options.max_halvings,
+            guess=guess,
         )
     except NewtonFailure as failure:
         raise simulation_error(
-            solver, failure, at_s, "finding the rest state", static=True
+            solver,
+            failure,
+            time_s=at_s,
+            what="finding the rest state",
+            static=True,
         ) from failure
 
 

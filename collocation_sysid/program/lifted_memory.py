@@ -204,7 +204,7 @@ class LiftedMemory(LiftedVariables):
         for rows in motion_equations(self.segment, self.reactions):
             slopes = np.flatnonzero(rows.row_of_dof[dofs] >= 0)
             entries.append(
-                _MotionEntries(slopes, rows.row_of_dof[dofs[slopes]], rows)
+                _MotionEntries(slopes, rows.row_of_dof[dofs[slopes]], rows=rows)
             )
         return entries
 
@@ -212,7 +212,7 @@ class LiftedMemory(LiftedVariables):
     def _stress_lags(self) -> list[_Lag]:
         """Lags of S_k by x_{k−lag}; the last evaluation has no equation."""
         return self._nonzero_lags(
-            self.segment.dynamics.state_weights, 0, self.shape[0]
+            self.segment.dynamics.state_weights, 0, stop=self.shape[0]
         )
 
     @cached_property
@@ -221,7 +221,7 @@ class LiftedMemory(LiftedVariables):
         return self._nonzero_lags(
             self.segment.dynamics.tables.p,
             self._first_evaluation,
-            self.segment.grid_times,
+            stop=self.segment.grid_times,
         )
 
     @staticmethod
@@ -231,7 +231,7 @@ class LiftedMemory(LiftedVariables):
         """
         columns = enumerate(table.T)
         return [
-            _Lag(lag, max(lag, first), stop, column)
+            _Lag(lag, max(lag, first), stop=stop, factors=column)
             for lag, column in columns
             if column.any()
         ]
@@ -242,7 +242,9 @@ class LiftedMemory(LiftedVariables):
         table = self.segment.dynamics.tables.w
         count = self.segment.grid_times
         lags = [
-            _Lag(j, self._first_evaluation, count - j, table[j:, j])
+            _Lag(
+                j, self._first_evaluation, stop=count - j, factors=table[j:, j]
+            )
             for j in range(table.shape[1])
         ]
         return [each for each in lags if each.factors.any()]

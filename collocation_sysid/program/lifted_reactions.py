@@ -167,7 +167,9 @@ class LiftedReactions(LiftedVariables):
         force[first:] = iterate.forces.force[:, self.sensed_dofs]
         mass_kg = dynamics.mass.inertia_kg[:, self.sensed_dofs]
         rows = z[self.columns] - self._scaled(
-            reaction_forces(dynamics, mass_kg, force, acceleration)
+            reaction_forces(
+                dynamics, mass_kg, force=force, acceleration=acceleration
+            )
         )
         return rows, np.concatenate(
             [by_x, np.ones(self.count), self._scaled(by_p)]

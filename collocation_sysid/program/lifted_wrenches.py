@@ -28,7 +28,7 @@ from .measurement_residual import MeasurementResidual
 from .transcription import RowWeights
 from .wrench_observable import LOW_PASS, MOMENT, GraspWrench
 
-ITSELF = GeneratedFunction(lambda u, _: u, 6, 0)
+ITSELF = GeneratedFunction(lambda u, _: u, 6, data_size=0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,7 +75,9 @@ class LocalLoss:
         return (
             self._constant
             if self._is_quadratic
-            else self._evaluate_at(x, phi, has_observation_curvature)
+            else self._evaluate_at(
+                x, phi, has_observation_curvature=has_observation_curvature
+            )
         )
 
     @property

@@ -120,14 +120,14 @@ def explain_failure(
         )
     try:
         instability = find_stability_loss(
-            experiment, theta, error.state_m, error.time_s
+            experiment, theta, x=error.state_m, time_s=error.time_s
         )
     except (ArpackError, RuntimeError, np.linalg.LinAlgError):
         return error
     if instability is None:
         return error
     explained_error = SimulationError(
-        instability.message, error.time_s, error.element
+        instability.message, error.time_s, element=error.element
     )
     explained_error.stability_loss = instability
     return explained_error
@@ -180,7 +180,9 @@ def find_stability_loss(
     )
     if not reference > 0:
         return None
-    value, shape = _lowest(forces, x, free, SHIFT * reference)
+    value, shape = _lowest(
+        forces, x, free=free, translation_m=SHIFT * reference
+    )
     if not value < LEAST_REDUCTION * reference:
         return None
     nodes = experiment.body.nodes
@@ -191,7 +193,10 @@ def find_stability_loss(
     mode = mode / np.linalg.norm(mode, axis=1).max()
     positions_m = x.reshape(-1, 3)[:own]
     return _on_surface(
-        nodes.points_m, positions_m, mode, experiment.body.mesh.surface
+        nodes.points_m,
+        positions_m,
+        mode=mode,
+        surface=experiment.body.mesh.surface,
     )
 
 

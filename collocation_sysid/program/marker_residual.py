@@ -99,7 +99,9 @@ class MarkerResidual(MeasurementResidual):
         )
         is_compared = markers.is_present & covered[:, None]
         return cls(
-            observable=PointPositions(rows, association, places),
+            observable=PointPositions(
+                rows, association, coordinate_parameters=places
+            ),
             nuisance=nuisance,
             huber=huber,
             names=markers.names,

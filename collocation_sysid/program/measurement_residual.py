@@ -71,14 +71,16 @@ class ResidualExpression:
         nothing is measured.
         """
         return GeneratedFunction(
-            self._residual_expression, self._input_count, self._data_count
+            self._residual_expression,
+            self._input_count,
+            data_size=self._data_count,
         )
 
     @cached_property
     def loss(self) -> GeneratedFunction:
         """Loss Σ ρ of the residual, of the same inputs."""
         return GeneratedFunction(
-            self._loss_expression, self._input_count, self._data_count
+            self._loss_expression, self._input_count, data_size=self._data_count
         )
 
     @property
@@ -314,7 +316,9 @@ class MeasurementResidual(ABC):
         """Groups that statistics use: those of the measurement, unless a subclass combines
         neighbours.
         """
-        return PooledResiduals(self.names, self.sigmas, self.is_compared)
+        return PooledResiduals(
+            self.names, self.sigmas, is_compared=self.is_compared
+        )
 
     def pool_values(self, values: Array) -> Array:
         """Return residuals (S, G, g, …), or their derivatives, as values (S, M, 3, …) of
@@ -556,15 +560,15 @@ class MeasurementResidual(ABC):
             _add_columns(
                 derivatives,
                 entities,
-                first + observable_derivatives.own_parameters,
-                by_observables[:, entities] @ neighbouring,
+                columns=first + observable_derivatives.own_parameters,
+                values=by_observables[:, entities] @ neighbouring,
             )
         if self.own_parameters.size:
             _add_columns(
                 derivatives,
                 np.arange(each),
-                first + self.own_parameters,
-                by_own,
+                columns=first + self.own_parameters,
+                values=by_own,
             )
         grouped = residual.reshape(samples, len(self.names), self.group_size)
         return grouped, derivatives.reshape(*grouped.shape, size)

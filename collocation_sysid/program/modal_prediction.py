@@ -177,7 +177,9 @@ class ModalResponse:
         forces = Forces.from_experiment(
             experiment, experiment.t_s[:1], body.theta_from_values(constants)
         ).only_loads()
-        modes = natural_modes(forces, body.nodes_m, experiment.free_dofs, MODES)
+        modes = natural_modes(
+            forces, body.nodes_m, free_dofs=experiment.free_dofs, count=MODES
+        )
         weighted = modes.shapes * forces.mass.inertia_kg[0, ::3, None]
         omega = modes.angular_frequencies_rad_s
         return cls(
@@ -219,7 +221,7 @@ class ModalResponse:
             scale * self.places_m + swayed / np.maximum(relative_size, 1.0)
         )
         return (
-            delayed_tracks(predictions, declared.t_s, declared.lag_s)
+            delayed_tracks(predictions, declared.t_s, lag_s=declared.lag_s)
             if declared.lag_s
             else predictions
         )

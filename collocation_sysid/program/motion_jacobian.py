@@ -60,7 +60,9 @@ class MotionJacobian:
     @cached_property
     def structure(self) -> BlockBand:
         """Sparsity structure of ∂c/∂x by columns."""
-        return BlockBand(self.pattern.size, self._row_starts, self._blocks())
+        return BlockBand(
+            self.pattern.size, self._row_starts, blocks=self._blocks()
+        )
 
     @cached_property
     def _skew(self) -> BlockBand:
@@ -69,7 +71,7 @@ class MotionJacobian:
         return skew_block_band(
             self.pattern.size,
             self._row_starts,
-            self._blocks(),
+            blocks=self._blocks(),
             by_velocity=has_skew_damping,
         )
 
@@ -106,7 +108,7 @@ class MotionJacobian:
                 BlockTerm(
                     lag - j - self.dynamics.first_row,
                     scale * shifted_back(a, lag),
-                    scale * shifted_back(b, lag),
+                    b=scale * shifted_back(b, lag),
                 )
                 for j, a, b in self.dynamics.block_terms(lag)
             ]

@@ -86,7 +86,7 @@ def natural_modes(
     largest = float((stiffness.diagonal() / mass).max(initial=0.0))
     requested = count + RIGID_MOTIONS
     if len(free_dofs) <= max(DENSE, 3 * requested):
-        squares, vectors = _dense_modes(stiffness, mass, requested)
+        squares, vectors = _dense_modes(stiffness, mass, requested=requested)
     else:
         lower[pattern.diagonal[free_dofs]] += SHIFT * largest * mass
         factor = Factoriser.cached(pattern, free_dofs).factorise(lower)
@@ -106,8 +106,8 @@ def natural_modes(
     return Modes(
         omega / (2 * np.pi),
         drag / (2 * omega),
-        shapes.reshape(-1, pattern.size // 3, 3),
-        int((~oscillating).sum()),
+        shapes=shapes.reshape(-1, pattern.size // 3, 3),
+        omitted_count=int((~oscillating).sum()),
     )
 
 

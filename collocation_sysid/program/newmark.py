@@ -110,7 +110,7 @@ def simulate_newmark(
     SimulationError
         If a step fails even after halvings.
     """
-    stepper = _Stepper(experiment, theta, options)
+    stepper = _Stepper(experiment, theta, options=options)
     times = experiment.t_s
     x, v = (
         np.zeros((len(times), experiment.body.pattern.size)) for _ in range(2)
@@ -168,7 +168,10 @@ class _Stepper:
         solver = self._solver(time_s)
         x, v = initial_state(self.experiment, self._forces(time_s), solver)
         previous_histories = start_states(
-            self._forces(time_s), x, v, self.experiment.loaded_since_s
+            self._forces(time_s),
+            x,
+            v=v,
+            loaded_s=self.experiment.loaded_since_s,
         )
         state = _State(
             time_s,
@@ -178,8 +181,10 @@ class _Stepper:
             previous_histories=previous_histories,
         )
         if self.experiment.obstacles:
-            state = replace(state, contact_n=self._contact_n(x, v, time_s))
-        return self._balanced(state, time_s, solver.free)
+            state = replace(
+                state, contact_n=self._contact_n(x, v, load_s=time_s)
+            )
+        return self._balanced(state, time_s, dofs=solver.free)
 
     def advance(self, state: _State, target_s: float) -> _State:
         """Return the state at `target_s`; where Newton's method fails, in shorter steps.
@@ -205,7 +210,7 @@ class _Stepper:
                 step /= 2
                 if step < smallest:
                     raise simulation_error(
-                        solver, failure, state.t_s, "a Newmark step"
+                        solver, failure, time_s=state.t_s, what="a Newmark step"
                     ) from failure
         return state
 
@@ -247,7 +252,9 @@ class _Stepper:
         total_n = np.zeros_like(x)
         for term in forces.external_terms:
             if isinstance(term, Contact) and not term.is_complementarity:
-                total_n += term.force(States(x[None], v[None], self.theta))[0]
+                total_n += term.force(
+                    States(x[None], v[None], theta=self.theta)
+                )[0]
         return total_n
 
     def _solver(self, time_s: float) -> NewtonSolver:
@@ -273,7 +280,7 @@ class _Stepper:
         if before is after:
             return state
         return self._balanced(
-            state, goal_s, np.setdiff1d(after.free, before.free)
+            state, goal_s, dofs=np.setdiff1d(after.free, before.free)
         )
 
     def _balanced(
@@ -296,12 +303,14 @@ class _Stepper:
         """
         h = end_s - state.t_s
         forces, touching = insert_previous_states(
-            self._forces(load_s, step_s=h), state.previous_histories, h
+            self._forces(load_s, step_s=h),
+            state.previous_histories,
+            interval_s=h,
         ).without_contact()
-        contact = StepContact(touching, self.theta, forces.pattern)
+        contact = StepContact(touching, self.theta, pattern=forces.pattern)
         mass = forces.mass.inertia_kg[0]
         x_prescribed, v_prescribed, a_prescribed = self._prescribed_motion(
-            solver, end_s, h, load_s
+            solver, end_s, step_s=h, holding_s=load_s
         )
         slope = 2.0 / h
         known_v = -slope * state.x - state.v
@@ -359,7 +368,7 @@ class _Stepper:
         contact_n = None
         if contact.acts:
             xi, nu = middle(x)
-            contact_n = self._contact_n(xi[0], nu[0], load_s, step_s=h)
+            contact_n = self._contact_n(xi[0], nu[0], load_s=load_s, step_s=h)
             # Held dofs have the acceleration of the grasp.
             free = solver.free
             a[free] -= (

@@ -161,12 +161,14 @@ class NewtonSolver:
         x = (
             x.copy()
             if prescribed_m is None
-            else self._with_prescribed(x, prescribed_m, linearise)
+            else self._with_prescribed(x, prescribed_m, linearise=linearise)
         )
         self._require_upright(x)
         if not keep_definite:
             # What these lead to without end may be far off: the search then begins where they did.
-            improved, done = self._simplified_newton(x, residual, linearise)
+            improved, done = self._simplified_newton(
+                x, residual, linearise=linearise
+            )
             if done:
                 return improved
         value, *matrix = self._timed(linearise, x)
@@ -204,7 +206,7 @@ class NewtonSolver:
         for _ in range(self.options.max_iterations):
             if self._last_factor is not None:
                 improved, done = self._chord_steps(
-                    x, residual, self._last_factor
+                    x, residual, factor=self._last_factor
                 )
                 if done:
                     return improved, True
@@ -524,6 +526,6 @@ def simulation_error(
         f"{what} failed: {failure.reason}; the worst element has det F = {ratio:.3g}. "
         "Stiffer parameters, a smaller timestep or a finer mesh may help",
         time_s,
-        element,
-        failure.x if static else None,
+        element=element,
+        state_m=failure.x if static else None,
     )

@@ -185,7 +185,9 @@ class PointPositions:
         column 3 node + axis.
         """
         nodes, shape = self.shape_functions(phi)
-        return interpolation_matrix(nodes, shape.weights, self.node_count)
+        return interpolation_matrix(
+            nodes, shape.weights, node_count=self.node_count
+        )
 
     def _interpolate(self, x: Array, nodes: Index, weights: Array) -> Array:
         """Return Σ_a weights[m, a, …] x_a, (R, m, 3, …), at those of the observable's R rows that x
@@ -247,7 +249,7 @@ class PointPositions:
             else motion.changes
         )
         return values, self.derivatives_from(
-            motion.x, self.shape_functions(phi), columns, by
+            motion.x, self.shape_functions(phi), columns=columns, changes=by
         )
 
     def derivatives_from(

@@ -87,10 +87,13 @@ class Observation:
         """
         dynamics = self.equations.dynamics.truncated_to(len(x))
         dofs = self.segment.sensed_dofs
-        force = forces_on_dofs(dynamics, x, dofs, histories)
+        force = forces_on_dofs(dynamics, x, dofs=dofs, histories=histories)
         mass_kg = self._mass_kg[: len(x)]
         reaction = reaction_forces(
-            dynamics, mass_kg, force, dynamics.acceleration(x)[:, dofs]
+            dynamics,
+            mass_kg,
+            force=force,
+            acceleration=dynamics.acceleration(x)[:, dofs],
         )
         return ReactionForces(reaction, x[:, dofs])
 
@@ -188,7 +191,7 @@ class Observation:
 
         at = x if step is None else x + step
         return [
-            ObservedMotion(at, partial(forced, changes), changes)
+            ObservedMotion(at, partial(forced, changes), changes=changes)
             for changes in response.observed_changes
         ]
 
@@ -222,11 +225,17 @@ class Observation:
         acceleration = dynamics.acceleration(x)[:, dofs]
         mass_kg = self._mass_kg[: len(x)]
         reaction = reaction_forces(
-            dynamics, mass_kg, grasp_forces.force, acceleration
+            dynamics,
+            mass_kg,
+            force=grasp_forces.force,
+            acceleration=acceleration,
         )
         at = x[:, dofs]
         by = reaction_changes(
-            dynamics, mass_kg, grasp_forces.changes, changes_m
+            dynamics,
+            mass_kg,
+            force_changes=grasp_forces.changes,
+            position_changes=changes_m,
         )
         if by_p:
             first = 0 if step is None else 1
@@ -234,12 +243,14 @@ class Observation:
                 slice(len(x)), acceleration, dofs
             )
         if step is None:
-            return ReactionForces(reaction, at, by, changes_m)
+            return ReactionForces(
+                reaction, at, reaction_by=by, position_by=changes_m
+            )
         return ReactionForces(
             reaction + by[..., 0],
             at + changes_m[..., 0],
-            by[..., 1:],
-            changes_m[..., 1:],
+            reaction_by=by[..., 1:],
+            position_by=changes_m[..., 1:],
         )
 
     def linearise(
@@ -265,7 +276,7 @@ class Observation:
         segment = self.segment
         size = self.segment.nq + len(self.phi)
         linearisations = []
-        motions = self.linearised_motions(x, response, step)
+        motions = self.linearised_motions(x, response, step=step)
         for reading, motion in zip(segment.residuals, motions, strict=True):
             values_and_slopes = reading.observable.linearise(
                 motion, self.phi, segment.dynamic_parameters, size

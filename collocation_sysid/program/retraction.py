@@ -126,8 +126,8 @@ def _axis(normal: sp.csc_array, prescribed: NDArray[np.bool_]) -> _Axis:
     return _Axis(
         free,
         fixed,
-        splu(sp.csc_matrix(rows[:, free])),
-        sp.csc_array(rows[:, fixed]),
+        factor=splu(sp.csc_matrix(rows[:, free])),
+        coupling=sp.csc_array(rows[:, fixed]),
     )
 
 

@@ -120,7 +120,7 @@ def continue_simulation(
         return np.zeros(
             (0, dynamics.body.pattern.size)
         ) if known is None else known, failure
-    solvers = NewtonSolvers(experiment, options, stopwatch)
+    solvers = NewtonSolvers(experiment, options, stopwatch=stopwatch)
     is_prescribed = ~np.isnan(dynamics.prescribed_m)
     x = np.zeros((dynamics.row_count, dynamics.body.pattern.size))
     v0 = np.zeros(x.shape[1])
@@ -168,7 +168,7 @@ def continue_simulation(
         if not dynamics.is_static:
             guess = extrapolate(x[:t], dynamics.step_s * v0)
         elif approximate_solution is None:
-            guess = _extrapolate_static(x[:t], solver.is_prescribed, goal)
+            guess = _extrapolate_static(x[:t], solver.is_prescribed, goal=goal)
         else:
             guess = approximate_solution[t]
         try:
@@ -179,7 +179,11 @@ def continue_simulation(
             time_s = float(dynamics.t_s[t])
             static = dynamics.is_static
             return x[:t], simulation_error(
-                solver, failure, time_s, f"the step at row {t}", static=static
+                solver,
+                failure,
+                time_s=time_s,
+                what=f"the step at row {t}",
+                static=static,
             )
         forces[t] = row.force(x[t])
         forces[t, dynamics.is_temporarily_prescribed[t]] = 0
@@ -250,7 +254,9 @@ class RowEquations:
         self.forces = dynamics.forces.at_times(slice(t, t + 1))
         if previous:
             self.forces = insert_previous_states(
-                self.forces, previous, float(dynamics.interval_to_next_s[t - 1])
+                self.forces,
+                previous,
+                interval_s=float(dynamics.interval_to_next_s[t - 1]),
             )
         self.forces_before = (
             dynamics.forces.at_times(slice(t - 1, t))
@@ -261,16 +267,20 @@ class RowEquations:
         contacts = []
         if not dynamics.is_static:
             self.rest, contacts = self.forces.without_contact()
-        self.contact = StepContact(contacts, self.rest.theta, self.rest.pattern)
+        self.contact = StepContact(
+            contacts, self.rest.theta, pattern=self.rest.pattern
+        )
         row = self.row
         first = max(0, t - dynamics.largest_lag)
         shape = x.shape[1:]
         past = x[first:t][::-1]
         past_forces = forces[first:t][::-1]
-        self.xi = weighted_sum_of_past(row.p, past, shape)
-        self.nu = weighted_sum_of_past(row.q, past, shape)
-        self.known = weighted_sum_of_past(row.w, past_forces, shape)
-        self.known -= row.mass_kg * weighted_sum_of_past(row.s, past, shape)
+        self.xi = weighted_sum_of_past(row.p, past, shape=shape)
+        self.nu = weighted_sum_of_past(row.q, past, shape=shape)
+        self.known = weighted_sum_of_past(row.w, past_forces, shape=shape)
+        self.known -= row.mass_kg * weighted_sum_of_past(
+            row.s, past, shape=shape
+        )
         self.known -= row.mass_kg * row.r * dynamics.start_velocity_m_s
 
     def with_load_step(self, share: float) -> RowEquations:
@@ -375,4 +385,6 @@ def solve_row(
         start[solver.is_prescribed] = goal
         return solver.solve(start, step.residual, step.linearise)
 
-    return follow_path(solve, previous, solver.options.max_halvings, guess)
+    return follow_path(
+        solve, previous, halvings=solver.options.max_halvings, guess=guess
+    )

@@ -85,7 +85,7 @@ def nuisance_indices(
             first += places[k] == first
             leader = leaders.setdefault((scope, entry.row), experiment)
             if scope is not None:
-                _require_same_objects(leader, experiment, entry.row)
+                _require_same_objects(leader, experiment, row=entry.row)
                 _require_same_prior((of, other), (experiment, entry))
         leader = leaders.get(
             (scopes.get(POSE_TURN.name), POSE_TURN), experiment
@@ -95,7 +95,9 @@ def nuisance_indices(
             if leader is experiment
             else NuisanceMap.from_experiment(leader).pivot_m
         )
-        indices.append(NuisanceIndices(places, places >= before, pivot_m))
+        indices.append(
+            NuisanceIndices(places, places >= before, pivot_m=pivot_m)
+        )
     return indices
 
 
@@ -117,8 +119,8 @@ def _require_same_objects(
             raise _sharing_error(
                 experiment,
                 row,
-                f"'{leader.name}', which has another {entry}",
-                f"the same {entry}",
+                result=f"'{leader.name}', which has another {entry}",
+                expected=f"the same {entry}",
             )
 
 
@@ -145,8 +147,8 @@ def _require_same_prior(
         raise _sharing_error(
             experiment,
             row,
-            difference,
-            f"the same prior as here, {second.sigma:g}",
+            result=difference,
+            expected=f"the same prior as here, {second.sigma:g}",
         )
     if row == PLACE:
         places = [_declared_place(*one), _declared_place(*other)]
@@ -155,8 +157,8 @@ def _require_same_prior(
             raise _sharing_error(
                 experiment,
                 row,
-                difference,
-                "the same position in both, or in neither",
+                result=difference,
+                expected="the same position in both, or in neither",
             )
 
 
@@ -173,7 +175,7 @@ def _sharing_error(
     """Return the error message for a parameter that cannot be shared."""
     key = row.key or row.name
     message = f"{key} is shared with {result}; expected {expected}, or a separate scope"
-    return InputError(message, None, f"experiment '{experiment.name}'")
+    return InputError(message, None, where=f"experiment '{experiment.name}'")
 
 
 def shared_charts(

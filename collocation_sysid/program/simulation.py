@@ -156,7 +156,7 @@ def simulate(
             progress=progress,
         )
     except SimulationError as error:
-        if (reason := explain_failure(experiment, theta, error)) is error:
+        if (reason := explain_failure(experiment, theta, error=error)) is error:
             raise
         raise reason from error
 
@@ -301,7 +301,9 @@ def _with_steps(
         dynamics = Dynamics.from_experiment(
             experiment, integrator, steps
         ).with_theta(theta)
-        grid = simulate_scheme(experiment, dynamics, options, progress)
+        grid = simulate_scheme(
+            experiment, dynamics, options=options, progress=progress
+        )
         x = grid[::steps]
         zeros = np.zeros_like(grid)
         v = (
@@ -310,11 +312,11 @@ def _with_steps(
             else np.gradient(grid, dynamics.step_s, axis=0)[::steps]
         )
         at = ReactionGrid.from_dynamics(dynamics)
-        force = forces_on_dofs(dynamics, grid, sensed)
+        force = forces_on_dofs(dynamics, grid, dofs=sensed)
         mass_kg = dynamics.mass.inertia_kg[:, sensed]
         acceleration = dynamics.acceleration(grid)
         reaction = reaction_forces(
-            dynamics, mass_kg, force, acceleration[:, sensed]
+            dynamics, mass_kg, force=force, acceleration=acceleration[:, sensed]
         )
         forced = ReactionForces(reaction, grid[:, sensed])
     shape = (len(x), -1, 3)
@@ -325,7 +327,7 @@ def _with_steps(
     )
     wrenches = tuple(
         sensor.predict_reactions(forced, np.zeros(ideal.size))
-        for sensor in wrench_residuals(experiment, at, ideal)
+        for sensor in wrench_residuals(experiment, at, nuisance=ideal)
     )
     return Trajectory(
         experiment.t_s,
@@ -335,7 +337,7 @@ def _with_steps(
         reactions=(at, forced),
         wrenches=wrenches,
         custom_sensor_values=_custom_sensor_values(
-            experiment, positions, (at, forced), ideal
+            experiment, positions, reactions=(at, forced), ideal=ideal
         ),
         steps_per_sample=steps,
     )
@@ -360,7 +362,7 @@ def _custom_sensor_values(
         Nuisance map without parameters.
     """
     readings = custom_sensor_residuals(
-        experiment, experiment.t_s, reactions[0], ideal
+        experiment, experiment.t_s, grid=reactions[0], nuisance=ideal
     )
 
     def known_reactions() -> ReactionForces:

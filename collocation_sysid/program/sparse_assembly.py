@@ -91,7 +91,7 @@ class SparseAssembly:
         codes = np.unique(
             np.concatenate([np.zeros(0, dtype=np.int64), *group_codes])
         )
-        before, absent = _locate(structure, height, codes)
+        before, absent = _locate(structure, height, codes=codes)
         own = before + np.cumsum(absent) - absent
         added = own[absent]
         columns = codes[absent] // height

@@ -86,7 +86,7 @@ def _instability(iterate: ExperimentIterate) -> Instability | None:
             growth_rate_1_s(
                 Forces.from_experiment(experiment, time, theta),
                 x,
-                np.flatnonzero(~there),
+                free_dofs=np.flatnonzero(~there),
             )
             for time, x, there in zip(
                 t_s, iterate.x[rows], is_prescribed, strict=True
@@ -100,7 +100,10 @@ def _instability(iterate: ExperimentIterate) -> Instability | None:
         np.inf if experiment.is_static else float(np.trapezoid(growths, t_s))
     )
     return Instability(
-        experiment.name, float(t_s[worst]), float(growths[worst]), e_foldings
+        experiment.name,
+        float(t_s[worst]),
+        growth_1_s=float(growths[worst]),
+        e_foldings=e_foldings,
     )
 
 
@@ -124,7 +127,10 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
     mass = forces.mass.inertia_kg[0, free_dofs]
     pattern = forces.pattern
     lowers = -at.by_position[0], -at.by_velocity[0]
-    if all(_is_definite(lower, pattern, free_dofs, mass) for lower in lowers):
+    if all(
+        _is_definite(lower, pattern, free_dofs=free_dofs, mass=mass)
+        for lower in lowers
+    ):
         return 0.0
     root = sp.diags_array(1 / np.sqrt(mass))
     stiffness, damping = (
@@ -173,7 +179,7 @@ def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
     in_basis = [basis.T @ (each @ basis) for each in (stiffness, damping)]
     exponents = _exponents(*in_basis)
     guess = exponents[np.argmax(exponents.real)]
-    return max(_growth_about(stiffness, damping, float(abs(guess))), 0.0)
+    return max(_growth_about(stiffness, damping, sigma=float(abs(guess))), 0.0)
 
 
 def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
@@ -240,7 +246,7 @@ def _growth_about(
     """Return the largest Re(s) of the exponents s with |s| of about `sigma` [1/s] that solve det(s²
     + D s + K) = 0, for sparse matrices; at least 0.
     """
-    turning = _CayleyTransform(stiffness, damping, sigma)
+    turning = _CayleyTransform(stiffness, damping, sigma=sigma)
     try:
         eigenpairs = eigs(
             turning,

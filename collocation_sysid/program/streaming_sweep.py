@@ -343,7 +343,10 @@ class StreamingSweep:
         )
         self.reactions = state.reactions.copy()
         self.forward = ForwardSubstitution(
-            self.solver, self.columns, state.last_rows, self.reactions.forces
+            self.solver,
+            self.columns,
+            last=state.last_rows,
+            grasp_forces=self.reactions.forces,
         )
         most = (
             (2 * self.model.neighbouring_samples + LARGEST_SAMPLE_DELAY + 2)
@@ -587,7 +590,10 @@ class StreamingSweep:
             length = float(np.abs(row_columns[:, 0]).max(initial=0.0))
             if not length <= limit:
                 self.forward = ForwardSubstitution(
-                    solver, self.columns, before, self.reactions.forces
+                    solver,
+                    self.columns,
+                    last=before,
+                    grasp_forces=self.reactions.forces,
                 )
                 return solved, length
             self.longest_m = max(self.longest_m, length)
@@ -676,7 +682,7 @@ class StreamingSweep:
         """
         if t == 0:
             return self._start_positions(poses)
-        equations = RowEquations(self.dynamics, self.x, self.force, t)
+        equations = RowEquations(self.dynamics, self.x, forces=self.force, t=t)
         goal = self.x[t, self.grasped]
         try:
             return solve_row(
@@ -694,7 +700,9 @@ class StreamingSweep:
         model = self.model
         what = f"the step at row {self.row}"
         time_s = self.row * model.interval_s / model.substeps
-        raise simulation_error(model.newton, failure, time_s, what) from failure
+        raise simulation_error(
+            model.newton, failure, time_s=time_s, what=what
+        ) from failure
 
     # Readings ---------------------------------------------------------------------------------
 
@@ -873,7 +881,7 @@ class StreamingSweep:
             is_present, at_zero[rows_present] + slopes @ self.transformed, 0.0
         )
         rows, slopes = huber_as_least_squares(
-            residual, slopes, self.model.collocation.huber
+            residual, slopes, huber=self.model.collocation.huber
         )
         return known.with_rows(
             rows[is_present], slopes[is_present], self.transformed

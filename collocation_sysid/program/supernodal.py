@@ -123,7 +123,7 @@ class Pardiso:
         columns = np.array(right, dtype=float, order="F")
         result = np.empty_like(columns)
         if columns.size:
-            self._call(SOLVE, columns, result)
+            self._call(SOLVE, columns, result=result)
         return result
 
     def _call(

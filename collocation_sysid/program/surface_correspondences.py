@@ -201,7 +201,9 @@ class SurfaceCorrespondences:
         """
         first = camera.depth.first_sample_with_points
         skin = VisibleSurface.from_body(body, camera.depth)
-        turn, shift_m = align_camera(camera, skin, shapes_m[first], first)
+        turn, shift_m = align_camera(
+            camera, skin, x=shapes_m[first], image=first
+        )
         moved = camera.with_pose(phi, turn, shift_m)
         is_implausible = (
             np.abs(moved[camera.parameter_indices]).max(initial=0.0) > FARTHEST

@@ -384,7 +384,9 @@ class Sweep:
         )
         self.matrix = Submatrix(self.pattern, self.free)
         self.prescribed_block = Submatrix(
-            self.pattern, self.free, transcription.prescribed_motion.dofs
+            self.pattern,
+            self.free,
+            columns=transcription.prescribed_motion.dofs,
         )
         self.of_sensed = Submatrix(self.pattern, self.sensed)
         self._takes = bool(self.dynamics.is_temporarily_prescribed.any())
@@ -428,7 +430,10 @@ class Sweep:
             len(x), len(self.sensed), sweep_columns.count
         )
         march = ForwardSubstitution(
-            self, sweep_columns, known.last if known else None, grasp_forces
+            self,
+            sweep_columns,
+            last=known.last if known else None,
+            grasp_forces=grasp_forces,
         )
         if known is not None:
             done = len(known.step)
@@ -669,7 +674,7 @@ class Sweep:
                 at.by_position_skew,
                 at.by_velocity_skew,
             )
-            yield LinearisedChunk(here, at, list(steps))
+            yield LinearisedChunk(here, at, steps=list(steps))
 
     def _factorise(
         self,
@@ -781,7 +786,7 @@ class ForwardSubstitution:
             for shape in (self.shape, self._of_free, len(solver.free))
         )
         solutions, increments, forces = ((each,) * reach for each in nothing)
-        last = last or ForwardState(solutions, increments, forces)
+        last = last or ForwardState(solutions, increments, forces=forces)
         self.past = deque(last.solutions, maxlen=reach)
         self.past_increments = deque(last.increments, maxlen=reach)
         self.past_forces = deque(last.forces, maxlen=reach)
@@ -861,7 +866,7 @@ class ForwardSubstitution:
                 self.indefinite += not step.factor.positive_definite
                 solution = np.zeros(self.shape) if out is None else out[step.t]
                 with solver.stopwatch.solving():
-                    self.solve_step(step, right, force, solution)
+                    self.solve_step(step, right, force=force, out=solution)
                 complete_steps(StepUnit.TIME_STEP)
                 yield solution
 
@@ -875,7 +880,9 @@ class ForwardSubstitution:
         force = solver.without_prescribed(step.t, step.force[solver.free])
         total = row.w[0] * force - (row.mass_kg * acceleration)[solver.free]
         if self.weighs_past:
-            total += weighted_sum_of_past(row.w, self.past_forces, force.shape)
+            total += weighted_sum_of_past(
+                row.w, self.past_forces, shape=force.shape
+            )
             self.past_forces.appendleft(force)
         return solver.without_prescribed(step.t, total)
 
@@ -905,11 +912,11 @@ class ForwardSubstitution:
         mass = row.mass_kg.take(free)[:, None]
         if self.weighs_past:
             right += weighted_sum_of_past(
-                w, self.past_increments, self._of_free
+                w, self.past_increments, shape=self._of_free
             )
-        right -= mass * weighted_sum_of_past(s, self.past, self.shape).take(
-            free, axis=0
-        )
+        right -= mass * weighted_sum_of_past(
+            s, self.past, shape=self.shape
+        ).take(free, axis=0)
         for each in self.internal_states:
             force = force + each.force_columns()
         forced = force.take(free, axis=0)
@@ -932,7 +939,9 @@ class ForwardSubstitution:
                 partial(self._stencil_sum, row.q, out),
             )
         if self.grasp_forces is not None:
-            self._store_grasp_forces(self.grasp_forces, step, force, out)
+            self._store_grasp_forces(
+                self.grasp_forces, step, force=force, solution=out
+            )
         self.past.appendleft(out)
 
     def _store_grasp_forces(
@@ -974,7 +983,7 @@ class ForwardSubstitution:
         t for the weights p or q.
         """
         return weights[0] * solution + weighted_sum_of_past(
-            weights, self.past, self.shape
+            weights, self.past, shape=self.shape
         )
 
     def _past_force(
@@ -994,9 +1003,9 @@ class ForwardSubstitution:
                 matrix.extract(block, row.skew(i, step.skew, step.rate_skew))
                 @ self.past[i - 1]
             )
-        past = weighted_sum_of_past(row.q, self.past, self.shape)
+        past = weighted_sum_of_past(row.q, self.past, shape=self.shape)
         total = matrix.extract(step.by_velocity, step.rate_skew) @ past
         if any(row.p[1:]):
-            past = weighted_sum_of_past(row.p, self.past, self.shape)
+            past = weighted_sum_of_past(row.p, self.past, shape=self.shape)
             total += matrix.extract(step.by_position, step.skew) @ past
         return total

@@ -200,8 +200,8 @@ class Transcription:
         return wrench_residuals(
             self.experiment,
             ReactionGrid.from_dynamics(self.dynamics),
-            self.nuisance,
-            self.huber,
+            nuisance=self.nuisance,
+            huber=self.huber,
         )
 
     @cached_property
@@ -281,7 +281,10 @@ class Transcription:
             if points and points.vector_count
         )
         return LocalLoss(
-            local, self.variable_count, self.nuisance.size, self.dof_count
+            local,
+            self.variable_count,
+            nuisance_count=self.nuisance.size,
+            dof_count=self.dof_count,
         )
 
     @cached_property
@@ -553,7 +556,7 @@ class Transcription:
     def prescribed_motion(self) -> GraspConstraint:
         """Prescribed displacements of the grasps as a function of φ."""
         return GraspConstraint(
-            self.experiment, self.nuisance, self.dynamics.t_s
+            self.experiment, self.nuisance, t_s=self.dynamics.t_s
         )
 
     def _prescribed_positions(
@@ -678,8 +681,8 @@ class Transcription:
         return inputs_from_experiment(
             self.experiment,
             self.parameters,
-            self.nuisance,
-            self.dynamics.evaluated_s,
+            nuisance=self.nuisance,
+            evaluated_s=self.dynamics.evaluated_s,
         )
 
     def corrected_experiment(self, phi: Array) -> Experiment:
@@ -741,7 +744,7 @@ class Transcription:
             are to be computed from x.
         """
         return self._scaled_constraints(
-            x, equations.dynamics.residual(x, histories), equations
+            x, equations.dynamics.residual(x, histories), equations=equations
         )
 
     def _scaled_constraints(
@@ -848,7 +851,7 @@ class Transcription:
             )
         by_p = by_p[dynamics.first_row :, self.constrained_dofs]
         rows = self._scaled_constraints(
-            x, dynamics.assemble_residual(x, forces.force), equations
+            x, dynamics.assemble_residual(x, forces.force), equations=equations
         )
         return rows, by_p.reshape(
             self.constraint_count, len(self.dynamic_parameters)
@@ -884,7 +887,7 @@ class Transcription:
         if isinstance(reaction_weights, np.ndarray):
             rows = rows + reaction_weights
             forces = forces + dynamics.combine_transposed(t.w, reaction_weights)
-        return RowWeights(multipliers, rows, forces)
+        return RowWeights(multipliers, rows, forces=forces)
 
     def history_vjp(
         self, x: Array, equations: EquationsAtParameters, weights: Array
@@ -939,7 +942,10 @@ class Transcription:
         """
         blocks = self._hessian_blocks(_state_factors)
         return BlockBand(
-            self.dof_count, self._hessian_starts, blocks, top_rows=self.nq
+            self.dof_count,
+            self._hessian_starts,
+            blocks=blocks,
+            top_rows=self.nq,
         )
 
     @cached_property
@@ -949,7 +955,10 @@ class Transcription:
             lambda p, q, pp, qq: (pp * q - qq * p, 0 * q)
         )
         return skew_block_band(
-            self.dof_count, self._hessian_starts, blocks, top_rows=self.nq
+            self.dof_count,
+            self._hessian_starts,
+            blocks=blocks,
+            top_rows=self.nq,
         )
 
     @cached_property
@@ -957,7 +966,11 @@ class Transcription:
         """Structure of `hessian` for adding the contribution of ∂²φ/∂v²."""
         blocks = self._hessian_blocks(lambda p, q, pp, qq: (q * qq, 0 * q))
         return BlockBand(
-            self.dof_count, self._hessian_starts, blocks, self.nq, adds=True
+            self.dof_count,
+            self._hessian_starts,
+            blocks=blocks,
+            top_rows=self.nq,
+            adds=True,
         )
 
     @property

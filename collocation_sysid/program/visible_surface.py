@@ -144,7 +144,7 @@ class VisibleSurface:
             Shape functions of the nodes, points [m], and outward unit normals.
         """
         weights, points, tangents = self._evaluate_tangents(
-            x, faces, barycentric
+            x, faces, barycentric=barycentric
         )
         normals = np.cross(tangents[:, 0], tangents[:, 1])
         normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
@@ -229,7 +229,9 @@ class VisibleSurface:
         optical_axis *= np.sign(optical_axis @ (x.mean(axis=0) - eye_m))
         depths = (x - eye_m) @ optical_axis
         away = (points_m - eye_m) @ optical_axis
-        corners = self.plane_triangles[self.is_facing(x, eye_m, 0.0)]
+        corners = self.plane_triangles[
+            self.is_facing(x, eye_m, minimum_cosine=0.0)
+        ]
         corners = corners[(depths[corners] > 0).all(axis=1)]
         places = ((x - eye_m) @ np.transpose(across) / depths[:, None])[corners]
         projected = (points_m - eye_m) @ np.transpose(across) / away[:, None]
@@ -313,7 +315,7 @@ class VisibleSurface:
         for _ in range(SETTLING):
             # Faces are curved: what is nearest on the flat triangle is beside what is on them.
             _, feet, tangents = self._evaluate_tangents(
-                x, faces[moving], places[moving]
+                x, faces[moving], barycentric=places[moving]
             )
             by_a, by_b = tangents.transpose(1, 0, 2)
             aa, ab, bb = (

@@ -322,7 +322,9 @@ class GraspWrench:
         see `tool_inputs`.
         """
         return GeneratedFunction(
-            self._tool_wrench, len(self.tool_parameters), sum(TOOL_DATA)
+            self._tool_wrench,
+            len(self.tool_parameters),
+            data_size=sum(TOOL_DATA),
         )
 
     def _tool_wrench(self, phi: ca.SX, data: ca.SX) -> ca.SX:
@@ -646,9 +648,11 @@ def _low_pass_step(
 
 
 # Force and torque (6,) of one node, by x_g and R_g; data are Q, o and what is held.
-MOMENT = GeneratedFunction(_moment, 6, 15)
+MOMENT = GeneratedFunction(_moment, 6, data_size=15)
 # W (6,) by a turn and a shift of the frame; data are Q, W and the point in the frame.
-IN_MOVED_FRAME = GeneratedFunction(_in_moved_frame, 6, 18)
+IN_MOVED_FRAME = GeneratedFunction(_in_moved_frame, 6, data_size=18)
 # Of T by the φ of `low_pass_parameters`; data are whether it is the start, and T / Δt of a φ of
 # one.
-LOW_PASS = Recursion(_low_pass_step, 1, 1, 1, 2)
+LOW_PASS = Recursion(
+    _low_pass_step, 1, signal_size=1, constant_count=1, data_size=2
+)

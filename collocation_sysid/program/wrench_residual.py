@@ -77,7 +77,9 @@ class WrenchResidual(MeasurementResidual):
         rows = (SENSOR_TIME, TARE)
         is_compared = (
             wrench.is_measured
-            & _is_covered(observable, wrench.t_s, observable.count)[:, None]
+            & _is_covered(observable, wrench.t_s, known=observable.count)[
+                :, None
+            ]
         )
         return cls(
             observable=observable,
@@ -108,7 +110,7 @@ class WrenchResidual(MeasurementResidual):
         """Return the mask (S,) of the samples for which the first `known` times suffice,
         for any shift of the clock.
         """
-        return _is_covered(self.observable, self.t_s, known)
+        return _is_covered(self.observable, self.t_s, known=known)
 
     def _neighbour_count(self, known: int) -> int:
         """Return the number of grid times that a sample is interpolated from."""
@@ -124,7 +126,7 @@ class WrenchResidual(MeasurementResidual):
         used = self._neighbour_count(known)
         t_s = self.observable.t_s[:known]
         shift_s = (phi[clock] * self.nuisance.scales[clock]).sum()
-        times = neighbouring_times(t_s, self.t_s + shift_s, used)
+        times = neighbouring_times(t_s, self.t_s + shift_s, count=used)
         data = self.observable.t_s[times] - self.t_s[:, None]
         return RowStencil(_vector_indices(times), data.T[..., None])
 

@@ -93,7 +93,10 @@ def align(
     table = table if window_s is None else _cut_to_window(table, window_s)
     grasp_intervals_s = grasp_intervals_s or [(-np.inf, np.inf)] * len(poses)
     table, notes = _cut_to_poses(
-        table, poses, grasp_intervals_s, 1 if static else _FEWEST_SAMPLES
+        table,
+        poses,
+        grasp_intervals_s=grasp_intervals_s,
+        fewest=1 if static else _FEWEST_SAMPLES,
     )
     if every > 1:
         table = MarkerTable(
@@ -114,13 +117,13 @@ def align(
     moved = []
     for k, sequence in enumerate(poses):
         name = "the poses" if len(poses) == 1 else f"the poses of grasp {k + 1}"
-        matched = _poses_on_grid(sequence, t_s, grid)
+        matched = _poses_on_grid(sequence, t_s, grid=grid)
         if matched is None:
             matched = replace(sequence, t_s=unrounded_s(sequence.t_s))
             notes.append(f"{name}{_interpolation_note(matched, grid)}")
         notes += [f"{name}{note}" for note in _jump_notes(matched, grid)]
         moved.append(matched)
-    return AlignedRecording(grid, tuple(moved), table, tuple(notes))
+    return AlignedRecording(grid, tuple(moved), table=table, notes=tuple(notes))
 
 
 def _cut_to_poses(

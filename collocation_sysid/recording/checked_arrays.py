@@ -54,7 +54,9 @@ def float_converter(
     """Return a function that copies values to a read-only array; arguments and errors are those of
     `read_only_floats`.
     """
-    return lambda values: read_only_floats(values, shape, name, finite)
+    return lambda values: read_only_floats(
+        values, shape, name=name, finite=finite
+    )
 
 
 def read_only_tracks(
@@ -78,7 +80,7 @@ def read_only_tracks(
     InputError
         If the values are not numbers, or the shape differs.
     """
-    tracks = read_only_floats(values, shape, name, finite=False)
+    tracks = read_only_floats(values, shape, name=name, finite=False)
     is_complete = np.isfinite(tracks).all(axis=2, keepdims=True)
     tracks = np.where(is_complete, tracks, np.nan)
     tracks.setflags(write=False)

@@ -107,11 +107,11 @@ class Gauge:
     def __post_init__(self) -> None:
         where = f"the reading '{self.name}'"
         points = cast(Sequence[Any], self.points_m)
-        times = read_only_floats(self.t_s, (None,), f"t_s of {where}")
+        times = read_only_floats(self.t_s, (None,), name=f"t_s of {where}")
         points = read_only_floats(
             points if len(points) else np.zeros((0, 3)),
             (None, 3),
-            f"points_m of {where}",
+            name=f"points_m of {where}",
         )
         vars(self).update(t_s=times, points_m=points)
         if fault := first_unordered_time(times):
@@ -156,12 +156,12 @@ class Gauge:
         samples = len(self.sample_times_s)
         if self.values is None:
             return read_only_floats(
-                np.zeros((samples, count)), (None, None), where
+                np.zeros((samples, count)), (None, None), name=where
             )
         columns = np.array(self.values, dtype=float)
         columns = columns[:, None] if columns.ndim == 1 else columns
         values = read_only_floats(
-            columns, (samples, None), f"values of {where}", finite=False
+            columns, (samples, None), name=f"values of {where}", finite=False
         )
         if np.isinf(values).any():
             raise InputError(

@@ -78,7 +78,7 @@ class DepthCamera:
 
     def __post_init__(self) -> None:
         pose = read_only_floats(
-            np.eye(4) if self.pose is None else self.pose, (4, 4), "pose"
+            np.eye(4) if self.pose is None else self.pose, (4, 4), name="pose"
         )
         turn = pose[:3, :3]
         rigid = (
@@ -91,7 +91,7 @@ class DepthCamera:
                 "[[R, p], [0, 0, 0, 1]] from its frame to the world, in metres"
             )
         distortion = read_only_floats(
-            self.distortion, (None,), "distortion of a camera"
+            self.distortion, (None,), name="distortion of a camera"
         )
         if len(distortion) > 5:
             raise InputError(
@@ -99,7 +99,9 @@ class DepthCamera:
             )
         vars(self).update(pose=pose, distortion=distortion)
         if self.matrix is not None:
-            matrix = read_only_floats(self.matrix, (3, 3), "matrix of a camera")
+            matrix = read_only_floats(
+                self.matrix, (3, 3), name="matrix of a camera"
+            )
             lower = matrix[[1, 2, 2, 2], [0, 0, 1, 2]]
             if not (np.diag(matrix) > 0).all() or not np.allclose(
                 lower, [0, 0, 0, 1]
@@ -250,7 +252,7 @@ class Depth:
 
     def __post_init__(self) -> None:
         where = f"the depth camera '{self.name}'"
-        times = read_only_floats(self.t_s, (None,), f"t_s of {where}")
+        times = read_only_floats(self.t_s, (None,), name=f"t_s of {where}")
         if fault := first_unordered_time(times):
             raise InputError(
                 f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}"

@@ -342,7 +342,7 @@ class Experiment:
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         first_share, last_share = (
-            self._share_since(load, change, times)
+            self._share_since(load, change, times=times)
             for change in get_args(LoadTime)
         )
         return first_share - last_share
@@ -565,8 +565,8 @@ class Experiment:
                 is_within_experiment(
                     grasp.wrench.t_s,
                     self.t_s,
-                    "the wrench of a grasp",
-                    self.is_static,
+                    name="the wrench of a grasp",
+                    is_static=self.is_static,
                 )
         for gauge in self.readings:
             what = f"the reading '{gauge.name}'"
@@ -575,7 +575,10 @@ class Experiment:
                     f"two readings are called {gauge.name!r}; expected another name"
                 )
             is_within_experiment(
-                gauge.sample_times_s, self.t_s, what, self.is_static
+                gauge.sample_times_s,
+                self.t_s,
+                name=what,
+                is_static=self.is_static,
             )
             if gauge.grasp is not None and not 1 <= gauge.grasp <= len(
                 self.grasps
@@ -592,7 +595,10 @@ class Experiment:
                     f"two depth cameras are called {depth.name!r}; expected another"
                 )
             is_within_experiment(
-                depth.sample_times_s, self.t_s, what, self.is_static
+                depth.sample_times_s,
+                self.t_s,
+                name=what,
+                is_static=self.is_static,
             )
             distance_s = np.abs(depth.sample_times_s[:, None] - self.t_s).min(
                 axis=1
@@ -682,7 +688,7 @@ class Experiment:
             self._append_obstacle_frames(len(self.start_positions_m))
             for name in ("start_positions_m", "start_velocities_m_s"):
                 read_only_floats(
-                    getattr(self, name), self.body.nodes_m.shape, name
+                    getattr(self, name), self.body.nodes_m.shape, name=name
                 )
         elif has_initial_state:
             raise InputError(

@@ -25,7 +25,10 @@ def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
 
     def refined_load(load):
         return replace(
-            load, nodes=refine_nodes(load.nodes, load.selection, body, finer)
+            load,
+            nodes=refine_nodes(
+                load.nodes, load.selection, body=body, finer=finer
+            ),
         )
 
     placement = place_markers(
@@ -50,10 +53,10 @@ def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
         ),
         markers=replace(markers, placement=placement, places_m=None),
         start_positions_m=_interpolated(
-            experiment.start_positions_m, body, finer
+            experiment.start_positions_m, body, finer=finer
         ),
         start_velocities_m_s=_interpolated(
-            experiment.start_velocities_m_s, body, finer
+            experiment.start_velocities_m_s, body, finer=finer
         ),
     )
 
@@ -66,5 +69,5 @@ def _interpolated(state: Array | None, body: Body, finer: Body) -> Array | None:
         return None
     here_m = finer.nodes.points_m
     there_m = body.nodes.points_m
-    places = place_markers(here_m, there_m, body, "embedded")
+    places = place_markers(here_m, there_m, body=body, attach="embedded")
     return (places.weights[:, :, None] * state[places.nodes]).sum(axis=1)

@@ -67,13 +67,13 @@ class TimeSeries:
             if np.ndim(values) <= len(shape)
             else values
         )
-        rows = read_only_floats(rows, (None, *shape), what)
+        rows = read_only_floats(rows, (None, *shape), name=what)
         if t_s is None and len(rows) != 1:
             raise InputError(
                 f"{len(rows)} rows of {what} without times; expected t_s"
             )
         if t_s is not None:
-            t_s = read_only_floats(t_s, (len(rows),), f"t_s of {what}")
+            t_s = read_only_floats(t_s, (len(rows),), name=f"t_s of {what}")
             if fault := first_unordered_time(t_s):
                 raise InputError(
                     f"{what}: {fault[1]}", where=f"row {fault[0] + 1}"
@@ -187,7 +187,7 @@ class PointMass(Load):
         return mass
 
 
-_TABLE = Key("file", Text | None, read_forces, "force_n")
+_TABLE = Key("file", Text | None, read=read_forces, constant="force_n")
 
 
 @declaration
@@ -229,7 +229,7 @@ class Force(Load):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        course = TimeSeries(self.force_n, self.t_s, "force_n", (3,))
+        course = TimeSeries(self.force_n, self.t_s, what="force_n", shape=(3,))
         vars(self).update(force_n=course.values, t_s=course.t_s)
 
     def node_forces_n(self, t_s: ArrayLike, node_count: int) -> Array:

@@ -54,7 +54,9 @@ class MarkerTable:
         if fault := first_unordered_time(self.t_s):
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
         shape = (len(self.t_s), len(self.names), 3)
-        tracks = read_only_tracks(self.positions_m, shape, "marker positions")
+        tracks = read_only_tracks(
+            self.positions_m, shape, name="marker positions"
+        )
         vars(self)["positions_m"] = tracks
 
 
@@ -153,7 +155,7 @@ def _label_chooser(
     ) -> list[int]:
         _require_distinct(labels, "two markers are labelled")
         for label in renamed:
-            _require_one_of(label, labels, "label")
+            _require_one_of(label, labels, what="label")
         known = [renamed.get(label, label) for label in labels]
         _require_distinct(known, "after renaming two markers are named")
         if names is None:
@@ -175,7 +177,7 @@ def _label_chooser(
                 "no markers are requested; omit the names to use all markers"
             )
         for name in names:
-            _require_one_of(name, known, "marker")
+            _require_one_of(name, known, what="marker")
         _require_distinct(names, "requested more than once: marker")
         index_of = {name: k for k, name in enumerate(known)}
         return [index_of[name] for name in names]
@@ -236,7 +238,7 @@ def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
     declared_rates = {key: rate for key, rate in rates.items() if rate}
     if t_s is not None:
         for key, rate in declared_rates.items():
-            _require_rate(t_s, key, rate)
+            _require_rate(t_s, key, rate_hz=rate)
         return t_s
     if not declared_rates:
         raise InputError(

@@ -30,7 +30,7 @@ UndeformedPlaces = Callable[[Array, Array], Array]
 
 
 Places = Literal["free", "surface"]
-_PLACES = Key("places", Places, lambda word: word == "surface")
+_PLACES = Key("places", Places, read=lambda word: word == "surface")
 
 
 @declaration
@@ -90,7 +90,9 @@ class Markers:
 
     def __post_init__(self) -> None:
         shape = len(self.t_s), None, 3
-        tracks = read_only_tracks(self.positions_m, shape, "marker positions")
+        tracks = read_only_tracks(
+            self.positions_m, shape, name="marker positions"
+        )
         m = tracks.shape[1]
         if self.names is None:
             vars(self)["names"] = tuple(f"m{k}" for k in range(1, m + 1))
@@ -108,7 +110,7 @@ class Markers:
             if self.sigma_m.ndim == 0
             else self.sigma_m
         )
-        sigma_m = read_only_floats(each, (m,), "sigma_m")
+        sigma_m = read_only_floats(each, (m,), name="sigma_m")
         for name, sigma in zip(self.names, sigma_m, strict=True):
             if not sigma > 0:
                 raise InputError(
@@ -141,7 +143,7 @@ class Markers:
         if placement is None:
             places_m = np.full((m, 3), np.nan) if places_m is None else places_m
             places_m = read_only_floats(
-                places_m, (m, 3), "places_m", finite=False
+                places_m, (m, 3), name="places_m", finite=False
             )
             known = np.isfinite(places_m).all(axis=1)
         vars(self).update(
@@ -152,7 +154,7 @@ class Markers:
             each = self.places_sigma_m
             each = np.broadcast_to(each, m) if each.ndim == 0 else each
             sigma_m = read_only_floats(
-                each, (m,), "places_sigma_m", finite=False
+                each, (m,), name="places_sigma_m", finite=False
             )
             vars(self)["places_sigma_m"] = sigma_m
 

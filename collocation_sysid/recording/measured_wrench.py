@@ -80,7 +80,7 @@ class Wrench:
             raise InputError("a wrench without samples; expected at least one")
         shape = len(self.t_s), 6
         values = read_only_floats(
-            self.values, shape, "values of the wrench", finite=False
+            self.values, shape, name="values of the wrench", finite=False
         )
         vars(self)["values"] = values
         if fault := first_unordered_time(self.t_s):

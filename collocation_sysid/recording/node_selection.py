@@ -91,7 +91,7 @@ def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:
         if isinstance(selection, Selection):
             return selection
         nodes = np.unique(
-            read_only_nodes(selection, (None,), f"nodes of {what}")
+            read_only_nodes(selection, (None,), name=f"nodes of {what}")
         )
         if nodes.size == 0:
             raise InputError(

@@ -262,7 +262,7 @@ def _hand_eye_sharing_key(experiment: Any) -> dict[str, Any]:
 PLACE = NuisanceRow(
     "marker_offset_m",
     "m",
-    1e-3,
+    sigma=1e-3,
     key="marker_offsets",
     of="place",
     axes="x y z",
@@ -277,7 +277,7 @@ PLACE = NuisanceRow(
 OFFSET = NuisanceRow(
     "camera_offset_m",
     "m",
-    None,
+    sigma=None,
     key="camera_offsets",
     of="marker",
     axes="x y z",
@@ -291,7 +291,7 @@ OFFSET = NuisanceRow(
 CALIBRATION_SCALE = NuisanceRow(
     "calibration_scale",
     "1",
-    None,
+    sigma=None,
     key="calibration_scale",
     considered=2e-3,
     label="scale of the cameras",
@@ -303,7 +303,7 @@ CALIBRATION_SCALE = NuisanceRow(
 CALIBRATION_DISTORTION = NuisanceRow(
     "calibration_distortion_1_m2",
     "1/m²",
-    None,
+    sigma=None,
     key="calibration_distortion",
     considered=0.02,
     applies=_has_markers,
@@ -315,7 +315,7 @@ CALIBRATION_DISTORTION = NuisanceRow(
 TIME = NuisanceRow(
     "time_shift_s",
     "s",
-    5e-3,
+    sigma=5e-3,
     key="time_shift",
     changes=("clock",),
     applies=_is_motion,
@@ -328,7 +328,7 @@ TIME = NuisanceRow(
 CLOCK_RATE = NuisanceRow(
     "clock_rate",
     "1",
-    None,
+    sigma=None,
     key="clock_rate",
     considered=1e-4,
     changes=("clock",),
@@ -343,7 +343,7 @@ CLOCK_RATE = NuisanceRow(
 POSE_TURN = NuisanceRow(
     "pose_turn_rad",
     "rad",
-    None,
+    sigma=None,
     key="pose",
     axes="x y z",
     changes=("reading", "gravity"),
@@ -357,7 +357,7 @@ POSE_TURN = NuisanceRow(
 POSE_SHIFT = NuisanceRow(
     "pose_shift_m",
     "m",
-    None,
+    sigma=None,
     key="pose",
     axes="x y z",
     reach=UNLIMITED_REACH,
@@ -370,7 +370,7 @@ POSE_SHIFT = NuisanceRow(
 TILT = NuisanceRow(
     "gravity_rad",
     "rad",
-    DEGREE,
+    sigma=DEGREE,
     key="gravity",
     axes="first second",
     changes=("gravity",),
@@ -384,7 +384,7 @@ TILT = NuisanceRow(
 GRASP_TURN = NuisanceRow(
     "hand_eye_rad",
     "rad",
-    0.5 * DEGREE,
+    sigma=0.5 * DEGREE,
     key="hand_eye",
     axes="x y z",
     changes=("grasps",),
@@ -398,7 +398,7 @@ GRASP_TURN = NuisanceRow(
 GRASP_SHIFT = NuisanceRow(
     "hand_eye_m",
     "m",
-    1e-3,
+    sigma=1e-3,
     key="hand_eye",
     axes="x y z",
     changes=("grasps",),
@@ -413,7 +413,7 @@ GRASP_SHIFT = NuisanceRow(
 STRAIN_ZERO = NuisanceRow(
     "strain_zero",
     "1",
-    None,
+    sigma=None,
     key="strain_zero",
     changes=("grasps",),
     applies=lambda experiment: experiment.specimen is not None,
@@ -424,7 +424,7 @@ STRAIN_ZERO = NuisanceRow(
 ZERO = NuisanceRow(
     "displacement_zero_m",
     "m",
-    1e-4,
+    sigma=1e-4,
     key="displacement_zero",
     of="grasp",
     axes="x y z",
@@ -437,7 +437,7 @@ ZERO = NuisanceRow(
 OBSTACLE_OFFSET = NuisanceRow(
     "obstacle_offset_m",
     "m",
-    1e-4,
+    sigma=1e-4,
     key="obstacle",
     of="obstacle",
     changes=("grasps",),
@@ -451,7 +451,7 @@ OBSTACLE_OFFSET = NuisanceRow(
 OBSTACLE_TILT = NuisanceRow(
     "obstacle_tilt_rad",
     "rad",
-    None,
+    sigma=None,
     key="obstacle",
     of="obstacle",
     axes="first second",
@@ -469,7 +469,7 @@ OBSTACLE_TILT = NuisanceRow(
 OBSTACLE_TIME = NuisanceRow(
     "obstacle_time_s",
     "s",
-    None,
+    sigma=None,
     key="obstacle",
     of="obstacle",
     changes=("grasps",),
@@ -485,7 +485,7 @@ OBSTACLE_TIME = NuisanceRow(
 TENSION_FACTOR = NuisanceRow(
     "tension_factor",
     "1",
-    None,
+    sigma=None,
     key="tension_factor",
     of="tendon",
     changes=("drives",),
@@ -496,7 +496,7 @@ TENSION_FACTOR = NuisanceRow(
 TENSION_OFFSET = NuisanceRow(
     "tension_lost_n",
     "N",
-    None,
+    sigma=None,
     key="tension_lost",
     of="tendon",
     changes=("drives",),
@@ -507,7 +507,7 @@ TENSION_OFFSET = NuisanceRow(
 PRESSURE_FACTOR = NuisanceRow(
     "pressure_factor",
     "1",
-    None,
+    sigma=None,
     key="pressure_factor",
     of="pressure",
     changes=("drives",),
@@ -518,7 +518,7 @@ PRESSURE_FACTOR = NuisanceRow(
 PRESSURE_OFFSET = NuisanceRow(
     "pressure_lost_pa",
     "Pa",
-    None,
+    sigma=None,
     key="pressure_lost",
     of="pressure",
     changes=("drives",),
@@ -529,7 +529,7 @@ PRESSURE_OFFSET = NuisanceRow(
 PRESSURE_LAG = NuisanceRow(
     "pressure_lag",
     "1",
-    None,
+    sigma=None,
     key="pressure_lag",
     of="pressure",
     changes=("drives",),
@@ -541,7 +541,7 @@ PRESSURE_LAG = NuisanceRow(
 JOINING = NuisanceRow(
     "joining_s",
     "s",
-    1e-2,
+    sigma=1e-2,
     key="joining",
     of="load",
     changes=("loads",),
@@ -554,7 +554,7 @@ JOINING = NuisanceRow(
 TARE = NuisanceRow(
     "tare",
     "σ",
-    10.0,
+    sigma=10.0,
     key="tare",
     of="sensor",
     changes=("sensor",),
@@ -567,7 +567,7 @@ TARE = NuisanceRow(
 SENSOR_TIME = NuisanceRow(
     "sensor_time_s",
     "s",
-    5e-3,
+    sigma=5e-3,
     key="sensor_time",
     of="sensor",
     changes=("sensor",),
@@ -582,7 +582,7 @@ SENSOR_TIME = NuisanceRow(
 SENSOR_LAG = NuisanceRow(
     "sensor_lag_s",
     "s",
-    None,
+    sigma=None,
     key="sensor_lag",
     of="sensor",
     changes=("sensor",),
@@ -598,7 +598,7 @@ SENSOR_LAG = NuisanceRow(
 TOOL_MASS = NuisanceRow(
     "tool_kg",
     "kg",
-    None,
+    sigma=None,
     key="tool",
     of="sensor",
     changes=("sensor",),
@@ -611,7 +611,7 @@ TOOL_MASS = NuisanceRow(
 TOOL_CENTRE = NuisanceRow(
     "tool_m",
     "m",
-    None,
+    sigma=None,
     key="tool",
     of="sensor",
     axes="x y z",
@@ -627,7 +627,7 @@ TOOL_CENTRE = NuisanceRow(
 DEPTH_TURN = NuisanceRow(
     "depth_turn_rad",
     "rad",
-    5 * DEGREE,
+    sigma=5 * DEGREE,
     key="depth_pose",
     of="depth",
     axes="x y z",
@@ -645,7 +645,7 @@ DEPTH_TURN = NuisanceRow(
 DEPTH_SHIFT = NuisanceRow(
     "depth_shift_m",
     "m",
-    0.02,
+    sigma=0.02,
     key="depth_pose",
     of="depth",
     axes="x y z",
@@ -665,7 +665,7 @@ DEPTH_SHIFT = NuisanceRow(
 DEPTH_BIAS = NuisanceRow(
     "depth_bias_m",
     "m",
-    5e-3,
+    sigma=5e-3,
     key="depth_bias",
     of="depth",
     changes=("depth",),
@@ -682,7 +682,7 @@ DEPTH_BIAS = NuisanceRow(
 DEPTH_SCALE = NuisanceRow(
     "depth_scale",
     "1",
-    5e-3,
+    sigma=5e-3,
     key="depth_scale",
     of="depth",
     changes=("depth",),
@@ -698,7 +698,7 @@ DEPTH_SCALE = NuisanceRow(
 DEPTH_TIME = NuisanceRow(
     "depth_time_s",
     "s",
-    5e-3,
+    sigma=5e-3,
     key="depth_time",
     of="depth",
     changes=("depth",),
@@ -715,7 +715,7 @@ DEPTH_TIME = NuisanceRow(
 DEPTH_EDGE = NuisanceRow(
     "depth_edge_px",
     "px",
-    2.0,
+    sigma=2.0,
     key="depth_edge",
     of="depth",
     changes=("depth",),
@@ -733,7 +733,7 @@ DEPTH_EDGE = NuisanceRow(
 # In the order of φ; neighbours of one component stand together.
 KINDS = tuple(row for row in [*vars().values()] if isinstance(row, NuisanceRow))
 # What a `Gauge` does not know of itself: it has the deviations, in place of `Nuisance`.
-GAUGE = NuisanceRow("reading", "", None, of="gauge", changes=())
+GAUGE = NuisanceRow("reading", "", sigma=None, of="gauge", changes=())
 
 
 @dataclass(frozen=True, kw_only=True)

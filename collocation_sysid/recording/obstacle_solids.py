@@ -146,7 +146,8 @@ class Sphere(Solid):
     def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
         """Return three circles, one across each axis; both arguments are ignored."""
         return [
-            _circle(self.centre_m, axis, self.radius_m) for axis in np.eye(3)
+            _circle(self.centre_m, axis, radius_m=self.radius_m)
+            for axis in np.eye(3)
         ]
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
@@ -182,7 +183,9 @@ class _AxialSolid(Solid):
         ignored.
         """
         axis = np.diff(self.ends_m, axis=0)[0]
-        first, last = (_circle(end, axis, self.radius_m) for end in self.ends_m)
+        first, last = (
+            _circle(end, axis, radius_m=self.radius_m) for end in self.ends_m
+        )
         quarters = range(0, len(first) - 1, (len(first) - 1) // 4)
         return [first, last, *(np.array([first[k], last[k]]) for k in quarters)]
 

@@ -54,17 +54,17 @@ class Placement:
 
     def __post_init__(self) -> None:
         nodes = read_only_nodes(
-            self.nodes, (None, None), "nodes of the placement"
+            self.nodes, (None, None), name="nodes of the placement"
         )
         if nodes.size and nodes.max() >= self.node_count:
             raise InputError(
                 f"the placement refers to node {nodes.max()}, but the body has {self.node_count}"
             )
         weights = read_only_floats(
-            self.weights, nodes.shape, "weights of the placement"
+            self.weights, nodes.shape, name="weights of the placement"
         )
         distance = read_only_floats(
-            self.distance_m, (len(nodes),), "distance_m of the placement"
+            self.distance_m, (len(nodes),), name="distance_m of the placement"
         )
         vars(self).update(nodes=nodes, weights=weights, distance_m=distance)
 
@@ -102,9 +102,11 @@ def place_markers(
         If a marker has no position or is too far from the body.
     """
     points = read_only_floats(
-        points_m, (None, 3), "marker positions", finite=False
+        points_m, (None, 3), name="marker positions", finite=False
     )
-    nodes_m = read_only_floats(node_positions_m, (None, 3), "node positions")
+    nodes_m = read_only_floats(
+        node_positions_m, (None, 3), name="node positions"
+    )
     labels = (
         [str(k) for k in range(len(points))] if names is None else list(names)
     )
@@ -148,7 +150,9 @@ def place_markers(
                 "check length_unit, the frame of the poses and the marker's reference_m, "
                 "or raise max_distance_m"
             )
-    return Placement(nodes, weights, distance, len(nodes_m))
+    return Placement(
+        nodes, weights, distance_m=distance, node_count=len(nodes_m)
+    )
 
 
 class LocatedBody:

@@ -76,7 +76,9 @@ def read_poses(
     if content.startswith(_ZIP):
         t_s, matrices = _read_archive(path)
         places = [f"index {k}" for k in range(len(t_s))]
-        return _from_matrices(t_s, matrices, length_unit, places)
+        return _from_matrices(
+            t_s, matrices, length_unit=length_unit, row_names=places
+        )
     grid = _with_column_names(read_table(decode(content)))
     lines = [f"line {row.line}" for row in grid.rows]
     time = find_column(grid, TIME)
@@ -88,14 +90,19 @@ def read_poses(
         matrices = _read_columns(
             grid, map(grid.columns.index, _MATRIX_COLUMNS)
         ).reshape(-1, 4, 4)
-        return _from_matrices(t_s, matrices, length_unit, lines)
+        return _from_matrices(
+            t_s, matrices, length_unit=length_unit, row_names=lines
+        )
     axes, metres = _position_columns(grid, length_unit)
     components = _quaternion_columns(
-        grid, quaternion, [k for k in others if k not in axes]
+        grid, quaternion, columns=[k for k in others if k not in axes]
     )
     positions_m = _read_columns(grid, axes) * metres
     return _checked_sequence(
-        t_s, positions_m, _read_columns(grid, components), lines
+        t_s,
+        positions_m,
+        quaternions=_read_columns(grid, components),
+        row_names=lines,
     )
 
 
@@ -110,7 +117,9 @@ def _checked_sequence(
     InputError
         If a pose is faulty; the message names its entry of `row_names` (T,).
     """
-    if fault := first_pose_fault(t_s, positions_m, quaternions):
+    if fault := first_pose_fault(
+        t_s, positions_m, quaternions_xyzw=quaternions
+    ):
         raise InputError(fault[1], where=row_names[fault[0]])
     return PoseSequence(t_s, positions_m, quaternions)
 
@@ -297,5 +306,8 @@ def _from_matrices(
     metres = METRES_PER_UNIT[length_unit or "m"]
     quaternions = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
     return _checked_sequence(
-        t_s, matrices[:, :3, 3] * metres, quaternions, row_names
+        t_s,
+        matrices[:, :3, 3] * metres,
+        quaternions=quaternions,
+        row_names=row_names,
     )

@@ -88,7 +88,9 @@ class PoseSequence:
         quaternions = read_only_floats(
             self.quaternions_xyzw, (m, 4), name="quaternions_xyzw", finite=False
         )
-        if fault := first_pose_fault(t_s, positions_m, quaternions):
+        if fault := first_pose_fault(
+            t_s, positions_m, quaternions_xyzw=quaternions
+        ):
             raise InputError(
                 fault[1], where=f"row {fault[0] + 1}" if m > 1 else None
             )
@@ -117,7 +119,9 @@ class PoseSequence:
         InputError
             If shapes disagree, or a matrix is no rigid motion; the first such matrix is named.
         """
-        times = read_only_floats(t_s, (None,), "t_s of the poses", finite=False)
+        times = read_only_floats(
+            t_s, (None,), name="t_s of the poses", finite=False
+        )
         motions = read_only_floats(
             matrices,
             (len(times), 4, 4),
@@ -428,7 +432,7 @@ def require_determined_motion(
             "both times if the grasp stands still",
             file,
         )
-    step_s = _typical_step_s(poses, first_s, last_s)
+    step_s = _typical_step_s(poses, first_s, last_s=last_s)
     if poses.interpolation == "smooth" and step_s > LONGEST_STEP_S:
         raise InputError(
             f"the poses move and are {step_s:.6g} s apart, and {lasts}; expected several a "

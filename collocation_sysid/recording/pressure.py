@@ -43,7 +43,9 @@ def _checked_faces(faces: Selection | ArrayLike) -> Selection | Index:
     return faces
 
 
-_TABLE = Key("pressure", Text | None, read_pressure, "pressure_pa")
+_TABLE = Key(
+    "pressure", Text | None, read=read_pressure, constant="pressure_pa"
+)
 
 
 @declaration
@@ -89,7 +91,7 @@ class Pressure(Actuator[EnclosedVolume]):
 
     def __post_init__(self) -> None:
         pressure = TimeSeries(
-            self.pressure_pa, self.t_s, f"pressure_pa of {self.name}"
+            self.pressure_pa, self.t_s, what=f"pressure_pa of {self.name}"
         )
         vars(self).update(
             pressure_pa=pressure.values,

@@ -27,7 +27,7 @@ def write_poses_csv(path: str | Path, poses: PoseSequence) -> None:
     values = np.column_stack(
         [poses.t_s, poses.positions_m, poses.quaternions_xyzw]
     )
-    _write_csv(path, POSE_COLUMNS, values)
+    _write_csv(path, POSE_COLUMNS, values=values)
 
 
 def write_markers_csv(
@@ -43,7 +43,7 @@ def write_markers_csv(
         *(f"{name}_{axis}" for name in table.names for axis in "xyz"),
     ]
     tracks = table.positions_m.reshape(len(table.t_s), -1)
-    _write_csv(path, header, np.column_stack([table.t_s, tracks]))
+    _write_csv(path, header, values=np.column_stack([table.t_s, tracks]))
 
 
 def write_wrench_csv(
@@ -57,7 +57,9 @@ def write_wrench_csv(
     rows = np.asarray(values, dtype=float)
     there = np.flatnonzero(np.isfinite(rows).any(axis=0))
     header = ["t_s", *(WRENCH_COLUMNS[k] for k in there)]
-    _write_csv(path, header, np.column_stack([np.asarray(t_s), rows[:, there]]))
+    _write_csv(
+        path, header, values=np.column_stack([np.asarray(t_s), rows[:, there]])
+    )
 
 
 def write_columns_csv(
@@ -69,7 +71,7 @@ def write_columns_csv(
     _write_csv(
         path,
         [*columns],
-        np.column_stack([np.asarray(each) for each in columns.values()]),
+        values=np.column_stack([np.asarray(each) for each in columns.values()]),
     )
 
 
@@ -82,7 +84,7 @@ def write_gauge_csv(
     _write_csv(
         path,
         ["t_s", *names],
-        np.column_stack([np.asarray(t_s), np.asarray(values)]),
+        values=np.column_stack([np.asarray(t_s), np.asarray(values)]),
     )
 
 

@@ -105,11 +105,11 @@ def fit_poses(
         If shapes disagree, a weight is negative, or the places of the markers with a positive
         weight lie on one line.
     """
-    reference = read_only_floats(reference_m, (None, 3), "reference_m")
+    reference = read_only_floats(reference_m, (None, 3), name="reference_m")
     count = len(reference)
-    tracks = read_only_tracks(tracks_m, (None, count, 3), "tracks_m")
+    tracks = read_only_tracks(tracks_m, (None, count, 3), name="tracks_m")
     of_marker = read_only_floats(
-        np.ones(count) if weights is None else weights, (count,), "weights"
+        np.ones(count) if weights is None else weights, (count,), name="weights"
     )
     if (of_marker < 0).any():
         raise InputError(f"a weight is {of_marker.min():g}; expected 0 or more")
@@ -121,7 +121,7 @@ def fit_poses(
     weight = of_marker * np.isfinite(tracks[:, :, 0])
     repeated = np.broadcast_to(reference, tracks.shape)
     missing = ~_fixes_rotation(repeated, weight)
-    rotations, translations = _best_motions(repeated, tracks, weight)
+    rotations, translations = _best_motions(repeated, tracks, weight=weight)
     fitted = (
         np.einsum("tij,bj->tbi", rotations, reference) + translations[:, None]
     )
@@ -217,7 +217,9 @@ def align_to_template(
             f"{np.count_nonzero(count)} of the template's markers have samples in the window, "
             "which do not determine a rotation; expected at least three that are not on one line"
         )
-    rotations, translations = _best_motions(means[None], places[None], weight)
+    rotations, translations = _best_motions(
+        means[None], places[None], weight=weight
+    )
     moved = means @ rotations[0].T + translations[0]
     return TemplateFit(
         rotations[0], translations[0], np.linalg.norm(moved - places, axis=1)

@@ -49,7 +49,9 @@ def sample_interval_s(
             f"{what}: a sample interval needs at least two samples", source
         )
     if fault := first_unordered_time(times):
-        raise InputError(f"{what}: {fault[1]}", source, f"row {fault[0] + 1}")
+        raise InputError(
+            f"{what}: {fault[1]}", source, where=f"row {fault[0] + 1}"
+        )
     steps = np.diff(times)
     mean_s = float(times[-1] - times[0]) / len(steps)
     uneven = np.abs(
@@ -64,7 +66,7 @@ def sample_interval_s(
             f"{times[row + 1]:.9g}, where other steps are {typical_s:.6g} s; samples must be "
             "evenly spaced: fill lost frames with blank rows, or set resample_hz",
             source,
-            f"row {row + 2}",
+            where=f"row {row + 2}",
         )
     return mean_s
 

@@ -118,4 +118,4 @@ class SolidSection(Section):
 def solid_from_section(section: SolidSection) -> Solid:
     """Return the solid that a `SolidSection` states."""
     ((name, own),) = ((name, own) for name, own in section if own is not None)
-    return KINDS[name](**declared_in(own, KINDS[name], name))
+    return KINDS[name](**declared_in(own, KINDS[name], where=name))

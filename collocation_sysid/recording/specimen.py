@@ -131,7 +131,7 @@ class Specimen:
             raise InputError(
                 f"found {self.test!r}; expected one of {', '.join(TESTS)}",
                 None,
-                "test",
+                where="test",
             )
         times = (
             np.arange(float(len(self.strain))) if self.t_s is None else self.t_s
@@ -143,7 +143,7 @@ class Specimen:
                 "found one of length_m and area_m2; expected both, or neither for a strain that "
                 "was measured on the specimen",
                 None,
-                "length_m",
+                where="length_m",
             )
         for name in (
             "stress_pa",
@@ -157,7 +157,7 @@ class Specimen:
                 raise InputError(
                     f"found {len(values)} values for {len(self.strain)} strains; expected as many",
                     None,
-                    name,
+                    where=name,
                 )
         for name in ("strain", "second_strain"):
             values = getattr(self, name)
@@ -169,7 +169,7 @@ class Specimen:
                     "length is negative; expected more than −1. If these are percent, divide them "
                     'by 100, or call the column "strain (%)"',
                     None,
-                    name,
+                    where=name,
                 )
 
     def _require_measurements_of_test(self) -> None:
@@ -181,19 +181,23 @@ class Specimen:
                 if self.second_strain is None
                 else f"{of} does not have"
             )
-            raise InputError(f"{fault} a second strain", None, "second_strain")
+            raise InputError(
+                f"{fault} a second strain", None, where="second_strain"
+            )
         if (
             self.second_stress_pa is not None
             and not self.deformation.second_stress
         ):
             raise InputError(
-                f"{of} does not have a second stress", None, "second_stress_pa"
+                f"{of} does not have a second stress",
+                None,
+                where="second_stress_pa",
             )
         if self.lateral_stretch is not None and not self.deformation.lateral:
             raise InputError(
                 f"{of} has no free direction, and no lateral stretch",
                 None,
-                "lateral_stretch",
+                where="lateral_stretch",
             )
 
     @property
@@ -238,9 +242,18 @@ class Specimen:
             Cell that another specimen of the same kind of test has; made of `material` and `prony`
             by default.
         """
-        cell = cell_body(self.test, material, prony) if body is None else body
+        cell = (
+            cell_body(self.test, material, prony=prony)
+            if body is None
+            else body
+        )
         assert self.t_s is not None
-        require_evaluable_law(cell, self.test, self.strain, self.second_strain)
+        require_evaluable_law(
+            cell,
+            self.test,
+            strain=self.strain,
+            second_strain=self.second_strain,
+        )
         nuisance = Nuisance.none(strain_zero=self.strain_zero or None)
         return Experiment(
             cell,
@@ -294,7 +307,9 @@ class Specimen:
             ),
         ):
             if values is not None and np.isfinite(values).any():
-                sensors.append(self._stress_sensor(name, component, values))
+                sensors.append(
+                    self._stress_sensor(name, component, values=values)
+                )
         if self.lateral_stretch is not None:
             axis = AXES.index(self.deformation.lateral)
             point_m = np.zeros(3)
@@ -391,7 +406,7 @@ def cell_body(
     return Body(
         mesh,
         material,
-        CELL_DENSITY_KG_M3,
+        density_kg_m3=CELL_DENSITY_KG_M3,
         damping=damping,
         prony=prony,
         rest_shape="stress_free",

@@ -162,7 +162,9 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
     strain = _strain(table, layout)
     second_strain = _second_strain(table, layout)
     lateral = _lateral_stretch(table, layout)
-    areas = _area_ratios(layout, strain, second_strain, lateral)
+    areas = _area_ratios(
+        layout, strain, second_strain=second_strain, lateral=lateral
+    )
     stress_pa = _stress_pa(table, layout)
     second_pa = table.values.get(SECOND_STRESS.key)
     if layout.test == "volumetric":
@@ -177,10 +179,10 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
     return SpecimenTable(
         table.t_s,
         strain,
-        stress_pa,
-        second_strain,
-        second_pa,
-        lateral,
+        stress_pa=stress_pa,
+        second_strain=second_strain,
+        second_stress_pa=second_pa,
+        lateral_stretch=lateral,
         is_incompressible=layout.stress == "true"
         and lateral is None
         and layout.test in ("uniaxial", "equibiaxial", "planar", "biaxial"),
@@ -228,10 +230,10 @@ def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
     possible = tuple(
         quantity for quantity in known if quantity in layout.quantities
     )
-    quantity = _one_of(table, possible, "deformation")
+    quantity = _one_of(table, possible, what="deformation")
     values = _complete(table, quantity)
     if quantity == STRETCH:
-        _require_positive(table, quantity, values)
+        _require_positive(table, quantity, ratio=values)
         return values - 1
     if layout.test == "volumetric":
         ratio = (
@@ -239,7 +241,7 @@ def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
             if quantity == VOLUME_RATIO
             else 1 + layout.strain_sign * values
         )
-        _require_positive(table, quantity, ratio)
+        _require_positive(table, quantity, ratio=ratio)
         return np.cbrt(ratio) - 1
     if quantity == DISPLACEMENT:
         if layout.length_m is None:
@@ -250,7 +252,7 @@ def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
         values = values / layout.length_m
     strain = layout.strain_sign * values
     if layout.test != "simple-shear":
-        _require_positive(table, quantity, 1 + strain)
+        _require_positive(table, quantity, ratio=1 + strain)
     return strain
 
 
@@ -280,7 +282,9 @@ def _second_strain(
     if layout.test != "biaxial":
         return None
     quantity = _one_of(
-        table, (SECOND_STRETCH, SECOND_STRAIN), "deformation of the second axis"
+        table,
+        (SECOND_STRETCH, SECOND_STRAIN),
+        what="deformation of the second axis",
     )
     values = _complete(table, quantity)
     strain = (
@@ -288,7 +292,7 @@ def _second_strain(
         if quantity == SECOND_STRETCH
         else layout.strain_sign * values
     )
-    _require_positive(table, STRETCH, 1 + strain)
+    _require_positive(table, STRETCH, ratio=1 + strain)
     return strain
 
 
@@ -309,7 +313,7 @@ def _stress_pa(table: QuantityTable, layout: SpecimenLayout) -> Array:
     possible = tuple(
         quantity for quantity in known if quantity in layout.quantities
     )
-    quantity = _one_of(table, possible, "load")
+    quantity = _one_of(table, possible, what="load")
     values = table.values[quantity.key]
     if quantity == PRESSURE:
         return -values
@@ -383,7 +387,9 @@ def specimen_columns(
     """
     strain, second_strain = specimen_strains(experiment)
     lateral = values.get(LATERAL_NAME)
-    areas = _area_ratios(layout, strain, second_strain, lateral)
+    areas = _area_ratios(
+        layout, strain, second_strain=second_strain, lateral=lateral
+    )
     is_true = layout.stress == "true"
     columns: dict[Quantity, Array] = {TIME: experiment.t_s}
     if layout.test == "volumetric":

@@ -38,7 +38,7 @@ def require_evaluable_law(
     ]
     if not laws or not len(strain):
         return
-    stretches = isochoric_stretches(test, strain, second_strain)
+    stretches = isochoric_stretches(test, strain, second_strain=second_strain)
     row = int(stretches.min(axis=1).argmin())
     smallest = float(stretches[row].min())
     if smallest < SMALLEST_POWER_STRETCH:

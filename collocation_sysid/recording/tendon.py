@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 FARTHEST_POINT_EDGES = 1.0
 
 
-_TABLE = Key("tension", Text | None, read_tension, "tension_n")
+_TABLE = Key("tension", Text | None, read=read_tension, constant="tension_n")
 
 
 @declaration
@@ -80,7 +80,9 @@ class Tendon(Actuator[PolylineLength]):
                 f"{name}: the points {same[0] + 1} and {same[0] + 2} are at the same place; "
                 "expected different ones, in their order from base to end"
             )
-        tension = TimeSeries(self.tension_n, self.t_s, f"tension_n of {name}")
+        tension = TimeSeries(
+            self.tension_n, self.t_s, what=f"tension_n of {name}"
+        )
         if (tension.values < 0).any():
             row = int(np.argmax(tension.values < 0))
             raise InputError(
@@ -111,7 +113,7 @@ class Tendon(Actuator[PolylineLength]):
                 f"{distances[worst]:.4g} m outside the body, more than the mean edge length of "
                 f"{shape.mean_edge_m:.4g} m; expected points_m on the undeformed body, in metres"
             )
-        return PolylineLength(nodes, weights, len(body.nodes_m))
+        return PolylineLength(nodes, weights, node_count=len(body.nodes_m))
 
     def energy_amplitude(
         self, declared_value: Any, factor: Any, offset: Any

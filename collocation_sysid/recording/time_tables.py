@@ -73,7 +73,7 @@ def read_tension(path: str | Path) -> tuple[Array, Array]:
         If a column is missing or unknown, a cell is not a number, time does not increase, or a
         tension is negative; the line is named.
     """
-    return _read_limited(path, TENSION, LARGEST_N, at_least=0.0)
+    return _read_limited(path, TENSION, largest=LARGEST_N, at_least=0.0)
 
 
 def read_pressure(path: str | Path) -> tuple[Array, Array]:
@@ -86,7 +86,7 @@ def read_pressure(path: str | Path) -> tuple[Array, Array]:
         If a column is missing or unknown, a cell is not a number, time does not increase, or a
         pressure is implausibly large; the line is named.
     """
-    return _read_limited(path, PRESSURE, LARGEST_PA)
+    return _read_limited(path, PRESSURE, largest=LARGEST_PA)
 
 
 @names_file_in_errors
@@ -166,7 +166,7 @@ def read_wrench(
     )
     factor = sign * (area_m2 or 1.0) / symmetry
     return _without_rounding(table.t_s), factor * _axis_components(
-        table, (*FORCES, *TORQUES), axis
+        table, (*FORCES, *TORQUES), axis=axis
     )
 
 
@@ -209,11 +209,11 @@ def read_displacement(
         If a column is missing, unknown, repeated or without unit, a cell is not a number, or time
         does not increase; the line is named.
     """
-    table = _read_displacements(path, columns, length_m, timed)
+    table = _read_displacements(path, columns, length_m=length_m, timed=timed)
     shifts_m = (
         sign
         * (length_m or 1.0)
-        * np.nan_to_num(_axis_components(table, DISPLACEMENTS, axis))
+        * np.nan_to_num(_axis_components(table, DISPLACEMENTS, axis=axis))
     )
     return PoseSequence(
         table.t_s, shifts_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1))
@@ -230,9 +230,9 @@ def displaced_axes(
     Arguments and errors are those of `read_displacement`.
     """
     shifts = _axis_components(
-        _read_displacements(path, columns, length_m, timed=False),
+        _read_displacements(path, columns, length_m=length_m, timed=False),
         DISPLACEMENTS,
-        axis,
+        axis=axis,
     )
     is_present = np.asarray(np.isfinite(shifts).any(axis=0))
     return "".join(

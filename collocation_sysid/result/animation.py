@@ -109,10 +109,10 @@ def animate(
     for name, value in (("--fps", fps), ("--slow", slowdown)):
         if not 0 < value < np.inf:
             raise InputError(
-                f"found {value:g}; expected a number above 0", None, name
+                f"found {value:g}; expected a number above 0", None, where=name
             )
     result, replays = read_run(run)
-    replay = experiment_named(replays, experiment, run)
+    replay = experiment_named(replays, experiment, run=run)
     with damaged_run_refused(Path(run)):
         text = run_headline(result)
     file = (
@@ -124,7 +124,7 @@ def animate(
         raise InputError(
             f"found '{file.suffix}'; expected {' or '.join(PIXELS_WIDE)}",
             file,
-            "--to",
+            where="--to",
         )
     return film(
         replay,
@@ -161,11 +161,11 @@ def film(
     headline : str
         Text above the body.
     """
-    picture = FilmFigure(replay, names, headline)
+    picture = FilmFigure(replay, names, headline=headline)
     t_s = replay.t_s
     if replay.static:  # which may take a second or a day
         t_s = np.arange(len(t_s)) / STATIC_SAMPLES_PER_SECOND
-    shown = film_samples(t_s, fps, slowdown)
+    shown = film_samples(t_s, fps, slowdown=slowdown)
     ffmpeg = _find_ffmpeg(file) if file.suffix.lower() == ".mp4" else None
     dpi = PIXELS_WIDE[file.suffix.lower()] / (FILM_WIDTH_MM / 25.4)
     with rc_context({"animation.ffmpeg_path": ffmpeg} if ffmpeg else {}):
@@ -202,7 +202,10 @@ def experiment_named(
     if experiment is None:
         return next(iter(available.values()))
     require_among(
-        experiment, available, run, None if run is None else "--experiment"
+        experiment,
+        available,
+        source=run,
+        where=None if run is None else "--experiment",
     )
     return available[experiment]
 
@@ -329,15 +332,19 @@ class FilmFigure:
             body = BodyDrawing(
                 axes,
                 view,
-                replay.surface,
+                surface=replay.surface,
                 parts=replay.surface_parts,
                 nodes=replay.surface_nodes,
                 edge_colour=wire,
             )
             self.drawings.append((name, positions, markers, body, title))
-        self._draw_annotations(axes, camera, view.mm_per_m, total)
+        self._draw_annotations(
+            axes, camera, mm_per_m=view.mm_per_m, height_mm=total
+        )
         self.cursor = (
-            self._draw_errors(compared, width, height, total)
+            self._draw_errors(
+                compared, width, height_mm=height, figure_height_mm=total
+            )
             if compared
             else None
         )
@@ -394,7 +401,9 @@ class FilmFigure:
             panel.plot(
                 t_s, 1e3 * rms_over_markers(squares), label=name, **style
             )
-        style_axes(panel, "", "time [s]", "marker error, RMS [mm]")
+        style_axes(
+            panel, "", xlabel="time [s]", ylabel="marker error, RMS [mm]"
+        )
         panel.set_ylim(bottom=0.0)
         add_legend_above(panel, columns=1)
         return panel.axvline(0.0, color=BLACK, lw=0.8)
@@ -407,8 +416,8 @@ class FilmFigure:
         height_mm: float,
     ) -> None:
         """Draw the axis directions, the scale bar and the legend around the body."""
-        draw_directions(axes, camera, (7.0, 4.0))
-        draw_scale(axes, mm_per_m, (FILM_WIDTH_MM * 0.17, 4.0))
+        draw_directions(axes, camera, origin_mm=(7.0, 4.0))
+        draw_scale(axes, mm_per_m, corner_mm=(FILM_WIDTH_MM * 0.17, 4.0))
         named = ["grasped", "measured", "behind the body"]
         if self.replay.visible_points:
             markers = named[1:] if len(self.replay.marker_names) else []
@@ -416,7 +425,7 @@ class FilmFigure:
         draw_legend(
             axes,
             legend_handles(*named),
-            (FILM_WIDTH_MM * (0.42 if len(named) < 4 else 0.35), 5.5),
+            corner_mm=(FILM_WIDTH_MM * (0.42 if len(named) < 4 else 0.35), 5.5),
         )
 
     def show_sample(self, sample: int) -> None:
@@ -494,5 +503,5 @@ def _find_ffmpeg(file: Path) -> str:
         "MP4 needs ffmpeg, which was not found: pip install 'collocation-sysid[film]', install "
         "ffmpeg, or choose a file ending in .gif",
         file,
-        "--to",
+        where="--to",
     )

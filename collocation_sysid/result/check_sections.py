@@ -52,7 +52,7 @@ def full_check_tables(findings: CheckResult) -> list[Shown]:
             Table(
                 "",
                 (),
-                tuple((f"{kind}:", each) for each in sentences),
+                rows=tuple((f"{kind}:", each) for each in sentences),
                 texts=1,
                 style=style,
             )
@@ -174,7 +174,7 @@ def _motion_section(findings: CheckResult) -> list[Shown]:
         if firsts
         else []
     )
-    return [Table(title, heads, rows, names=0), *more]
+    return [Table(title, heads, rows=rows, names=0), *more]
 
 
 def _measurements_section(findings: QuickCheck) -> Table:

@@ -129,7 +129,9 @@ def field_kernel(element: Element, law: PointLaw) -> ElementKernel:
         fields, _DEFORMATION_GRADIENT, ca.vec(point.material_gradient)
     )
     return kernel_from_outputs(
-        "fields", point, {"fields": (Derivative(point.volume * evaluated, ()),)}
+        "fields",
+        point,
+        outputs={"fields": (Derivative(point.volume * evaluated, ()),)},
     )
 
 

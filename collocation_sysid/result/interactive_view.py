@@ -59,15 +59,15 @@ def export_page(
         If `run` is not a run folder, or has no such experiment or field.
     """
     result, replays = read_run(run)
-    replay = experiment_named(replays, experiment, run)
+    replay = experiment_named(replays, experiment, run=run)
     with damaged_run_refused(Path(run)):
         text = run_headline(result)
     colouring = (
         None
         if field is None
-        else Colouring.by_field(field, field_on_faces(run, replay, field))
+        else Colouring.by_field(field, field_on_faces(run, replay, field=field))
     )
-    return write_page(replay, file, text, colouring)
+    return write_page(replay, file, headline=text, colouring=colouring)
 
 
 def field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
@@ -138,11 +138,11 @@ def view_run(
             "page with --html, which needs nothing"
         )
     _, replays = read_run(run)
-    replay = experiment_named(replays, experiment, run)
+    replay = experiment_named(replays, experiment, run=run)
     frames = frame_files(Path(run), replay.name)
     with _damaged_frames_refused(Path(run)):
         scene = _FrameWindow(
-            frames, field, replay, off_screen=screenshot is not None
+            frames, field, replay=replay, off_screen=screenshot is not None
         )
     if screenshot is None:
         scene.plotter.show()
@@ -186,7 +186,9 @@ def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
 def _damaged_frames_refused(run: Path) -> AbstractContextManager[None]:
     """Return a context in which errors from damaged frames become an InputError on the run."""
     return damage_refused(
-        run, f"{FRAMES_FILE} or one of its frames", "solve the problem again"
+        run,
+        f"{FRAMES_FILE} or one of its frames",
+        remedy="solve the problem again",
     )
 
 

@@ -160,7 +160,8 @@ class ParameterSliders:
         self._is_resetting = False
         self.simulation: ForwardSimulation | None = None
         self.sliders = {
-            name: _slider(widgets, name, each) for name, each in ranges.items()
+            name: _slider(widgets, name, values=each)
+            for name, each in ranges.items()
         }
         self.picture = widgets.Image(format="png")
         self.message = widgets.Label()
@@ -304,22 +305,22 @@ class ParameterSliders:
             return marker_tracks(
                 experiment.t_s,
                 experiment.markers.names,
-                experiment.markers.positions_m,
-                self._fitted_markers_m,
-                simulation.trajectory.markers_m,
+                measured_m=experiment.markers.positions_m,
+                fitted_m=self._fitted_markers_m,
+                simulated_m=simulation.trajectory.markers_m,
             )
         if experiment.wrenches:
             sensor = experiment.wrenches[0]
             columns = _sensor_columns(
-                sensor.t_s, sensor.values, simulation.wrenches[0]
+                sensor.t_s, sensor.values, simulated=simulation.wrenches[0]
             )
             columns[:, 1:] *= sensor.symmetry
-            return sensor_picture(columns, COMPONENTS, UNITS)
+            return sensor_picture(columns, COMPONENTS, units=UNITS)
         if experiment.readings:
             gauge = experiment.readings[0]
             predicted = simulation.readings[gauge.name]
             columns = _sensor_columns(
-                gauge.sample_times_s, gauge.measured_values, predicted
+                gauge.sample_times_s, gauge.measured_values, simulated=predicted
             )
             count = gauge.measured_values.shape[1]
             return sensor_picture(

@@ -64,7 +64,11 @@ def probe_section(result: Result) -> TitledParts:
     )
     return TitledParts(
         "Probes",
-        (Table("", heads, tuple(rows), texts=1), read, *_conclusions(result)),
+        (
+            Table("", heads, rows=tuple(rows), texts=1),
+            read,
+            *_conclusions(result),
+        ),
     )
 
 
@@ -167,7 +171,7 @@ def _conclusions(result: Result) -> Iterator[str]:
         disagreeing = [p for p in significant if p.kind == kind]
         if disagreeing:
             changes = (
-                f"{p.name}: {listed(_named_change(p, result, n) for n in p.sentences)}"
+                f"{p.name}: {listed(_named_change(p, result, name=n) for n in p.sentences)}"
                 for p in disagreeing
             )
             yield f"{kind}s disagree significantly ({'; '.join(changes)})"
@@ -175,7 +179,9 @@ def _conclusions(result: Result) -> Iterator[str]:
         first = relaxed[0]
         names = _shown_estimates(result)
         moved = [
-            _named_change(first, result, n) for n in names if n in first.moves
+            _named_change(first, result, name=n)
+            for n in names
+            if n in first.moves
         ][:2]
         size = short(first.size or 0.0)
         error = short(first.size_error or 0.0)

@@ -584,5 +584,5 @@ def read_arrays(run: Path) -> dict[str, NDArray[Any]]:
 def damaged_run_refused(run: Path) -> AbstractContextManager[None]:
     """Return a context that turns errors from damaged files of a run into an InputError."""
     return damage_refused(
-        run, f"{RESULT_FILE} or {ARRAYS_FILE}", "solve the problem again"
+        run, f"{RESULT_FILE} or {ARRAYS_FILE}", remedy="solve the problem again"
     )

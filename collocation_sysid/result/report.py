@@ -81,7 +81,7 @@ def comparison_report(folder: str | Path) -> TitledParts:
         "a folder of compare-methods, compare-models or sweep",
     )
     with damage_refused(
-        folder, SUMMARY_FILE, "repeat the study; finished runs are kept"
+        folder, SUMMARY_FILE, remedy="repeat the study; finished runs are kept"
     ):
         study = read(StudySummary, content)
         pictures = [

@@ -111,7 +111,9 @@ def draw_run(
     began_s = time.perf_counter()
     result = build_result(solved)
     file = folder / RESULT_FILE
-    _write_pictures(solved, result, folder, report or (lambda _: None))
+    _write_pictures(
+        solved, result, folder=folder, say=report or (lambda _: None)
+    )
     if not file.is_file() or file.read_text(encoding="utf-8") != _result_text(
         result
     ):
@@ -151,7 +153,7 @@ def _write_pictures(
     save_pictures(
         folder,
         all_pictures(replays(finished), result) | {"jacobian": jacobian},
-        say,
+        say=say,
     )
 
 
@@ -248,7 +250,9 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
                 places_m=places_m,
                 wrenches=_wrench_columns(finished, experiment),
                 readings=_custom_sensor_columns(finished, experiment),
-                contact=_surface_contact(finished, experiment, shown[0]),
+                contact=_surface_contact(
+                    finished, experiment, positions_m=shown[0]
+                ),
             )
             of_cells = _field_estimates(finished, experiment.body)
             of_cameras = _depth_rows(finished, experiment)
@@ -302,7 +306,7 @@ def _surface_contact(
         experiment = part.segment.corrected_experiment(part.phi)
     theta = experiment.body.theta_from_values(finished.solution.parameters)
     return surface_gaps_and_pressures(
-        experiment, np.array(theta), positions_m.reshape(len(positions_m), -1)
+        experiment, np.array(theta), x=positions_m.reshape(len(positions_m), -1)
     )
 
 

@@ -92,7 +92,9 @@ def refine_run(
 
     def keep(refinement: Refinement) -> Result:
         """Write a refinement and the updated result into the folder, and return the latter."""
-        after = with_refinement(before, refinement, problem.parameters)
+        after = with_refinement(
+            before, refinement, parameters=problem.parameters
+        )
         with replaced_file(levels_file) as levels, replaced_file(file) as draft:
             levels.write_text(as_json(refinement) + "\n", encoding="utf-8")
             draft.write_text(as_json(after) + "\n", encoding="utf-8")
@@ -149,7 +151,9 @@ def with_refinement(
         derived=corrected(before.derived),
     )
     budget = {
-        name: _updated_shares(shares, before.values[name], after.values[name])
+        name: _updated_shares(
+            shares, before.values[name], after=after.values[name]
+        )
         for name, shares in before.budget.items()
     }
     uncertainties = {
@@ -162,8 +166,8 @@ def with_refinement(
     ]
     concerns = (
         *others,
-        *numerical_concerns(optimum, uncertainties, refinement),
-        *combined_concerns(parameters, after.values, budget),
+        *numerical_concerns(optimum, uncertainties, refinement=refinement),
+        *combined_concerns(parameters, after.values, shares=budget),
     )
     return replace(
         after, budget=budget, trust=Assessment.from_concerns(concerns)

@@ -263,7 +263,7 @@ def _parameter_section(result: Result) -> TitledParts:
     heads = ("", "value", "±", "95 % interval", "± stat", "± syst", "guess", "")
     faint = tuple(range(len(result.parameters), len(values)))
     parts: list[Shown] = [
-        Table("", heads, rows, texts=1, faint=faint, note_column=1)
+        Table("", heads, rows=rows, texts=1, faint=faint, note_column=1)
     ]
     parts += [field.sentence(name) for name, field in result.fields.items()]
     if any(each.combined95 for each in values.values()):
@@ -386,7 +386,9 @@ def budget_table(result: Result) -> Table:
         )
         for s in shown
     ]
-    return Table("", ("% of the variance", *map(symbol_of, lines)), tuple(rows))
+    return Table(
+        "", ("% of the variance", *map(symbol_of, lines)), rows=tuple(rows)
+    )
 
 
 def _estimate_row(result: Result, name: str) -> tuple[str, ...]:
@@ -452,7 +454,7 @@ def refinement_table(result: Result) -> Table:
             "corrected",
             "95 % interval",
         ),
-        tuple(rows),
+        rows=tuple(rows),
     )
 
 
@@ -731,7 +733,7 @@ def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
             )
         heads = ("", "x", "±", "y", "±", "z", "±", "prior ±", "")
         if rows:
-            table = Table("", heads, tuple(rows), texts=1)
+            table = Table("", heads, rows=tuple(rows), texts=1)
             title = f"Positions of the markers of '{experiment}'"
             yield TitledParts(title, (Line(explanation, "quiet"), table))
 
@@ -748,7 +750,7 @@ def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
             words, _, unit = label.rstrip("]").rpartition(" [")
             sizes = (each.value, each.std_error, each.prior)
             rows.append((words, *(_size_text(size, unit) for size in sizes)))
-        table = Table("", ("", "value", "±", "prior ±"), tuple(rows))
+        table = Table("", ("", "value", "±", "prior ±"), rows=tuple(rows))
         title = f"Nuisance parameters of '{experiment}'"
         is_part = experiment in (result.fit.symmetry or {})
         loads = " Forces are those of the modelled part." if is_part else ""
@@ -770,7 +772,7 @@ def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
             for each in result.residuals
         )
         yield Table(
-            "", ("marker", "RMS", "samples", "diagnosis"), rows, texts=1
+            "", ("marker", "RMS", "samples", "diagnosis"), rows=rows, texts=1
         )
     if worst := _largest_errors(run):
         rows = tuple(
@@ -778,7 +780,7 @@ def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
         )
         yield from (
             "Largest errors:",
-            Table("", ("marker", "time", "error"), rows),
+            Table("", ("marker", "time", "error"), rows=rows),
         )
 
 
@@ -869,7 +871,9 @@ def _provenance_parts(result: Result, run: Path) -> Iterator[Shown]:
     yield Table(
         "",
         (),
-        tuple((key, ", ".join(map(str, each))) for key, each in listed_rows),
+        rows=tuple(
+            (key, ", ".join(map(str, each))) for key, each in listed_rows
+        ),
         texts=1,
     )
     file = run / "problem.toml"

@@ -72,8 +72,12 @@ def write_vtu(
         )
     points = np.asarray(points_m, dtype=float)
     nodes = np.asarray(cells, dtype=np.int64)
-    at_points = _checked_arrays("point", point_data or {}, len(points), path)
-    in_cells = _checked_arrays("cell", cell_data or {}, len(nodes), path)
+    at_points = _checked_arrays(
+        "point", point_data or {}, count=len(points), path=path
+    )
+    in_cells = _checked_arrays(
+        "cell", cell_data or {}, count=len(nodes), path=path
+    )
     by_block: dict[str, Any] = {
         name: [array] for name, array in in_cells.items()
     }
@@ -257,7 +261,9 @@ def replaced_folder(
         is given, so that no work is lost, and again at the end.
     """
     target = _resolved_parent(Path(path))
-    require_replaceable(target, overwrite, marker_file, content_word)
+    require_replaceable(
+        target, overwrite, marker_file=marker_file, content_word=content_word
+    )
     target.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(target)
     process_name = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"
@@ -271,11 +277,16 @@ def replaced_folder(
         shutil.rmtree(temporary, ignore_errors=True)
         raise
     try:
-        require_replaceable(target, overwrite, marker_file, content_word)
+        require_replaceable(
+            target,
+            overwrite,
+            marker_file=marker_file,
+            content_word=content_word,
+        )
         _replace_folder(
             temporary,
             target,
-            target.with_name(f".{target.name}.{process_name}.old"),
+            backup=target.with_name(f".{target.name}.{process_name}.old"),
         )
     except (InputError, OSError) as error:
         backup = target.with_name(f"{target.name}-{process_name}")

@@ -269,7 +269,7 @@ def _iteration_table(lines: list[Iteration]) -> Shown:
     return Table(
         "",
         heads,
-        tuple(map(_iteration_row, lines[-SHOWN_ITERATIONS:])),
+        rows=tuple(map(_iteration_row, lines[-SHOWN_ITERATIONS:])),
         names=0,
     )
 

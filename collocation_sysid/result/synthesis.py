@@ -152,7 +152,7 @@ def write_data(
     ]
     _require_separate_files(problem, names)
     files = [place / name for named in names for name in named.values()]
-    _refuse_foreign(problem, place, files)
+    _refuse_foreign(problem, place, files=files)
     for experiment in problem.experiments if recipe.frames else ():
         require_replaceable(
             place / experiment.name,
@@ -244,14 +244,21 @@ def _write_tables(
     if experiment.specimen is not None or isinstance(section, SpecimenSection):
         stated = section if isinstance(section, SpecimenSection) else None
         _write_specimen(
-            experiment, stated, trajectory, files[_SPECIMEN_KEY], rng, recipe
+            experiment,
+            stated,
+            trajectory=trajectory,
+            file=files[_SPECIMEN_KEY],
+            rng=rng,
+            recipe=recipe,
         )
         return
     noise = recipe.noise_m * rng.normal(size=trajectory.markers_m.shape)
     names = experiment.markers.names
     tracks = trajectory.markers_m + noise
     if _MARKERS_KEY in files:
-        write_markers_csv(files[_MARKERS_KEY], experiment.t_s, names, tracks)
+        write_markers_csv(
+            files[_MARKERS_KEY], experiment.t_s, names=names, positions_m=tracks
+        )
     for k, grasp in enumerate(experiment.grasps):
         if (key := _numbered_key("poses", k)) in files:
             write_poses_csv(files[key], grasp.poses)
@@ -269,14 +276,16 @@ def _write_tables(
         )
         wrenches.append(measured + sigmas * rng.normal(size=wrench.shape))
     if section is not None and has_displacement_table(section):
-        for name, table in bench_tables(section, experiment, wrenches).items():
+        for name, table in bench_tables(
+            section, experiment, wrenches=wrenches
+        ).items():
             write_columns_csv(files[name], table.columns)
     else:
         for k, (sensor, layout) in enumerate(
             zip(experiment.wrenches, layouts, strict=True)
         ):
             table = BenchTable(sensor.t_s)
-            add_wrench(table, layout, sensor.t_s, wrenches[k])
+            add_wrench(table, layout, at_s=sensor.t_s, wrench=wrenches[k])
             write_columns_csv(files[_numbered_key("wrench", k)], table.columns)
     for gauge, read in zip(
         experiment.readings, trajectory.custom_sensor_values, strict=True
@@ -284,7 +293,10 @@ def _write_tables(
         noise = recipe.noise_own * gauge.sigma * rng.normal(size=read.shape)
         key = f"reading_{gauge.name}"
         write_gauge_csv(
-            files[key], gauge.sample_times_s, gauge.columns, read + noise
+            files[key],
+            gauge.sample_times_s,
+            names=gauge.columns,
+            values=read + noise,
         )
 
 
@@ -323,7 +335,7 @@ def _write_specimen(
     layout = SpecimenLayout(test=experiment.specimen.test, columns={})
     if section is not None:
         layout = layout_from_section(section)
-    write_columns_csv(file, specimen_columns(experiment, values, layout))
+    write_columns_csv(file, specimen_columns(experiment, values, layout=layout))
 
 
 def _wrench_layouts(section: ExperimentSection | None) -> list[WrenchSection]:
@@ -339,7 +351,7 @@ def _require_guesses(problem: Problem) -> None:
         raise InputError(
             f"has no guess, and a simulation needs a value; expected --set {key}.guess=VALUE",
             problem.path,
-            key,
+            where=key,
         )
 
 
@@ -465,6 +477,6 @@ def _require_separate_files(
                     f"is read by '{owners[name]}' too, but a simulation writes a file for each; "
                     f"expected another file than {name}",
                     problem.path,
-                    f"experiment '{experiment.name}': file",
+                    where=f"experiment '{experiment.name}': file",
                 )
             owners[name] = experiment.name

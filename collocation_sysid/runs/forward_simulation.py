@@ -122,7 +122,9 @@ def simulate_experiments(
             complete_steps(StepUnit.SIMULATION, share - completed)
             completed = share
 
-        return simulate_experiment(problem, experiment, solution, report)
+        return simulate_experiment(
+            problem, experiment, solution=solution, report=report
+        )
 
     with counted_phase(StepUnit.SIMULATION, len(problem.experiments)):
         rollouts = map_experiments(
@@ -171,7 +173,7 @@ def simulate_experiment(
             zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True)
         ),
         places_m=dict(zip(experiment.markers.names, places_m, strict=True)),
-        blind_error=_blind_error(problem, segment, solution),
+        blind_error=_blind_error(problem, segment, solution=solution),
         copy_error=nearest_recording_error(experiment, fitted),
     )
 
@@ -215,7 +217,7 @@ def simulate_with_parameters(
     trajectory = _simulate(
         problem, segment, phi=phi, parameters=parameters, report=report
     )
-    predicted, surfaces = _predict_instruments(segment, trajectory, phi)
+    predicted, surfaces = _predict_instruments(segment, trajectory, phi=phi)
     error = prediction_error(experiment, predicted)
     return ForwardSimulation(
         rms_m=error.rms_m or 0.0,
@@ -285,7 +287,7 @@ def _predict_instruments(
     x = positions_m.reshape(len(positions_m), -1)
     gauged = zip(
         segment.custom_sensors,
-        _predict_sensors(segment, x, trajectory.reactions, phi),
+        _predict_sensors(segment, x, reactions=trajectory.reactions, phi=phi),
         strict=True,
     )
     surfaces = {
@@ -320,7 +322,7 @@ def _blind_error(
         trajectory = _simulate(problem, segment, phi, solution.parameters)
     except (InputError, SimulationError):
         return None
-    predicted, _ = _predict_instruments(segment, trajectory, phi)
+    predicted, _ = _predict_instruments(segment, trajectory, phi=phi)
     return prediction_error(segment.experiment, predicted)
 
 
@@ -410,8 +412,10 @@ def step_error(
         ):
             way = share * np.nan_to_num((rolled - read) / sensor.wrench.sigmas)
             differences.append(way.reshape(-1, 2, 3))
-        differences += _sensor_differences(part, rollout.trajectory, share)
-        differences += _depth_differences(part, rollout.trajectory, share)
+        differences += _sensor_differences(
+            part, rollout.trajectory, share=share
+        )
+        differences += _depth_differences(part, rollout.trajectory, share=share)
     change = change_in_observations(fit, differences)[: collocation.nq]
     q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
     linear = problem.parameters.linear_names
@@ -508,7 +512,10 @@ def _predict_sensors(
 
     motion = ObservedMotion(x, forced)
     gauges = custom_sensor_residuals(
-        segment.experiment, segment.experiment.t_s, grid, segment.nuisance
+        segment.experiment,
+        segment.experiment.t_s,
+        grid=grid,
+        nuisance=segment.nuisance,
     )
     return [gauge.predict_motion(motion, phi) for gauge in gauges]
 

@@ -149,13 +149,15 @@ def solve_refined(
             if report_progress is not None:
                 report_progress(f"solving again: {kind} halved {level}×")
             refined = _solve_refined_problem(
-                at, start, f"{kind} halved {level}×"
+                at, start, what=f"{kind} halved {level}×"
             )
             start = WarmStart.of(refined)
-            reached.append(_level_summary(kind, level, refined))
+            reached.append(_level_summary(kind, level, solution=refined))
             if save_progress is not None:
-                save_progress(_errors_from_levels(reached, problem, estimates))
-    return _errors_from_levels(reached, problem, estimates)
+                save_progress(
+                    _errors_from_levels(reached, problem, estimates=estimates)
+                )
+    return _errors_from_levels(reached, problem, estimates=estimates)
 
 
 def _errors_from_levels(

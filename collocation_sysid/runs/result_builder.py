@@ -86,7 +86,7 @@ def build_result(answer: SolvedProblem) -> Result:
         dynamics=DynamicsResult(
             solution.max_violation_n,
             solution.max_violation_relative,
-            tuple(map(str, solution.largest_violations)),
+            largest=tuple(map(str, solution.largest_violations)),
         ),
         rollout=_forward_results(answer),
         iterations=solution.iterations,
@@ -294,7 +294,7 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
             reading_unit=_sensor_units(experiment),
             depth=depths.get(name),
             friction=friction_summaries(
-                experiment, part.equations.dynamics, part.x
+                experiment, part.equations.dynamics, x=part.x
             )
             or None,
             air_density_kg_m3=experiment.air_density_kg_m3,
@@ -338,10 +338,12 @@ def _forward_results(answer: SolvedProblem) -> ForwardResult:
             )
             largest.append(compared.max_m)
     if not largest:
-        return ForwardResult(None, None, experiments)
+        return ForwardResult(None, None, experiments=experiments)
     total, count = np.sum(squares, axis=0)
     return ForwardResult(
-        float(np.sqrt(total / max(1, count))), max(largest), experiments
+        float(np.sqrt(total / max(1, count))),
+        max(largest),
+        experiments=experiments,
     )
 
 
@@ -398,7 +400,9 @@ def _nuisance(answer: SolvedProblem) -> dict[str, dict[str, NuisanceResult]]:
                 deviations[name] * entry.sigma if name in deviations else None
             )
             here = named.setdefault(part.segment.experiment.name, {})
-            here[entry.label] = NuisanceResult(value, entry.sigma, error)
+            here[entry.label] = NuisanceResult(
+                value, entry.sigma, std_error=error
+            )
     return named
 
 
@@ -464,7 +468,9 @@ def _nuisance_sentences(
         elif row.by == "worst":
             groups = [[max(here, key=lambda k: abs(part.phi[k]))]]
         for own in groups:
-            yield _nuisance_sentence(part, own, values[own], answer)
+            yield _nuisance_sentence(
+                part, own, values=values[own], answer=answer
+            )
 
 
 def _nuisance_sentence(

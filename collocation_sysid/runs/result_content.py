@@ -551,7 +551,9 @@ class Result:
         """
         folder = Path(run)
         content = read_json(folder / RESULT_FILE, expected)
-        with damage_refused(folder, RESULT_FILE, "solve the problem again"):
+        with damage_refused(
+            folder, RESULT_FILE, remedy="solve the problem again"
+        ):
             return read(cls, content)
 
     @property

@@ -130,4 +130,6 @@ def follow_starts(
         note += ": there are local minima; the lowest one is reported"
     chosen = replace(scan, best=best, parameters=scan.starts[best])
     started = replace(collocation, parameters=scan.starts[best])
-    return CompletedStart(started, chosen, solution if is_own else None, note)
+    return CompletedStart(
+        started, chosen, solution=solution if is_own else None, note=note
+    )

@@ -240,10 +240,12 @@ class SolvedProblem:
             for name, each in self.estimates.items()
         }
         numerical = numerical_concerns(
-            self.optimum, uncertainties, self.refinement
+            self.optimum, uncertainties, refinement=self.refinement
         )
         shares = {name: line.shares for name, line in self.budget.items()}
-        vague = combined_concerns(self.start_parameters, self.estimates, shares)
+        vague = combined_concerns(
+            self.start_parameters, self.estimates, shares=shares
+        )
         of_fields = [
             concern
             for field in self.fields.values()
@@ -258,7 +260,9 @@ class SolvedProblem:
                 (*causes, *of_fit, *of_fields, *probed, *numerical, *vague)
             )
         interrupted = Concern(
-            "solve/interrupted", "doubtful", {"left_out": self.omitted_checks}
+            "solve/interrupted",
+            "doubtful",
+            data={"left_out": self.omitted_checks},
         )
         return Assessment.from_concerns(
             (interrupted, *(of_fit if self.uncertainty is not None else ()))
@@ -290,7 +294,9 @@ class SolvedProblem:
             segment.body for segment in collocation.transcriptions
         )
         known = (
-            field_estimates(b, collocation.parameters, q, self.uncertainty)
+            field_estimates(
+                b, collocation.parameters, q=q, uncertainty=self.uncertainty
+            )
             for b in bodies
         )
         return {field.name: field for each in known for field in each}

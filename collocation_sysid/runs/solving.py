@@ -83,13 +83,15 @@ def solve(
             f"{getattr(solver, 'name', solver)} cannot distribute its experiments to workers; "
             "expected the method 'reduced-space', or no scheduler",
             None,
-            "--scheduler",
+            where="--scheduler",
         )
     with connect_executor(scheduler) as workers:
         return _solve_with_likeliest_lengths(
             problem,
             start,
-            partial(_solve_once, solver=solver, watch=watch, workers=workers),
+            solve_once=partial(
+                _solve_once, solver=solver, watch=watch, workers=workers
+            ),
         )
 
 
@@ -119,7 +121,7 @@ def _solve_with_likeliest_lengths(
         The last solution.
     """
     if any(not modes.has_phases for modes in problem.two_phase_fields.values()):
-        return solve_two_phases(problem, start, solve_once)
+        return solve_two_phases(problem, start, solve_once=solve_once)
     solution = solve_once(problem, start)
     tried = [problem.lengths_m]
     fields = {
@@ -170,10 +172,10 @@ def _solve_once(
             collocation = replace(collocation, substeps=warm_start.substeps)
         has_guesses = not collocation.parameters.names_without_guess
         if has_guesses:
-            require_memory(problem, collocation, solver)
+            require_memory(problem, collocation, method=solver)
         collocation, scan = start_problem(collocation, needs_complete_start)
         if not has_guesses:  # the estimate evaluates the program at a guess
-            require_memory(problem, collocation, solver)
+            require_memory(problem, collocation, method=solver)
         collocation = associated_at_guess(collocation)
         variables = None
         if warm_start is not None and not scan:
@@ -188,7 +190,7 @@ def _solve_once(
                 scan=scan,
                 watch=watch,
                 solve=lambda by, of: solve_with_renewed_correspondences(
-                    by, of, watch
+                    by, of, watch=watch
                 ),
             )
             collocation = associated_at_guess(scanned.collocation)
@@ -197,22 +199,24 @@ def _solve_once(
             started_from = [scanned.note] if scanned.note else []
         if solution is None:
             solution = solve_with_renewed_correspondences(
-                solver, collocation, watch, variables
+                solver, collocation, watch=watch, start=variables
             )
         if scan is None and solution.status in FAILED_STATUSES:
-            scan, solution = _solve_from_scan(solver, solution, watch)
+            scan, solution = _solve_from_scan(solver, solution, watch=watch)
         if (
             solution.status.converged
             and warm_start is None
             and solution.method == ReducedSpace.name
         ):
-            solution = _best_of_second_start(solver, solution, watch)
+            solution = _best_of_second_start(solver, solution, watch=watch)
     except InputError as error:
         raise error.located(problem.path) from error
     if solution.status is Status.REFUSED:
         reasons = "; ".join(solution.notes)
         raise InputError(
-            f"{solution.message} {reasons}".strip(), problem.path, "solver"
+            f"{solution.message} {reasons}".strip(),
+            problem.path,
+            where="solver",
         )
     scan_notes = [] if scan is None else [scan.sentence]
     notes = (
@@ -289,13 +293,13 @@ def _solve_from_scan(
     """
     reason = f"the search from the guess failed ({failed.status.value})"
     needs_complete_start = getattr(solver, "needs_complete_start", False)
-    scan = rescue(failed.collocation, reason, needs_complete_start)
+    scan = rescue(failed.collocation, reason, is_complete=needs_complete_start)
     if scan is None:
         return None, failed
     again = associated_at_guess(
         replace(failed.collocation, parameters=scan.parameters)
     )
-    solution = solve_with_renewed_correspondences(solver, again, watch)
+    solution = solve_with_renewed_correspondences(solver, again, watch=watch)
     ended = solution.status.converged or solution.status is Status.INTERRUPTED
     return (scan, solution) if ended else (None, failed)
 
@@ -313,7 +317,7 @@ def _best_of_second_start(
     if other is None:
         return first
     again = associated_at_guess(replace(first.collocation, parameters=other))
-    second = solve_with_renewed_correspondences(solver, again, watch)
+    second = solve_with_renewed_correspondences(solver, again, watch=watch)
     gain = first.history[-1].loss - second.history[-1].loss
     if second.status is Status.INTERRUPTED:
         return replace(first, status=second.status, message=second.message)
@@ -406,7 +410,7 @@ def _usual_modulus(name: str, young_pa: float) -> float:
     value = (
         USUAL_POISSON
         if without_region(name) == "poisson"
-        else usual_value(name, young_pa, USUAL_POISSON)
+        else usual_value(name, young_pa, poisson=USUAL_POISSON)
     )
     assert value is not None
     return value

@@ -116,7 +116,7 @@ def _smooth_fit(fit: LinearisedFit) -> _SmoothFitQuality:
     return _SmoothFitQuality(
         fit.chi_squared,
         _chi_squared_per_measurement(fit),
-        factorise_information(fit).determined_count,
+        determined=factorise_information(fit).determined_count,
     )
 
 
@@ -149,11 +149,11 @@ def solve_two_phases(
     if not solution.status.converged:
         return solution
     smooth = _smooth_fit(linearise_fit(solution.collocation, solution.z))
-    at_smooth = _linearise_in_elements(problem, search, solution)
+    at_smooth = _linearise_in_elements(problem, search, solution=solution)
     phase = initial_phases(
         at_smooth.normal_equations(1.0),
         at_smooth.faces,
-        search.modes.volumes_m3,
+        volumes_m3=search.modes.volumes_m3,
     )
     best: Solution | None = None
     at_best = at_smooth
@@ -171,7 +171,9 @@ def solve_two_phases(
         rounds += 1
         if not candidate.status.converged:
             break
-        at_candidate = _linearise_in_elements(problem, search, candidate)
+        at_candidate = _linearise_in_elements(
+            problem, search, solution=candidate
+        )
         if (
             best is not None
             and at_candidate.fit.chi_squared >= at_best.fit.chi_squared
@@ -180,7 +182,7 @@ def solve_two_phases(
         best = candidate
         at_best = at_candidate
         draws = sample_phases(
-            at_best.normal_equations(1.0), at_best.faces, phase
+            at_best.normal_equations(1.0), at_best.faces, start=phase
         )
         next_phase = _likelier_phases(draws.probability)
         volumes_m3 = search.modes.volumes_m3
@@ -196,9 +198,12 @@ def solve_two_phases(
     # shrink inclusions.
     settings = replace(USUAL, face_nats=USUAL.face_nats / temperature)
     draws = sample_phases(
-        at_best.normal_equations(temperature), at_best.faces, final, settings
+        at_best.normal_equations(temperature),
+        at_best.faces,
+        start=final,
+        settings=settings,
     )
-    samples = _samples(draws, at_best.fit, search, best)
+    samples = _samples(draws, at_best.fit, search=search, solution=best)
     best = _with_samples(best, replace(samples, smooth_misfit=smooth.misfit))
     note = (
         f"two phases of {search.name}: started from a smooth field (χ² per measurement "
@@ -335,7 +340,7 @@ def _linearise_in_elements(
     base = part.field.logarithms(theta[body.field_slices[search.number]])
     elements = ElementLogarithms.relative_to(search.modes, base)
     fit = _fit_with_elements(
-        problem.with_fields({search.name: elements}), solution, search
+        problem.with_fields({search.name: elements}), solution, search=search
     )
     return _LinearisedMeasurements(
         fit=fit,
@@ -380,7 +385,7 @@ def _samples(
     mean, slopes = mean_logarithm(
         _two_phase_body(solution, search),
         solution.collocation.parameters,
-        solution.q,
+        q=solution.q,
         part_index=search.number,
         names=names,
     )

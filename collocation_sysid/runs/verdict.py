@@ -76,7 +76,7 @@ def solution_concerns(
     status = solution.status
     yield from body_concerns(solution)
     if not status.converged:
-        yield Concern("solve/lost", "doubtful", {"why": solution.message})
+        yield Concern("solve/lost", "doubtful", data={"why": solution.message})
         return
     if status is Status.ACCEPTABLE:
         yield Concern("solve/acceptable")
@@ -92,7 +92,9 @@ def solution_concerns(
         low, high = nuisance.bounds(part.segment.association.clock_samples)
         # A lag and a tool may well be none.
         low = np.where(low == 0, -np.inf, low)
-        yield from nuisance_concerns(nuisance.names, part.phi, low, high)
+        yield from nuisance_concerns(
+            nuisance.names, part.phi, low=low, high=high
+        )
         for camera in range(len(part.segment.experiment.depths)):
             pose = nuisance.indices_of_rows(
                 DEPTH_TURN, DEPTH_SHIFT, component=camera
@@ -106,7 +108,9 @@ def solution_concerns(
         for k in nuisance.indices_of_rows(TIME):
             scale = float(nuisance.scales[k])
             name = part.segment.experiment.name
-            yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
+            yield from clock_concerns(
+                name, float(part.phi[k]) * scale, prior_s=scale
+            )
     yield from stability_concerns(
         find_instabilities(solution.collocation, solution.z)
     )
@@ -117,15 +121,18 @@ def solution_concerns(
     for name, rollout in rollouts.items():
         yield from _unseen_depth_concerns(name, rollout)
         yield from _forward_concerns(
-            name, rollout, solution, expected_rms_m(solution, uncertainty)
+            name,
+            rollout,
+            solution=solution,
+            noise_m=expected_rms_m(solution, uncertainty),
         )
     collocation = solution.collocation
     for segment in collocation.transcriptions:
         yield from rotation_step_concerns(
             segment.experiment,
             collocation.substeps,
-            DOUBTFUL_ANGLE_RAD,
-            "scheme/turn",
+            limit_rad=DOUBTFUL_ANGLE_RAD,
+            code="scheme/turn",
         )
     for motion in motions:
         if (
@@ -135,8 +142,8 @@ def solution_concerns(
             yield from scheme_concerns(
                 motion.experiment,
                 motion.first_mode.damping_ratio,
-                motion.first_mode.numerical_damping_ratio,
-                motion.first_mode.period_error,
+                added_ratio=motion.first_mode.numerical_damping_ratio,
+                period_error=motion.first_mode.period_error,
             )
 
 
@@ -159,7 +166,7 @@ def combined_concerns(
     """
     return [
         _undetermined_concern(
-            item.name, estimates[item.name], shares[item.name]
+            item.name, estimates[item.name], shares=shares[item.name]
         )
         for item in parameters.free
         if item.name in shares and not estimates[item.name].is_determined
@@ -180,7 +187,9 @@ def _undetermined_concern(
         "share": share,
     }
     return Concern(
-        "information/combined", "check", {**data, "remedy": remedy_for(source)}
+        "information/combined",
+        "check",
+        data={**data, "remedy": remedy_for(source)},
     )
 
 
@@ -203,7 +212,7 @@ def body_concerns(solution: Solution) -> Iterator[Concern]:
         segment.experiment for segment in solution.collocation.transcriptions
     ]
     yield from scale_concerns(
-        experiments, solution.collocation.parameters, "doubtful"
+        experiments, solution.collocation.parameters, grade="doubtful"
     )
 
 
@@ -255,7 +264,7 @@ def _unseen_depth_concerns(
                 "camera": camera,
                 "seen": error.compared_points,
             }
-            yield Concern("prediction/unseen", "doubtful", data)
+            yield Concern("prediction/unseen", "doubtful", data=data)
 
 
 def _forward_concerns(
@@ -282,7 +291,7 @@ def _forward_concerns(
             Concern(
                 "roll-out/failed",
                 "doubtful",
-                {"experiment": name, "why": rollout},
+                data={"experiment": name, "why": rollout},
             )
         ]
     fitted = name in fit_rms_m
@@ -306,7 +315,7 @@ def _forward_concerns(
             noise_rms_m=0.0,
             is_fitted=fitted,
         )
-    return [*of_markers, *_depth_concerns(name, rollout, solution)]
+    return [*of_markers, *_depth_concerns(name, rollout, solution=solution)]
 
 
 def _depth_concerns(
@@ -365,7 +374,9 @@ def expected_rms_m(
         if uncertainty is None
         else measured - uncertainty.degrees_of_freedom
     )
-    return rms_expected_from_noise_m(sigma_m, samples, float(fitted))
+    return rms_expected_from_noise_m(
+        sigma_m, samples, parameter_count=float(fitted)
+    )
 
 
 def modes_by_experiment(
@@ -388,7 +399,10 @@ def modes_by_experiment(
         theta = experiment.body.theta_from_values(solution.parameters)
         try:
             motions[experiment.name] = check_modes(
-                experiment, scheme, experiment.timestep_s / substeps, theta
+                experiment,
+                scheme,
+                step_s=experiment.timestep_s / substeps,
+                theta=theta,
             )
         except SimulationError:
             continue

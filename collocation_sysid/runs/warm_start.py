@@ -86,7 +86,9 @@ class WarmStart:
         points = np.array(
             [place for named in places_m.values() for place in named.values()]
         )
-        with damage_refused(folder, RESULT_FILE, "solve that problem again"):
+        with damage_refused(
+            folder, RESULT_FILE, remedy="solve that problem again"
+        ):
             all_values = np.array(
                 [
                     *values.values(),

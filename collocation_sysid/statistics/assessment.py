@@ -187,21 +187,21 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
         *concern_if(
             is_used and persistent,
             factor > GROSS_MISFIT,
-            "residuals/persist",
+            code="residuals/persist",
             autocorrelation=dependence.lag1,
         ),
-        *concern_if(is_used and not persistent, False, "residuals/shared"),
+        *concern_if(is_used and not persistent, False, code="residuals/shared"),
         *concern_if(
             larger,
             factor > GROSS_MISFIT and no_noise,
-            "noise/larger",
+            code="noise/larger",
             factor=factor,
             stated=sigma_key,
         ),
         *concern_if(
             smaller,
             False,
-            "noise/smaller",
+            code="noise/smaller",
             factor=1 / (factor or 1.0),
             stated=sigma_key,
         ),
@@ -219,7 +219,9 @@ def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:
         else np.flatnonzero(scatter.is_disagreeing).tolist()
     )
     names = [display_name(uncertainty.names[k]) for k in disagreeing]
-    return concern_if(bool(names), False, "residuals/recordings", names=names)
+    return concern_if(
+        bool(names), False, code="residuals/recordings", names=names
+    )
 
 
 def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
@@ -263,11 +265,11 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     several = len(bounded) > 1
     code = "information/bounds" if several else "information/bound"
     return [
-        *concern_if(bool(bounded), several, code, names=bounded),
+        *concern_if(bool(bounded), several, code=code, names=bounded),
         *concern_if(
             bool(undetermined),
             len(undetermined) == len(estimates),
-            "information/none",
+            code="information/none",
             names=undetermined,
         ),
     ]
@@ -379,7 +381,10 @@ def outlier_share_concerns(
         1, sum(d.samples for d in diagnoses_list)
     )
     return concern_if(
-        share > WILD, share > HARDLY_TAME, "residuals/wild", percent=100 * share
+        share > WILD,
+        share > HARDLY_TAME,
+        code="residuals/wild",
+        percent=100 * share,
     )
 
 
@@ -410,11 +415,11 @@ def nuisance_concerns(
     for name, phi, lowest, highest in items:
         deviation = abs(float(phi))
         limited = not lowest + 1e-3 < phi < highest - 1e-3
-        concerns += concern_if(limited, True, "nuisance/limit", name=name)
+        concerns += concern_if(limited, True, code="nuisance/limit", name=name)
         concerns += concern_if(
             deviation > limit and not limited,
             deviation > ABSURD,
-            "nuisance/far",
+            code="nuisance/far",
             name=name,
             deviations=deviation,
         )
@@ -442,7 +447,7 @@ def camera_pose_concerns(
     return concern_if(
         deviation > LARGEST_CAMERA_OFFSET,
         False,
-        "nuisance/camera",
+        code="nuisance/camera",
         name=names[worst],
         deviations=deviation,
     )
@@ -466,7 +471,7 @@ def outline_concerns(camera: str, distances_px: Array) -> list[Concern]:
     return concern_if(
         share > OUTLINE_SHARE,
         False,
-        "residuals/outline",
+        code="residuals/outline",
         camera=camera,
         pixels=LARGEST_OUTLINE_DISTANCE_PX,
         percent=100 * share,
@@ -488,7 +493,7 @@ def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
     return concern_if(
         abs(shift_s) > LATE * prior_s,
         False,
-        "nuisance/clock",
+        code="nuisance/clock",
         experiment=name,
         shift_ms=1e3 * abs(shift_s),
         when="later" if shift_s > 0 else "earlier",
@@ -526,7 +531,7 @@ def forward_simulation_concerns(
         return concern_if(
             times > PREDICTION,
             gross,
-            "roll-out/predicted",
+            code="roll-out/predicted",
             experiment=name,
             times=times,
         )
@@ -534,7 +539,7 @@ def forward_simulation_concerns(
     return concern_if(
         missed > ROLLOUT,
         missed > GROSS_ROLLOUT,
-        "roll-out/misses",
+        code="roll-out/misses",
         experiment=name,
         rms_mm=1e3 * rms_m,
         fit_mm=1e3 * fit_rms_m,
@@ -574,7 +579,7 @@ def prediction_concerns(
     return concern_if(
         robust_sigmas > MISFIT and not is_chance,
         robust_sigmas > GROSS_MISFIT,
-        "prediction/misses",
+        code="prediction/misses",
         experiment=name,
         what=what,
         stated=sigma_key,
@@ -589,7 +594,9 @@ def stability_concerns(instabilities: Iterable[Instability]) -> list[Concern]:
     for each in instabilities:
         grows = each.e_foldings > E_FOLDINGS
         grossly = each.e_foldings > GROSS_E_FOLDINGS
-        concerns += concern_if(grows, grossly, "stability/grows", **vars(each))
+        concerns += concern_if(
+            grows, grossly, code="stability/grows", **vars(each)
+        )
     return concerns
 
 
@@ -622,21 +629,21 @@ def contact_concerns(
             *concern_if(
                 not each.face_count,
                 not guess,
-                "contact/never",
+                code="contact/never",
                 mm=1e3 * each.gap_m,
                 **data,
             ),
-            *concern_if(coarse, False, "contact/coarse", **sizes, **data),
+            *concern_if(coarse, False, code="contact/coarse", **sizes, **data),
             *concern_if(
                 bool(guess) and each.is_initially_in_contact,
                 False,
-                "contact/pressed",
+                code="contact/pressed",
                 **data,
             ),
             *concern_if(
                 bool(guess and each.separation_s),
                 False,
-                "contact/lost",
+                code="contact/lost",
                 t_s=each.separation_s,
                 **data,
             ),
@@ -666,7 +673,7 @@ def rotation_step_concerns(
     turn = fastest_rotation(experiment, substeps)
     sizes = {"step_ms": 1e3 * turn.step_s, "rate_rad_s": turn.rate_rad_s}
     return concern_if(
-        turn.angle_rad > limit_rad, False, code, **vars(turn), **sizes
+        turn.angle_rad > limit_rad, False, code=code, **vars(turn), **sizes
     )
 
 
@@ -690,7 +697,7 @@ def scheme_concerns(
         *concern_if(
             added_ratio > max(DAMPING_SHARE * damping_ratio, LITTLE_DAMPING),
             added_ratio > GROSS_DAMPING_SHARE * damping_ratio,
-            "scheme/damping",
+            code="scheme/damping",
             experiment=name,
             added=added_ratio,
             damping=damping_ratio,
@@ -698,7 +705,7 @@ def scheme_concerns(
         *concern_if(
             abs(period_error) > PERIOD_ERROR,
             abs(period_error) > GROSS_PERIOD_ERROR,
-            "scheme/period",
+            code="scheme/period",
             experiment=name,
             change=period_error,
         ),

@@ -157,7 +157,7 @@ def lagged_products(
         ):  # one at a time: all lags at once are large
             is_present = present[:, channel]
             lagged = [
-                _lagged(slope[:, channel], is_present, k)
+                _lagged(slope[:, channel], is_present, lag=k)
                 for k in range(last + 1)
             ]
             stacked = np.stack([each.ravel() for each in lagged])
@@ -183,7 +183,9 @@ def lagged_products(
     for overlap in overlaps:
         within = slice(first, first := first + len(overlap))
         expected[within, within] -= 2 * overlap
-    return LaggedProducts(tuple(lags), np.array(products), expected, shifted)
+    return LaggedProducts(
+        tuple(lags), np.array(products), expected=expected, shifted=shifted
+    )
 
 
 def toeplitz_product(autocorrelation: Array, values: Array) -> Array:
@@ -374,13 +376,15 @@ def analyse_dependence(
         (len(over_space) * moments.p_value for moments in over_space),
         default=1.0,
     )
-    moments = lagged_products(fit, information, [1] * len(fit.blocks))
+    moments = lagged_products(fit, information, lags=[1] * len(fit.blocks))
     # Rows and columns: variance and lag one, pooled over the experiments.
     pool = np.tile(np.eye(2), len(fit.blocks))
     products = pool @ moments.products
     expected = pool @ moments.expected @ pool.T
     if not expected[1, 1] > 0:  # nothing follows on anything
-        return Dependence(0.0, np.inf, _channel_correlation_p(fit), space_p)
+        return Dependence(
+            0.0, np.inf, shared_p=_channel_correlation_p(fit), space_p=space_p
+        )
     variance = products[0] / expected[0, 0]
     lag1_variance = (products[1] - variance * expected[1, 0]) / expected[1, 1]
     return Dependence(
@@ -422,12 +426,12 @@ def error_processes(
         for block in fit.blocks
     ]
     moments = lagged_products(
-        fit, information, [max(1, order) for order in orders]
+        fit, information, lags=[max(1, order) for order in orders]
     )
     autocovariances = moments.autocovariances()
     for _ in range(ROUNDS):
         tails = [
-            _long_lag_autocovariances(block, gamma, order)
+            _long_lag_autocovariances(block, gamma, order=order)
             for block, gamma, order in zip(
                 fit.blocks, autocovariances, orders, strict=True
             )
@@ -446,7 +450,7 @@ def error_processes(
         ):
             break
     return tuple(
-        _error_process(block, slope, gamma[: order + 1])
+        _error_process(block, slope, autocovariance=gamma[: order + 1])
         for block, slope, gamma, order in zip(
             fit.blocks,
             information.scaled_jacobians,
@@ -504,7 +508,9 @@ def _error_process(
         autocovariance = np.array([raw_variance])
     coefficients = _autoregression_of(block, autocovariance)
     correlation = process_autocorrelation(coefficients, len(residual))
-    innovation, known = _innovations(residual, present, coefficients)
+    innovation, known = _innovations(
+        residual, present, coefficients=coefficients
+    )
     channels = _channel_covariance(innovation, known)
     weight = present.sum(axis=0)
     if not weight @ np.diag(channels) > 0:  # no run of samples is long enough

@@ -179,7 +179,7 @@ def camera_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
             either = "; or if ".join(" and ".join(names) for names in mistakes)
             data = {"mistakes": either}
             code = "camera/likely"
-        yield Hypothesis(code, of, data, strength=strength)
+        yield Hypothesis(code, of, data=data, strength=strength)
 
 
 class _CameraTrial:

@@ -118,20 +118,23 @@ def combine(
     low, high = (
         at.from_value(end) + centre - optimum for end in estimate.statistical95
     )
-    statistical95 = _interval(at, low, high, bounds)
+    statistical95 = _interval(at, low, high=high, bounds=bounds)
     if not is_corrected:
         least, most = estimate.statistical95
         statistical95 = _clip(bounds, least), _clip(bounds, most)
     if systematic is None:
         return CombinedEstimate(
-            value, spread, statistical95, known_correction=correction
+            value,
+            spread,
+            statistical95=statistical95,
+            known_correction=correction,
         )
     if error is not None and error.interval95 is not None:
         low, high = map(at.from_value, error.interval95)
         low = low + known_effect
         high = high + known_effect
-    low, high = widened_interval((low, high), centre, systematic)
-    combined95 = _interval(at, low, high, bounds)
+    low, high = widened_interval((low, high), centre, deviation=systematic)
+    combined95 = _interval(at, low, high=high, bounds=bounds)
     deviation = (
         (high - low) / 2 / NORMAL_95 / at.derivative(at.to_value(centre))
     )

@@ -50,9 +50,9 @@ TOPICS: Mapping[str, Topic] = {
     "scale": Topic(
         "The scale",
         "forces",
-        "Measure a force, attach a known mass, or fix a density: motion alone determines only "
+        remedy="Measure a force, attach a known mass, or fix a density: motion alone determines only "
         "ratios.",
-        {
+        messages={
             "unknown": "only the ratios of {names} are identifiable (E/ρ), because no known "
             "force or mass sets their scale; fix a density, state a known mass, or measure a "
             "wrench",
@@ -61,9 +61,9 @@ TOPICS: Mapping[str, Topic] = {
     "description": Topic(
         "The description",
         "wrong_description",
-        "Compare units, frames, labels and clocks of the problem file with the laboratory's "
+        remedy="Compare units, frames, labels and clocks of the problem file with the laboratory's "
         "notes. The command check tests the recordings for common mistakes before a solve.",
-        {
+        messages={
             "poses-inverted": "the markers move as if the poses were inverted: invert them; a "
             "pose must map the undeformed body to its current position",
             "rotation-inverted": "the markers move as if the poses' rotations were inverted: "
@@ -165,10 +165,10 @@ TOPICS: Mapping[str, Topic] = {
     "noise": Topic(
         "Size of the noise",
         "verdict",
-        "The error bars are computed from the residuals. State the sensor's noise as sigma "
+        remedy="The error bars are computed from the residuals. State the sensor's noise as sigma "
         "if it is known. If a single marker deviates, look for exchanged labels and "
         "reflections in its track.",
-        {
+        messages={
             "larger": "the residuals are {factor:.2g} times as large as expected from {stated}",
             "smaller": "{stated} seems {factor:.2g} times too large for these residuals",
             "marker": "the residuals of {marker} are {factor:.2g} times sigma_m",
@@ -182,11 +182,11 @@ TOPICS: Mapping[str, Topic] = {
     "residuals": Topic(
         "Residuals that are not noise",
         "trust",
-        "Look at the residuals over time: a constant part indicates a wrong position or "
+        remedy="Look at the residuals over time: a constant part indicates a wrong position or "
         "offset, large residuals at the beginning a wrong time of release, an oscillation a "
         "wrong stiffness or damping. The command compare-models --materials tests whether another "
         "material law predicts better.",
-        {
+        messages={
             "outline": "{percent:.0f} % of the model's outline are more than {pixels:.0f} pixels "
             "away from the edge of the body in the images of {camera}: the body may be grasped "
             "at another place, be partly hidden, or have another stiffness; if depths are "
@@ -208,11 +208,11 @@ TOPICS: Mapping[str, Topic] = {
     "assumption": Topic(
         "Assumptions that the data contradict",
         "budget",
-        "Find out whether the assumption is wrong, for instance by repeating the first "
+        remedy="Find out whether the assumption is wrong, for instance by repeating the first "
         "recording at the end, or whether the model lacks an effect with similar "
         "consequences, as a missing memory resembles a drift. The command solve --probe "
         "computes the effect beyond first order and relaxes the other assumptions.",
-        {
+        messages={
             "contradicted": "the data contradict the assumption that {assumption}: with {name} = "
             "{size} ± {size_error} χ² decreases by {chi_squared:.3g}, and the estimates become "
             "{estimates}{instead}",
@@ -221,9 +221,9 @@ TOPICS: Mapping[str, Topic] = {
     "information": Topic(
         "Parameters that the data do not determine",
         "budget",
-        "Fix such a parameter at a known value, give it a prior or wider bounds, or record a "
+        remedy="Fix such a parameter at a known value, give it a prior or wider bounds, or record a "
         "motion that depends on it.",
-        {
+        messages={
             "bound": "{names} ended at its bound",
             "bounds": "{names} ended at their bounds",
             "none": "the data do not determine {names}",
@@ -244,8 +244,8 @@ TOPICS: Mapping[str, Topic] = {
     "markers": Topic(
         "The markers",
         "motion_capture",
-        "Check labels, unit, frame and positions of the markers, and when each marker is visible.",
-        {
+        remedy="Check labels, unit, frame and positions of the markers, and when each marker is visible.",
+        messages={
             "off": "marker '{marker}' of '{experiment}' lies {by_mm:.3g} mm outside the body, so "
             "that its motion is extrapolated: give its reference_m, or check the frame and "
             "unit",
@@ -260,10 +260,10 @@ TOPICS: Mapping[str, Topic] = {
     "nuisance": Topic(
         "Nuisance parameters of a recording",
         "motion_capture",
-        "Check whether the value is possible: are gravity, clocks, grasps and positions as "
+        remedy="Check whether the value is possible: are gravity, clocks, grasps and positions as "
         "stated in the problem file? If it is possible, widen its prior in "
         "[experiment.nuisance].",
-        {
+        messages={
             "limit": "{name} ended at the largest value allowed",
             "far": "{name} is {deviations:.1f} standard deviations of its prior away from zero",
             "camera": "{name} is {deviations:.1f} standard deviations of its prior away from the "
@@ -276,9 +276,9 @@ TOPICS: Mapping[str, Topic] = {
     "scheme": Topic(
         "Step and scheme",
         "scheme",
-        "Raise transcription.substeps, or use the midpoint scheme, which damps least. The "
+        remedy="Raise transcription.substeps, or use the midpoint scheme, which damps least. The "
         "command refine RUN measures the remaining error.",
-        {
+        messages={
             "step": "the estimated time-step error dominates the uncertainty of {name}: it was "
             "corrected by {percent:+.2g} %, {errors:.2g} standard uncertainties; raise "
             "transcription.substeps, or run refine to measure the error",
@@ -300,9 +300,9 @@ TOPICS: Mapping[str, Topic] = {
     "stability": Topic(
         "Unstable states",
         "material",
-        "Does the body buckle there? If not, the damping law generates energy: use damping = "
+        remedy="Does the body buckle there? If not, the damping law generates energy: use damping = "
         '"kelvin-voigt", which cannot, and make sure that moduli and densities are plausible.',
-        {
+        messages={
             "grows": "the motion of '{experiment}' is unstable at t = {time_s:.3g} s: disturbances "
             "grow at a rate of {growth_1_s:.2g} 1/s",
             "material": "the material {material}{where} is unstable at strains of '{experiment}' "
@@ -316,9 +316,9 @@ TOPICS: Mapping[str, Topic] = {
     "contact": Topic(
         "Contact",
         "contact",
-        "Check the position, the normal and the motion of the obstacle, and the mesh in the "
+        remedy="Check the position, the normal and the motion of the obstacle, and the mesh in the "
         "contact area.",
-        {
+        messages={
             "never": "in '{experiment}'{more} the body never touches {obstacle}{guess}; the "
             "smallest gap is {mm:.3g} mm: its force and friction carry no information",
             "coarse": "in '{experiment}'{more} only {faces:.2g} faces, {face_mm:.2g} mm large, "
@@ -335,9 +335,9 @@ TOPICS: Mapping[str, Topic] = {
     "mesh": Topic(
         "The mesh",
         "mesh",
-        'Refine it, and use element = "tet10", or "tet10-p0" for ν ≥ 0.45. The command '
+        remedy='Refine it, and use element = "tet10", or "tet10-p0" for ν ≥ 0.45. The command '
         "refine RUN measures the remaining error.",
-        {
+        messages={
             "refined": "step and mesh dominate the uncertainty of {name}: it was corrected by "
             "{percent:+.2g} %, {errors:.2g} standard uncertainties",
             "flat": "element {number} is nearly flat (mean-ratio quality {quality:.2g}, aspect "
@@ -354,9 +354,9 @@ TOPICS: Mapping[str, Topic] = {
     "roll-out": Topic(
         "The forward simulation",
         "trust",
-        "If the fit is good and the simulation is not, the step is too long. If a recording is "
+        remedy="If the fit is good and the simulation is not, the step is too long. If a recording is "
         "predicted badly, the model lacks an effect that this recording contains.",
-        {
+        messages={
             "failed": "the forward simulation of '{experiment}' failed: {why}",
             "misses": "the forward simulation of '{experiment}' deviates from the measurements by "
             "{rms_mm:.2g} mm, the fit by {fit_mm:.2g} mm",
@@ -367,10 +367,10 @@ TOPICS: Mapping[str, Topic] = {
     "prediction": Topic(
         "The prediction",
         "trust",
-        "The parameters are stated, not estimated: make sure that they belong to this body, and "
+        remedy="The parameters are stated, not estimated: make sure that they belong to this body, and "
         "that sigma is the sensor's noise. Then check which effects the model lacks, or estimate a "
         "parameter.",
-        {
+        messages={
             "misses": "the prediction of '{experiment}' deviates from {what} by {size}{sigmas:.2g} "
             "times {stated}",
             "unseen": "none of the {seen} points of {camera} is near the predicted surface of "
@@ -380,8 +380,8 @@ TOPICS: Mapping[str, Topic] = {
     "memory": Topic(
         "RAM",
         "large",
-        "Use the method reduced-space, fewer time steps or a coarser mesh.",
-        {
+        remedy="Use the method reduced-space, fewer time steps or a coarser mesh.",
+        messages={
             "short": "{method} will take about {needed_gb:.2g} GB, more than this machine's "
             "{there_gb:.2g} GB: {remedy}",
         },
@@ -389,9 +389,9 @@ TOPICS: Mapping[str, Topic] = {
     "field": Topic(
         "The field",
         "field",
-        "State the amplitude or lengths that the data suggest, or use regions where constants are "
+        remedy="State the amplitude or lengths that the data suggest, or use regions where constants are "
         "known to differ: a prior that is too tight makes intervals too narrow.",
-        {
+        messages={
             "amplitude": "{name} varies more within the body than the prior of its field allows: "
             "the data suggest an amplitude of about {likely:.2g}, not {stated:.2g}",
             "one-phase": "the data do not show two materials: the contrast of {name} is "
@@ -417,9 +417,9 @@ TOPICS: Mapping[str, Topic] = {
     "solve": Topic(
         "The solve",
         "trust",
-        "Start from another guess, or without one, and make sure that the command check "
+        remedy="Start from another guess, or without one, and make sure that the command check "
         "reports no mistake.",
-        {
+        messages={
             "lost": "the solve did not converge: {why}",
             "no-start": "there is no initial state yet: the first frame needs a pose",
             "not-simulable": "the body cannot be simulated with these parameters",
@@ -494,7 +494,7 @@ def concern_if(
     else "check"; an empty list unless `is_present`.
     """
     return (
-        [Concern(code, "doubtful" if is_gross else "check", data)]
+        [Concern(code, "doubtful" if is_gross else "check", data=data)]
         if is_present
         else []
     )

@@ -124,9 +124,9 @@ def changes_of_assumptions(
     assumptions = [(row, s) for row, s in rows if s is not None]
     correlation = deviations.get(CORRELATION_KEY) or CORRELATION
     of_bodies = changed_residuals(
-        collocation, z, assumptions, surface_correlation=correlation
+        collocation, z, assumptions=assumptions, surface_correlation=correlation
     )
-    of_nuisances = changes_of_nuisances(collocation, z, deviations)
+    of_nuisances = changes_of_nuisances(collocation, z, deviations=deviations)
     both = zip(of_bodies.blocks, of_nuisances.blocks, strict=True)
     blocks = [np.concatenate(each, axis=3) for each in both]
     return ResidualChanges(of_bodies.names + of_nuisances.names, blocks)
@@ -224,7 +224,9 @@ def changed_residuals(
     changes: list[Array] = []
     for part in collocation.iterates(z):
         at = ExperimentAtAnswer(
-            part, collocation.parameters, surface_correlation
+            part,
+            collocation.parameters,
+            surface_correlation=surface_correlation,
         )
         is_specimen = part.segment.experiment.specimen is not None
         effects = [
@@ -291,7 +293,7 @@ def _changes_by_effects(
         rows_n=rows,
     )
     for reading, _, observation, by in propagate_columns(
-        part, solver, columns, rows[:, segment.sensed_dofs]
+        part, solver, columns=columns, inertia_n=rows[:, segment.sensed_dofs]
     ):
         yield reading.residual_changes(observation, by, part.phi)
 
@@ -352,4 +354,4 @@ def _without_row_changes(
         assert lacking.reaction_by is not None  # along columns
         return replace(lacking, reaction_by=lacking.reaction_by - inertia_n)
 
-    return ObservedMotion(motion.x, forced, motion.changes)
+    return ObservedMotion(motion.x, forced, changes=motion.changes)

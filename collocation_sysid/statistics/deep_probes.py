@@ -68,7 +68,7 @@ def routine_probes_with_steps(fit: SolvedFit) -> tuple[Probe, ...]:
         return probes
     worst = max(alarming, key=lambda probe: probe.chi_squared)
     with_steps = replace(
-        _iterate_probe(fit, worst, significance_limit(fit.changes)),
+        _iterate_probe(fit, worst, limit=significance_limit(fit.changes)),
         routine=True,
     )
     return tuple(with_steps if probe is worst else probe for probe in probes)
@@ -87,7 +87,9 @@ def deep_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
     return (
         *(_with_significant_moves(each, limit) for each in parts),
         *(
-            _iterate_probe(solved_fit, probe, limits.get(probe.name, limit))
+            _iterate_probe(
+                solved_fit, probe, limit=limits.get(probe.name, limit)
+            )
             for probe in relaxed
         ),
     )
@@ -101,7 +103,7 @@ def _window_probes(at: SolvedFit) -> Iterator[Probe]:
             _restrict(block, cut)
             for block, cut in zip(at.fit.blocks, cuts, strict=True)
         ]
-        alone = fit_part(at.fit, blocks, np.arange(len(at.fit.names)))
+        alone = fit_part(at.fit, blocks, columns=np.arange(len(at.fit.names)))
         yield from _part_probe(at, "window", name, *alone)
 
 
@@ -162,7 +164,12 @@ def _part_probe(
     )
     remaining = least_squares_of_fit(alone)
     falls = remaining.loss(-step) - remaining.loss(np.zeros(len(step)))
-    yield Probe(kind, name, falls, at.changes_of_estimates(uncertainty))
+    yield Probe(
+        kind,
+        name,
+        chi_squared=falls,
+        moves=at.changes_of_estimates(uncertainty),
+    )
 
 
 def _with_significant_moves(probe: Probe, limit: float) -> Probe:
@@ -186,13 +193,13 @@ def _relaxed_probes(at: SolvedFit) -> Iterator[Probe]:
     """Relax each assumption that changes anything, by one linear step."""
     for name in dict.fromkeys(at.changes.names):
         wide = with_relaxed_assumption(
-            at.fit, at.changes, name, _widening(name)
+            at.fit, at.changes, name=name, widening=_widening(name)
         )
         if any(
             block.jacobian[..., len(at.fit.names) :].any()
             for block in wide.blocks
         ):
-            yield relaxed_probe(at, name, wide, at.parameters)
+            yield relaxed_probe(at, name, wide=wide, p=at.parameters)
 
 
 def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
@@ -218,7 +225,7 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
         for name, size in at.deviations.items()
     }
     wide = with_relaxed_assumption(
-        at.fit, at.changes, probe.name, _widening(probe.name)
+        at.fit, at.changes, name=probe.name, widening=_widening(probe.name)
     )
     p = at.parameters
     _, positions = collocation.unpack(at.z)
@@ -231,14 +238,14 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
         if failure is not None:
             break
         z = collocation.pack(p, positions)
-        changes = probed_changes(collocation, z, alone)
+        changes = probed_changes(collocation, z, deviations=alone)
         there = linearise_fit(collocation, z).with_disturbances(
             b.disturbances for b in at.fit.blocks
         )
         wide = with_relaxed_assumption(
-            there, changes, probe.name, _widening(probe.name)
+            there, changes, name=probe.name, widening=_widening(probe.name)
         )
-        probe = relaxed_probe(at, probe.name, wide, p)
+        probe = relaxed_probe(at, probe.name, wide=wide, p=p)
         if np.abs(step[: wide.shared_count]).max(initial=0.0) < SETTLED:
             break
     return replace(

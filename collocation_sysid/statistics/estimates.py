@@ -172,7 +172,7 @@ def user_estimates(
             continue
         deviation = float(np.sqrt(covariance_q[k, k]))
         estimate = _parameter_estimate(
-            item, value, deviation, float(quantiles[k])
+            item, value, deviation=deviation, quantile=float(quantiles[k])
         )
         other = int(np.argmax(partners[k]))
         relative = (
@@ -191,7 +191,7 @@ def user_estimates(
                 "its 95 % interval covers the whole range between its bounds"
             )
             estimate = Estimate(
-                value, None, estimate.statistical95, reason=reason
+                value, None, statistical95=estimate.statistical95, reason=reason
             )
         elif (
             partners[k, other] > CONFOUNDED and relative > CONFOUNDED_DEVIATION
@@ -201,7 +201,7 @@ def user_estimates(
                 f"(correlation {correlation_from_covariance(covariance_q)[k, other]:.3f})"
             )
             estimate = Estimate(
-                value, None, estimate.statistical95, reason=reason
+                value, None, statistical95=estimate.statistical95, reason=reason
             )
         estimates[item.name] = estimate
     for item in parameters.items:
@@ -260,7 +260,10 @@ def derived_estimates(
             )
             deviation = float(np.sqrt(variance)) / value
             estimates[name] = _logarithmic_estimate(
-                name, value, deviation, float(quantiles[used].max())
+                name,
+                value,
+                deviation=deviation,
+                quantile=float(quantiles[used].max()),
             )
     return estimates
 
@@ -281,10 +284,15 @@ def _parameter_estimate(
         Half width of the interval in standard deviations.
     """
     if item.scale == "log":
-        return _logarithmic_estimate(item.name, value, deviation, quantile)
+        return _logarithmic_estimate(
+            item.name, value, deviation=deviation, quantile=quantile
+        )
     if without_region(item.name) == "poisson" and value > 0:
         return _logarithmic_estimate(
-            item.name, value, deviation * item.unit / value, quantile
+            item.name,
+            value,
+            deviation=deviation * item.unit / value,
+            quantile=quantile,
         )
     if not deviation <= UNDETERMINED:
         return Estimate(value, reason="the data do not determine it")
@@ -293,7 +301,10 @@ def _parameter_estimate(
     return Estimate(
         value,
         spread,
-        (max(least, value - quantile * spread), value + quantile * spread),
+        statistical95=(
+            max(least, value - quantile * spread),
+            value + quantile * spread,
+        ),
     )
 
 
@@ -344,8 +355,8 @@ def _logarithmic_estimate(
     if at.is_odds:
         reason = "its 95 % interval covers nearly all of (0, 0.5)"
     if high - low > WIDE_POISSON if at.is_odds else high > WIDE_FACTOR * low:
-        return Estimate(value, None, (low, high), reason=reason)
-    return Estimate(value, value * deviation, (low, high))
+        return Estimate(value, None, statistical95=(low, high), reason=reason)
+    return Estimate(value, value * deviation, statistical95=(low, high))
 
 
 # A relaxation time beyond so many recordings is not seen to end.

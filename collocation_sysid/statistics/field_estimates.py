@@ -275,7 +275,7 @@ class FieldEstimate:
             }
             least = {"least": float(self.value.min()), "stated": amplitude}
             determined.insert(
-                0, Concern("field/negative", "doubtful", counts | least)
+                0, Concern("field/negative", "doubtful", data=counts | least)
             )
         return determined
 
@@ -319,7 +319,7 @@ def field_estimates(
             continue
         coefficients = body.field_slices[number]
         mean, slopes = _mean_logarithm(
-            constants, number, modes
+            constants, number, modes=modes
         ).evaluate_with_jacobian(q, NOTHING)
         local = mean[0] + modes.logarithms(theta[coefficients])
         declared = None
@@ -358,7 +358,7 @@ def field_estimates(
         )
         if isinstance(modes, TwoPhaseModes):
             contrast = theta[coefficients.stop - 1]
-            estimate = _with_phases(estimate, modes, float(contrast))
+            estimate = _with_phases(estimate, modes, contrast=float(contrast))
         estimates.append(estimate)
     return estimates
 
@@ -428,7 +428,7 @@ def field_estimates_at(
     ):
         known = covariance[:nq, :nq]
         for field in field_estimates(
-            body, collocation.parameters, z[:nq], known
+            body, collocation.parameters, q=z[:nq], uncertainty=known
         ):
             estimates.setdefault(field.name, field)
     return estimates
@@ -460,7 +460,7 @@ def mean_logarithm(
     modes = body.parts[part_index].field
     assert modes is not None
     mean, slopes = _mean_logarithm(
-        ThetaMap(parameters, body), part_index, modes
+        ThetaMap(parameters, body), part_index, modes=modes
     ).evaluate_with_jacobian(q, NOTHING)
     free = [item.name for item in parameters.free]
     return float(mean[0]), slopes.reshape(-1)[

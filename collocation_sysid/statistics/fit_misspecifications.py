@@ -102,10 +102,10 @@ def find_misspecifications(
     if max(misfits) > NOISE:
         worst = fitted[int(np.argmax(misfits))]
         hypotheses += find_misspecifications_by_modes(
-            worst, solution.parameters, solution.collocation.huber
+            worst, solution.parameters, huber=solution.collocation.huber
         )
         if max((each.strength for each in hypotheses), default=0.0) < CERTAIN:
-            hypotheses += _refit_hypotheses(solution, worst, budget)
+            hypotheses += _refit_hypotheses(solution, worst, budget=budget)
     return rank(hypotheses)
 
 
@@ -125,14 +125,14 @@ def _refit_hypotheses(
         `find_misspecifications`.
     """
     first = first_samples(experiment, MOST_SAMPLES)
-    alone = _Refitter(solution, first, budget)
+    alone = _Refitter(solution, first, sweeps=budget)
     fitted_m = alone.fit(first)
     if fitted_m is None:
         return []
     trial = HypothesisTest(
         _misfit(first, fitted_m),
         alone.misfit_after_refit,
-        BETTER,
+        required_factor=BETTER,
         smallest_misfit=1.0,
         noise_level=NOISE,
     )
@@ -181,7 +181,9 @@ def _grasp_layer_hypotheses(
     """
     for deeper, deep in ((True, "deeper"), (False, "less deep")):
         if (layered := _with_shifted_grasps(declared, deeper)) is not None:
-            yield Hypothesis("grasp-layer", of, {"deep": deep}, layered)
+            yield Hypothesis(
+                "grasp-layer", of, data={"deep": deep}, corrected=layered
+            )
 
 
 def _slip_hypotheses(
@@ -210,7 +212,7 @@ def _slip_hypotheses(
     without = replace(
         declared, markers=replace(declared.markers, positions_m=tracks)
     )
-    yield Hypothesis("marker-slip", of, data, without)
+    yield Hypothesis("marker-slip", of, data=data, corrected=without)
 
 
 def _largest_step(residual: Array) -> tuple[float, int]:
@@ -318,7 +320,7 @@ def _clock_hypotheses(
         shifted = later
         fitted_m = fitted
         if (now := _misfit(shifted, fitted_m)) < least:
-            best = clock_hypothesis(of, lag_s, shifted)
+            best = clock_hypothesis(of, lag_s, corrected=shifted)
             least = now
     if best is not None:
         yield best
@@ -338,7 +340,7 @@ def with_pose_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
             experiment,
             t_s=t_s[is_covered],
             grasps=[
-                replace(g, poses=_delayed_poses(g, t_s, lag_s))
+                replace(g, poses=_delayed_poses(g, t_s, lag_s=lag_s))
                 for g in experiment.grasps
             ],
             markers=replace(

@@ -104,8 +104,8 @@ def _combination_sentences(uncertainty: Uncertainty) -> list[str]:
                 _combination_sentence(
                     uncertainty,
                     known[members],
-                    max(value, 0.0),
-                    vector[members],
+                    eigenvalue=max(value, 0.0),
+                    vector=vector[members],
                 )
             )
     return sentences

@@ -362,7 +362,9 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
         for reading, (misfit, by_own) in zip(
             segment.residuals, linearised, strict=True
         ):
-            residual, by_own = huber_as_weights(misfit, by_own, reading.huber)
+            residual, by_own = huber_as_weights(
+                misfit, by_own, huber=reading.huber
+            )
             residual, misfit, by_own = map(
                 reading.pool_values, (residual, misfit, by_own)
             )
@@ -465,7 +467,7 @@ def factorise_information(fit: LinearisedFit) -> Information:
     all_rows = least_squares_of_fit(fit)
     slopes = tuple(block.channels[1] @ all_rows.root for block in fit.blocks)
     prior = all_rows.root * fit.prior_jacobian[:, None]
-    return Information(all_rows, slopes, prior.T @ prior)
+    return Information(all_rows, slopes, prior=prior.T @ prior)
 
 
 def least_squares_of_fit(fit: LinearisedFit) -> SquareRootInformation:

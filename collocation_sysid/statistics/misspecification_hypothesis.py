@@ -59,7 +59,7 @@ class Hypothesis:
         tried = {} if self.corrected is None else {"nearer": self.strength}
         of = {"of": self.subject} if self.subject else {}
         return Concern(
-            f"description/{self.code}", grade, {**of, **self.data, **tried}
+            f"description/{self.code}", grade, data={**of, **self.data, **tried}
         )
 
     def as_dict(self) -> dict[str, Any]:

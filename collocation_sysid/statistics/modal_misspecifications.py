@@ -117,7 +117,7 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
         trial = HypothesisTest(
             remaining_misfit(markers.positions_m),
             remaining_misfit,
-            LEAST_IMPROVEMENT,
+            required_factor=LEAST_IMPROVEMENT,
         )
         yield from trial.accepted(
             _axes(f"'{experiment.name}'", markers.positions_m)
@@ -205,7 +205,9 @@ class ModalComparison:
     def hypotheses(self) -> Iterator[Hypothesis]:
         """Iterate over the hypotheses that fit far better than the description as stated."""
         trial = HypothesisTest(
-            self.misfit_m(self.declared), self.misfit_m, LEAST_IMPROVEMENT
+            self.misfit_m(self.declared),
+            self.misfit_m,
+            required_factor=LEAST_IMPROVEMENT,
         )
         yield from trial.accepted(
             [
@@ -227,7 +229,7 @@ class ModalComparison:
         if strength > 1:
             data = {"by_mm": 1e3 * misfit_m, "size_mm": 1e3 * size_m}
             yield Hypothesis(
-                "unlike", self.declared.name, data, strength=strength
+                "unlike", self.declared.name, data=data, strength=strength
             )
 
     def _other_axes(self) -> Iterator[Hypothesis]:
@@ -240,7 +242,9 @@ class ModalComparison:
 
         declared_m = self.declared.tracks_m
         yield from HypothesisTest(
-            remaining_misfit(declared_m), remaining_misfit, LEAST_IMPROVEMENT
+            remaining_misfit(declared_m),
+            remaining_misfit,
+            required_factor=LEAST_IMPROVEMENT,
         ).accepted(_axes(self.declared.name, declared_m))
 
     def _misfits_m(self, declared: DeclaredMotion, predicted: Array) -> Array:
@@ -306,13 +310,17 @@ class ModalComparison:
             np.abs(LAGS_S) < LONGEST_LAG * np.ptp(declared.t_s)
         ].tolist()
         delayed = (
-            delayed_tracks(predicted, declared.t_s, lag_s) for lag_s in allowed
+            delayed_tracks(predicted, declared.t_s, lag_s=lag_s)
+            for lag_s in allowed
         )
         misfits = [self._misfits_m(declared, each).min() for each in delayed]
         if misfits:
             lag_s = allowed[int(np.argmin(misfits))]
             yield clock_hypothesis(
-                declared.name, lag_s, replace(declared, lag_s=lag_s), FITTED
+                declared.name,
+                lag_s,
+                corrected=replace(declared, lag_s=lag_s),
+                handicap=FITTED,
             )
 
     def _name_hypotheses(self) -> Iterator[Hypothesis]:
@@ -336,17 +344,22 @@ class ModalComparison:
         if not len(exchanged):
             return
         few, renamed = (
-            _with_markers(declared, declared.tracks_m[:, order], exchanged)
+            _with_markers(
+                declared, declared.tracks_m[:, order], markers=exchanged
+            )
             for order in (np.arange(len(chosen)), np.argsort(chosen))
         )
         listed = ", ".join(
             f"{self.names[k]} is {self.names[chosen[k]]}" for k in exchanged
         )
         hypothesis = Hypothesis(
-            "markers-exchanged", declared.name, {"names": listed}, renamed
+            "markers-exchanged",
+            declared.name,
+            data={"names": listed},
+            corrected=renamed,
         )
         yield from HypothesisTest(
-            self.misfit_m(few), self.misfit_m, LEAST_IMPROVEMENT
+            self.misfit_m(few), self.misfit_m, required_factor=LEAST_IMPROVEMENT
         ).accepted([hypothesis])
 
 
@@ -397,13 +410,19 @@ def simple_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
     if moving or np.abs(declared.translations_m).any():
         yield from _pose_hypotheses(declared)
         yield from _unit_hypotheses(
-            declared, "translations_m", "the poses would fit if they", "grasp"
+            declared,
+            "translations_m",
+            who="the poses would fit if they",
+            section="grasp",
         )
     yield from _unit_hypotheses(
-        declared, "tracks_m", "the markers would fit if they", "markers"
+        declared,
+        "tracks_m",
+        who="the markers would fit if they",
+        section="markers",
     )
     yield from _unit_hypotheses(
-        declared, "mesh_scale", "the mesh would fit if it", "object"
+        declared, "mesh_scale", who="the mesh would fit if it", section="object"
     )
     yield from gravity_hypotheses(declared)
 
@@ -429,7 +448,10 @@ def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
         ).as_matrix()
         without = replace(declared, rotations=reordered)
         yield Hypothesis(
-            "quaternion-order", declared.name, {"order": order}, without
+            "quaternion-order",
+            declared.name,
+            data={"order": order},
+            corrected=without,
         )
 
 
@@ -454,7 +476,9 @@ def _unit_hypotheses(
         remedy = f'set {key} = "{unit}"' if unit else f"check {key}"
         data = {"who": who, "factor": factor, "remedy": remedy}
         without = replace(declared, **{what: factor * getattr(declared, what)})
-        yield Hypothesis("length-unit", declared.name, data, without)
+        yield Hypothesis(
+            "length-unit", declared.name, data=data, corrected=without
+        )
 
 
 def gravity_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
@@ -472,4 +496,6 @@ def gravity_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
                     "vector": ", ".join(f"{x:g}" for x in other),
                 }
                 without = replace(declared, gravity_m_s2=other)
-                yield Hypothesis("gravity", declared.name, data, without)
+                yield Hypothesis(
+                    "gravity", declared.name, data=data, corrected=without
+                )

@@ -58,7 +58,10 @@ def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
             "nodes": int(sizes[loose].max()),
         }
         yield Hypothesis(
-            "mesh-parts", f"'{experiment.name}'", data, strength=float(count)
+            "mesh-parts",
+            f"'{experiment.name}'",
+            data=data,
+            strength=float(count),
         )
 
 
@@ -82,7 +85,9 @@ def _containing(
     )
     code = "obstacle-normal" if reversible else "obstacle-place"
     data = {"obstacle": obstacle.name, "percent": 100 * share}
-    yield Hypothesis(code, f"'{experiment.name}'", data, strength=100 * share)
+    yield Hypothesis(
+        code, f"'{experiment.name}'", data=data, strength=100 * share
+    )
 
 
 def _gaps_m(obstacle: Obstacle, points_m: Array) -> Array:

@@ -83,7 +83,7 @@ def size_and_density_hypotheses(body: Body) -> tuple[Hypothesis, ...]:
     )
     for each in tried:
         if each.strength > IMPOSSIBLE:
-            raise InputError(each.message, None, "object")
+            raise InputError(each.message, None, where="object")
     return tuple(each for each in tried if each.strength > 1)
 
 
@@ -166,7 +166,7 @@ def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
                 data = {"axis": axis, "grasp": k, "correlation": correlation}
                 strength = 1 / (1 + correlation + 1e-3)
                 yield Hypothesis(
-                    "sign", f"'{experiment.name}'", data, strength=strength
+                    "sign", f"'{experiment.name}'", data=data, strength=strength
                 )
 
 
@@ -283,7 +283,7 @@ def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
         data = {"by_mm": 1e3 * motion_m}
         of = f"'{experiment.name}'"
         yield Hypothesis(
-            "poses-constant", of, data, strength=float(motion_m / still_m)
+            "poses-constant", of, data=data, strength=float(motion_m / still_m)
         )
 
 
@@ -347,7 +347,7 @@ def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
         usual_m = max(
             _usual_change(sizes[:, m]), most_m, 2 * float(markers.sigma_m[m])
         )
-        if _is_lasting(markers.positions_m, m, k + 2, size_m):
+        if _is_lasting(markers.positions_m, m, sample=k + 2, step_m=size_m):
             yield from _step_hypothesis(
                 "marker-slip/alone",
                 experiment,
@@ -388,7 +388,7 @@ def _step_hypothesis(
     }
     if size_m >= SUDDEN * usual_m:
         yield Hypothesis(
-            code, f"'{experiment.name}'", data, strength=size_m / usual_m
+            code, f"'{experiment.name}'", data=data, strength=size_m / usual_m
         )
 
 
@@ -463,7 +463,7 @@ def name_exchange_hypotheses(
         Hypothesis(
             "markers-exchanged/later",
             f"'{experiment.name}'",
-            data,
+            data=data,
             strength=strength,
         ),
     )
@@ -488,7 +488,7 @@ def _marker_identities(experiment: Experiment) -> tuple[Index, float]:
         is_present = np.isfinite(now_m[:, 0])
         known = np.flatnonzero(is_present & np.isfinite(last_m[:, 0]))
         chosen, clearly = _best_assignment(
-            last_m[known], now_m[known], markers.sigma_m[known]
+            last_m[known], now_m[known], sigma_m=markers.sigma_m[known]
         )
         if clearly > CLEARLY:
             order[k:, known] = order[k, known[chosen]]

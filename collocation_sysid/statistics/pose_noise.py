@@ -130,7 +130,7 @@ def with_pose_noise(
         disturbances: list[Array | None] = [None] * len(part.segment.residuals)
         if any(noise.sigma_m or noise.sigma_rad for noise in noise_of_grasps):
             drawn = _residual_samples(
-                part, noise_of_grasps, np.random.default_rng(seed)
+                part, noise_of_grasps, rng=np.random.default_rng(seed)
             )
             if any(np.sqrt(np.mean(each**2)) >= NEGLIGIBLE for each in drawn):
                 disturbances = [*drawn]
@@ -151,7 +151,9 @@ def _grasp_noise(name: str, grasp: Grasp) -> PoseNoise:
     rough_m, rough_rad = estimate_pose_noise(grasp.poses)
     sigma_m = rough_m if grasp.sigma_m is None else grasp.sigma_m
     sigma_rad = rough_rad if grasp.sigma_rad is None else grasp.sigma_rad
-    return PoseNoise(name, sigma_m, sigma_rad, grasp.sigma_m is None)
+    return PoseNoise(
+        name, sigma_m, sigma_rad=sigma_rad, is_estimated=grasp.sigma_m is None
+    )
 
 
 def _residual_samples(
@@ -186,7 +188,7 @@ def _residual_samples(
         solver, iterate.equations, displacements_m
     )
     for reading, motion, values, by in propagate_columns(
-        iterate, solver, columns
+        iterate, solver, columns=columns
     ):
         for grasp, shifts, rotations in pose_errors:
             by = by + reading.observable.frame_changes(

@@ -130,7 +130,11 @@ def compute_profile(
     step = 2 * deviation if np.isfinite(deviation) and deviation > 0 else 0.1
     lower, upper = (
         None
-        if (way := _find_end(rise, side * step, float(np.log(bound / value))))
+        if (
+            way := _find_end(
+                rise, side * step, bound=float(np.log(bound / value))
+            )
+        )
         is None
         else float(value * np.exp(way))
         for side, bound in zip((-1, 1), bounds, strict=True)
@@ -234,14 +238,14 @@ def profile_of_solution(
         raise InputError(
             f"found {name!r}; expected one of the estimated parameters {', '.join(free)}",
             None,
-            "uncertainty.profile",
+            where="uncertainty.profile",
         )
     k = free.index(name)
     variance = float(uncertainty.covariance[k, k])
     item = parameters.free[k]
 
     def solve_fixed(_: str, value: float) -> float:
-        return _loss_with_fixed(solution, item, value)
+        return _loss_with_fixed(solution, item, value=value)
 
     return compute_profile(
         solve_fixed,
@@ -249,7 +253,7 @@ def profile_of_solution(
         best=(solution.parameters[name], _loss_of(solution)),
         bounds=(item.lower, item.upper),
         deviation=float(np.sqrt(variance)),
-        noise_scale=_noise_scale(solution, fit, uncertainty, k),
+        noise_scale=_noise_scale(solution, fit, uncertainty=uncertainty, k=k),
     )
 
 

@@ -134,7 +134,9 @@ def single_fits(fit: LinearisedFit) -> Iterator[tuple[LinearisedFit, Array]]:
         columns = np.r_[
             np.arange(fit.shared_count), fit.shared_count + np.flatnonzero(mine)
         ]
-        yield fit_part(fit, [fit.blocks[k] for k in block_numbers], columns)
+        yield fit_part(
+            fit, [fit.blocks[k] for k in block_numbers], columns=columns
+        )
 
 
 def fit_part(
@@ -197,9 +199,9 @@ def compare_recordings(
     return RecordingComparison(
         tuple(alone),
         np.where(is_determined, steps, np.nan),
-        np.where(is_determined, deviations, np.nan),
-        _sensitivities_to_differences(
-            fit, [*alone], np.where(np.isfinite(excess), excess, 1.0)
+        deviations=np.where(is_determined, deviations, np.nan),
+        sensitivities=_sensitivities_to_differences(
+            fit, [*alone], excess=np.where(np.isfinite(excess), excess, 1.0)
         ),
     )
 

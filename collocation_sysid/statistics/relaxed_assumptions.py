@@ -151,7 +151,7 @@ class SolvedFit:
         )
         fit = replace(fit, derived=DerivedModuli.from_bodies(constants, q))
         return uncertainty_from_fit(
-            fit, self.collocation.parameters, q, self.error_model
+            fit, self.collocation.parameters, q=q, error_model=self.error_model
         )
 
     def changes_of_estimates(
@@ -231,7 +231,7 @@ def probed_changes(
         Result of `changes_of_assumptions` for these deviations, if it is known.
     """
     known = (
-        changes_of_assumptions(collocation, z, deviations)
+        changes_of_assumptions(collocation, z, deviations=deviations)
         if changes is None
         else changes
     )
@@ -353,7 +353,10 @@ def relaxed_probe(
     )
     worst = int(np.argmax(np.nan_to_num(np.abs(own) / errors)))
     probe = Probe(
-        "assumption", name, decrease, fit.changes_of_estimates(uncertainty)
+        "assumption",
+        name,
+        chi_squared=decrease,
+        moves=fit.changes_of_estimates(uncertainty),
     )
     probe = replace(
         probe,

@@ -299,7 +299,7 @@ def _message(
         )
         cause += "" if estimated[1] else "; estimate time_shift"
     elif diagnosis.oscillating_share > DOMINANT:
-        cause = _oscillation_message(diagnosis, t_s, motion)
+        cause = _oscillation_message(diagnosis, t_s, motion=motion)
     elif persistent and diagnosis.lag1 > DOMINANT:
         cause = "the residuals drift slowly: the model lacks creep of the material or slip in the grasp"
         if block.is_static:
@@ -412,10 +412,12 @@ def remove_outliers(
                 1, int(EXCEPTIONS * block.is_present[:, marker].sum())
             )
             while allowed and (
-                outlier := _find_outlier(block, marker, RARE / len(fit.blocks))
+                outlier := _find_outlier(
+                    block, marker, significance=RARE / len(fit.blocks)
+                )
             ):
                 outliers.append(outlier)
-                block = _without_sample(block, marker, outlier.sample)
+                block = _without_sample(block, marker, sample=outlier.sample)
                 allowed = allowed - 1
         blocks.append(block)
     return (
@@ -442,7 +444,7 @@ def _find_outlier(
     chance = (
         count
         * block.is_present.shape[1]
-        * beta_sf(share, freedom, (count - 1) * freedom)
+        * beta_sf(share, freedom, b=(count - 1) * freedom)
     )
     if count < FEWEST_SAMPLES or share < MOST or chance > significance:
         return None

@@ -81,13 +81,15 @@ def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
     probes = []
     for name in ROUTINE:
         wide = with_relaxed_assumption(
-            solved_fit.fit, solved_fit.changes, name, WIDENING
+            solved_fit.fit, solved_fit.changes, name=name, widening=WIDENING
         )
         if any(
             block.jacobian[..., len(solved_fit.fit.names) :].any()
             for block in wide.blocks
         ):
-            probe = relaxed_probe(solved_fit, name, wide, solved_fit.parameters)
+            probe = relaxed_probe(
+                solved_fit, name, wide=wide, p=solved_fit.parameters
+            )
             significant = (name,) if probe.is_beyond(limit) else ()
             probes.append(replace(probe, routine=True, sentences=significant))
     return tuple(probes)

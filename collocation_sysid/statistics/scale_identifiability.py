@@ -57,7 +57,11 @@ def scale_concerns(
 ) -> list[Concern]:
     """Return a concern if the scale is not determined."""
     names = parameters_of_open_scale(experiments, parameters)
-    return [Concern("scale/unknown", grade, {"names": names})] if names else []
+    return (
+        [Concern("scale/unknown", grade, data={"names": names})]
+        if names
+        else []
+    )
 
 
 def relative_scale_note(
@@ -108,7 +112,9 @@ def _scaled_parameters(
         constants = ThetaMap(usual, body)
         theta = constants.theta(usual.guess_q)
         slope = constants.jacobian(usual.guess_q)
-        change = _common_scaling(body, theta, slope, includes_declared)
+        change = _common_scaling(
+            body, theta, slope=slope, includes_declared=includes_declared
+        )
         if key in with_known_force or change is None:
             change = np.zeros(len(slope))
         size = np.where(theta == 0, 1.0, np.abs(theta))

@@ -83,7 +83,7 @@ def surface_modes(
     fields = np.zeros((len(corners.points_m), SURFACE_MODES))
     length_m = correlation * float(extents_m(corners.points_m)[0])
     own = _correlation_modes(
-        corners.points_m[surface], area_m2[surface], length_m
+        corners.points_m[surface], area_m2[surface], length_m=length_m
     )
     fields[surface, : own.shape[1]] = own
     if known.size:
@@ -93,7 +93,7 @@ def surface_modes(
         )
     displacements = fields[:, :, None] * normals[:, None, :]
     harmonic = _harmonic_extension(
-        corners, surface, displacements.reshape(len(fields), -1)
+        corners, surface, values=displacements.reshape(len(fields), -1)
     )
     of_corners = harmonic.reshape(len(fields), SURFACE_MODES, 3)
     return _extend_to_all_nodes(body, of_corners.transpose(1, 0, 2))

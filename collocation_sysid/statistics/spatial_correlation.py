@@ -113,13 +113,17 @@ def estimate_spatial_correlation(
     longest = max(LONGEST * float(distances_m.max()), 2 * nearest)
     white, _ = _restricted_likelihood(contrasts, 0.0, length_m=1.0)
     candidates = [
-        (*_restricted_likelihood(contrasts, share, length), share, length)
+        (
+            *_restricted_likelihood(contrasts, share, length_m=length),
+            share,
+            length,
+        )
         for share in SHARES
         for length in np.geomspace(nearest / 2, longest, LENGTHS)
     ]
     least, level, share, length = min(candidates)
     p = float(chi2_sf(max(0.0, white - least), 2))
-    shape = _correlation_matrix(distances_m, share, float(length))
+    shape = _correlation_matrix(distances_m, share, length_m=float(length))
     share_known = count / max(1, sum(len(f) for _, f, _ in contrasts))
     freedom = max(
         1.0,
@@ -128,7 +132,9 @@ def estimate_spatial_correlation(
         * np.trace(shape) ** 2
         / float(np.sum(shape**2)),
     )
-    return SpatialCorrelation(level * shape, float(length), p, freedom)
+    return SpatialCorrelation(
+        level * shape, float(length), p_value=p, freedom=freedom
+    )
 
 
 def _correlation_matrix(
@@ -162,7 +168,9 @@ def _restricted_likelihood(
     count = 0
     for z, free, distances_m in contrasts:
         root = np.linalg.cholesky(
-            free.T @ _correlation_matrix(distances_m, share, length_m) @ free
+            free.T
+            @ _correlation_matrix(distances_m, share, length_m=length_m)
+            @ free
         )
         squares += float(np.sum(np.linalg.solve(root, z) ** 2))
         logarithms += 2 * float(np.log(np.diag(root)).sum())

@@ -93,7 +93,7 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
     test = HypothesisTest(
         misfit,
         misfit_of,
-        REQUIRED_FACTOR,
+        required_factor=REQUIRED_FACTOR,
         smallest_misfit=1.0,
         noise_level=NOISE_LEVEL,
     )
@@ -189,7 +189,10 @@ def _hypotheses(
     areas = area_ratios(deformation, strain)
     if areas is not None and np.ptp(areas):
         yield Hypothesis(
-            "specimen-true-stress", of, {}, _with_stress(experiment, areas)
+            "specimen-true-stress",
+            of,
+            data={},
+            corrected=_with_stress(experiment, areas),
         )
     is_invertible = (strain >= 0).all() and strain.max() < 1.0
     if (
@@ -197,11 +200,17 @@ def _hypotheses(
         and is_invertible
     ):
         yield Hypothesis(
-            "specimen-compression", of, {}, _compressed(experiment)
+            "specimen-compression",
+            of,
+            data={},
+            corrected=_compressed(experiment),
         )
     if strain.max() > PERCENT_STRAIN and deformation.test != "volumetric":
         yield Hypothesis(
-            "specimen-percent", of, {}, _strained(experiment, 0.01)
+            "specimen-percent",
+            of,
+            data={},
+            corrected=_strained(experiment, 0.01),
         )
     ratios = [other / _initial_slope(experiment) for other in other_slopes_pa]
     for unit, factor in UNIT_FACTORS.items():
@@ -211,7 +220,10 @@ def _hypotheses(
         if (decades > np.log(UNIT_LIKE)).any():
             corrected = _with_stress(experiment, np.full_like(strain, factor))
             yield Hypothesis(
-                "specimen-unit", of, {"unit": unit, "factor": factor}, corrected
+                "specimen-unit",
+                of,
+                data={"unit": unit, "factor": factor},
+                corrected=corrected,
             )
 
 

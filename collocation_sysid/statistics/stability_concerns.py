@@ -38,7 +38,9 @@ def rest_stability_concerns(body: Body, theta: Array) -> Iterator[Concern]:
         if is_examined(part.material):
             own = np.asarray(constants[: len(part.material.constants)])
             if (
-                not stability_margins(part.material, own, np.ones((1, 3)))[0]
+                not stability_margins(
+                    part.material, own, stretches=np.ones((1, 3))
+                )[0]
                 > 0
             ):
                 lam, mu = body.lame(theta)[part.name]
@@ -48,7 +50,7 @@ def rest_stability_concerns(body: Body, theta: Array) -> Iterator[Concern]:
                     "mu_pa": mu,
                     "kappa_pa": lam + 2 / 3 * mu,
                 }
-                yield Concern("stability/rest", "doubtful", data)
+                yield Concern("stability/rest", "doubtful", data=data)
 
 
 def strain_stability_concerns(
@@ -74,7 +76,7 @@ def strain_stability_concerns(
         body = experiment.body
         theta = np.asarray(iterate.equations.theta)
         if any(is_examined(part.material) for part in body.parts):
-            stretches = principal_stretches(body, states, theta)
+            stretches = principal_stretches(body, states, theta=theta)
             yield from _part_concerns(
                 body,
                 theta,
@@ -119,7 +121,9 @@ def _part_concerns(
         largest = np.argsort(
             -np.abs(np.log(points)).max(axis=1), kind="stable"
         )[:POINTS]
-        margins = stability_margins(part.material, own, points[largest])
+        margins = stability_margins(
+            part.material, own, stretches=points[largest]
+        )
         shear_pa = abs(body.lame(theta)[part.name][1])
         if (
             not np.isfinite(margins).any()
@@ -130,7 +134,7 @@ def _part_concerns(
         yield Concern(
             "stability/material",
             "check",
-            {
+            data={
                 "material": part.material.name,
                 "where": f" of region '{part.name}'" if part.name else "",
                 "experiment": experiment,

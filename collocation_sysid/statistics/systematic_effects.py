@@ -246,12 +246,14 @@ class ExperimentAtAnswer:
         """
         segment = self.iterate.segment
         gaps_m = surface_gaps_and_pressures(
-            segment.experiment, self.theta, self.iterate.x
+            segment.experiment, self.theta, x=self.iterate.x
         )[0]
         nearest = np.fmin.reduce(gaps_m, axis=0)
         is_in_contact = np.nan_to_num(nearest, nan=np.inf) < segment.length_m
         known = np.unique(self.body.mesh.surface[is_in_contact])
-        modes = surface_modes(self.body, known, self.surface_correlation)
+        modes = surface_modes(
+            self.body, known, correlation=self.surface_correlation
+        )
         return thickness_m(self.body) * modes
 
     @cached_property
@@ -303,10 +305,13 @@ class ExperimentAtAnswer:
         """Reaction forces (N, g) on the grasped dofs [N]; zero while they are not prescribed."""
         dofs = self.iterate.equations.prescribed.dofs
         x = self.iterate.x
-        force = forces_on_dofs(self.dynamics, x, dofs)
+        force = forces_on_dofs(self.dynamics, x, dofs=dofs)
         mass = self.dynamics.mass.inertia_kg[:, dofs]
         reaction_n = reaction_forces(
-            self.dynamics, mass, force, self.acceleration[:, dofs]
+            self.dynamics,
+            mass,
+            force=force,
+            acceleration=self.acceleration[:, dofs],
         )
         return np.where(
             np.isnan(self.iterate.equations.prescribed.positions_m),
@@ -779,7 +784,12 @@ def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
         return None
     return Effect(
         at.force_change_by_reference(
-            sag_m(at.body, at.theta, at.likely_support_dofs, axis)
+            sag_m(
+                at.body,
+                at.theta,
+                support_dofs=at.likely_support_dofs,
+                axis=axis,
+            )
         )
     )
 
@@ -800,54 +810,146 @@ def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
     )
 
 
-# fmt: off
 ASSUMPTIONS = (
-    Assumption("body_scale", "1", 0.01, "size of the mesh", _size),
-    Assumption("rest_shape", "1", 0.58,
-        "weight under which the mesh was deformed when it was made, along each axis, if "
-            "object.rest_shape is not stated", _rest_shape,
-        "x y z"),
-    Assumption("surface", "1", 0.005,
-        "displacement of the surface along its normal, relative to the thickness",
-        _surface, _MODES),
-    Assumption("mass", "1", 0.01, "mass of the body, if it is not estimated", _mass),
-    Assumption("density_gradient", "1", 0.05,
-        "density at one end of the body relative to that in its middle", _density_gradient, "x y "
-        "z"),
-    Assumption("anisotropy", "1", 0.05,
-        "stiffness along one axis relative to that across it", _anisotropy, "x y z",
-        of_specimens=True),
-    Assumption("stiffness_drift", "1", 0.02,
-        "stiffness at the end of a recording relative to that at its beginning", _drift,
-        of_specimens=True),
-    Assumption("time_scale", "1", 1e-4, "rate of all clocks", _time_scale),
-    Assumption("poisson", "", 0.02, "Poisson's ratio, if it is stated", _poisson,
-        of_specimens=True),
-    Assumption("damping_law", "1", 1.0,
-        "damping force of another objective law, as a fraction of its difference from the "
-            "stated law",
-        _objective_damping, " ".join(OBJECTIVE_DAMPINGS)),
-    Assumption("rayleigh_damping", "1", None,
-        "damping force of the Rayleigh law, as a fraction of its difference from the stated "
-            "law",
-        _rayleigh_damping),
-    Assumption("grip_layer_m", "m", 2e-4,
-        "compliance of grip and skin, as the thickness of a layer of the body's material", _grip),
-    Assumption("machine_compliance_m_n", "m/N", 1e-6, "compliance of the test bench", _machine,
-        of_specimens=True),
-    Assumption("platen_friction", "", 0.1,
-        "coefficient of friction of platens between which nodes slide", _platen_friction),
-    Assumption("contact_stiffness", "1", 1.0,
-        "compliance of the contact with obstacles, as a fraction of that of the pressure law",
-        _contact_stiffness),
-    Assumption("buoyancy", "1", AIR_DENSITY_DEVIATION,
-        "buoyancy relative to that of the model, because of the density of the air", _buoyancy),
-    Assumption("added_mass", "1", AIR_COEFFICIENT_DEVIATION,
-        "added mass of the air relative to that of the model", _added_mass),
-    Assumption("air_drag", "1", AIR_COEFFICIENT_DEVIATION,
-        "drag of the air relative to that of the model", _air_drag),
+    Assumption(
+        "body_scale",
+        "1",
+        sigma=0.01,
+        description="size of the mesh",
+        effect=_size,
+    ),
+    Assumption(
+        "rest_shape",
+        "1",
+        sigma=0.58,
+        description="weight under which the mesh was deformed when it was made, along each axis, if "
+        "object.rest_shape is not stated",
+        effect=_rest_shape,
+        component_names="x y z",
+    ),
+    Assumption(
+        "surface",
+        "1",
+        sigma=0.005,
+        description="displacement of the surface along its normal, relative to the thickness",
+        effect=_surface,
+        component_names=_MODES,
+    ),
+    Assumption(
+        "mass",
+        "1",
+        sigma=0.01,
+        description="mass of the body, if it is not estimated",
+        effect=_mass,
+    ),
+    Assumption(
+        "density_gradient",
+        "1",
+        sigma=0.05,
+        description="density at one end of the body relative to that in its middle",
+        effect=_density_gradient,
+        component_names="x y z",
+    ),
+    Assumption(
+        "anisotropy",
+        "1",
+        sigma=0.05,
+        description="stiffness along one axis relative to that across it",
+        effect=_anisotropy,
+        component_names="x y z",
+        of_specimens=True,
+    ),
+    Assumption(
+        "stiffness_drift",
+        "1",
+        sigma=0.02,
+        description="stiffness at the end of a recording relative to that at its beginning",
+        effect=_drift,
+        of_specimens=True,
+    ),
+    Assumption(
+        "time_scale",
+        "1",
+        sigma=1e-4,
+        description="rate of all clocks",
+        effect=_time_scale,
+    ),
+    Assumption(
+        "poisson",
+        "",
+        sigma=0.02,
+        description="Poisson's ratio, if it is stated",
+        effect=_poisson,
+        of_specimens=True,
+    ),
+    Assumption(
+        "damping_law",
+        "1",
+        sigma=1.0,
+        description="damping force of another objective law, as a fraction of its difference from the "
+        "stated law",
+        effect=_objective_damping,
+        component_names=" ".join(OBJECTIVE_DAMPINGS),
+    ),
+    Assumption(
+        "rayleigh_damping",
+        "1",
+        sigma=None,
+        description="damping force of the Rayleigh law, as a fraction of its difference from the stated "
+        "law",
+        effect=_rayleigh_damping,
+    ),
+    Assumption(
+        "grip_layer_m",
+        "m",
+        sigma=2e-4,
+        description="compliance of grip and skin, as the thickness of a layer of the body's material",
+        effect=_grip,
+    ),
+    Assumption(
+        "machine_compliance_m_n",
+        "m/N",
+        sigma=1e-6,
+        description="compliance of the test bench",
+        effect=_machine,
+        of_specimens=True,
+    ),
+    Assumption(
+        "platen_friction",
+        "",
+        sigma=0.1,
+        description="coefficient of friction of platens between which nodes slide",
+        effect=_platen_friction,
+    ),
+    Assumption(
+        "contact_stiffness",
+        "1",
+        sigma=1.0,
+        description="compliance of the contact with obstacles, as a fraction of that of the pressure law",
+        effect=_contact_stiffness,
+    ),
+    Assumption(
+        "buoyancy",
+        "1",
+        sigma=AIR_DENSITY_DEVIATION,
+        description="buoyancy relative to that of the model, because of the density of the air",
+        effect=_buoyancy,
+    ),
+    Assumption(
+        "added_mass",
+        "1",
+        sigma=AIR_COEFFICIENT_DEVIATION,
+        description="added mass of the air relative to that of the model",
+        effect=_added_mass,
+    ),
+    Assumption(
+        "air_drag",
+        "1",
+        sigma=AIR_COEFFICIENT_DEVIATION,
+        description="drag of the air relative to that of the model",
+        effect=_air_drag,
+    ),
 )
-# fmt: on
 
 
 class KnownEffect(Section):

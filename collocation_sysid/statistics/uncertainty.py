@@ -211,9 +211,12 @@ def uncertainty_at(
     SimulationError
         If the equations of motion are singular.
     """
-    fit, _ = with_pose_noise(linearise_fit(collocation, z), collocation, z)
+    fit, _ = with_pose_noise(linearise_fit(collocation, z), collocation, z=z)
     return uncertainty_from_fit(
-        fit, collocation.parameters, z[: collocation.nq], error_model
+        fit,
+        collocation.parameters,
+        q=z[: collocation.nq],
+        error_model=error_model,
     )
 
 
@@ -255,10 +258,12 @@ def uncertainty_from_fit(
             f"{len(fit.names)} parameters; give sigma_m and use noise = 'given'"
         )
     all_free, quantiles, basis = _error_bars(fit, factored, error_model)
-    of_all, bounded = _reported_covariance(all_free, fit, parameters, q)
-    scatter = _compare_recordings(fit, parameters, q, error_model)
+    of_all, bounded = _reported_covariance(
+        all_free, fit, parameters=parameters, q=q
+    )
+    scatter = _compare_recordings(fit, parameters, q=q, errors=error_model)
     of_q, quantiles, wider = _widen_by_scatter(
-        of_all[:shared, :shared], quantiles, scatter
+        of_all[:shared, :shared], quantiles, scatter=scatter
     )
     estimates = user_estimates(
         parameters, q, covariance_q=of_q, at_bound=bounded, quantiles=quantiles
@@ -275,7 +280,9 @@ def uncertainty_from_fit(
         correlation=correlation_from_covariance(of_q),
         quantiles=quantiles,
         estimates=estimates,
-        derived=derived_estimates(fit.derived, of_q, bounded, quantiles),
+        derived=derived_estimates(
+            fit.derived, of_q, at_bound=bounded, quantiles=quantiles
+        ),
         nuisance=dict(zip(fit.names[shared:], deviations, strict=True)),
         nuisance_covariance=of_all[shared:, shared:],
         chi_squared=fit.chi_squared,
@@ -284,10 +291,13 @@ def uncertainty_from_fit(
             *parameter_notes(parameters, estimates),
             *memory_notes(estimates, longest_s),
             *noise_notes(
-                error_model.noise, basis.noise, basis.level, basis.errors
+                error_model.noise,
+                basis.noise,
+                level=basis.level,
+                errors=basis.errors,
             ),
             *correlation_notes(
-                error_model.errors, basis.errors, basis.dependence
+                error_model.errors, basis.errors, dependence=basis.dependence
             ),
             *disagreement_notes(fit, scatter),
         ),
@@ -318,7 +328,7 @@ def _error_bars(
     used = "independent"
     if correlated:
         of_score, few_freedom = _correlated_score_covariance(
-            fit, factored, kind, level
+            fit, factored, kind=kind, level=level
         )
         persistent = factored.fit.covariance(of_score)
         before, after = (
@@ -356,7 +366,7 @@ def _reported_covariance(
     reported = covariance.copy()
     shared = fit.shared_count
     uninformed = _has_no_information(
-        parameters, q, np.diag(covariance)[:shared]
+        parameters, q, variances=np.diag(covariance)[:shared]
     )
     at_bound = fit.at_bound.copy()
     at_bound[:shared] &= ~uninformed
@@ -410,7 +420,9 @@ def _compare_recordings(
     for alone, step in single_fits(fit):
         if alone.measurement_count <= len(alone.names):
             continue
-        uncertainty = uncertainty_from_fit(alone, parameters, q, errors)
+        uncertainty = uncertainty_from_fit(
+            alone, parameters, q=q, error_model=errors
+        )
         independent = (
             least_squares_of_fit(alone).standard_errors[: fit.shared_count] ** 2
         )
@@ -452,7 +464,7 @@ def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool]:
         tested, lag1_deviation=tested.lag1_deviation * level.unevenness
     )
     return tested, tested.is_correlated and not _is_explained(
-        fit, factored, level, tested
+        fit, factored, level=level, result=tested
     )
 
 
@@ -570,8 +582,8 @@ def marker_places(
             None
             if errors is None or not np.isfinite(errors[m]).all()
             else errors[m],
-            float(chart.sigma_m[m]),
-            chart.prior_places_m[m] if markers.located[m] else None,
+            prior_m=float(chart.sigma_m[m]),
+            declared_m=chart.prior_places_m[m] if markers.located[m] else None,
         )
         for m, (name, position) in enumerate(
             zip(

@@ -83,7 +83,7 @@ class BudgetLine:
         }
         shares[source] = deviation**2 / total
         least, most = widened_interval(
-            (low, high), coordinate.from_value(self.value), deviation
+            (low, high), coordinate.from_value(self.value), deviation=deviation
         )
         return BudgetLine(
             self.value,
@@ -174,7 +174,7 @@ class VarianceSources:
             )
             own[np.ix_(shared, shared)] = inverse[: len(shared), : len(shared)]
         moved = estimate_changes(fit, assumed.blocks)[: fit.shared_count]
-        by_q = _estimate_derivatives(fit, parameters, q)
+        by_q = _estimate_derivatives(fit, parameters, q=q)
         scatter = uncertainty.scatter
         between = np.zeros((fit.shared_count, 0))
         freedom = 0
@@ -335,13 +335,13 @@ def _line(
     at = IntervalCoordinate.for_estimate(
         name, (estimate.value, *estimate.statistical95, *ends), linear
     )
-    noise = _variance(at, estimate.value, estimate.statistical95)
+    noise = _variance(at, estimate.value, ends=estimate.statistical95)
     middle = estimate.value if error is None else error.extrapolated
     by_q = sources.derivatives[name]
     own, agreed = sources.noise_shares(by_q)
     excess = noise * (1 - agreed)
     parts = {NOISE: noise * agreed * own, NUISANCES: noise * agreed * (1 - own)}
-    parts[NUMERICAL] = max(0.0, _variance(at, middle, ends) - noise)
+    parts[NUMERICAL] = max(0.0, _variance(at, middle, ends=ends) - noise)
     by_coordinate = by_q * at.derivative(estimate.value)
     by_assumption = sources.variances_of_assumptions(by_coordinate)
     others = sum(parts.values()) + sum(by_assumption.values())

@@ -110,7 +110,7 @@ def wrench_causes(solution: Solution) -> list[Hypothesis]:
         _from_markers(
             solution.collocation,
             with_markers,
-            ReducedSpace(max_iterations=MOST_SWEEPS),
+            method=ReducedSpace(max_iterations=MOST_SWEEPS),
         )
     )
 
@@ -133,7 +133,7 @@ def wrench_mistakes(collocation: Collocation) -> list[Hypothesis]:
     method = ReducedSpace(
         max_iterations=CHECKED_SWEEPS, tolerance=CHECKED_TOLERANCE
     )
-    parts = _from_markers(beginning, beginning.transcriptions, method)
+    parts = _from_markers(beginning, beginning.transcriptions, method=method)
     return _of_parts(
         [part for part in parts if _markers_misfit(part) < MARKERS_MISFIT]
     )
@@ -187,7 +187,7 @@ def _from_markers(
         phi = np.array(
             [values.get(name, 0.0) for name in segment.nuisance.names]
         )
-        parts.append(ExperimentIterate(segment, part.q, phi, part.x))
+        parts.append(ExperimentIterate(segment, part.q, phi=phi, x=part.x))
     return parts
 
 
@@ -197,7 +197,7 @@ def _of_parts(parts: Sequence[ExperimentIterate]) -> list[Hypothesis]:
     for part in parts:
         forced = part.motion.reactions
         for sensor in part.segment.sensors:
-            hypotheses += _OneSensor(part, sensor, forced).causes()
+            hypotheses += _OneSensor(part, sensor, forced=forced).causes()
     return hypotheses
 
 
@@ -248,7 +248,7 @@ class _OneSensor:
         misfit = self.misfit(self.declared)
         if misfit > MISFIT:
             test = HypothesisTest(
-                misfit, self.misfit, BETTER, smallest_misfit=1.0
+                misfit, self.misfit, required_factor=BETTER, smallest_misfit=1.0
             )
             accepted = list(test.accepted(self._mistakes()))
         yield from accepted or self._large_tare()
@@ -417,7 +417,7 @@ class _OneSensor:
                 if wrench.measured_components[columns].any()
                 else ()
             ):
-                without = _multiplied(wrench, columns, factor)
+                without = _multiplied(wrench, columns, factor=factor)
                 yield hypothesis(
                     "wrench-unit", without, what=what, unit=unit, factor=factor
                 )
@@ -431,7 +431,7 @@ class _OneSensor:
                 data = {"what": what, "factor": factor}
                 yield hypothesis(
                     "wrench-gain",
-                    _multiplied(wrench, columns, factor),
+                    _multiplied(wrench, columns, factor=factor),
                     FITTED,
                     **data,
                 )

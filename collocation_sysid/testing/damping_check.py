@@ -81,9 +81,11 @@ def check_damping(
             "one of both",
         )
     values = usual_constants((*known.constants, *made.constants), constants)
-    stress = DampingStress(made, known, np.array([*values.values()]))
+    stress = DampingStress(made, known, values=np.array([*values.values()]))
     for number, F in enumerate(
-        deformation_gradients(check.rng, DEFORMATIONS, largest_strain)
+        deformation_gradients(
+            check.rng, DEFORMATIONS, largest_strain=largest_strain
+        )
     ):
         where = (
             f"at random deformation {number} (strains up to {largest_strain:g})"
@@ -98,21 +100,23 @@ def check_damping(
         check_internal_forces(
             check,
             known,
-            made,
-            values,
-            element,
+            damping=made,
+            values=values,
+            element=element,
             is_objective=is_objective,
             is_dissipative=is_dissipative,
         )
     own = {constant.name: values[constant.name] for constant in made.constants}
     check_missing_constant(check, own, material=known, damping=made)
-    F = next(iter(deformation_gradients(check.rng, 1, largest_strain)))
+    F = next(
+        iter(deformation_gradients(check.rng, 1, largest_strain=largest_strain))
+    )
     check_pickling(
         check,
         made,
-        lambda each: DampingStress(each, known, stress.values).evaluate(F, F)[
-            0
-        ],
+        evaluate=lambda each: DampingStress(
+            each, known, values=stress.values
+        ).evaluate(F, F)[0],
     )
 
 

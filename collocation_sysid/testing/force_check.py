@@ -177,7 +177,7 @@ class ForceLaw:
         return GeneratedFunction(
             self.force.expression,
             self.force.input_size(self.dofs),
-            CONTEXT_SIZE,
+            data_size=CONTEXT_SIZE,
             is_compiled=self.force.is_compiled,
         )
 
@@ -423,7 +423,7 @@ def _check_round_trips(
             NodeForceSection.model_validate(table), "object.force.0"
         )
 
-    check_pickling(check, law.force, evaluate)
+    check_pickling(check, law.force, evaluate=evaluate)
     if file is not None:
         table = {
             "file": Path(file).name,
@@ -434,7 +434,7 @@ def _check_round_trips(
         check_problem_file(
             check,
             file,
-            table,
+            table=table,
             load=load,
             extension=law.force,
             evaluate=evaluate,

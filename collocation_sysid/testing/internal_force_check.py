@@ -102,7 +102,9 @@ class PlainInternalForce:
                 for field in (x, v)
             )
             stress = self._stress(
-                F, rate, ca.vertsplit(constants, self._split(part.material))
+                F,
+                rate,
+                constants=ca.vertsplit(constants, self._split(part.material)),
             )
             force -= point[-1] * ca.vec(ca.reshape(stress, 3, 3) @ gradients.T)
         return force
@@ -217,7 +219,11 @@ def check_internal_forces(
         If a force or derivative differs.
     """
     body = Body(
-        uneven_box(1), material, DENSITY_KG_M3, element, damping=damping
+        uneven_box(1),
+        material,
+        density_kg_m3=DENSITY_KG_M3,
+        element=element,
+        damping=damping,
     )
     theta = np.array(
         [*usual_constants(tuple(body.constants.values()), values).values()]
@@ -274,7 +280,7 @@ def _check_derivatives(
     x, v, w = state
     elements = f"{where} {body.element.name} elements".strip()
     force = body.force(x, v, theta)[0]
-    first = _first_derivatives(body, x, v, theta)
+    first = _first_derivatives(body, x, v=v, theta=theta)
     second = _second_derivatives(body, state, theta)
     # Forces of an undeformed body are zero; what counts is their change by a large change of x.
     size = max(
@@ -390,7 +396,7 @@ def _check_differences(
     def weighted_derivative_at(u: Array) -> Array:
         """Return the compiled first derivative of wᵀ f at (x, v, θ)."""
         return w @ _first_derivatives(
-            body, u[:size], u[size : 2 * size], u[2 * size :]
+            body, u[:size], v=u[size : 2 * size], theta=u[2 * size :]
         )
 
     where = f"of the compiled force of {body.element.name} elements is wrong"
@@ -413,8 +419,10 @@ def _check_differences(
 def _first_derivatives(body: Body, x: Array, v: Array, theta: Array) -> Array:
     """Return the compiled ∂f/∂(x, v, θ), (3n, 6n + k), at one state."""
     at = body.linearise(x, v, theta)
-    by_x = full_matrix(body.pattern, at.by_position[0], at.by_position_skew[0])
-    by_v = full_matrix(body.pattern, at.by_velocity[0], np.zeros(0))
+    by_x = full_matrix(
+        body.pattern, at.by_position[0], skew=at.by_position_skew[0]
+    )
+    by_v = full_matrix(body.pattern, at.by_velocity[0], skew=np.zeros(0))
     return np.hstack([by_x.toarray(), by_v.toarray(), at.by_theta[0]])
 
 
@@ -423,9 +431,11 @@ def _second_derivatives(body: Body, state: list[Array], theta: Array) -> Array:
     x, v, w = state
     at = body.second_derivatives(x, v, w, theta)
     none = np.zeros(0)
-    by_xx = full_matrix(body.pattern, at.position_position[0], none).toarray()
+    by_xx = full_matrix(
+        body.pattern, at.position_position[0], skew=none
+    ).toarray()
     by_xv = full_matrix(
-        body.pattern, at.position_velocity[0], at.position_velocity_skew[0]
+        body.pattern, at.position_velocity[0], skew=at.position_velocity_skew[0]
     ).toarray()
     by_x_theta = at.position_theta[0]
     by_v_theta = at.velocity_theta[0]

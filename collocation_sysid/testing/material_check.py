@@ -111,14 +111,16 @@ def check_material(
         check_internal_forces(
             check,
             made,
-            DAMPINGS["kelvin-voigt"],
-            values,
-            element,
+            damping=DAMPINGS["kelvin-voigt"],
+            values=values,
+            element=element,
             is_objective=is_objective,
             is_dissipative=True,
         )
     if has_memory:
-        body = Body(uneven_box(1), made, DENSITY_KG_M3, prony=["prony_1"])
+        body = Body(
+            uneven_box(1), made, density_kg_m3=DENSITY_KG_M3, prony=["prony_1"]
+        )
         check_program(check, program_of(swung_experiment(body), values))
 
 
@@ -220,7 +222,7 @@ def _deformations(
 ) -> Iterator[tuple[str, Array]]:
     """Return descriptions and deformation gradients (9,): random ones, then equal stretches."""
     for number, F in enumerate(
-        deformation_gradients(rng, DEFORMATIONS, largest_strain)
+        deformation_gradients(rng, DEFORMATIONS, largest_strain=largest_strain)
     ):
         yield (
             f"at random deformation {number} (strains up to {largest_strain:g})",
@@ -303,7 +305,7 @@ def _check_derivatives(
         statement=f"∂P/∂F is wrong {where}",
         scale=0.1,
     )
-    _check_kernel_derivatives(check, law, F, where)
+    _check_kernel_derivatives(check, law, F=F, where=where)
 
 
 def _check_kernel_derivatives(
@@ -382,7 +384,7 @@ def _check_round_trips(
     constants = np.array([*values.values()])
     deformations = [
         *deformation_gradients(
-            np.random.default_rng(0), DEFORMATIONS, ROUND_TRIP
+            np.random.default_rng(0), DEFORMATIONS, largest_strain=ROUND_TRIP
         )
     ]
 
@@ -397,10 +399,15 @@ def _check_round_trips(
             CodeSection.model_validate(table), "object.material"
         )
 
-    check_pickling(check, material, evaluate)
+    check_pickling(check, material, evaluate=evaluate)
     if file is not None:
         name = function or getattr(material.energy, "__name__", material.name)
         table = {"file": Path(file).name, "function": name}
         check_problem_file(
-            check, file, table, load=load, extension=material, evaluate=evaluate
+            check,
+            file,
+            table=table,
+            load=load,
+            extension=material,
+            evaluate=evaluate,
         )

@@ -78,7 +78,7 @@ def check_method(
     _check_answer(
         check, solution, is_exact=is_exact, largest_error=largest_error
     )
-    _check_history(check, solution, lines)
+    _check_history(check, solution, lines=lines)
     check.require_equal(
         _fingerprint(collocation),
         before,
@@ -94,7 +94,9 @@ def check_method(
     )
     if is_dataclass(method) and hasattr(type(method), "name"):
         _check_options(check, method)
-        check_pickling(check, method, lambda each: [float(each == method)])
+        check_pickling(
+            check, method, evaluate=lambda each: [float(each == method)]
+        )
 
 
 def small_recording() -> Collocation:
@@ -201,7 +203,7 @@ def _check_options(check: PropertyCheck, method: Any) -> None:
     kind = type(method)
     key = f"solver.{method.name}"
     check.require_refusal(
-        lambda: method_from_options(kind, {"no_such_option": 1}, key),
+        lambda: method_from_options(kind, {"no_such_option": 1}, key=key),
         naming="no_such_option",
         statement="an unknown option",
     )
@@ -210,7 +212,7 @@ def _check_options(check: PropertyCheck, method: Any) -> None:
         if isinstance(value, bool | int | float):
             check.require_refusal(
                 lambda name=name: method_from_options(
-                    kind, {name: "text"}, key
+                    kind, {name: "text"}, key=key
                 ),
                 naming=f"{key}.{name}",
                 statement=f"the text 'text' as the option {name}",
@@ -222,7 +224,7 @@ def _check_options(check: PropertyCheck, method: Any) -> None:
     }
     try:
         read = method_from_options(
-            kind, tomllib.loads(tomli_w.dumps(stated)), key
+            kind, tomllib.loads(tomli_w.dumps(stated)), key=key
         )
     except InputError as error:
         check.fail(

@@ -91,9 +91,9 @@ def check_nuisance(
     if row not in KINDS:
         _check_messages(check, row, base)
     if row.reading is not None:
-        _check_reading(check, row, collocation)
+        _check_reading(check, row, collocation=collocation)
     if row.clock is not None:
-        _check_clock(check, row, collocation)
+        _check_clock(check, row, collocation=collocation)
     check_program(check, collocation)
 
 
@@ -138,7 +138,7 @@ def _check_reading(
     t_s = float(np.mean(data.recorded_s))
     y = check.rng.uniform(0.01, 0.1, 3)
     check.require_equal(
-        _read(row, y, np.zeros(count), t_s, data),
+        _read(row, y, values=np.zeros(count), t_s=t_s, data=data),
         y,
         statement="zero changes the reading of a marker",
     )
@@ -160,7 +160,7 @@ def _check_reading(
     jacobian, hessian = (each.full() for each in derivatives.call([u]))
     scale = np.concatenate([np.full(3, 0.01), np.full(count, sigma)])
     check.require_derivative(
-        lambda at: _read(row, at[:3], at[3:], t_s, data),
+        lambda at: _read(row, at[:3], values=at[3:], t_s=t_s, data=data),
         jacobian,
         u,
         statement="the first derivative of the reading is wrong",
@@ -173,7 +173,7 @@ def _check_reading(
         statement="the second derivative of the reading is wrong",
         scale=scale,
     )
-    _check_predicted_reading(check, row, collocation)
+    _check_predicted_reading(check, row, collocation=collocation)
 
 
 def _marker_residual(collocation: Collocation) -> MarkerResidual:
@@ -209,7 +209,13 @@ def _check_predicted_reading(
         for sample, t_s in enumerate(residual.t_s):
             check.require_equal(
                 predicted[sample],
-                _read(row, plain[sample, marker], physical, float(t_s), data),
+                _read(
+                    row,
+                    plain[sample, marker],
+                    values=physical,
+                    t_s=float(t_s),
+                    data=data,
+                ),
                 statement=f"the predicted marker {residual.names[marker]} is not the reading "
                 f"at t = {t_s:.4g} s",
                 scale=float(np.abs(plain).max()),
@@ -224,7 +230,11 @@ def _check_clock(
     data = residual.nuisance
     count = _value_count(row)
     late = _read(
-        row, np.zeros(3), np.zeros(count), float(data.recorded_s[1]), data
+        row,
+        np.zeros(3),
+        values=np.zeros(count),
+        t_s=float(data.recorded_s[1]),
+        data=data,
     )
     check.require_equal(
         late, np.zeros(1), statement="zero changes the clock", scale=1.0
@@ -240,7 +250,7 @@ def _check_clock(
     values = (phi * data.scales)[[k for k in own if k in indices]]
     for sample in range(FIRST_INNER_SAMPLE, len(residual.t_s)):
         t_s = float(residual.t_s[sample])
-        delay = _read(row, np.zeros(3), values, t_s, data)[0]
+        delay = _read(row, np.zeros(3), values=values, t_s=t_s, data=data)[0]
         later = _smooth_motion(check, collocation, shift_s=float(delay))
         check.require_equal(
             predicted[sample, 0],
@@ -302,7 +312,9 @@ def _check_round_trips(
         """Return prior, limits and effect of a row."""
         has_effect = each.reading is not None or each.clock is not None
         effect = (
-            _read(each, y, values, t_s, data) if has_effect else np.zeros(0)
+            _read(each, y, values=values, t_s=t_s, data=data)
+            if has_effect
+            else np.zeros(0)
         )
         limits = np.array([each.low, each.high, each.reach])
         limits = np.where(np.isfinite(limits), limits, 0.0)
@@ -312,13 +324,13 @@ def _check_round_trips(
         """Return the row of a table of a problem file."""
         return loader.nuisance_row(CustomNuisanceSection.model_validate(table))
 
-    check_pickling(check, row, evaluate)
+    check_pickling(check, row, evaluate=evaluate)
     if file is not None:
         table = {"file": Path(file).name, "row": name_in_file or row.name}
         check_problem_file(
             check,
             file,
-            table,
+            table=table,
             load=load,
             extension=row,
             evaluate=evaluate,

@@ -88,7 +88,9 @@ class PropertyCheck:
         values = np.asarray(found, dtype=float)
         references = np.asarray(expected, dtype=float)
         if values.shape != references.shape:
-            self.fail(f"{statement} (shapes)", values.shape, references.shape)
+            self.fail(
+                f"{statement} (shapes)", values.shape, expected=references.shape
+            )
         if not values.size:
             return
         size = np.abs(references).max() if scale is None else scale
@@ -98,7 +100,9 @@ class PropertyCheck:
         )
         if not errors[worst] <= tolerance * size:
             entry = f", entry {tuple(map(int, worst))}" if worst else ""
-            self.fail(f"{statement}{entry}", values[worst], references[worst])
+            self.fail(
+                f"{statement}{entry}", values[worst], expected=references[worst]
+            )
 
     def require_derivative(
         self,
@@ -226,16 +230,18 @@ class PropertyCheck:
                 self.fail(
                     f"the message for {statement} lacks the name",
                     str(error),
-                    expected,
+                    expected=expected,
                 )
         except Exception as error:  # any other error is what the check reports
             self.fail(
                 f"{statement} is not refused",
                 f"{type(error).__name__}: {error}",
-                expected,
+                expected=expected,
             )
         else:
-            self.fail(f"{statement} is not refused", "no error", expected)
+            self.fail(
+                f"{statement} is not refused", "no error", expected=expected
+            )
 
 
 def _closest(

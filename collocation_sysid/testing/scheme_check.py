@@ -76,7 +76,7 @@ def check_scheme(scheme: str | Scheme) -> None:
         naming="no_start_rule",
         statement="an unknown start rule",
     )
-    check_pickling(check, made, lambda each: [float(each == made)])
+    check_pickling(check, made, evaluate=lambda each: [float(each == made)])
 
 
 def _moment(coefficients: tuple[float, ...], power: int) -> float:
@@ -96,7 +96,7 @@ def _check_regular(check: PropertyCheck, stencil: Stencil) -> None:
         "the acceleration of t²": (_moment(stencil.s, 2), 2.0),
         "the weight r of the start velocity": (stencil.r, 0.0),
     }
-    _check_values(check, expected, "the regular stencil")
+    _check_values(check, expected, where="the regular stencil")
 
 
 def _check_start(check: PropertyCheck, stencil: Stencil, row: int) -> None:
@@ -111,7 +111,7 @@ def _check_start(check: PropertyCheck, stencil: Stencil, row: int) -> None:
             0.0,
         ),
     }
-    _check_values(check, expected, f"the stencil of row {row}")
+    _check_values(check, expected, where=f"the stencil of row {row}")
     points = max(len(stencil.p), len(stencil.q)) + len(stencil.w) - 1
     if max(points, len(stencil.s)) > row + 1:
         check.fail(

@@ -91,7 +91,7 @@ def check_sensor(
     _check_round_trips(check, sensor, file, function)
     collocation = _small_program(sensor)
     if sensor.grasp is None:
-        _check_prediction(check, expression, collocation)
+        _check_prediction(check, expression, collocation=collocation)
     check_program(check, collocation)
 
 
@@ -309,10 +309,15 @@ def _check_round_trips(
         )
         return replace(sensor, expression=expression)
 
-    check_pickling(check, sensor, evaluate)
+    check_pickling(check, sensor, evaluate=evaluate)
     if file is not None:
         name = function or getattr(sensor.expression, "__name__", sensor.name)
         table = {"code": Path(file).name, "function": name}
         check_problem_file(
-            check, file, table, load=load, extension=sensor, evaluate=evaluate
+            check,
+            file,
+            table=table,
+            load=load,
+            extension=sensor,
+            evaluate=evaluate,
         )

@@ -85,7 +85,7 @@ def usual_constants(
 
 def _usual_constant(name: str) -> float:
     """Return a value of a constant at which all terms of its law count."""
-    value = usual_value(name, YOUNG_PA, POISSON)
+    value = usual_value(name, YOUNG_PA, poisson=POISSON)
     if value is None:
         return 1.0
     return SMALL_MODULUS_PA if is_modulus(name) and not value else value

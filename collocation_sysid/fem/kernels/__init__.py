@@ -253,6 +253,6 @@ def make_skyline(
     from .skyline import SkylineFactorisation
 
     try:
-        return SkylineFactorisation(size, rows, columns, source)
+        return SkylineFactorisation(size, rows, columns=columns, source=source)
     except RuntimeError:
         return None

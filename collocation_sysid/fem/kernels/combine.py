@@ -81,7 +81,9 @@ def compile_combiner(plan: CombinationPlan) -> Combiner:
     from .jit import NativeCode, compile_function
 
     signature = (*[ctypes.c_int64] * 3, *[ctypes.c_void_p] * 7)
-    run = compile_function(NativeCode("combine", "combine", signature, _emit))
+    run = compile_function(
+        NativeCode("combine", "combine", signature=signature, build=_emit)
+    )
     constants = [
         array.ctypes.data
         for array in (plan.tasks, plan.coefficients, plan.targets, plan.sources)
@@ -135,7 +137,7 @@ def _emit() -> Any:
     for pointer in function.args[3:]:
         pointer.add_attribute("noalias")
     builder: Any = ir.IRBuilder(function.append_basic_block("entry"))
-    with for_range(builder, start, stop, "task") as task:
+    with for_range(builder, start, stop=stop, name="task") as task:
         first = builder.mul(task, I64(5))
         out, begin, length, row, add = (
             builder.load(builder.gep(tasks, [builder.add(first, I64(k))]))
@@ -154,7 +156,7 @@ def _emit() -> Any:
         )
 
         def loop(accumulate: bool) -> None:
-            with for_range(builder, I64(0), length, "entry") as i:
+            with for_range(builder, I64(0), stop=length, name="entry") as i:
                 source = builder.sext(
                     builder.load(builder.gep(sources_here, [i])), I64
                 )

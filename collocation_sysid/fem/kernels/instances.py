@@ -76,7 +76,12 @@ def compile_instance_evaluator(function: ca.Function) -> Instances:
     key = f"instances {lanes} {hashlib.sha256(function.serialize().encode()).hexdigest()}"
     signature = (ctypes.c_int64, *[ctypes.c_void_p] * arrays)
     run = compile_function(
-        NativeCode("instances", key, signature, lambda: _emit(function, lanes))
+        NativeCode(
+            "instances",
+            key,
+            signature=signature,
+            build=lambda: _emit(function, lanes),
+        )
     )
 
     def evaluate(inputs: list[Array]) -> list[Array]:
@@ -115,7 +120,9 @@ def _emit(function: ca.Function, lanes: int) -> Any:
     for place in places:
         place.add_attribute("noalias")
     b: Builder = ir.IRBuilder(run.append_basic_block("entry"))
-    with for_range(b, I64(0), b.udiv(count, I64(lanes)), "block") as block:
+    with for_range(
+        b, I64(0), stop=b.udiv(count, I64(lanes)), name="block"
+    ) as block:
         first = b.mul(block, I64(lanes))
 
         def pointer(array: int, entry: int) -> Value:
@@ -127,7 +134,9 @@ def _emit(function: ca.Function, lanes: int) -> Any:
         def read(array: int, entry: int) -> Value:
             return b.load(pointer(array, entry), align=8)
 
-        for output, entry, value in emit_function(b, function, vector, read):
+        for output, entry, value in emit_function(
+            b, function, vector=vector, read=read
+        ):
             b.store(value, pointer(function.n_in() + output, entry), align=8)
     b.ret_void()
     return module

@@ -149,7 +149,8 @@ def _emit_intrinsic(name: str) -> Emit:
         vector = operands[0].type
         full_name = f"llvm.{name}.v{vector.count}f64"
         return b.call(
-            _declare(b.module, full_name, vector, len(operands)), operands
+            _declare(b.module, full_name, kind=vector, operands=len(operands)),
+            operands,
         )
 
     return emit
@@ -159,7 +160,7 @@ def _emit_library_call(name: str) -> Emit:
     """Return the emitter of a function of the C library, called lane by lane."""
 
     def emit(b: Builder, *operands: Value) -> Value:
-        function = _declare(b.module, name, DOUBLE, len(operands))
+        function = _declare(b.module, name, kind=DOUBLE, operands=len(operands))
         # Otherwise a call may set errno, and the compiler keeps even those that are repeated.
         function.attributes.add("readnone")
         result: Value = ir.Constant(operands[0].type, ir.Undefined)
@@ -213,7 +214,9 @@ def _sign(b: Builder, x: Value) -> Value:
 
 def _erfinv(b: Builder, x: Value) -> Value:
     """Emit the inverse error function."""
-    ((_, _, value),) = emit_function(b, ERFINV, x.type, lambda *_: x)
+    ((_, _, value),) = emit_function(
+        b, ERFINV, vector=x.type, read=lambda *_: x
+    )
     return value
 
 

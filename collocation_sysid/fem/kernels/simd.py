@@ -133,12 +133,12 @@ class SimdEvaluator:
                 *constants,
             )
 
-        run_in_slices(run, len(out), threads)
+        run_in_slices(run, len(out), threads=threads)
 
 
 def _emit_kernel(kernel: ElementKernel, points: int, lanes: int) -> ir.Module:
     """Return the LLVM module of a kernel; see `_KernelEmitter` for the arguments."""
-    return _KernelEmitter(kernel, points, lanes).emit()
+    return _KernelEmitter(kernel, points, lanes=lanes).emit()
 
 
 def _block_major(
@@ -289,29 +289,32 @@ class _KernelEmitter:
             self._splat(b.load(b.gep(theta, [I64(k)])))
             for k in range(theta_size)
         ]
-        with for_range(b, t0, t1, "t") as t:
+        with for_range(b, t0, stop=t1, name="t") as t:
             rows = [b.gep(row, [b.mul(t, field_stride)]) for row in field_rows]
             out_row = b.gep(out, [b.mul(t, out_stride)])
             with b.if_then(b.icmp_signed("==", add, I64(0))):
                 self._clear(out_row, out_stride)
-            with for_range(b, I64(0), blocks, "block") as block:
+            with for_range(b, I64(0), stop=blocks, name="block") as block:
                 address = b.gep(
                     nodes, [b.mul(block, I64(self.size // 3 * self.lanes))]
                 )
                 self._gather(rows, address, gathered)
-                with for_range(b, I64(0), I64(total), "zero") as k:
+                with for_range(b, I64(0), stop=I64(total), name="zero") as k:
                     self._store(self.vector(None), totals, k)
                 first = b.mul(block, I64(self.points))
                 for phase in phases:
                     with for_range(
-                        b, first, b.add(first, I64(self.points)), "point"
+                        b,
+                        first,
+                        stop=b.add(first, I64(self.points)),
+                        name="point",
                     ) as point:
                         address = b.gep(
                             geometry,
                             [b.mul(point, I64(geometry_size * self.lanes))],
                         )
                         point_data = (
-                            [self._load_point_data(memory, t, point)]
+                            [self._load_point_data(memory, t, point=point)]
                             if memory
                             else []
                         )
@@ -324,7 +327,7 @@ class _KernelEmitter:
                                 *point_data,
                                 totals,
                             ],
-                            pieces,
+                            pieces=pieces,
                         )
                         self._contract(
                             phase,
@@ -334,7 +337,7 @@ class _KernelEmitter:
                             totals=totals,
                         )
                 if self.coupling:
-                    self._couple(self.coupling, totals, combined)
+                    self._couple(self.coupling, totals, combined=combined)
                 address = b.gep(
                     geometry, [b.mul(first, I64(geometry_size * self.lanes))]
                 )
@@ -345,9 +348,11 @@ class _KernelEmitter:
                 targets = b.gep(
                     destinations, [b.mul(block, I64(outputs * self.lanes))]
                 )
-                with for_range(b, I64(0), I64(outputs), "output") as k:
+                with for_range(
+                    b, I64(0), stop=I64(outputs), name="output"
+                ) as k:
                     value = b.select(is_element, self._load(totals, k), zero)
-                    self._scatter(value, targets, k, out_row)
+                    self._scatter(value, targets, k=k, row=out_row)
         b.ret_void()
         return self.module
 
@@ -397,7 +402,9 @@ class _KernelEmitter:
     def _gather(self, rows: list, nodes: Value, gathered: list) -> None:
         """Load the three coordinates of every node of W elements, field by field."""
         b = self.builder
-        with for_range(b, I64(0), I64(self.size // 3), "node") as node:
+        with for_range(
+            b, I64(0), stop=I64(self.size // 3), name="node"
+        ) as node:
             first = b.mul(node, I64(self.lanes))
             lanes = [
                 b.sext(b.load(b.gep(nodes, [b.add(first, I64(lane))])), I64)
@@ -464,7 +471,7 @@ class _KernelEmitter:
             return self._load(inputs[slot], I64(place))
 
         for piece, entry, value in emit_function(
-            self.builder, phase.sx, self.vector, read
+            self.builder, phase.sx, vector=self.vector, read=read
         ):
             self._store(value, pieces, I64(phase.pieces[piece] + entry))
 
@@ -485,12 +492,16 @@ class _KernelEmitter:
             output_base = self._offset_pointer(totals, phase.outputs[k])
             length = phase.lengths[k]
             if how == "none":
-                with for_range(b, I64(0), I64(length), "entry") as entry:
+                with for_range(
+                    b, I64(0), stop=I64(length), name="entry"
+                ) as entry:
                     self._accumulate(
-                        self._load(piece_base, entry), output_base, entry
+                        self._load(piece_base, entry), output_base, entry=entry
                     )
             elif how == "nodes":
-                with for_range(b, I64(0), I64(self.nodes), "node") as node:
+                with for_range(
+                    b, I64(0), stop=I64(self.nodes), name="node"
+                ) as node:
                     values = self._at_node(
                         piece_base, length // 9, self._gradient(geometry, node)
                     )
@@ -499,10 +510,12 @@ class _KernelEmitter:
                         self._accumulate(
                             value,
                             output_base,
-                            b.add(b.mul(node, I64(3)), first),
+                            entry=b.add(b.mul(node, I64(3)), first),
                         )
             else:
-                with for_range(b, I64(0), I64(self.nodes), "column") as node:
+                with for_range(
+                    b, I64(0), stop=I64(self.nodes), name="column"
+                ) as node:
                     gradient = self._gradient(geometry, node)
                     for column, row, value in self._at_node(
                         piece_base, 9, gradient
@@ -512,7 +525,7 @@ class _KernelEmitter:
                         half, gradient, a=node, node=node, outputs=output_base
                     )
                     with for_range(
-                        b, b.add(node, I64(1)), I64(self.nodes), "row"
+                        b, b.add(node, I64(1)), stop=I64(self.nodes), name="row"
                     ) as other:
                         self._add_node_block(
                             half,
@@ -532,7 +545,9 @@ class _KernelEmitter:
                 continue
             c = b.add(b.mul(node, I64(3)), I64(column))
             r = b.add(b.mul(a, I64(3)), I64(row))
-            self._accumulate(value, outputs, b.add(self._column_start(c), r))
+            self._accumulate(
+                value, outputs, entry=b.add(self._column_start(c), r)
+            )
 
     def _column_start(self, c: Value) -> Value:
         """Return c (2 size − c − 1) / 2, the offset of column c in a lower triangle, less its row
@@ -553,7 +568,9 @@ class _KernelEmitter:
                 self._combine(columns, totals, output_base, self._accumulate)
             elif how == "pairs":
                 self._combine(columns, totals, combined, self._store)
-                with for_range(b, I64(0), I64(self.size), "column") as c:
+                with for_range(
+                    b, I64(0), stop=I64(self.size), name="column"
+                ) as c:
                     factors = [
                         (
                             j * self.size,
@@ -567,9 +584,11 @@ class _KernelEmitter:
                         output_base,
                         [b.mul(self._column_start(c), I64(self.lanes))],
                     )
-                    with for_range(b, c, I64(self.size), "row") as r:
+                    with for_range(b, c, stop=I64(self.size), name="row") as r:
                         self._accumulate(
-                            self._combination(factors, combined, r), start, r
+                            self._combination(factors, combined, entry=r),
+                            start,
+                            entry=r,
                         )
 
     def _coefficients(
@@ -588,7 +607,7 @@ class _KernelEmitter:
             return self._load(totals, I64(self.sums[entry]))
 
         for k, entry, value in emit_function(
-            self.builder, coupling, self.vector, read
+            self.builder, coupling, vector=self.vector, read=read
         ):
             row, column = entries[k][entry]
             columns[k].setdefault(column, []).append((self.vectors[row], value))
@@ -605,10 +624,10 @@ class _KernelEmitter:
         for column, factors in columns.items():
             column_base = self._offset_pointer(out, column * self.size)
             with for_range(
-                self.builder, I64(0), I64(self.size), "entry"
+                self.builder, I64(0), stop=I64(self.size), name="entry"
             ) as entry:
                 put(
-                    self._combination(factors, totals, entry),
+                    self._combination(factors, totals, entry=entry),
                     column_base,
                     entry,
                 )

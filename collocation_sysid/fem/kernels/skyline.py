@@ -212,7 +212,10 @@ def _compile(name: str, sides: int) -> CompiledFunction:
     key = f"skyline {name} {sides} {lanes}"
     return compile_function(
         NativeCode(
-            name, key, signature, lambda: emit(_SkylineEmitter(lanes, sides))
+            name,
+            key,
+            signature=signature,
+            build=lambda: emit(_SkylineEmitter(lanes, sides)),
         )
     )
 
@@ -254,7 +257,7 @@ class _SkylineEmitter:
             self._begin("fill")
         )
         b = self.b
-        with for_range(b, I64(0), count, "entry") as k:
+        with for_range(b, I64(0), stop=count, name="entry") as k:
             origin, place = (
                 b.load(b.gep(array, [k])) for array in (source, places)
             )
@@ -282,10 +285,12 @@ class _SkylineEmitter:
         )
         b = self.b
         groups = b.sdiv(size, I64(PIVOTS))
-        with for_range(b, I64(0), groups, "group") as group:
+        with for_range(b, I64(0), stop=groups, name="group") as group:
             first = b.mul(group, I64(PIVOTS))
             self._eliminate([b.add(first, I64(p)) for p in range(PIVOTS)])
-        with for_range(b, b.mul(groups, I64(PIVOTS)), size, "rest") as pivot:
+        with for_range(
+            b, b.mul(groups, I64(PIVOTS)), stop=size, name="rest"
+        ) as pivot:
             self._eliminate([pivot])
         b.ret_void()
         return self.module
@@ -297,17 +302,19 @@ class _SkylineEmitter:
         for p, pivot in enumerate(pivots):
             self._scale(pivot, last)
             for later in pivots[p + 1 :]:
-                self._subtract([pivot], later, last)
+                self._subtract([pivot], later, last=last)
         next_row = b.add(pivots[-1], I64(1))
-        with for_range(b, next_row, b.add(last, I64(1)), "row") as row:
-            self._subtract(pivots, row, last)
+        with for_range(
+            b, next_row, stop=b.add(last, I64(1)), name="row"
+        ) as row:
+            self._subtract(pivots, row, last=last)
 
     def _scale(self, pivot: Value, last: Value) -> None:
         """Divide the entries below and right of a pivot by the pivot, and set the others to
         zero.
         """
         b = self.b
-        diagonal = b.load(self._entry(self.sides[0], pivot, pivot))
+        diagonal = b.load(self._entry(self.sides[0], pivot, place=pivot))
         b.store(diagonal, b.gep(self.pivots, [pivot]))
         inverse = self._splat(b.fdiv(DOUBLE(1.0), diagonal))
         lanes = ir.Constant(
@@ -315,7 +322,9 @@ class _SkylineEmitter:
         )
         with self._vectors(pivot, last) as start:
             after = b.icmp_signed(">", lanes, self._splat(b.sub(pivot, start)))
-            places = [self._entry(side, pivot, start) for side in self.sides]
+            places = [
+                self._entry(side, pivot, place=start) for side in self.sides
+            ]
             nothing = ir.Constant(self.vector, [0.0] * self.lanes)
             values = [
                 b.select(after, self._load(place), nothing) for place in places
@@ -339,7 +348,7 @@ class _SkylineEmitter:
         for pivot in pivots:
             diagonal = b.load(b.gep(self.pivots, [pivot]))
             row_entries = [
-                b.load(self._entry(side, pivot, row))
+                b.load(self._entry(side, pivot, place=row))
                 for side in reversed(self.sides)
             ]
             scales.append(
@@ -347,13 +356,13 @@ class _SkylineEmitter:
             )
         with self._vectors(row, last) as start:
             for k, side in enumerate(self.sides):
-                target = self._entry(side, row, start)
+                target = self._entry(side, row, place=start)
                 value = self._load(target)
                 for pivot, scale in zip(pivots, scales, strict=True):
                     value = self._multiply_subtract(
                         value,
-                        self._load(self._entry(side, pivot, start)),
-                        scale[k],
+                        self._load(self._entry(side, pivot, place=start)),
+                        y=scale[k],
                     )
                 self._store(value, target)
 
@@ -378,33 +387,35 @@ class _SkylineEmitter:
             self.module, kind, f"llvm.vector.reduce.fadd.v{self.lanes}f64"
         )
         dot = b.alloca(self.vector)
-        with for_range(b, I64(0), size, "forward") as k:
+        with for_range(b, I64(0), stop=size, name="forward") as k:
             last = b.load(b.gep(reach, [k]))
-            with for_range(b, I64(0), columns, "column") as column:
+            with for_range(b, I64(0), stop=columns, name="column") as column:
                 right = b.gep(rows, [b.mul(column, stride)])
                 loaded = self._splat(b.load(b.gep(right, [k])))
                 with self._vectors(k, last) as start:
                     place = b.gep(right, [start])
-                    factor = self._entry(first, k, start)
+                    factor = self._entry(first, k, place=start)
                     self._store(
                         self._multiply_subtract(
-                            self._load(place), self._load(factor), loaded
+                            self._load(place), self._load(factor), y=loaded
                         ),
                         place,
                     )
-        with for_range(b, I64(0), size, "backward") as done:
+        with for_range(b, I64(0), stop=size, name="backward") as done:
             k = b.sub(b.sub(size, I64(1)), done)
             last = b.load(b.gep(reach, [k]))
             diagonal = b.load(b.gep(pivots, [k]))
-            with for_range(b, I64(0), columns, "column") as column:
+            with for_range(b, I64(0), stop=columns, name="column") as column:
                 right = b.gep(rows, [b.mul(column, stride)])
                 b.store(ir.Constant(self.vector, [0.0] * self.lanes), dot)
                 with self._vectors(k, last) as start:
                     loaded = b.gep(right, [start])
-                    factor = self._entry(second, k, start)
+                    factor = self._entry(second, k, place=start)
                     b.store(
                         self._multiply_subtract(
-                            b.load(dot), self._load(loaded), self._load(factor)
+                            b.load(dot),
+                            self._load(loaded),
+                            y=self._load(factor),
                         ),
                         dot,
                     )
@@ -423,7 +434,7 @@ class _SkylineEmitter:
         b = self.b
         lanes = I64(self.lanes)
         stop = b.add(b.sdiv(last, lanes), I64(1))
-        with for_range(b, b.sdiv(first, lanes), stop, "vector") as k:
+        with for_range(b, b.sdiv(first, lanes), stop=stop, name="vector") as k:
             yield b.mul(k, lanes)
 
     def _entry(self, side: Value, row: Value, place: Value) -> Value:

@@ -88,7 +88,9 @@ class CasadiSolver(Options):
         InputError
             For an option that the plugin does not know.
         """
-        recorder = Recorder(self.name, collocation, watch, self.max_time_s)
+        recorder = Recorder(
+            self.name, collocation, watch=watch, max_time_s=self.max_time_s
+        )
         plugin = self.name.removeprefix(PREFIX)
         with recorder.stopwatch.building():
             program = collocation.with_lifted_variables()

@@ -211,9 +211,9 @@ def minimise_cg_descent(
             options=options,
         )
         trial = line.search(
-            _initial_step(x, f, g)
+            _initial_step(x, f, g=g)
             if k == 0
-            else _initial_step_after(line, step, change)
+            else _initial_step_after(line, step, change=change)
         )
         if trial is None and line.slope > -float(g @ g) * (
             1 - 1e-12
@@ -229,7 +229,7 @@ def minimise_cg_descent(
                 approximate=average.approximate,
                 options=options,
             )
-            trial = line.search(_initial_step(x, f, g))
+            trial = line.search(_initial_step(x, f, g=g))
         if trial is None:
             return result("line-search", k)
         change = abs(trial.value - f)
@@ -412,7 +412,7 @@ class _LineSearch:
         self.value = value
         self.direction = direction
         self.slope = float(gradient @ direction)
-        self.start = _LineTrial(0.0, value, self.slope, gradient)
+        self.start = _LineTrial(0.0, value, slope=self.slope, gradient=gradient)
         self.limit = value + error
         self.approximate = approximate
         self.options = options
@@ -436,7 +436,7 @@ class _LineSearch:
                     middle = (low.step + high.step) / 2
                     if not low.step < middle < high.step:
                         return None  # no number lies between
-                    low, high = self._update(low, high, middle)
+                    low, high = self._update(low, high, step=middle)
                 a = low
                 b = high
         except _TrialAccepted as found:
@@ -463,7 +463,10 @@ class _LineSearch:
             float(gradient @ self.direction) if np.isfinite(value) else np.nan
         )
         trial = _LineTrial(
-            step, value if np.isfinite(slope) else np.inf, slope, gradient
+            step,
+            value if np.isfinite(slope) else np.inf,
+            slope=slope,
+            gradient=gradient,
         )
         if self._satisfies_wolfe(trial):
             raise _TrialAccepted(trial)
@@ -537,11 +540,11 @@ class _LineSearch:
         the exceptions.
         """
         step = _secant(a, b)
-        low, high = self._update(a, b, step)
+        low, high = self._update(a, b, step=step)
         if high.step == step:
-            return self._update(low, high, _secant(b, high))
+            return self._update(low, high, step=_secant(b, high))
         if low.step == step:
-            return self._update(low, high, _secant(a, low))
+            return self._update(low, high, step=_secant(a, low))
         return low, high
 
 

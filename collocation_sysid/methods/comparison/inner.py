@@ -75,7 +75,7 @@ def minimise_merit(
             report=report,
         )
     scaled = _ScaledMerit(merit, z, smooth=inner != "l-bfgs-b")
-    follow = _ConvergenceCheck(scaled, tolerance, report)
+    follow = _ConvergenceCheck(scaled, tolerance, report=report)
     follow(scaled.start)
     if follow.converged:
         return True

@@ -86,7 +86,7 @@ def minimise_levenberg_marquardt(
             return True
         if count == max_iterations:
             break
-        system = _quadratic_model(merit, point, is_local, order)
+        system = _quadratic_model(merit, point, exact=is_local, order=order)
         while True:
             step = system.step(damping)
             if step is None and system.exact:
@@ -392,7 +392,7 @@ class _QuadraticModel:
                     f"{len(place)} variables; expected at most {MOST_MEMORY / 1e9:.0f} GB. "
                     "Choose inner = 'l-bfgs-b', or the method 'reduced-space'",
                     None,
-                    "solver",
+                    where="solver",
                 )
             band = np.zeros((width, len(place)), order="F")
             band[rows - columns, columns] = square.data[lower]

@@ -111,7 +111,7 @@ class PenaltyProblem:
 
     def from_original(self, z: Array) -> Array:
         """Return variables from those of the given problem."""
-        return convert_variables(z, self.original, self.nlp)
+        return convert_variables(z, self.original, target=self.nlp)
 
     def to_original(self, z: Array) -> Array:
         """Return variables of the given problem from z, with grasped nodes at their prescribed
@@ -128,7 +128,7 @@ class PenaltyProblem:
         return convert_variables(
             prescribed if self.has_valid_elements(prescribed) else z,
             self.nlp,
-            self.original,
+            target=self.original,
         )
 
     def to_original_multipliers(self, multipliers: Array) -> Array:

@@ -142,7 +142,7 @@ class PenaltyOptions(Options):
         if self.last_rho < self.rho:
             finding = f"found {self.rho_max:g} with rho = {self.rho:g}"
             raise InputError(
-                f"{finding}; expected no less than rho", None, "rho_max"
+                f"{finding}; expected no less than rho", None, where="rho_max"
             )
 
     def __call__(
@@ -163,8 +163,10 @@ class PenaltyOptions(Options):
         """
         climb = _PenaltySolve(
             self,
-            Recorder(self.name, collocation, watch, self.max_time_s),
-            start,
+            Recorder(
+                self.name, collocation, watch=watch, max_time_s=self.max_time_s
+            ),
+            start=start,
         )
         status, why = climb.recorder.run_search(climb.run)
         return climb.solution(status, why)
@@ -334,7 +336,7 @@ class _PenaltySolve:
                 "elements are inverted at the initial point; start from another guess"
             )
         no_weights = np.zeros(nlp.constraint_count)
-        merit = MeritFunction(self.problem, options.rho, no_weights)
+        merit = MeritFunction(self.problem, options.rho, multipliers=no_weights)
         self.stage = Stage(merit, options.first_gradient)
         self.iterations = 0
         self.gradient = np.inf
@@ -463,5 +465,7 @@ class _PenaltySolve:
         rows = self.problem.constraint_values(self.variables)
         scaled = float(np.abs(rows).max(initial=0.0))
         return ConstraintViolation(
-            newtons, newtons / max(nlp.largest_force_n(z), 1e-300), scaled
+            newtons,
+            newtons / max(nlp.largest_force_n(z), 1e-300),
+            scaled=scaled,
         )

@@ -79,8 +79,10 @@ class Shooting(Options):
         Only the parameters of `start` are used. If their simulation fails, the status says so and
         the positions are those of a rigid motion with the grasp.
         """
-        recorder = Recorder(self.name, collocation, watch, self.max_time_s)
-        search = _ShootingSearch(self, recorder, start)
+        recorder = Recorder(
+            self.name, collocation, watch=watch, max_time_s=self.max_time_s
+        )
+        search = _ShootingSearch(self, recorder, start=start)
         status, message = recorder.run_search(search.run)
         best = search.best
         shots = search.simulations
@@ -142,7 +144,7 @@ def adjoint_gradient(
     SimulationError
         If the equations of a time step are singular.
     """
-    multipliers = constraint_multipliers(collocation, z, stopwatch)
+    multipliers = constraint_multipliers(collocation, z, stopwatch=stopwatch)
     slope = collocation.gradient(z) + collocation.jacobian_vjp(z, multipliers)
     return collocation.parameters_from(slope)
 
@@ -342,7 +344,9 @@ class _ShootingSearch:
             raise SearchEnded(Status.TIME_LIMIT)
         self.simulations += 1
         collocation = self.collocation
-        z = simulate_variables(collocation, p, self.recorder.stopwatch)
+        z = simulate_variables(
+            collocation, p, stopwatch=self.recorder.stopwatch
+        )
         if self.horizon is not None:
             point = self.horizon.evaluate(p, collocation.unpack(z)[1])
             value = point.loss * collocation.loss_scale
@@ -354,7 +358,9 @@ class _ShootingSearch:
                 slope=point.fit.jacobian,
             )
         else:
-            slope = adjoint_gradient(collocation, z, self.recorder.stopwatch)
+            slope = adjoint_gradient(
+                collocation, z, stopwatch=self.recorder.stopwatch
+            )
             shot = _SimulatedPoint(
                 p.copy(),
                 z,

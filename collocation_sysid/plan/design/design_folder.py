@@ -107,13 +107,13 @@ def write_design(
         write_markers_csv(
             place / MARKERS_FILE,
             markers.t_s,
-            markers.names,
-            markers.positions_m,
+            names=markers.names,
+            positions_m=markers.positions_m,
         )
         for sensor, wrench in zip(
             experiment.wrenches, design.predicted.wrenches, strict=True
         ):
-            write_wrench_csv(place / WRENCH_FILE, sensor.t_s, wrench)
+            write_wrench_csv(place / WRENCH_FILE, sensor.t_s, values=wrench)
         if design.recording.problem.origin is not None:
             text = HEAD + tomli_w.dumps(
                 _problem_content(design, target.resolve())
@@ -129,7 +129,7 @@ def write_design(
             film(
                 replay,
                 place / FILM_FILE,
-                FRAMES_PER_SECOND,
+                fps=FRAMES_PER_SECOND,
                 names=("predicted", ""),
             )
         (place / DESIGN_FILE).write_text(
@@ -227,7 +227,7 @@ def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
     old_folder = origin.path.resolve().parent
     for key in ("object", "experiment"):
         problem_table[key] = _relative_to(
-            problem_table[key], old_folder, folder
+            problem_table[key], old_folder, new=folder
         )
     tables = problem_table["experiment"]
     names = [each.get("name") for each in tables]
@@ -303,12 +303,12 @@ def _relative_to(value: Any, old: Path, new: Path) -> Any:
     Names of columns are not file names.
     """
     if isinstance(value, list):
-        return [_relative_to(each, old, new) for each in value]
+        return [_relative_to(each, old, new=new) for each in value]
     if not isinstance(value, dict):
         return value
     return {
         key: Path(os.path.relpath(old / each, new)).as_posix()
         if key in OF_FILES and isinstance(each, str)
-        else (each if key == "columns" else _relative_to(each, old, new))
+        else (each if key == "columns" else _relative_to(each, old, new=new))
         for key, each in value.items()
     }

@@ -68,7 +68,7 @@ def _error_table(design: Design) -> Table:
                 else "",
             )
         )
-    return Table("", heads, tuple(rows))
+    return Table("", heads, rows=tuple(rows))
 
 
 def _percent(share: float) -> str:
@@ -105,7 +105,9 @@ def motion_picture(design: Design) -> Figure:
     t_s = design.motion.grid_s
     limits = design.limits
     place, rate, curvature = design.motion.derivatives(t_s)
-    angular = angular_motion(place[:, 3:], rate[:, 3:], curvature[:, 3:])
+    angular = angular_motion(
+        place[:, 3:], rate[:, 3:], curvature=curvature[:, 3:]
+    )
     for axis, colour in zip(range(3), COLOUR_CYCLE, strict=False):
         style = {"color": colour, "lw": LINE_PT, "label": "xyz"[axis]}
         shift.plot(t_s, 1e3 * place[:, axis], **style)
@@ -132,10 +134,12 @@ def motion_picture(design: Design) -> Figure:
         )
         axes.axhline(100, color="black", lw=0.6, ls="--")
         axes.set_ylim(bottom=0)
-    style_axes(shift, "", "", "displacement of the hand [mm]")
-    style_axes(turn, "", "", "rotation vector [°]")
-    style_axes(speed, "", "time [s]", "speed [% of limit]")
-    style_axes(growth, "", "time [s]", "acceleration [% of limit]")
+    style_axes(shift, "", xlabel="", ylabel="displacement of the hand [mm]")
+    style_axes(turn, "", xlabel="", ylabel="rotation vector [°]")
+    style_axes(speed, "", xlabel="time [s]", ylabel="speed [% of limit]")
+    style_axes(
+        growth, "", xlabel="time [s]", ylabel="acceleration [% of limit]"
+    )
     add_legend_above(shift, columns=3)
     add_legend_above(speed, columns=2)
     return figure
@@ -177,7 +181,7 @@ def error_bars_picture(design: Design) -> Figure:
         rows, [symbol_as_mathtext(name) or symbol_of(name) for name in names]
     )
     axes.set_ylim(len(names) - 0.5, -0.5)
-    style_axes(axes, "", "predicted standard error [%]", "")
+    style_axes(axes, "", xlabel="predicted standard error [%]", ylabel="")
     axes.tick_params(axis="y", labelsize=SMALL_PT)
     add_legend_above(axes, columns=2)
     return figure

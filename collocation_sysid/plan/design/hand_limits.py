@@ -118,7 +118,9 @@ class Limits(Section):
         try:
             return cls.model_validate(content)
         except ValidationError as error:
-            raise explain_validation_error(error, content, file, cls) from error
+            raise explain_validation_error(
+                error, content, path=file, root=cls
+            ) from error
 
     def bounds_from(self, hand_m: Array) -> HandBounds:
         """Return the limits of a hand that starts at a position (3,) in the poses' world [m].
@@ -138,9 +140,9 @@ class Limits(Section):
                 f"the hand starts at {at}, which is not between {' and '.join(corners)}; expected "
                 "a workspace that contains the start",
                 None,
-                "workspace_m",
+                where="workspace_m",
             )
-        return HandBounds(self, low, high)
+        return HandBounds(self, low, high_m=high)
 
     def out_of_view(self, markers_m: Array) -> float:
         """Return how far markers (T, M, 3) [m] leave the views; zero if all are in view.

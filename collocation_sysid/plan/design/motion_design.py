@@ -347,10 +347,10 @@ def design_motion(
         raise InputError(
             f"found {duration_s:g}; expected a number of seconds above 0",
             None,
-            "--duration",
+            where="--duration",
         )
     recording = FutureRecording(
-        problem, _select_experiment(problem, experiment), duration_s
+        problem, _select_experiment(problem, experiment), duration_s=duration_s
     )
     recording.bounds(limits)
     recording.highest_hz(limits)
@@ -364,7 +364,10 @@ def design_motion(
     else:
         _require_guesses(problem)
         draws = prior_draws(
-            problem.parameters, options.spread, options.pairs, options.seed
+            problem.parameters,
+            options.spread,
+            pairs=options.pairs,
+            seed=options.seed,
         )
         known = np.zeros((len(draws[0]),) * 2)
     judge = MotionObjective(
@@ -390,7 +393,7 @@ def design_motion(
     if best.coefficients is None or best.value >= FORBIDDEN:
         raise InputError(_no_motion_message(best), problem.path)
     say("simulating the best motion")
-    return _evaluate_design(judge, best, add)
+    return _evaluate_design(judge, best, add=add)
 
 
 def _evaluate_design(
@@ -513,7 +516,7 @@ def _select_experiment(problem: Problem, name: str | None) -> Experiment:
     if name is None:
         return moving[0]
     named = {each.name: each for each in moving}
-    require_among(name, named, problem.path, "--experiment")
+    require_among(name, named, source=problem.path, where="--experiment")
     return named[name]
 
 
@@ -525,7 +528,7 @@ def _require_guesses(problem: Problem) -> None:
             "has no guess, but a motion is designed for a value of each parameter; expected "
             f"--set {key}.guess=VALUE, or --add to identify it first",
             problem.path,
-            key,
+            where=key,
         )
 
 

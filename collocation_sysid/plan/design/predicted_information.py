@@ -113,7 +113,7 @@ class DesignCriterion:
                 f"of {', '.join(self.names)} one follows from the others, so that their "
                 "confidence ellipsoid has no volume; name fewer, or choose --criterion A or worst",
                 None,
-                "--for",
+                where="--for",
             )
 
 
@@ -402,7 +402,7 @@ class FutureRecording:
                 f"found {limits.frequency_hz:g}; expected at most {rate_hz / 2:g}, half the rate "
                 "of the samples",
                 None,
-                "frequency_hz",
+                where="frequency_hz",
             )
         return limits.frequency_hz or rate_hz / 10
 
@@ -478,7 +478,10 @@ class FutureRecording:
             else experiment
         )
         return Collocation(
-            [fitted], problem.parameters, problem.scheme, problem.first_substeps
+            [fitted],
+            problem.parameters,
+            scheme=problem.scheme,
+            substeps=problem.first_substeps,
         )
 
     def linearise(
@@ -500,8 +503,8 @@ class FutureRecording:
         x, failure = continue_simulation(
             experiment,
             segment.dynamics.with_theta(segment.constants.theta(q)),
-            known,
-            NewtonOptions(tolerance=TOLERANCE),
+            known=known,
+            options=NewtonOptions(tolerance=TOLERANCE),
         )
         if failure is not None:
             raise failure

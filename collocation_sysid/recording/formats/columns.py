@@ -61,44 +61,74 @@ class Quantity:
         return f"{self.key}_{self.unit}"
 
 
-TIME = Quantity("t", "time", "s", "time zeit prüfzeit temps tiempo tempo")
-DISPLACEMENTS = tuple(Quantity(axis, "length", "m") for axis in "xyz")
-FORCES = tuple(Quantity(f"f{axis}", "force", "n") for axis in "xyz")
-TORQUES = tuple(Quantity(f"t{axis}", "torque", "nm") for axis in "xyz")
+TIME = Quantity(
+    "t", "time", unit="s", words="time zeit prüfzeit temps tiempo tempo"
+)
+DISPLACEMENTS = tuple(Quantity(axis, "length", unit="m") for axis in "xyz")
+FORCES = tuple(Quantity(f"f{axis}", "force", unit="n") for axis in "xyz")
+TORQUES = tuple(Quantity(f"t{axis}", "torque", unit="nm") for axis in "xyz")
 DISPLACEMENT = Quantity(
     "displacement",
     "length",
-    "m",
-    "displacement extension elongation compression deflection stroke crosshead position travel "
+    unit="m",
+    words="displacement extension elongation compression deflection stroke crosshead position travel "
     "weg standardweg traversenweg verformung déplacement",
 )
-FORCE = Quantity("force", "force", "n", "force load kraft standardkraft")
-STRAIN = Quantity(
-    "strain", "ratio", "1", "strain dehnung stauchung déformation"
+FORCE = Quantity(
+    "force", "force", unit="n", words="force load kraft standardkraft"
 )
-STRESS = Quantity("stress", "pressure", "pa", "stress spannung contrainte")
-TENSION = Quantity("tension", "force", "n", "tension")
-PRESSURE = Quantity("pressure", "pressure", "pa", "pressure druck pression")
+STRAIN = Quantity(
+    "strain", "ratio", unit="1", words="strain dehnung stauchung déformation"
+)
+STRESS = Quantity(
+    "stress", "pressure", unit="pa", words="stress spannung contrainte"
+)
+TENSION = Quantity("tension", "force", unit="n", words="tension")
+PRESSURE = Quantity(
+    "pressure", "pressure", unit="pa", words="pressure druck pression"
+)
 _STRETCHES = "stretch lambda λ streckung"
-STRETCH = Quantity("stretch", "ratio", "1", _STRETCHES, unitless=True)
+STRETCH = Quantity(
+    "stretch", "ratio", unit="1", words=_STRETCHES, unitless=True
+)
 SECOND_STRETCH = Quantity(
-    "second_stretch", "ratio", "1", _STRETCHES, "second", unitless=True
+    "second_stretch",
+    "ratio",
+    unit="1",
+    words=_STRETCHES,
+    qualifier="second",
+    unitless=True,
 )
 LATERAL_STRETCH = Quantity(
-    "lateral_stretch", "ratio", "1", _STRETCHES, "lateral", unitless=True
+    "lateral_stretch",
+    "ratio",
+    unit="1",
+    words=_STRETCHES,
+    qualifier="lateral",
+    unitless=True,
 )
-SECOND_STRAIN = Quantity("second_strain", "ratio", "1", STRAIN.words, "second")
+SECOND_STRAIN = Quantity(
+    "second_strain", "ratio", unit="1", words=STRAIN.words, qualifier="second"
+)
 LATERAL_STRAIN = Quantity(
-    "lateral_strain", "ratio", "1", STRAIN.words, "lateral"
+    "lateral_strain", "ratio", unit="1", words=STRAIN.words, qualifier="lateral"
 )
 VOLUME_RATIO = Quantity(
-    "volume_ratio", "ratio", "1", "volumenverhältnis", unitless=True
+    "volume_ratio", "ratio", unit="1", words="volumenverhältnis", unitless=True
 )
 SECOND_STRESS = Quantity(
-    "second_stress", "pressure", "pa", STRESS.words, "second"
+    "second_stress",
+    "pressure",
+    unit="pa",
+    words=STRESS.words,
+    qualifier="second",
 )
 TRUE_STRESS = Quantity(
-    "true_stress", "pressure", "pa", STRESS.words, "deformed"
+    "true_stress",
+    "pressure",
+    unit="pa",
+    words=STRESS.words,
+    qualifier="deformed",
 )
 KNOWN_QUANTITIES = (
     *(TIME, *DISPLACEMENTS, *FORCES, *TORQUES),
@@ -174,16 +204,19 @@ def read_columns(
     """
     grid = read_table(decode(read_bytes(path)))
     if "t_s" in grid.columns and not column_names:
-        _require_known_columns(grid, quantities, requires_all)
-    places = _find_columns(grid, quantities, column_names or {})
+        _require_known_columns(grid, quantities, all_of=requires_all)
+    places = _find_columns(grid, quantities, mapped=column_names or {})
     t = places.pop(TIME.key, None)
     if len(places) < (len(quantities) if requires_all else 1) or (
         requires_times and t is None
     ):
-        raise _columns_error(grid, quantities, requires_all)
+        raise _columns_error(grid, quantities, all_of=requires_all)
     values = {}
     for key, (place, factor) in places.items():
-        values[key] = factor * numeric_cells(grid, [place], blank_allowed)[:, 0]
+        values[key] = (
+            factor
+            * numeric_cells(grid, [place], blank_allowed=blank_allowed)[:, 0]
+        )
         if np.isnan(values[key]).all():
             raise InputError(
                 f"column {grid.columns[place]} has no values; remove it"
@@ -193,7 +226,7 @@ def read_columns(
         if t is None
         else times_in_column(grid, *t)
     )
-    return QuantityTable(grid, t_s, values)
+    return QuantityTable(grid, t_s, values=values)
 
 
 # Which column -------------------------------------------------------------------------------------
@@ -228,7 +261,7 @@ def _find_columns(
             )
             raise InputError(f"columns has the key {key!r}; {expected}")
     chosen = {
-        key: _column_named_by_user(grid, by_key[key], name)
+        key: _column_named_by_user(grid, by_key[key], name=name)
         for key, name in mapped.items()
     }
     sought = quantities if not chosen.keys() - {TIME.key} else ()
@@ -273,7 +306,7 @@ def _column_named_by_user(
         )
     factor = None if unit is None else si_factor(unit, quantity.dimension)
     if factor is None:
-        raise _unit_error(grid, column, unit, quantity)
+        raise _unit_error(grid, column, unit=unit, quantity=quantity)
     return grid.columns.index(column), factor
 
 
@@ -311,7 +344,9 @@ def find_column(
         )
     if units and not fitting:
         first = next(iter(units))
-        raise _unit_error(grid, grid.columns[first], units[first], quantity)
+        raise _unit_error(
+            grid, grid.columns[first], unit=units[first], quantity=quantity
+        )
     return fitting[0] if fitting else None
 
 
@@ -361,7 +396,10 @@ def _require_known_columns(
         if name_and_unit(column)[0].lower() not in known:
             hint = hint_at(column, [quantity.column for quantity in quantities])
             raise _columns_error(
-                grid, quantities, all_of, f": {column} is not among them{hint}"
+                grid,
+                quantities,
+                all_of=all_of,
+                why=f": {column} is not among them{hint}",
             )
 
 

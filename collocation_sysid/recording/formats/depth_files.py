@@ -125,7 +125,7 @@ def read_depth(
                 known=known_camera_fields,
             )
     if path.is_dir():
-        return _read_folder(path, count_m, length_m)
+        return _read_folder(path, count_m, length_m=length_m)
     require_regular(path)
     kind = path.suffix.lower()
     if kind not in _READERS:
@@ -145,7 +145,9 @@ def read_depth(
     if isinstance(content, DepthFileContent):
         return content
     if kind in CLOUDS:
-        return DepthFileContent([], [_scaled_cloud(content, path, length_m)])
+        return DepthFileContent(
+            [], [_scaled_cloud(content, path, length_m=length_m)]
+        )
     with located(path):
         return DepthFileContent([_in_metres(content, count_m)], [])
 
@@ -191,11 +193,13 @@ def _read_topic(
     if "images" not in kind:
         clouds = [
             _scaled_cloud(
-                _points_from_columns(decode_cloud(each)), path, length_m
+                _points_from_columns(decode_cloud(each)),
+                path,
+                length_m=length_m,
             )
             for each in messages
         ]
-        return DepthFileContent([], clouds, t_s)
+        return DepthFileContent([], clouds, t_s=t_s)
     images = _LazyImages(messages, count_m, path)
     matrix = None
     distortion = None
@@ -203,10 +207,14 @@ def _read_topic(
         rectified = RECTIFIED.search(address.topic.lower()) is not None
         with located(f"{address.log}#{camera[0]}"):
             if "matrix" not in known:
-                matrix = camera_matrix(camera[1], rectified, images[0].shape)
+                matrix = camera_matrix(
+                    camera[1], rectified, shape=images[0].shape
+                )
             if "distortion" not in known:
                 distortion = distortion_coefficients(camera[1], rectified)
-    return DepthFileContent(images, [], t_s, matrix, distortion=distortion)
+    return DepthFileContent(
+        images, [], t_s=t_s, matrix=matrix, distortion=distortion
+    )
 
 
 def _camera_of_topic(log: Log, topic: str) -> tuple[str, Any] | None:
@@ -258,7 +266,7 @@ def _read_folder(
             f"contains {', '.join(sorted(kinds))}; expected files of one kind",
             path,
         )
-    parts = [read_depth(each, count_m, length_m) for each in files]
+    parts = [read_depth(each, count_m, length_m=length_m) for each in files]
     times = path / "times.csv"
     t_s = None
     if times.is_file():
@@ -270,7 +278,7 @@ def _read_folder(
             )
     images = [image for part in parts for image in part.images_m]
     return DepthFileContent(
-        images, [cloud for part in parts for cloud in part.clouds_m], t_s
+        images, [cloud for part in parts for cloud in part.clouds_m], t_s=t_s
     )
 
 

@@ -135,7 +135,7 @@ def decode_image(message: Any) -> Any:
         return _decode_compressed(str(message.format), _message_data(message))
     order = ">" if getattr(message, "is_bigendian", 0) else "<"
     form = np.dtype(order + ENCODINGS[message.encoding])
-    return _unpadded_rows(message, message.step, form.itemsize).view(form)
+    return _unpadded_rows(message, message.step, size=form.itemsize).view(form)
 
 
 def _decode_compressed(kind: str, data: bytes) -> Any:
@@ -221,7 +221,7 @@ def decode_cloud(message: Any) -> dict[str, Array]:
             f"has the columns {columns} in points of {message.point_step} bytes; expected each "
             "once, of types 1 to 8, within these"
         ) from error
-    rows = _unpadded_rows(message, message.row_step, message.point_step)
+    rows = _unpadded_rows(message, message.row_step, size=message.point_step)
     points = np.frombuffer(rows.tobytes(), form)
     return {name: points[name].astype(float) for name in form.names or ()}
 

@@ -71,8 +71,10 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     raw = tracks_of_table(
         table,
         labels,
-        [each.coordinate_columns for each in columns.values()],
-        chosen,
+        coordinate_columns=[
+            each.coordinate_columns for each in columns.values()
+        ],
+        chosen=chosen,
         time=1,
         unit=length_unit_of_text(unit, "line 1, Length Units"),
         unit_key="Length Units",

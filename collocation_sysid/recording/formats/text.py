@@ -222,7 +222,7 @@ def table_of_rows(
         len(r.cells) == common and not any(r.cells[width:]) for r in rows
     ):
         rows = [Row(row.line, row.cells[:width]) for row in rows]
-    table = TextTable(columns, rows, names_line)
+    table = TextTable(columns, rows, names_line=names_line)
     for k, row in enumerate(rows):
         if len(row.cells) != width:
             raise table.error_at(
@@ -258,7 +258,7 @@ def read_table(text: str) -> TextTable:
             f"{a} ({u.strip('()[]')})"
             for a, u in zip_longest(above, header, fillvalue="")
         ]
-    return table_of_rows(header, rows[names + 1 :], rows[names].line)
+    return table_of_rows(header, rows[names + 1 :], names_line=rows[names].line)
 
 
 def _is_unit(cell: str) -> bool:

@@ -99,7 +99,9 @@ def list_topics(path: str | Path) -> list[LogTopic]:
         If the path is no log, the log is damaged, or a package that reads it is missing.
     """
     with open_log(Path(path), episode=0) as log:
-        return [_describe_topic(log, Path(path), name) for name in log.topics]
+        return [
+            _describe_topic(log, Path(path), name=name) for name in log.topics
+        ]
 
 
 def topic_as_csv(address: TopicAddress) -> bytes:
@@ -125,7 +127,7 @@ def topic_as_csv(address: TopicAddress) -> bytes:
             return _csv_content(
                 POSE,
                 *_poses_through_frames(
-                    _all_transforms(log, messages, address.topic), address
+                    _all_transforms(log, messages, topic=address.topic), address
                 ),
             )
         times, ordered = sort_by_time(messages, log.start_ns)
@@ -145,9 +147,13 @@ def topic_as_csv(address: TopicAddress) -> bytes:
     )
     if address.robot is not None:
         return _csv_content(
-            POSE, times, _poses_from_joints(columns, values, address, unit)
+            POSE,
+            times,
+            values=_poses_from_joints(
+                columns, values, address=address, unit=unit
+            ),
         )
-    return _csv_content(columns, times, values)
+    return _csv_content(columns, times, values=values)
 
 
 def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
@@ -169,7 +175,9 @@ def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
     serves = ""
     write = [f"{path.name}#{name}"]
     if first and _is_transforms(first[0][1]):
-        chains = moving_chains(_all_transforms(log, log.messages(name), name))
+        chains = moving_chains(
+            _all_transforms(log, log.messages(name), topic=name)
+        )
         serves = (
             "poses of one frame relative to another"
             if chains
@@ -246,7 +254,7 @@ def sort_by_time(
     """
     t_s = np.array(
         [
-            measurement_time_s(message, at_ns, start_ns)
+            measurement_time_s(message, at_ns, start_ns=start_ns)
             for at_ns, message in messages
         ]
     )
@@ -480,7 +488,7 @@ def _poses_of_transforms(
                 edge := _transform_frames(each)
             ) is not None and pose is not None:
                 edges.setdefault(edge, {}).setdefault(
-                    measurement_time_s(each, at_ns, start_ns), pose
+                    measurement_time_s(each, at_ns, start_ns=start_ns), pose
                 )
     return edges
 
@@ -557,7 +565,7 @@ def _poses_through_frames(
     )
 
     parent, child = _requested_frames(edges, address)
-    path = _frame_path(edges, parent, child)
+    path = _frame_path(edges, parent, child=child)
     moving = [
         np.array(sorted(edges[edge])) for edge in path if len(edges[edge]) > 1
     ]
@@ -705,7 +713,9 @@ def _poses_from_joints(
         for name, value in zip(columns, position, strict=True):
             if name in limits:
                 angle = np.radians(value) if unit == "deg" else value
-                _require_joint_limits(name, angle, limits[name], address)
+                _require_joint_limits(
+                    name, angle, limits=limits[name], address=address
+                )
                 robot.set_joint(name, angle)
         poses[row] = pq_from_transform(robot.get_transform(child, parent))[
             [0, 1, 2, 4, 5, 6, 3]

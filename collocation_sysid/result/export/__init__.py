@@ -30,17 +30,22 @@ IDENTIFIED_FILE = "identified.json"
 
 TARGETS: dict[str, ExportTarget] = {
     "mujoco": ExportTarget(
-        "MuJoCo", mujoco.MODEL, mujoco.export, mujoco.verify
+        "MuJoCo", mujoco.MODEL, export=mujoco.export, verify=mujoco.verify
     ),
-    "newton": ExportTarget("Newton", newton.MODULE_FILE, newton.export),
-    "usd": ExportTarget("OpenUSD", usd.STAGE_FILE, usd.export, usd.verify),
-    "sofa": ExportTarget("SOFA", sofa.SCENE, sofa.export),
-    "febio": ExportTarget("FEBio", febio.MODEL, febio.export),
+    "newton": ExportTarget("Newton", newton.MODULE_FILE, export=newton.export),
+    "usd": ExportTarget(
+        "OpenUSD", usd.STAGE_FILE, export=usd.export, verify=usd.verify
+    ),
+    "sofa": ExportTarget("SOFA", sofa.SCENE, export=sofa.export),
+    "febio": ExportTarget("FEBio", febio.MODEL, export=febio.export),
     "calculix": ExportTarget(
-        "CalculiX", calculix.DECK, calculix.export, calculix.verify
+        "CalculiX",
+        calculix.DECK,
+        export=calculix.export,
+        verify=calculix.verify,
     ),
     "json": ExportTarget(
-        "JSON", IDENTIFIED_FILE, lambda body: ExportedFiles({}, ())
+        "JSON", IDENTIFIED_FILE, export=lambda body: ExportedFiles({}, ())
     ),
 }
 # Main file of each format: the targets, and the recording for a viewer.
@@ -140,7 +145,9 @@ def comparison_table(
                 each.remark,
             )
         )
-    return Table("", ("", name, "ours", "difference", ""), tuple(rows), names=5)
+    return Table(
+        "", ("", name, "ours", "difference", ""), rows=tuple(rows), names=5
+    )
 
 
 def target_named(name: str) -> ExportTarget:

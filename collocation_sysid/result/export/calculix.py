@@ -92,11 +92,11 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     mesh += "".join(
         f"*ELSET,ELSET=BODY\nE{k}\n" for k in range(len(body.regions))
     )
-    head = comment_lines(body, limits, "** ")
+    head = comment_lines(body, limits, start="** ")
     obstacles = faceted_obstacles(body)
     steps = ""
     for t_s in _step_times_s(body):
-        steps += _step_card(body, obstacles, t_s, linear)
+        steps += _step_card(body, obstacles, t_s=t_s, is_linear=linear)
     return ExportedFiles(
         {
             DECK: f"{head}{mesh}{materials}{_obstacle_cards(body, obstacles)}{steps}"
@@ -353,7 +353,7 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
         ) from None
     times = _step_times_s(body)
     theirs, their_forces = _read_final_state(
-        folder / "body.dat", len(body.nodes_m), len(times)
+        folder / "body.dat", len(body.nodes_m), steps=len(times)
     )
     if theirs is None:
         messages = [x for x in ended.stdout.splitlines() if "ERROR" in x] or [
@@ -386,7 +386,7 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
         our_n = float(np.linalg.norm(force))
         comparisons.append(
             PredictionComparison(
-                f"force of {each.name} {what}", their_n, our_n, "N"
+                f"force of {each.name} {what}", their_n, ours=our_n, unit="N"
             )
         )
     return comparisons

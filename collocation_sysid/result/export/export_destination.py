@@ -139,7 +139,7 @@ def parse_destination(
     if text in main_files:
         folder = out or run_folder / f"export-{text}"
         return ExportDestination(
-            text, folder, folder / main_files[text], is_folder=True
+            text, folder, main_file=folder / main_files[text], is_folder=True
         )
     path = Path(text)
     suffix = path.suffix.lower()
@@ -162,27 +162,29 @@ def parse_destination(
             )
             + hint_at(text, main_files),
             None,
-            "--to",
+            where="--to",
         )
     if len(formats) > 1:
         raise InputError(
             f"found {text!r}, but {suffix} is the suffix of {' and '.join(formats)}; write the "
             f"name of the format, such as --to {formats[0]}, and a folder with --out",
             None,
-            "--to",
+            where="--to",
         )
     if out is not None:
         raise InputError(
             f"--to names the destination {text} already; leave out --out, or write --to "
             f"{formats[0]}",
             None,
-            "--out",
+            where="--out",
         )
     (name,) = formats
     if suffix:
-        return ExportDestination(name, path.parent, path, is_folder=False)
+        return ExportDestination(
+            name, path.parent, main_file=path, is_folder=False
+        )
     return ExportDestination(
-        name, path, path / main_files[name], is_folder=True
+        name, path, main_file=path / main_files[name], is_folder=True
     )
 
 
@@ -195,7 +197,9 @@ def _require_replaceable(file: Path) -> None:
         Naming the file.
     """
     if file.is_dir() and not file.is_symlink():
-        raise InputError("is a folder; expected a file to write", file, "--to")
+        raise InputError(
+            "is a folder; expected a file to write", file, where="--to"
+        )
     if (file.exists() or file.is_symlink()) and not is_written_here(file):
         raise InputError(
             "this file exists and was not written by this program, or was changed since, so it "

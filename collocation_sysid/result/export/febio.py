@@ -46,13 +46,13 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     """Return the model of a static step with growing loads, and what FEBio cannot express."""
     limits = CAPABILITIES.limitations(body)
     materials = "".join(
-        _material_xml(k, region, limits)
+        _material_xml(k, region, limits=limits)
         for k, region in enumerate(body.regions, 1)
     )
     if body.node_loads_n.any():
         limits.append("point masses and forces on nodes are not exported")
     xml = '<?xml version="1.0" encoding="UTF-8"?>\n' + comment_lines(
-        body, limits, "<!-- ", " -->"
+        body, limits, start="<!-- ", end=" -->"
     )
     xml += '<febio_spec version="4.0">\n<Module type="solid"/>\n'
     xml += (
@@ -228,7 +228,9 @@ def _obstacle_mesh_xml(
             f'<node id="{i}">{values_as_text(point, ",")}</node>\n'
             for i, point in enumerate(wall.start_points_m, wall.first_node + 1)
         )
-        cells = _numbered_elements("elem", wall.tetrahedra + 1, wall.first_cell)
+        cells = _numbered_elements(
+            "elem", wall.tetrahedra + 1, offset=wall.first_cell
+        )
         solids += f'<Nodes name="nodes_wall_{k}">\n{nodes}</Nodes>\n'
         solids += f'<Elements type="tet4" name="cells_wall_{k}">\n{cells}</Elements>\n'
         touching = body.body.nodes.nodes_of_faces(corners[wall.faces]) + 1

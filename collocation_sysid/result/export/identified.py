@@ -96,7 +96,9 @@ class IdentifiedRegion:
             return ()
         c = self.constants
         return tuple(
-            PowerTerm(c[f"mu_{p}_pa"], c[f"alpha_{p}"], c.get(f"beta_{p}", 0.0))
+            PowerTerm(
+                c[f"mu_{p}_pa"], c[f"alpha_{p}"], beta=c.get(f"beta_{p}", 0.0)
+            )
             for p in term_numbers(c)
         )
 
@@ -220,7 +222,7 @@ class IdentifiedBody:
                 "expected a stress-free mesh: write body.stress_free_mesh(theta) to a file, and "
                 'solve with that and rest_shape = "stress_free"',
                 folder,
-                "object.rest_shape",
+                where="object.rest_shape",
             )
         collocation = problem.collocation()
         names = [
@@ -389,7 +391,7 @@ class IdentifiedBody:
                         IdentifiedBranch(
                             b.name,
                             values[f"{b.name}.share"],
-                            values[f"{b.name}.tau_s"],
+                            tau_s=values[f"{b.name}.tau_s"],
                         )
                         for b in part.prony
                     ),

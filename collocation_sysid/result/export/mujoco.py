@@ -48,9 +48,9 @@ CAPABILITIES = TargetCapabilities(
     {"st-venant-kirchhoff": "flex"},
     "a flex has the law of St. Venant and Kirchhoff; {material} has the same E and ν at small "
     "strain, but stresses differ in second order of the strain",
-    'the damping of a flex is the law "material", γ_r (λ tr(Ė) I + 2 μ Ė); {damping} agrees with '
-    "it at small strain",
-    "mass-proportional damping, γ_m = {gamma_m_1_s:.4g} 1/s, is not supported, and MuJoCo "
+    stiffness_damping='the damping of a flex is the law "material", γ_r (λ tr(Ė) I + 2 μ Ė); '
+    "{damping} agrees with it at small strain",
+    mass_damping="mass-proportional damping, γ_m = {gamma_m_1_s:.4g} 1/s, is not supported, and MuJoCo "
     "refuses dampers on the nodes of a flex",
     damping_law="material",
     has_moving_grasps=True,
@@ -84,7 +84,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
             "motion, set position and velocity of the free joints at every step, as --verify does"
         )
     step_s = _stable_step_s(body)
-    x = comment_lines(body, limits, "<!-- ", " -->")
+    x = comment_lines(body, limits, start="<!-- ", end=" -->")
     x += f"<mujoco model={xml_attribute(body.title or 'body')}>\n"
     gravity = values_as_text(body.experiment.gravity_m_s2)
     x += f'<option timestep="{step_s!r}" gravity="{gravity}" jacobian="sparse"/>\n'
@@ -274,9 +274,9 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
         raise InputError(
             f"MuJoCo refuses the model: {error}", folder / MODEL
         ) from error
-    compared = [_compare_first_frequency(body, mujoco, model)]
+    compared = [_compare_first_frequency(body, mujoco, model=model)]
     if not body.experiment.is_static and body.simulated_m is not None:
-        compared.append(_compare_motion(body, mujoco, model))
+        compared.append(_compare_motion(body, mujoco, model=model))
     return compared
 
 
@@ -338,7 +338,10 @@ def _compare_first_frequency(
         forces, body.nodes_m, free_dofs=dofs, count=1
     ).frequencies_hz
     return PredictionComparison(
-        "first natural frequency, undeformed", theirs, float(ours[0]), "Hz"
+        "first natural frequency, undeformed",
+        theirs,
+        ours=float(ours[0]),
+        unit="Hz",
     )
 
 
@@ -371,8 +374,11 @@ def _compare_motion(
         _set_grasp_state(
             body,
             mujoco,
-            data,
-            (body.start_s + k * model.opt.timestep, model.opt.timestep),
+            data=data,
+            time_and_step_s=(
+                body.start_s + k * model.opt.timestep,
+                model.opt.timestep,
+            ),
         )
         mujoco.mj_step(model, data)
         if (k + 1) % steps == 0:

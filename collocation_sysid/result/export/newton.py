@@ -23,7 +23,7 @@ DATA_FILE = "body.json"
 CAPABILITIES = TargetCapabilities(
     {"stable-neo-hookean": "soft mesh"},
     "{material} becomes the stable neo-Hookean energy of the same λ and μ at small strain",
-    "damping γ_r becomes a viscosity k = γ_r μ / 2 [Pa s] with the stress 4 k Ė, the law "
+    stiffness_damping="damping γ_r becomes a viscosity k = γ_r μ / 2 [Pa s] with the stress 4 k Ė, the law "
     '"material" without its part λ tr(Ė): changes of volume are damped less; the identified law '
     "is {damping}",
     has_rounded_edges=False,
@@ -140,7 +140,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         ],
     }
     files = {
-        MODULE_FILE: comment_lines(body, limits, "# ") + _MODULE_SOURCE,
+        MODULE_FILE: comment_lines(body, limits, start="# ") + _MODULE_SOURCE,
         DATA_FILE: json.dumps(content(data)) + "\n",
     }
     return ExportedFiles(files, tuple(limits))

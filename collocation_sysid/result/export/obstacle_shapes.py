@@ -163,7 +163,7 @@ class Facets:
         places = _hull_points(
             Primitive.from_solid(solid),
             getattr(solid, "rounding_m", 0.0),
-            depth_m,
+            depth_m=depth_m,
         )
         hull = ConvexHull(places)
         used, triangles = np.unique(hull.simplices, return_inverse=True)

@@ -76,7 +76,7 @@ def write_rerun(
         raise InputError(MISSING)
     result, replays = read_run(run)
     if experiment is not None:
-        replays = [experiment_named(replays, experiment, run)]
+        replays = [experiment_named(replays, experiment, run=run)]
     replays = [replay for replay in replays if replay.has_shapes]
     if not replays:
         raise InputError("no experiment of this run has a trajectory", run)
@@ -84,7 +84,7 @@ def write_rerun(
     with replaced_folder(
         folder, marker_file=RECORDING_FILE, content_word="recording"
     ) as place:
-        recording = _Recording(place / RECORDING_FILE, result, replays)
+        recording = _Recording(place / RECORDING_FILE, result, replays=replays)
         limits = _limits(stresses)
         for replay, stress in zip(replays, stresses, strict=True):
             recording.write_experiment(replay, stress, limits)
@@ -101,7 +101,7 @@ def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
     if replay.positions_m is None:  # only fitted experiments have frames
         return None
     try:
-        return field_on_faces(run, replay, DEFAULT_FIELD)
+        return field_on_faces(run, replay, field=DEFAULT_FIELD)
     except InputError:
         return None
 
@@ -230,7 +230,7 @@ class _Recording:
                 self._write_curve(
                     self._path("parameters", name, curve),
                     span_s,
-                    [value, value],
+                    values=[value, value],
                 )
 
     def write_experiment(
@@ -252,7 +252,7 @@ class _Recording:
         """
         name = replay.name
         self.stream.log(self._path(name), self._up_axis(replay.up), static=True)
-        self._write_surface(replay, stress, limits)
+        self._write_surface(replay, stress, limits=limits)
         extent_m = float(np.ptp(replay.undeformed_m, axis=0).max())
         radius_m = MARKER_RADIUS_RATIO * extent_m
         shapes_m = replay.shapes_m
@@ -330,18 +330,20 @@ class _Recording:
             "vertex_positions": positions_m.reshape(-1, 3)
         }
         if stress is not None:
-            colours = vertex_colours(triangles, stress[there], limits, count)
+            colours = vertex_colours(
+                triangles, stress[there], limits=limits, count=count
+            )
             columns["vertex_colors"] = colours.reshape(-1, 4)
         self._send(
             path,
             replay.t_s[there],
-            rr.Mesh3D.columns(**columns),
-            [count] * len(positions_m),
+            columns=rr.Mesh3D.columns(**columns),
+            counts=[count] * len(positions_m),
         )
         if stress is not None:
             largest = np.nanmax(np.nan_to_num(stress, nan=-np.inf), axis=1)
             path = self._path(replay.name, "largest_von_mises_pa")
-            self._write_curve(path, replay.t_s, largest)
+            self._write_curve(path, replay.t_s, values=largest)
 
     def _write_points(
         self,
@@ -359,7 +361,9 @@ class _Recording:
         style = rr.Points3D.from_fields(colors=colour, radii=radius_m)
         self.stream.log(path, style, static=True)
         columns = rr.Points3D.columns(positions=np.concatenate(there))
-        self._send(path, t_s, columns, [len(each) for each in there])
+        self._send(
+            path, t_s, columns=columns, counts=[len(each) for each in there]
+        )
 
     def _write_obstacles(self, replay: MotionRecord) -> None:
         """Write the outlines of obstacles."""
@@ -388,7 +392,7 @@ class _Recording:
             replay.marker_names, distances_mm.T, strict=True
         ):
             path = self._path(replay.name, "residuals_mm", str(marker))
-            self._write_curve(path, replay.t_s, values)
+            self._write_curve(path, replay.t_s, values=values)
 
     def _write_wrenches(self, replay: MotionRecord) -> None:
         """Write forces and torques as measured, fitted and simulated."""
@@ -405,7 +409,7 @@ class _Recording:
                 ):
                     label = f"{component} [{unit}]"
                     path = self._path(replay.name, f"wrench_{k}", label, kind)
-                    self._write_curve(path, t_s, curve)
+                    self._write_curve(path, t_s, values=curve)
 
     def _write_curve(
         self, path: str, t_s: Array, values: Sequence[float] | Array

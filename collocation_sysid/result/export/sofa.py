@@ -84,7 +84,9 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     mass = values_as_text(body.total_node_mass_kg)
     grasped = " ".join(map(str, np.flatnonzero(body.is_node_prescribed)))
     cells = " ".join(map(str, body.body.cells.ravel()))
-    x = '<?xml version="1.0"?>\n' + comment_lines(body, limits, "<!-- ", " -->")
+    x = '<?xml version="1.0"?>\n' + comment_lines(
+        body, limits, start="<!-- ", end=" -->"
+    )
     x += f'<Node name="root" dt="{body.experiment.timestep_s / 4!r}" '
     x += f'gravity="{values_as_text(body.experiment.gravity_m_s2)}">\n'
     x += "".join(

@@ -45,8 +45,8 @@ CAPABILITIES = TargetCapabilities(
     {},
     "the simulator chooses the energy for E and ν instead of {material}: in Newton it is the "
     "stable neo-Hookean law",
-    "damping γ_r is not part of the USD schemas: it is exported as a custom attribute",
-    "γ_m = {gamma_m_1_s:.4g} 1/s is not part of the USD schemas: it is exported as a custom "
+    stiffness_damping="damping γ_r is not part of the USD schemas: it is exported as a custom attribute",
+    mass_damping="γ_m = {gamma_m_1_s:.4g} 1/s is not part of the USD schemas: it is exported as a custom "
     "attribute",
     has_moving_grasps=True,
     has_moving_obstacles=True,
@@ -101,7 +101,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     stage.SetEndTimeCode(float(rate_hz * t_s[-1]))
     world = pxr.UsdGeom.Xform.Define(stage, "/World").GetPrim()
     stage.SetDefaultPrim(world)
-    world.SetDocumentation(comment_lines(body, limits, ""))
+    world.SetDocumentation(comment_lines(body, limits, start=""))
     scene = pxr.UsdPhysics.Scene.Define(stage, "/World/Physics")
     gravity = body.experiment.gravity_m_s2
     size = float(np.linalg.norm(gravity))
@@ -110,7 +110,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         pxr.Gf.Vec3f(*(gravity / (size or 1.0)).tolist())
     )
     placed_m = np.where(body.is_prescribed, body.prescribed_m, body.nodes_m)
-    _add_mesh(pxr, stage, body, placed_m)
+    _add_mesh(pxr, stage, body=body, start_positions_m=placed_m)
     for k, grasp in enumerate(body.experiment.grasps, start=1):
         _add_gripper(
             pxr,
@@ -206,7 +206,7 @@ def _add_mesh(
     rest.Set(body.nodes_m.astype(np.float32))
     masses = prim.CreateAttribute("physics:masses", number.FloatArray, False)
     masses.Set(_cell_masses_kg(body, cells).astype(np.float32))
-    _set_token(pxr, prim, "physics:masses:elementType", "tetrahedron")
+    _set_token(pxr, prim, name="physics:masses:elementType", text="tetrahedron")
     grasped = prim.CreateAttribute(
         f"{ATTRIBUTE_NAMESPACE}:graspedPoints", number.IntArray
     )
@@ -214,10 +214,13 @@ def _add_mesh(
     names = _unique_prim_names([region.name for region in body.regions])
     pairs = zip(body.regions, names, strict=True)
     materials = [
-        _add_material(pxr, stage, region, name) for region, name in pairs
+        _add_material(pxr, stage, region=region, name=name)
+        for region, name in pairs
     ]
     _bind_material(
-        pxr, prim, materials[int(np.argmax([len(each) for each in cells]))]
+        pxr,
+        prim,
+        material=materials[int(np.argmax([len(each) for each in cells]))],
     )
     firsts = np.cumsum([0, *map(len, cells)])
     for k, material in enumerate(materials if len(cells) > 1 else ()):
@@ -229,7 +232,7 @@ def _add_mesh(
             indices,
             "materialBind",
         )
-        _bind_material(pxr, subset.GetPrim(), material)
+        _bind_material(pxr, subset.GetPrim(), material=material)
 
 
 def _cell_masses_kg(body: IdentifiedBody, cells: list[Index]) -> Array:
@@ -325,7 +328,7 @@ def _add_gripper(
             [pxr.Sdf.Path(target)]
         )
     for name, text in (("type0", "point"), ("type1", "xform")):
-        _set_token(pxr, prim, f"physics:{name}", text)
+        _set_token(pxr, prim, name=f"physics:{name}", text=text)
     local_m = (start_positions_m[nodes] - positions_m[0]) @ matrices[0]
     for name, kind, values in (
         ("indices0", types.IntArray, nodes.astype(np.int32)),
@@ -409,7 +412,7 @@ def _add_obstacle(
         rubbing.CreateDynamicFrictionAttr,
     ):
         attribute(float(obstacle.friction))
-    _bind_material(pxr, solid.GetPrim(), material)
+    _bind_material(pxr, solid.GetPrim(), material=material)
 
 
 def _unique_prim_names(names: Sequence[str]) -> list[str]:

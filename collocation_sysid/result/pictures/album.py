@@ -53,12 +53,14 @@ def all_pictures(
         if not item.fixed and n in result.values
     ]
     pictures = (
-        {"convergence": convergence(result.history, names, truth)}
+        {"convergence": convergence(result.history, names, truth=truth)}
         if result.history
         else {}
     )
     if (scan := result.scan) is not None:
-        pictures["scan"] = scan_picture(scan.young_pa, scan.misfit, scan.best)
+        pictures["scan"] = scan_picture(
+            scan.young_pa, scan.misfit, best=scan.best
+        )
     confidence = Confidence.from_result(result)
     if confidence is not None and len(confidence.names) > 1:
         pictures["confidence"] = confidence_ellipses(confidence)
@@ -73,7 +75,7 @@ def all_pictures(
             body.undeformed_m, body.tetrahedra
         )
         for name, values in body.fields.items():
-            pictures[f"field_{name}"] = field_picture(body, name, values)
+            pictures[f"field_{name}"] = field_picture(body, name, values=values)
     drawn = (
         named for replay in replays for named in _experiment_pictures(replay)
     )
@@ -107,7 +109,7 @@ def _experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
         for name, values in replay.readings.items():
             unit = replay.reading_units.get(name, "")
             picture = strain_picture(
-                replay.strain, replay.t_s, values, name, unit
+                replay.strain, replay.t_s, samples=values, name=name, unit=unit
             )
             yield f"{name.replace(' ', '_')}_{replay.name}", picture
         return
@@ -124,18 +126,22 @@ def _experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
         )
         yield (
             f"error_{replay.name}",
-            marker_errors(t_s, measured, fitted, rolled_out),
+            marker_errors(
+                t_s, measured, fitted_m=fitted, simulated_m=rolled_out
+            ),
         )
     if len(names) and not replay.static:
         yield (
             f"spectrum_{replay.name}",
-            spectrum_picture(t_s, measured, fitted, replay.natural_hz),
+            spectrum_picture(
+                t_s, measured, fitted_m=fitted, natural_hz=replay.natural_hz
+            ),
         )
     for k, sensed in enumerate(replay.wrenches, start=1):
         which = "" if len(replay.wrenches) == 1 else f"_{k}"
         yield (
             f"wrench_{replay.name}{which}",
-            sensor_picture(sensed, COMPONENTS, UNITS),
+            sensor_picture(sensed, COMPONENTS, units=UNITS),
         )
     for name, values in replay.readings.items():
         places = values.shape[1] // 3
@@ -146,7 +152,7 @@ def _experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
         units = [unit] * places if unit else []
         yield (
             f"reading_{replay.name}_{name}",
-            sensor_picture(values, names, units),
+            sensor_picture(values, names, units=units),
         )
     for name, points in replay.visible_points.items():
         yield f"depth_{replay.name}_{name}", depth_picture(points)
@@ -216,4 +222,4 @@ def redraw_pictures(
     """
     result, replays = read_run(run)
     with damaged_run_refused(Path(run)):
-        return save_pictures(folder, all_pictures(replays, result), say)
+        return save_pictures(folder, all_pictures(replays, result), say=say)

@@ -147,7 +147,12 @@ def confidence_ellipses(confidence: Confidence) -> Figure:
             continue
         i = column
         j = row + 1
-        _draw_pair(axes, ellipse_outline(confidence, i, j), half[i], half[j])
+        _draw_pair(
+            axes,
+            ellipse_outline(confidence, i, j=j),
+            half_width=half[i],
+            half_height=half[j],
+        )
         style_axes(axes)
         axes.set(xlim=scales[i].limits, ylim=scales[j].limits)
         last = row == count - 1
@@ -322,7 +327,7 @@ def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
         starts = [a + b for a, b in zip(starts, widths, strict=True)]
     axes.set_yticks(range(len(rows)), [symbol_as_mathtext(row) for row in rows])
     axes.set_xlim(0, 1)
-    style_axes(axes, "", "share of the variance", "")
+    style_axes(axes, "", xlabel="share of the variance", ylabel="")
     figure.legend(
         loc="upper left", ncols=LEGEND_COLUMNS, frameon=False, fontsize=SMALL_PT,
         handlelength=1.2, labelspacing=0.3, columnspacing=1.5,

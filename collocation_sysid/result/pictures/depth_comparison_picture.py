@@ -52,7 +52,7 @@ def depth_picture(rows: Array) -> Figure:
             "no point is near enough to the body to be compared"
         )
     fitted = bool(np.isfinite(points[:, 4]).any())
-    axes, dot = _new_panels(points, times, 1 + fitted)
+    axes, dot = _new_panels(points, times, rows=1 + fitted)
     nearest, farthest = np.percentile(points[:, 3], [1, 99])
     depth = {"cmap": "viridis", "vmin": nearest, "vmax": farthest, "s": dot}
     end = (

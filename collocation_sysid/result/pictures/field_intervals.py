@@ -107,7 +107,7 @@ def field_picture(replay: MotionRecord, name: str, values: Array) -> Figure:
                 untold
             )
             colours[np.isnan(values[:, place])] = OTHER_REGION_COLOUR
-            BodyDrawing(axes, view, faces).update(
+            BodyDrawing(axes, view, surface=faces).update(
                 nodes_m, no_nodes, np.zeros((0, 3)), colours[own[owners]]
             )
             if row == 0:
@@ -128,6 +128,6 @@ def field_picture(replay: MotionRecord, name: str, values: Array) -> Figure:
     bar.ax.tick_params(labelsize=SMALL_PT, width=0.4, length=2, pad=1.5)
     end = {"ha": "right", "va": "top", "fontsize": SMALL_PT}
     axes.text(PAGE_MM - 1, total - 1.0, symbol_with_unit(name), **end)
-    draw_directions(axes, camera, (6.0, FOOT_MM))
-    draw_scale(axes, view.mm_per_m, (CORNER_MM + width + GAP_MM, 3.5))
+    draw_directions(axes, camera, origin_mm=(6.0, FOOT_MM))
+    draw_scale(axes, view.mm_per_m, corner_mm=(CORNER_MM + width + GAP_MM, 3.5))
     return figure

@@ -58,7 +58,7 @@ def instability_picture(instability: StabilityLoss) -> Figure:
         amplitude
     )[:, :3]
     none = np.zeros(len(shown_m), dtype=bool)
-    BodyDrawing(axes, view, instability.faces).update(
+    BodyDrawing(axes, view, surface=instability.faces).update(
         shown_m, none, np.zeros((0, 3)), colours
     )
     title = (
@@ -73,6 +73,6 @@ def instability_picture(instability: StabilityLoss) -> Figure:
         ha="center",
         fontsize=SMALL_PT,
     )
-    draw_directions(axes, camera, (6.0, FOOT_MM))
-    draw_scale(axes, view.mm_per_m, (MARGIN_MM, 3.5))
+    draw_directions(axes, camera, origin_mm=(6.0, FOOT_MM))
+    draw_scale(axes, view.mm_per_m, corner_mm=(MARGIN_MM, 3.5))
     return figure

@@ -72,10 +72,10 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
         figure.add_subplot(grid[k]) for k in (0, 1, 3, 5)
     )
     if nq:
-        _draw_magnitudes(full_axes, matrix[:, :nq], norm)
-    _draw_magnitudes(middle, band, norm)
-    image = _draw_magnitudes(right, block, norm)
-    style_axes(full_axes, "", "", "equations of motion")
+        _draw_magnitudes(full_axes, matrix[:, :nq], norm=norm)
+    _draw_magnitudes(middle, band, norm=norm)
+    image = _draw_magnitudes(right, block, norm=norm)
+    style_axes(full_axes, "", xlabel="", ylabel="equations of motion")
     full_axes.set_xticks(
         np.arange(nq) + 0.5,
         [symbol_as_mathtext(p.name) for p in collocation.parameters.free],
@@ -84,7 +84,7 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     _tick_blocks(
         full_axes, "y", letter="c", times=range(first, steps), size=height
     )
-    style_axes(middle, f"{steps} of {total} timesteps", "node positions")
+    style_axes(middle, f"{steps} of {total} timesteps", xlabel="node positions")
     _tick_blocks(middle, "x", letter="x", times=range(steps), size=width)
     _tick_blocks(
         middle, "y", letter="c", times=range(first, steps), size=height
@@ -95,8 +95,8 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     style_axes(
         right,
         f"{name}: connectivity of the mesh",
-        "column, 3 node + axis",
-        f"row{free}",
+        xlabel="column, 3 node + axis",
+        ylabel=f"row{free}",
     )
     for axes in (full_axes, middle, right):
         axes.grid(False)

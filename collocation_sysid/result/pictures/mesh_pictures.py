@@ -133,7 +133,9 @@ def mesh_picture(replay: MotionRecord) -> Figure:
             parts=replay.surface_parts,
             nodes=replay.surface_nodes,
         ).update(nodes_m, is_grasped, places_m)
-        marks |= _draw_declared_positions(axes, view, places_m, declared_m)
+        marks |= _draw_declared_positions(
+            axes, view, places_m=places_m, declared_m=declared_m
+        )
         if replay.tendons_m is not None:
             axes.plot(
                 *view.to_sheet_mm(replay.tendons_m).T,
@@ -176,7 +178,7 @@ def mesh_picture(replay: MotionRecord) -> Figure:
             ]
         )
     for k, handles in enumerate(filter(None, lines)):
-        draw_legend(axes, handles, (1.0, total - 1.5 - k * LINE_MM))
+        draw_legend(axes, handles, corner_mm=(1.0, total - 1.5 - k * LINE_MM))
     return figure
 
 
@@ -347,9 +349,14 @@ def elements_picture(nodes_m: Array, tetrahedra: NDArray[np.integer]) -> Figure:
     worst = float(quality.min())
     quality_axes.axvline(worst, color=VERMILION, lw=1.0)
     style_axes(
-        size_axes, f"{len(tetrahedra)} elements", "size [mm]", "elements"
+        size_axes,
+        f"{len(tetrahedra)} elements",
+        xlabel="size [mm]",
+        ylabel="elements",
     )
-    style_axes(quality_axes, f"worst {worst:.2f}", "quality, 1 = regular")
+    style_axes(
+        quality_axes, f"worst {worst:.2f}", xlabel="quality, 1 = regular"
+    )
     quality_axes.title.set_color(VERMILION)
     for axes in (size_axes, quality_axes):
         axes.grid(False, axis="x")

@@ -119,7 +119,7 @@ def marker_tracks(
     """
     drawn = drawn_models(fitted_m, simulated_m)
     shown = _worst_markers(
-        measured_m, [model for _, model, _ in drawn], max_markers
+        measured_m, [model for _, model, _ in drawn], count=max_markers
     )
     some = (
         f"{len(shown)} of {len(names)} markers, those with the largest errors"
@@ -150,14 +150,19 @@ def marker_tracks(
     }
     for row, marker in enumerate(shown):
         for axis, letter in enumerate("xyz"):
-            upper_box, lower_box = _axes_boxes(row, axis, height, head)
+            upper_box, lower_box = _axes_boxes(
+                row, axis, height=height, head=head
+            )
             upper = figure.add_axes(upper_box)
             lower = figure.add_axes(lower_box)
             measured = 1e3 * measured_m[:, marker, axis]
             style_axes(
-                upper, f"{names[marker]}, {letter}", "", "" if axis else "[mm]"
+                upper,
+                f"{names[marker]}, {letter}",
+                xlabel="",
+                ylabel="" if axis else "[mm]",
             )
-            style_axes(lower, "", "", "" if axis else "error")
+            style_axes(lower, "", xlabel="", ylabel="" if axis else "error")
             for each in (upper, lower):
                 each.set_xlim(start, stop)
                 each.xaxis.set_major_locator(MaxNLocator(4))
@@ -288,7 +293,7 @@ def marker_errors(
         totals.append(float(1e3 * np.sqrt(np.nanmean(squares))))
         label = f"{label}: {totals[-1]:.3g} mm RMS in total"
         axes.plot(t_s, 1e3 * rms_over_markers(squares), label=label, **style)
-    style_axes(axes, "", "time [s]", "RMS over markers [mm]")
+    style_axes(axes, "", xlabel="time [s]", ylabel="RMS over markers [mm]")
     if totals and max(totals) > LOG_AXIS_RATIO * min(totals) > 0:
         make_log_axis(axes)
     else:
@@ -352,8 +357,8 @@ def sensor_picture(
         style_axes(
             each,
             names[k],
-            "time [s]" if last else "",
-            f"[{units[k]}]" if units else "",
+            xlabel="time [s]" if last else "",
+            ylabel=f"[{units[k]}]" if units else "",
         )
         each.yaxis.set_major_locator(MaxNLocator(4))
         dots = {

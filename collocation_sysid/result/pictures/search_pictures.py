@@ -70,15 +70,15 @@ def convergence(
             axes.plot(
                 numbers[part], _positive_or_nan(values[part]), "o-", **style
             )
-        style_axes(axes, "", "", label)
+        style_axes(axes, "", xlabel="", ylabel=label)
         make_log_axis(axes)
-    _mark_continuation_stages(panels[:3], history, rungs)
+    _mark_continuation_stages(panels[:3], history, stages=rungs)
     drawn = (
         list(history[0].parameters)
         if names is None and history
         else list(names or ())
     )
-    _draw_parameters(panels[3], history, drawn, truth)
+    _draw_parameters(panels[3], history, names=drawn, truth=truth)
     panels[3].set_xlabel("iteration", fontsize=TEXT_PT)
     for axes in panels:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -165,7 +165,12 @@ def _draw_parameters(
             label=label,
             **style,
         )
-    style_axes(axes, "", "", f"θ / {'final θ' if truth is None else 'truth'}")
+    style_axes(
+        axes,
+        "",
+        xlabel="",
+        ylabel=f"θ / {'final θ' if truth is None else 'truth'}",
+    )
     make_log_axis(axes)
     if history and names:
         add_legend_above(axes, columns=2)
@@ -206,7 +211,7 @@ def scan_picture(young_pa: Array, misfit: Array, best: int) -> Figure:
         color=BLUE,
         label="simulated",
     )
-    style_axes(axes, "", "Young's modulus E [Pa]", "misfit [σ]")
+    style_axes(axes, "", xlabel="Young's modulus E [Pa]", ylabel="misfit [σ]")
     axes.set_xscale("log")
     make_log_axis(axes)
     failed = np.isnan(misfit)

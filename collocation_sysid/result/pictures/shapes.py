@@ -128,7 +128,7 @@ def shapes_picture(
     colours = (
         [None] * len(shown)
         if field is None
-        else _draw_colour_bar(axes, field, shown)
+        else _draw_colour_bar(axes, field, samples=shown)
     )
     start = CORNER_MM + (gap - GAP_MM) / 2
     for t, first, last, colour in zip(
@@ -137,7 +137,7 @@ def shapes_picture(
         view = SheetView(
             camera,
             scale,
-            np.array([start - scale * first, FOOT_MM - scale * low]),
+            origin_mm=np.array([start - scale * first, FOOT_MM - scale * low]),
         )
         body = BodyDrawing(
             axes,
@@ -160,13 +160,15 @@ def shapes_picture(
         middle = start + scale * (last - first) / 2
         axes.text(middle, FOOT_MM / 2, f"{t_s[t] - t_s[0]:.3g} s", **text)
         start += scale * (last - first) + gap
-    draw_directions(axes, camera, (7.5, FOOT_MM + 3.0))
-    draw_scale(axes, scale, (2.0, total - 2.5))
+    draw_directions(axes, camera, origin_mm=(7.5, FOOT_MM + 3.0))
+    draw_scale(axes, scale, corner_mm=(2.0, total - 2.5))
     marks = (
         ("measured", "behind the body") if np.isfinite(measured_m).any() else ()
     )
     draw_legend(
-        axes, legend_handles("grasped", *marks), (PAGE_MM * 0.3, total - 1.0)
+        axes,
+        legend_handles("grasped", *marks),
+        corner_mm=(PAGE_MM * 0.3, total - 1.0),
     )
     return figure
 
@@ -209,7 +211,7 @@ def contact_pictures(replay: MotionRecord) -> dict[str, Figure]:
     pressures_pa = replay.pressures_pa
     if positions_m is None or gaps_m is None or pressures_pa is None:
         return {}
-    camera = _camera_facing_weights(replay, positions_m, pressures_pa)
+    camera = _camera_facing_weights(replay, positions_m, weights=pressures_pa)
     fields = {
         "pressure": SurfaceField(
             "pressure [Pa]", lambda samples: pressures_pa[samples]
@@ -217,7 +219,7 @@ def contact_pictures(replay: MotionRecord) -> dict[str, Figure]:
         "gap": SurfaceField("gap [mm]", lambda samples: 1e3 * gaps_m[samples]),
     }
     return {
-        name: shapes_picture(replay, SHOWN_SHAPES, field, camera)
+        name: shapes_picture(replay, SHOWN_SHAPES, field=field, camera=camera)
         for name, field in fields.items()
     }
 
@@ -302,9 +304,9 @@ def field_shapes(
     coloured = (
         None
         if field is None
-        else _surface_field(replay, body, constants, field)
+        else _surface_field(replay, body, constants=constants, field=field)
     )
-    return shapes_picture(replay, count, coloured)
+    return shapes_picture(replay, count, field=coloured)
 
 
 def _surface_field(

@@ -61,7 +61,7 @@ def spectrum_picture(
         axes.plot(
             hertz, rest, color=BLUE, lw=LINE_PT, label="measured − fitted"
         )
-    style_axes(axes, "", "frequency [Hz]", "density [mm²/Hz]")
+    style_axes(axes, "", xlabel="frequency [Hz]", ylabel="density [mm²/Hz]")
     make_log_axis(axes)
     low, high = axes.get_ylim()
     axes.set_ylim(
@@ -70,7 +70,9 @@ def spectrum_picture(
     )
     axes.set_xlim(0, rate / 2)
     _draw_modes(
-        axes, natural_hz if natural_hz is not None else np.zeros(0), rate / 2
+        axes,
+        natural_hz if natural_hz is not None else np.zeros(0),
+        limit_hz=rate / 2,
     )
     add_legend_above(axes, columns=2)
     return figure

@@ -44,7 +44,9 @@ def strain_picture(
     at = np.interp(samples[:, 0], t_s, strain)
     shown_unit, factor = _readable_unit(samples[:, 1], unit)
     measured, fitted, simulated = factor * samples[:, 1:].T
-    figure = framed_figure(COLUMN_MM, HEIGHT_MM, 15, 2, 9.5, 9)
+    figure = framed_figure(
+        COLUMN_MM, HEIGHT_MM, left_mm=15, right_mm=2, foot_mm=9.5, top_mm=9
+    )
     axes = figure.subplots()
     dots = {
         "ls": "",
@@ -62,7 +64,7 @@ def strain_picture(
     for label, values, style in drawn_models(*models):
         axes.plot(at, values, label=label, **style)
     label = f"{name} [{shown_unit}]" if shown_unit else name
-    style_axes(axes, "", "strain", label)
+    style_axes(axes, "", xlabel="strain", ylabel=label)
     axes.yaxis.set_major_locator(MaxNLocator(5))
     add_legend_above(axes, columns=3)
     return figure

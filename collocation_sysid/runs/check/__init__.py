@@ -284,7 +284,9 @@ def check_problem(
     report_progress("comparing derivatives with differences")
     jacobian_error, hessian_error = derivative_errors(first, first_z)
     report_progress("estimating time and memory of the methods")
-    program = _program_fields(problem, collocation, first, first_z)
+    program = _program_fields(
+        problem, collocation, first=first, first_z=first_z
+    )
     simulated = first
     z = first_z
     if full or total_s <= LONGEST_SIMULATION_S:
@@ -314,7 +316,7 @@ def check_problem(
             f"take about {fit_s:.2g} s; check --full does it"
         )
     findings = CheckResult(
-        **_simulated_fields(problem, simulated, z),
+        **_simulated_fields(problem, simulated, z=z),
         timesteps=_grid_rows(collocation),
         rms_at_guess_m=None
         if simulated is first
@@ -332,7 +334,9 @@ def check_problem(
         else _contact_concerns(simulated, z, is_complete=simulated is not first)
     )
     concerns = (
-        *_concerns(problem, findings, find_instabilities(simulated, z)),
+        *_concerns(
+            problem, findings, unstable=find_instabilities(simulated, z)
+        ),
         *strain_stability_concerns(simulated.iterates(z)),
         *touching,
     )
@@ -455,8 +459,8 @@ def _natural_modes(
         check_modes(
             s.experiment,
             scheme,
-            s.dynamics.step_s,
-            s.body.theta_from_values(guesses),
+            step_s=s.dynamics.step_s,
+            theta=s.body.theta_from_values(guesses),
         )
         for s in collocation.transcriptions
         if not s.experiment.is_static
@@ -536,7 +540,7 @@ def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
         check_body(
             body,
             body.theta_from_values(guesses),
-            own,
+            experiments=own,
             is_homogeneous=specimens.issuperset(own),
         )
         for body, own in zip(problem.bodies, names, strict=True)
@@ -574,7 +578,7 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
         cause
         for e in problem.experiments
         for cause in find_misspecifications_by_modes(
-            e, constants, problem.huber
+            e, constants, huber=problem.huber
         )
     )
     blind = (

@@ -90,8 +90,8 @@ def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
         ElementShape(
             int(e),
             float(quality[e]),
-            float(longest[e] / heights[e]),
-            float(longest[e]),
+            aspect_ratio=float(longest[e] / heights[e]),
+            longest_edge_m=float(longest[e]),
         )
         for e in np.argsort(quality, kind="stable")[:count]
     )
@@ -106,7 +106,9 @@ def slenderness(mesh: TetMesh) -> Slenderness:
     area = float(_areas(mesh.points_m[mesh.surface]).sum())
     thickness = min(float(edges[0]), 6 * mesh.volume_m3 / area)
     cell = float(np.cbrt(6 * np.median(mesh.volumes_m3)))
-    return Slenderness(float(edges[-1]), thickness, thickness / cell)
+    return Slenderness(
+        float(edges[-1]), thickness, cells_across=thickness / cell
+    )
 
 
 def element_concerns(
@@ -135,7 +137,7 @@ def element_concerns(
         *concern_if(
             worst.quality < POOR_QUALITY,
             False,
-            "mesh/flat",
+            code="mesh/flat",
             number=worst.element,
             quality=worst.quality,
             aspect_ratio=worst.aspect_ratio,
@@ -143,7 +145,7 @@ def element_concerns(
         *concern_if(
             poisson >= limit - ROUNDING,
             False,
-            "mesh/locks",
+            code="mesh/locks",
             poisson=poisson,
             element=name,
             limit=limit,
@@ -152,7 +154,7 @@ def element_concerns(
         *concern_if(
             slender and shape.cells_across < needed - ROUNDING,
             False,
-            "mesh/few",
+            code="mesh/few",
             cells=shape.cells_across,
             element=name,
             thickness_mm=1e3 * shape.thickness_m,
@@ -295,7 +297,7 @@ def check_body(
             *(
                 ()
                 if is_homogeneous
-                else element_concerns(body, theta, shape, worst[0])
+                else element_concerns(body, theta, shape=shape, worst=worst[0])
             ),
             *rest_stability_concerns(body, theta),
             *(() if is_homogeneous else _field_concerns(fields)),
@@ -400,7 +402,9 @@ def check_grasps(
     """
     points_m = experiment.body.nodes.points_m
     return tuple(
-        _check_grasp(experiment.name, points_m, g, mean_edge_m)
+        _check_grasp(
+            experiment.name, points_m, grasp=g, mean_edge_m=mean_edge_m
+        )
         for g in experiment.body_grasps
     )
 
@@ -481,7 +485,7 @@ def grasp_concerns(grasp_check: GraspCheck) -> list[Concern]:
     return concern_if(
         by_chance,
         False,
-        "description/grasp",
+        code="description/grasp",
         experiment=grasp_check.experiment,
         **counts,
     )

@@ -170,12 +170,14 @@ def method_costs(
         MethodCost(
             "reduced-space",
             memory_mb(collocation),
-            _estimated_sweeps_s(collocation, short, z, factorisation),
+            time_s=_estimated_sweeps_s(
+                collocation, short, z=z, factorisation=factorisation
+            ),
         ),
         MethodCost(
             "interior-point",
             interior_point_mb(nonzeros),
-            TYPICAL_ITERATIONS
+            time_s=TYPICAL_ITERATIONS
             * SECONDS_PER_NONZERO
             * nonzeros
             * width**TIMESTEP_POWER,

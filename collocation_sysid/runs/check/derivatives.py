@@ -60,7 +60,7 @@ def shortened_experiment(experiment: Experiment, samples: int) -> Experiment:
     """
     fewest = 1 if experiment.is_static else FEWEST_SHARED_SAMPLES
     samples, depths = until_all_cameras_see(
-        experiment.depths, experiment.t_s, samples, fewest
+        experiment.depths, experiment.t_s, count=samples, fewest=fewest
     )
     markers = experiment.markers
     here = slice(samples)
@@ -70,7 +70,7 @@ def shortened_experiment(experiment: Experiment, samples: int) -> Experiment:
     markers = replace(markers, t_s=markers.t_s[here], positions_m=tracks)
     t_s = experiment.t_s[here]
     grasps = [
-        replace(g, wrench=_shortened_wrench(g.wrench, t_s, fewest))
+        replace(g, wrench=_shortened_wrench(g.wrench, t_s, fewest=fewest))
         for g in experiment.grasps
     ]
     return replace(
@@ -136,7 +136,7 @@ def derivative_errors(
         if sum(program.lifted_nonzeros) > MOST_LIFTED_NONZEROS:
             return of_slopes, 0.0
         collocation = program
-        z = convert_variables(z, plain, program)
+        z = convert_variables(z, plain, target=program)
     point = z + 1e-3 * rng.normal(size=len(z))
     direction = rng.normal(size=len(z))
     multipliers = rng.normal(size=collocation.constraint_count)

@@ -183,11 +183,14 @@ def recording_concerns(
     off = farthest.distance_m > LARGEST_DISTANCE_EDGES * body.edges_m[1]
     return [
         *concern_if(
-            off, False, "markers/off", **of(farthest, farthest.distance_m)
+            off, False, code="markers/off", **of(farthest, farthest.distance_m)
         ),
-        *concern_if(unseen, False, "markers/unseen", **of(most_missing)),
-        *concern_if(missing, False, "markers/missing", **of(most_missing)),
+        *concern_if(unseen, False, code="markers/unseen", **of(most_missing)),
+        *concern_if(missing, False, code="markers/missing", **of(most_missing)),
         *concern_if(
-            astray, False, "markers/astray", **of(worst, worst.start_miss_m)
+            astray,
+            False,
+            code="markers/astray",
+            **of(worst, worst.start_miss_m),
         ),
     ]

@@ -123,12 +123,17 @@ def check_modes(
     count = is_prescribed.sum(axis=(1, 2))
     least = int(np.flatnonzero(count == count.min())[-1])
     time_s = float(experiment.t_s[least])
-    x, about = _reference_state(experiment, is_prescribed[least], time_s, theta)
+    x, about = _reference_state(
+        experiment, is_prescribed[least], time_s=time_s, theta=theta
+    )
     free = np.flatnonzero(~is_prescribed[least])
     modes = natural_modes(
-        Forces.from_experiment(experiment, time_s, theta), x, free, MODE_COUNT
+        Forces.from_experiment(experiment, time_s, theta),
+        x,
+        free_dofs=free,
+        count=MODE_COUNT,
     )
-    findings = _mode_findings(modes, experiment, scheme, step_s)
+    findings = _mode_findings(modes, experiment, scheme=scheme, step_s=step_s)
     needed = None
     if findings:
         omega = float(modes.angular_frequencies_rad_s[0])
@@ -163,7 +168,7 @@ def _reference_state(
         try:
             solver = NewtonSolver(experiment, prescribed=is_prescribed)
             return equilibrium(
-                experiment, theta, time_s, solver=solver
+                experiment, theta, time_s=time_s, solver=solver
             ), "rest state"
         except SimulationError:
             pass
@@ -181,9 +186,12 @@ def _mode_findings(
         modes.frequencies_hz, modes.damping_ratios, strict=True
     ):
         omega = 2 * np.pi * frequency
-        undamped = numerical_mode(scheme, omega, step_s)
+        undamped = numerical_mode(scheme, omega, timestep_s=step_s)
         damped = numerical_mode(
-            scheme, omega, step_s, _oscillating_damping_ratio(float(ratio))
+            scheme,
+            omega,
+            timestep_s=step_s,
+            damping_ratio=_oscillating_damping_ratio(float(ratio)),
         )
         findings.append(
             ModeCheck(
@@ -231,12 +239,12 @@ def mode_concerns(motion: ModesCheck) -> list[Concern]:
         *concern_if(
             samples < FEW_SAMPLES,
             False,
-            "information/rate",
+            code="information/rate",
             **first,
             **rate_data,
         ),
         *concern_if(
-            is_short, False, "information/short", **first, **duration_data
+            is_short, False, code="information/short", **first, **duration_data
         ),
     ]
 
@@ -271,7 +279,7 @@ def _grid_concerns(motion: ModesCheck, mode: ModeCheck) -> list[Concern]:
         "remedy": _step_remedy(motion),
     }
     few = mode.steps_per_period < FEW_STEPS
-    return concern_if(few, False, "scheme/coarse", **first, **steps)
+    return concern_if(few, False, code="scheme/coarse", **first, **steps)
 
 
 def _first_mode_data(motion: ModesCheck, mode: ModeCheck) -> dict[str, Any]:
