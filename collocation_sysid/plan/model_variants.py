@@ -212,7 +212,7 @@ def variants(
         For an unknown region, and branches that belong to others.
     """
     file, _ = read_problem_file(path, overrides)
-    content = file.model_dump(mode="json", exclude_unset=True)
+    content = file.model_dump(mode="json", exclude_unset=True, by_alias=True)
     body = content["object"]
     _require_region(body, region, branches=bool(branches), path=path)
     varied = []

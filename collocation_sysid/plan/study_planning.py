@@ -383,7 +383,7 @@ def _planned_run(
         and section.fixed is None
         and section.tied_to is None
     }
-    content = file.model_dump(mode="json", exclude_unset=True)
+    content = file.model_dump(mode="json", exclude_unset=True, by_alias=True)
     solver = content.get("solver", {})
     content["solver"] = {
         key: solver[key] for key in ("huber", method) if key in solver
