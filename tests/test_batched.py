@@ -512,7 +512,9 @@ def compiled(monkeypatch) -> list[str]:
     done = []
     compile_module = jit._compile
     monkeypatch.setattr(
-        jit, "_compile", lambda *args: done.append("") or compile_module(*args)
+        jit,
+        "_compile",
+        lambda *args, **more: done.append("") or compile_module(*args, **more),
     )
     return done
 

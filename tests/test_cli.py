@@ -378,10 +378,10 @@ def test_an_interrupt_while_the_folder_is_written_loses_nothing(
     monkeypatch.setattr(
         run_record,
         "_write_all_frames",
-        lambda *_: signal.raise_signal(signal.SIGTERM),
+        lambda *_, **__: signal.raise_signal(signal.SIGTERM),
     )
     monkeypatch.setattr(
-        run_record, "_write_pictures", lambda *_: time.sleep(60)
+        run_record, "_write_pictures", lambda *_, **__: time.sleep(60)
     )
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
@@ -397,7 +397,7 @@ def test_another_result_in_the_folder_is_left_alone_when_the_pictures_are_drawn(
     monkeypatch.setattr(
         run_record,
         "_write_pictures",
-        lambda *_: file.write_text('{"another": 1}'),
+        lambda *_, **__: file.write_text('{"another": 1}'),
     )
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 2

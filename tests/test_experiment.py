@@ -53,7 +53,7 @@ def experiment(**changes) -> Experiment:
         frames=np.zeros((0, 4), dtype=int),
     )
     body.parts = [SimpleNamespace(name="", density_kg_m3=1000.0)]
-    body.with_frames = lambda *_: body
+    body.with_frames = lambda *_, **__: body
     fields: dict[str, Any] = {
         "name": "swing",
         "body": body,

@@ -406,7 +406,9 @@ def test_a_generated_mesh_that_memory_cannot_hold_is_refused_before_it_is_made(
 ):
     monkeypatch.setattr(problem_size, "machine_memory_mb", lambda: 2e3)
     monkeypatch.setattr(
-        loading, "box_of_edge", lambda *_: pytest.fail("the mesh was made")
+        loading,
+        "box_of_edge",
+        lambda *_, **__: pytest.fail("the mesh was made"),
     )
     box = "box_m = [0.06, 0.06, 0.09]\nedge_length_m = 0.0015"
     replace_text('mesh = "body.vtu"', box)(tiny)
@@ -521,7 +523,7 @@ import os, signal, sys, threading, time
 from collocation_sysid import cli
 from collocation_sysid.methods import nlpsol
 from collocation_sysid.result import run_record
-run_record._write_pictures = lambda *_: None
+run_record._write_pictures = lambda *_, **__: None
 sys.argv = ["collocation-sysid", "solve", "problem.toml", "--out", "run", "-q"]
 def end():
     for _ in range({times}):
@@ -530,7 +532,7 @@ def end():
 def deaf(**_):
     threading.Thread(target=end).start()
     time.sleep(600)
-nlpsol._create_solver = lambda *_: deaf
+nlpsol._create_solver = lambda *_, **__: deaf
 nlpsol.GRACE_S = 0.2 if {times} == 1 else 600
 cli.main()
 """

@@ -73,11 +73,11 @@ def test_an_interrupt_ends_the_others_within_their_next_row():
             raise KeyboardInterrupt
         for _ in range(1000):
             begun.set()
-            run_in_slices(lambda *_: rows.append(0), 1, 1)
+            run_in_slices(lambda *_, **__: rows.append(0), 1, 1)
             time.sleep(0.005)
 
     with pytest.raises(KeyboardInterrupt):
         map_experiments(run, range(2), threads=2)
     assert len(rows) < 900
-    run_in_slices(lambda *_: rows.append(-1), 1, 1)
+    run_in_slices(lambda *_, **__: rows.append(-1), 1, 1)
     assert rows[-1] == -1

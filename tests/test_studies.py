@@ -76,7 +76,7 @@ def test_a_variant_is_solved_from_every_start(small_problem):
 
 
 def test_a_slow_variant_gets_the_first_starts(small_problem, monkeypatch):
-    monkeypatch.setattr("studies.run_all", lambda *_: None)
+    monkeypatch.setattr("studies.run_all", lambda *_, **__: None)
     variants = [
         Variant("all", "shooting"),
         Variant("few", "penalty", share=0.25),
@@ -121,7 +121,7 @@ def test_table_1_sets_every_method_beside_truth_and_paper():
 
 
 def test_table_1_names_options_that_the_methods_have(monkeypatch, tmp_path):
-    monkeypatch.setattr("studies.run_all", lambda *_: None)
+    monkeypatch.setattr("studies.run_all", lambda *_, **__: None)
     rows = run_variants(study_table1.PROBLEM, study_table1.VARIANTS, tmp_path)
     assert {len(each) for each in rows.values()} == {1}
 

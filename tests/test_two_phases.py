@@ -326,7 +326,7 @@ def test_two_fields_of_two_phases_are_refused():
     with pytest.raises(
         cs.InputError, match=r"2 two-phase fields \(young_pa, core.young_pa\)"
     ):
-        solve_two_phases(both, None, lambda *_: pytest.fail("solved"))
+        solve_two_phases(both, None, lambda *_, **__: pytest.fail("solved"))
 
 
 def test_live_refuses_phases_that_nobody_knows_yet():

@@ -252,7 +252,7 @@ def test_the_search_for_causes_is_bounded_by_what_the_fit_took(
         Counted,
     )
     by_modes = "collocation_sysid.statistics.fit_misspecifications.find_misspecifications_by_modes"
-    monkeypatch.setattr(by_modes, lambda *_: ())
+    monkeypatch.setattr(by_modes, lambda *_, **__: ())
     assert find_misspecifications(solution)[0].cause == "marker-slip"
     assert len(sweeps) > 1
     assert (
