@@ -472,7 +472,7 @@ def test_there_is_no_note_where_the_evaluator_is_as_asked_for(
 
 @pytest.fixture
 def broken_compiler(cache, monkeypatch):
-    def fail(*_):
+    def fail(*_, **__):
         raise RuntimeError("no registers")
 
     monkeypatch.setattr(jit, "_compile", fail)

@@ -431,7 +431,7 @@ def test_a_method_that_does_not_fit_into_memory_is_warned_of(monkeypatch):
 # What is seen at once, and what takes longer -----------------------------------------------------
 
 
-def no_simulation(*_):
+def no_simulation(*_, **__):
     raise AssertionError("simulated")
 
 

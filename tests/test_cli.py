@@ -336,7 +336,7 @@ def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(
 ):
     shown = []
 
-    def interrupt(*_: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         shown.append((sys.stdout.getvalue(), result_in(tiny / "run")))
         signal.raise_signal(signal.SIGINT)
 
@@ -360,7 +360,7 @@ def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(
 def test_the_answer_is_shown_even_if_its_folder_cannot_be_written(
     tiny, monkeypatch
 ):
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device", "run")
 
     monkeypatch.setattr(run_record, "_write_all_frames", fail)

@@ -553,7 +553,7 @@ def test_an_error_in_the_callers_function_reaches_the_caller(capfd):
 def test_an_error_in_an_evaluation_reaches_the_caller(
     name: str, monkeypatch, capfd
 ):
-    def broken(*_: object) -> None:
+    def broken(*_: object, **__: object) -> None:
         raise KeyboardInterrupt(name)
 
     monkeypatch.setattr(Collocation, name, broken)

@@ -50,7 +50,7 @@ def assert_harmless(outcome: Outcome) -> None:
 def bounded(seconds: int) -> Iterator[None]:
     """End what would take minutes."""
 
-    def end(*_: object) -> None:
+    def end(*_: object, **__: object) -> None:
         raise TimeoutError
 
     before = signal.signal(signal.SIGALRM, end)

@@ -241,7 +241,7 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "poses.csv"
     path.write_text("old")
 
-    def fail(*_):
+    def fail(*_, **__):
         raise OSError("disk full")
 
     monkeypatch.setattr("collocation_sysid.files.os.replace", fail)

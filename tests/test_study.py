@@ -377,7 +377,7 @@ def test_a_late_run_is_killed(stand_in):
 OBEDIENT = """
 import json, pathlib, signal, sys
 file, ready = map(pathlib.Path, (sys.argv[-1], sys.argv[-2]))
-def end(*_):
+def end(*_, **__):
     file.write_text(json.dumps({"outcome": "finished", "result": json.loads(sys.argv[1])}))
     sys.exit()
 signal.signal(signal.SIGTERM, end)
