@@ -42,6 +42,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 from xml.etree import ElementTree
 
 import numpy as np
@@ -1226,15 +1227,15 @@ def table(
                 raise RuntimeError(
                     f"the small problem is not solved: {ended.err}"
                 )
-        run_record._write_pictures = lambda *_: None
-        cases = Cases(folder, problem, solved, count, seed, limit_s, kept)
-        for name in only:
-            began = time.monotonic()
-            counts = KINDS[name].run(cases)
-            took = f"{time.monotonic() - began:.0f}"
-            cells = (str(counts[outcome]) for outcome in OUTCOMES)
-            rows.append((name, str(counts.total()), *cells, took))
-            print(*rows[-1], sep=", ", file=sys.stderr, flush=True)
+        with mock.patch.object(run_record, "_write_pictures"):
+            cases = Cases(folder, problem, solved, count, seed, limit_s, kept)
+            for name in only:
+                began = time.monotonic()
+                counts = KINDS[name].run(cases)
+                took = f"{time.monotonic() - began:.0f}"
+                cells = (str(counts[outcome]) for outcome in OUTCOMES)
+                rows.append((name, str(counts.total()), *cells, took))
+                print(*rows[-1], sep=", ", file=sys.stderr, flush=True)
     return markdown(("input", "cases", *OUTCOMES, "s"), rows)
 
 
