@@ -19,7 +19,8 @@ _LINK_TO_PAGE = re.compile(
 )
 
 
-def _folder() -> Path:
+def documentation_folder() -> Path:
+    """Return the folder of the pages: that of the wheel, or docs/ in a checkout."""
     return _IN_WHEEL if _IN_WHEEL.is_dir() else _IN_CHECKOUT
 
 
@@ -29,7 +30,10 @@ def page_files() -> dict[str, Path]:
 
     The dictionary is empty where neither a wheel nor a checkout is installed.
     """
-    files = (*_folder().glob("howto/*.md"), *_folder().glob("*.md"))
+    files = (
+        *documentation_folder().glob("howto/*.md"),
+        *documentation_folder().glob("*.md"),
+    )
     return {
         file.stem: file
         for file in sorted(files, key=_topic)
@@ -80,7 +84,11 @@ def page_url(topic: str) -> str | None:
     base = documentation_url()
     if base is None:
         return None
-    page = page_files()[topic].relative_to(_folder()).with_suffix(".html")
+    page = (
+        page_files()[topic]
+        .relative_to(documentation_folder())
+        .with_suffix(".html")
+    )
     return f"{base}/{page.as_posix()}"
 
 

@@ -49,6 +49,7 @@ LAYERS = (
     {"pipeline", "installation_check"},
     {"live"},
     {"plan"},
+    {"benchmark"},
     {"cli", "testing"},
     {"__main__"},
 )
@@ -117,6 +118,7 @@ OUTER = (
     "result",
     "live",
     "plan",
+    "benchmark",
     "cli",
     "testing",
     "pipeline",

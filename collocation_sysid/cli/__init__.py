@@ -3,9 +3,9 @@
 Each command is a function in one of the modules `FAMILIES`: `problem_commands` (solve, simulate,
 check), `run_commands` (refine, export, plot, report, animate, view), `study_commands`
 (compare-methods, compare-models, sweep), `design_commands` (design), `stream_commands` (live,
-replay), `installation_commands` (doctor, completion) and `texts` (methods, schema, explain, log,
-new). `command_options` makes command-line options from dataclasses, `common` has exit codes and
-output, and `markdown` shows documentation on a terminal.
+replay), `benchmark_commands` (benchmark), `installation_commands` (doctor, completion) and `texts`
+(methods, schema, explain, log, new). `command_options` makes command-line options from dataclasses,
+`common` has exit codes and output, and `markdown` shows documentation on a terminal.
 
 Exit codes: 0 converged, 1 not converged or, with ``solve --strict``, doubtful, 2 bad input,
 130 interrupted.
@@ -42,6 +42,7 @@ FAMILIES = (
     "design_commands",
     "run_commands",
     "stream_commands",
+    "benchmark_commands",
     "texts",
     "installation_commands",
 )
@@ -63,7 +64,7 @@ COMMAND_GROUPS = {
         "sweep",
         "design",
     ),
-    "Exchange data": ("log", "export"),
+    "Exchange data": ("log", "export", "benchmark"),
     "Reference and installation": (
         "explain",
         "methods",

@@ -1,0 +1,216 @@
+"""Command that compares simulators with measured bodies: benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ..display import Table
+from ..errors import InputError
+from ..serialisation import as_json
+from .command_options import AsJson, Quiet, command
+from .common import error_console, print_result
+
+if TYPE_CHECKING:
+    from ..benchmark import Score
+
+commands = typer.Typer()
+
+# Factor and name of a readable unit for each SI unit of a score.
+READABLE_UNITS = {"m": (1e3, "mm"), "N": (1.0, "N"), "Pa": (1e-3, "kPa")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkCommand:
+    """Options of `benchmark`.
+
+    Attributes
+    ----------
+    folder : FOLDER
+        Benchmark folder; without it, the bodies are listed.
+    write : --write
+        Write the bodies into the folder, instead of scoring the predictions in it.
+    body : NAME
+        Only this body; by default all in the folder, or all whose data are on this computer.
+    """
+
+    folder: Annotated[Path | None, typer.Argument()] = None
+    write: bool = False
+    body: str | None = None
+    as_json: AsJson = False
+    quiet: Quiet = False
+
+
+@command(
+    commands,
+    "benchmark",
+    "benchmark bodies --write",
+    "benchmark bodies --write --body isoprene_rubber",
+    "benchmark bodies",
+)
+def benchmark(options: BenchmarkCommand) -> None:
+    """List, write or score the bodies of a benchmark of simulators.
+
+    Without FOLDER, the bodies are listed. With --write, the folder gets the mesh, the prescribed
+    motion, the constants with combined intervals and the measurements of each body, for users of
+    any simulator. Without --write, the predictions that were added to the folder are compared with
+    the measurements, beside the simulation of this package and the undeformed body.
+
+    The README.md in the folder states the task, the metric and the format of the predictions.
+
+    The exit code is 0, and 2 if the folder is no benchmark or a prediction is missing or invalid.
+    """
+    from ..benchmark import score_benchmark
+
+    if options.folder is None:
+        _list_bodies(options)
+    elif options.write:
+        _write_bodies(options, options.folder)
+    else:
+        scores = score_benchmark(options.folder, options.body)
+        if options.as_json:
+            typer.echo(as_json([asdict(each) for each in scores]))
+        else:
+            print_result([*score_tables(scores), *score_warnings(scores)])
+
+
+def _list_bodies(options: BenchmarkCommand) -> None:
+    """Print the bodies; refuse options that need a folder."""
+    from ..benchmark import BODIES
+    from ..benchmark.identified_constants import catalogue_entry
+
+    if options.write or options.body is not None:
+        where = "--write" if options.write else "--body"
+        raise InputError(
+            "needs a folder; expected benchmark FOLDER", None, where=where
+        )
+    listed: list[dict[str, Any]] = []
+    for body in BODIES.values():
+        entry = catalogue_entry(body.entry)
+        listed.append(
+            {
+                "body": body.name,
+                "specimen": entry.specimen,
+                "is_measured": entry.is_measured,
+                "recordings": body.recordings,
+                "is_held_out": body.are_held_out,
+                "is_available": body.is_available,
+                "script": body.script,
+                "licence": entry.licence,
+            }
+        )
+    if options.as_json:
+        typer.echo(as_json(listed))
+        return
+    rows = tuple(
+        (
+            each["body"],
+            "measured" if each["is_measured"] else "simulated",
+            "held out" if each["is_held_out"] else "fitted",
+            "yes" if each["is_available"] else f"scripts/{each['script']}",
+            each["licence"],
+            each["specimen"],
+        )
+        for each in listed
+    )
+    heads = ("body", "data", "recording", "available", "licence", "specimen")
+    print_result(Table("", heads, rows=rows, names=5, texts=1))
+
+
+def _write_bodies(options: BenchmarkCommand, folder: Path) -> None:
+    """Write the benchmark folder, and print its path and the bodies that were left out."""
+    from rich.progress import Progress
+
+    from ..benchmark import BODIES, write_benchmark
+    from ..benchmark.benchmark_bodies import chosen_bodies
+
+    chosen = chosen_bodies(options.body)
+    with Progress(
+        console=error_console,
+        transient=True,
+        disable=options.quiet or not error_console.is_terminal,
+    ) as bar:
+        task = bar.add_task("simulating", total=1.0)
+        write_benchmark(
+            chosen,
+            folder,
+            progress=lambda share: bar.update(task, completed=share),
+        )
+    left_out = [
+        body
+        for body in BODIES.values()
+        if options.body is None and body not in chosen
+    ]
+    if options.as_json:
+        report = {
+            "folder": str(folder),
+            "bodies": [body.name for body in chosen],
+            "left_out": [body.name for body in left_out],
+        }
+        typer.echo(as_json(report))
+        return
+    for body in left_out:
+        error_console.print(
+            f"{body.name} is left out: its data are not on this computer; scripts/{body.script} "
+            "fetches them",
+            soft_wrap=True,
+        )
+    typer.echo(folder)
+
+
+def score_tables(scores: Sequence[Score]) -> list[Table]:
+    """Return a table of the scores for each recording, in readable units."""
+    tables = []
+    titles = dict.fromkeys((each.body, each.recording) for each in scores)
+    for title in titles:
+        own = [each for each in scores if (each.body, each.recording) == title]
+        factor, unit = READABLE_UNITS[own[0].unit]
+        role = "held out" if own[0].is_held_out else "fitted"
+        rows = tuple(
+            (
+                each.source,
+                f"{factor * each.rms:.4g}",
+                f"{factor * each.largest:.4g}",
+                f"{100 * each.deflection_share:.3g}",
+                f"{each.sigmas:.3g}",
+                ""
+                if each.rms_without_offsets is None
+                else f"{factor * each.rms_without_offsets:.4g}",
+            )
+            for each in own
+        )
+        heads = (
+            "",
+            f"RMS {unit}",
+            f"largest {unit}",
+            "% of deflection" if own[0].unit == "m" else "% of largest load",
+            "of noise",
+            "without offsets",
+        )
+        if own[0].rms_without_offsets is None:
+            heads = heads[:-1]
+            rows = tuple(row[:-1] for row in rows)
+        tables.append(Table(f"{title[0]}, {title[1]} ({role})", heads, rows))
+    return tables
+
+
+def score_warnings(scores: Sequence[Score]) -> list[str]:
+    """Return a warning for each prediction that is worse than the undeformed body."""
+    from ..benchmark.scores import PREDICTION, UNDEFORMED
+
+    trivial = {
+        (each.body, each.recording): each.rms
+        for each in scores
+        if each.source == UNDEFORMED
+    }
+    return [
+        f"warning: the prediction of {each.body}, {each.recording}, is worse than the undeformed "
+        "body; check units (m, N, Pa), frame, signs and the order of the columns"
+        for each in scores
+        if each.source == PREDICTION
+        and each.rms > trivial[each.body, each.recording]
+    ]
