@@ -45,7 +45,7 @@ CUBE_DIVISIONS = (1, 1, 1)
 
 @dataclass(frozen=True, eq=False)
 class BodyTask:
-    """What is written about one body.
+    """Content of the folder of one body, before it is written.
 
     Attributes
     ----------
