@@ -6,6 +6,7 @@ A hand swings a foam block, cameras track four points on it. From the hand's pos
 come Young's modulus and the damping, with error bars.
 """
 
+# sphinx_gallery_thumbnail_path = 'pictures/1_swung_block.png'
 import matplotlib.pyplot as plt
 import numpy as np
 

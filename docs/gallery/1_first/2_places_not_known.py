@@ -6,6 +6,7 @@ Nobody measured where the markers sit on the block. Their places on the undeform
 estimated with everything else, and what that costs is in the error bars.
 """
 
+# sphinx_gallery_thumbnail_path = 'pictures/2_places_not_known.png'
 import matplotlib.pyplot as plt
 import numpy as np
 

@@ -6,6 +6,7 @@ Under gravity alone a body twice as stiff and twice as heavy moves the same: onl
 force sensor in the wrist tells both.
 """
 
+# sphinx_gallery_thumbnail_path = 'pictures/3_wrist_sensor.png'
 from dataclasses import replace
 
 import matplotlib.pyplot as plt

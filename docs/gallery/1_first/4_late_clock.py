@@ -6,6 +6,7 @@ The cameras' clock is 30 ms late, and the problem says that there is one clock f
 converges all the same; the verdict tells what is wrong with it.
 """
 
+# sphinx_gallery_thumbnail_path = 'pictures/4_late_clock.png'
 from dataclasses import replace
 
 import matplotlib.pyplot as plt

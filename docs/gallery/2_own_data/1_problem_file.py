@@ -6,6 +6,7 @@ A mesh, the gripper's poses and the marker tracks lie in a folder; a problem fil
 says what they are. It is what ``collocation-sysid solve`` takes.
 """
 
+# sphinx_gallery_thumbnail_path = 'pictures/1_problem_file.png'
 import tempfile
 from pathlib import Path
 

@@ -6,6 +6,7 @@ A testing machine presses a rubber block and measures the force; no camera looks
 sticks to the platens or slides on them decides what modulus the same force means.
 """
 
+# sphinx_gallery_thumbnail_path = 'pictures/2_test_bench.png'
 import matplotlib.pyplot as plt
 import numpy as np
 

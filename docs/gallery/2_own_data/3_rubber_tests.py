@@ -8,6 +8,7 @@ kinds of test of one rubber, so that predictions can be compared with measuremen
 is homogeneous, and no mesh is needed.
 """
 
+# sphinx_gallery_thumbnail_path = 'pictures/3_rubber_tests.png'
 import matplotlib.pyplot as plt
 import numpy as np
 

@@ -6,6 +6,7 @@ A material is its energy density, a function of the deformation gradient and of 
 Derivatives, compiled kernels and estimates follow from it.
 """
 
+# sphinx_gallery_thumbnail_path = 'pictures/1_own_material.png'
 import casadi as ca
 import matplotlib.pyplot as plt
 import numpy as np

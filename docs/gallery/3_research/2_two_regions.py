@@ -5,6 +5,7 @@ A soft finger with a stiff core
 Regions have materials and parameters of their own, named after them.
 """
 
+# sphinx_gallery_thumbnail_path = 'pictures/2_two_regions.png'
 import matplotlib.pyplot as plt
 import numpy as np
 

@@ -6,6 +6,7 @@ A block with memory is swung and held still. A material without memory fits the 
 finds a modulus between the two that there are; with one branch both come out.
 """
 
+# sphinx_gallery_thumbnail_path = 'pictures/3_memory.png'
 import matplotlib.pyplot as plt
 import numpy as np
 

@@ -6,6 +6,7 @@ Error bars know the noise. What the mesh and the step do to the answer, ``refine
 solves again with half the step and on a mesh twice as fine.
 """
 
+# sphinx_gallery_thumbnail_path = 'pictures/4_finer.png'
 import matplotlib.pyplot as plt
 import numpy as np
 

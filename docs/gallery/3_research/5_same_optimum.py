@@ -6,6 +6,7 @@ Interior point takes all positions as variables, reduced space only the paramete
 with the same optimum. The penalty method lets the equations of motion give way.
 """
 
+# sphinx_gallery_thumbnail_path = 'pictures/5_same_optimum.png'
 import matplotlib.pyplot as plt
 import numpy as np
 
