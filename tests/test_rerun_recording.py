@@ -38,7 +38,9 @@ def read_back(file: Path) -> dict[str, dict[str, list]]:
     for chunk in RrdReader(str(file)).stream().to_chunks():
         batch = chunk.to_record_batch()
         columns = {
-            name: batch.column(name).to_pylist() for name in batch.schema.names
+            name: batch.column(name).to_pylist()
+            for name in batch.schema.names
+            if name not in ("log_time", "log_tick")  # of the computer
         }
         known = entities.setdefault(chunk.entity_path.strip("/"), {})
         for name, values in columns.items():

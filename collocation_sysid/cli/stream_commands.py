@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import sys
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.text import Text
 
 from ..errors import InputError
 from ..files import require_possible
-from ..live import LiveEstimator, LiveOptions
+from ..live import LiveEstimator, LiveOptions, LiveUpdate
 from ..live.sources import read_problem
 from ..validated_types import NotNegative, Options, Positive
 from .command_options import (
@@ -24,6 +25,10 @@ from .command_options import (
     command,
 )
 from .common import EXIT_BAD_INPUT, error_console, print_result
+
+if TYPE_CHECKING:
+    from ..live.frames import Frame
+    from ..live.live_recording import LiveRecording
 
 commands = typer.Typer()
 
@@ -38,18 +43,67 @@ class LiveEstimationOptions(Options):
         Computing time per frame [ms]; by default 80 % of the time between samples.
     window_s : float
         Time span before the present frame in which earlier frames are recomputed [s].
+    rerun : FILE
+        Record estimates, mesh and residuals as they arrive for the Rerun viewer, an .rrd.
     """
 
     budget_ms: Positive | None = None
     window_s: Positive = 3.0
+    rerun: Path | None = None
     set_: Overrides = None
     allow_code: AllowCode = False
 
     def make_estimator(self, recording: Path) -> LiveEstimator:
-        """Return the estimator for a problem file or a run folder, with these options."""
+        """Return the estimator for a problem file or a run folder, with these options.
+
+        Raises
+        ------
+        InputError
+            Also if the file of --rerun cannot be written.
+        """
+        if self.rerun is not None:
+            from ..live.live_recording import require_recordable
+
+            require_recordable(self.rerun)
         budget_s = None if self.budget_ms is None else 1e-3 * self.budget_ms
         problem = read_problem(recording, self.set_ or (), self.allow_code)
         return LiveEstimator(problem, LiveOptions(budget_s, self.window_s))
+
+    @contextmanager
+    def open_recording(
+        self, estimator: LiveEstimator
+    ) -> Iterator[LiveRecording | None]:
+        """Give the recording of --rerun, which is closed at the end; None without the option."""
+        if self.rerun is None:
+            yield None
+            return
+        from ..live.live_recording import LiveRecording
+
+        written = LiveRecording(self.rerun, estimator.model.experiment)
+        try:
+            yield written
+        finally:
+            written.close()
+
+
+def processed(
+    estimator: LiveEstimator, frame: Frame, recording: LiveRecording | None
+) -> LiveUpdate:
+    """Return the update of a frame, and add it to the recording if there is one."""
+    update = estimator.process_frame(frame)
+    if recording is not None:
+        recording.write(frame, update, estimator.node_positions_m)
+    return update
+
+
+def settled_update(
+    estimator: LiveEstimator, recording: LiveRecording | None
+) -> LiveUpdate | None:
+    """Return the final update, None without frames, and add it to the recording if there is one."""
+    settled = estimator.finish()
+    if recording is not None and settled is not None:
+        recording.write_estimates(settled)
+    return settled
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +124,7 @@ class LiveCommand(LiveEstimationOptions):
     commands,
     "live problem.toml < frames.jsonl",
     "live problem.toml --udp 9870 > estimates.jsonl",
+    "live problem.toml --rerun swing.rrd < frames.jsonl",
 )
 def live(options: LiveCommand) -> None:
     """Estimate the parameters while a recording is made.
@@ -115,17 +170,20 @@ def live(options: LiveCommand) -> None:
         wrenches=estimator.model.wrenches,
     )
     bad = 0
-    with without_garbage_of_startup():
-        for line in lines:
-            try:
-                frame = reader.read(line)
-            except InputError as error:
-                bad += 1
-                error_console.print(Text(f"error: {error}"), soft_wrap=True)
-                continue
-            if frame is not None:
-                typer.echo(update_as_json(estimator.process_frame(frame)))
-    if (settled := estimator.finish()) is not None:
+    with options.open_recording(estimator) as recording:
+        with without_garbage_of_startup():
+            for line in lines:
+                try:
+                    frame = reader.read(line)
+                except InputError as error:
+                    bad += 1
+                    error_console.print(Text(f"error: {error}"), soft_wrap=True)
+                    continue
+                if frame is not None:
+                    update = processed(estimator, frame, recording)
+                    typer.echo(update_as_json(update))
+        settled = settled_update(estimator, recording)
+    if settled is not None:
         typer.echo(update_as_json(settled))
     if bad:
         raise typer.Exit(EXIT_BAD_INPUT)
@@ -183,14 +241,15 @@ def replay(options: ReplayCommand) -> None:
         error_console.is_terminal and not options.quiet and not options.as_json
     )
     shown = Live(console=error_console, refresh_per_second=10)
-    with without_garbage_of_startup(), shown if watched else nullcontext():
-        for frame in paced_frames(frames, pace) if pace else frames:
-            updates.append(estimator.process_frame(frame))
-            if options.as_json:
-                typer.echo(json_line(updates[-1]))
-            elif watched:
-                shown.update(on_terminal(live_display.display_of(updates)))
-    settled = estimator.finish() or updates[-1]
+    with options.open_recording(estimator) as recording:
+        with without_garbage_of_startup(), shown if watched else nullcontext():
+            for frame in paced_frames(frames, pace) if pace else frames:
+                updates.append(processed(estimator, frame, recording))
+                if options.as_json:
+                    typer.echo(json_line(updates[-1]))
+                elif watched:
+                    shown.update(on_terminal(live_display.display_of(updates)))
+        settled = settled_update(estimator, recording) or updates[-1]
     if options.as_json:
         typer.echo(json_line(settled))
     else:

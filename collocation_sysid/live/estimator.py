@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -144,6 +144,9 @@ class LiveUpdate:
         Computing time of the frame.
     relinearised : int
         Number of rows that were computed again.
+    marker_distances_m : (M,) array
+        Distance of each marker of the last sample from the estimate's; NaN where missing, empty if
+        there is no sample.
     """
 
     t_s: float
@@ -153,6 +156,7 @@ class LiveUpdate:
     notes: tuple[str, ...]
     latency_s: float
     relinearised: int
+    marker_distances_m: Array = field(default_factory=lambda: np.zeros(0))
 
     def __repr__(self) -> str:
         values = ", ".join(
@@ -360,6 +364,7 @@ class LiveEstimator:
         before = self.clock()
         self._drop_old_rows()
         squared_distances = np.concatenate([*squares, np.zeros(0)])
+        squared_distances = squared_distances[np.isfinite(squared_distances)]
         rms_m = (
             float(np.sqrt(squared_distances.mean()))
             if len(squared_distances)
@@ -376,8 +381,22 @@ class LiveEstimator:
             notes=tuple(notes),
             latency_s=latency_s,
             relinearised=done,
+            marker_distances_m=np.sqrt(squares[-1]) if squares else np.zeros(0),
         )
         return self.last
+
+    @property
+    def node_positions_m(self) -> Array | None:
+        """Node positions (n, 3) of the latest row at the estimate [m], to first order around the
+        linearisation point; None before the first row.
+        """
+        if self.first_pass is None:
+            return None
+        x = self.first_pass.latest_positions_at(self.model.transformed(self.p))
+        if x is None:
+            return None
+        node_count = len(self.model.experiment.body.nodes.points_m)
+        return x.reshape(-1, 3)[:node_count]
 
     @one_blas_thread()
     def finish(self) -> LiveUpdate | None:
@@ -554,8 +573,8 @@ class LiveEstimator:
         readings : sequence of Sample
             Samples after the last row of the log.
         squares : list of array
-            Squared residuals [m²] of the markers, those without NaN; an array is appended for each
-            marker sample, in place.
+            Squared residuals [m²] of the markers (M,), NaN where missing; an array is appended for
+            each marker sample, in place.
         rows : int
             Number of rows computed since the row after which the samples are evaluated.
         """
@@ -584,7 +603,7 @@ class LiveEstimator:
                     reading = reading._replace(values=remaining)
                     linearised.at_zero[outliers] = residual[outliers] = np.nan
                 squared = np.sum((residual * sigma_m) ** 2, axis=1)
-                squares.append(squared[np.isfinite(squared)])
+                squares.append(squared)
             self.log[-1].samples.append(reading)
         track.add_residuals(all_linearised)
         return notes

@@ -280,9 +280,21 @@ class WindowPass:
             for k, x in enumerate(predicted, 1)
         ]
 
+    def latest_positions_at(self, transformed: Array) -> Array | None:
+        """Return the positions (3n,) of the latest row at transformed parameters (P,), to first
+        order; None if there is no row in the window.
+        """
+        if not self.blocks or not self.blocks[-1].stored_rows:
+            return None
+        return self._positions_at(self.blocks[-1].stored_rows[-1], transformed)
+
     def _predicted_positions(self, base: StoredRow) -> Array:
         """Return the positions of a stored row, moved to p along its columns."""
-        step = (self.sweep.transformed - base.transformed)[self.sweep.moving]
+        return self._positions_at(base, self.sweep.transformed)
+
+    def _positions_at(self, base: StoredRow, transformed: Array) -> Array:
+        """Return the positions (3n,) of a stored row at transformed parameters (P,)."""
+        step = (transformed - base.transformed)[self.sweep.moving]
         return base.x + base.columns @ step.astype(np.float32)
 
     def drop_oldest_block(self) -> int:
