@@ -54,12 +54,12 @@ import problem_files
 from studies import markdown
 
 from collocation_sysid import cli
+from collocation_sysid.extras.export import TARGETS
 from collocation_sysid.fem.kernels import jit
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.recording import read_markers, read_poses
 from collocation_sysid.recording.formats import topics  # noqa: F401
 from collocation_sysid.result import run_record
-from collocation_sysid.result.export import TARGETS
 from collocation_sysid.result.pictures import all_pictures  # noqa: F401
 from collocation_sysid.runs import check  # noqa: F401
 

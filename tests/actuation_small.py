@@ -7,10 +7,10 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import spsolve
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.mesh_checks import orient_elements
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh_checks import orient_elements
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.shape import EnclosedVolume
-from collocation_sysid.fem.structured import box_mesh
 
 
 def box_with_cavity() -> TetMesh:

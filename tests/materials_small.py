@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.materials import MATERIALS
+from collocation_sysid.fem.laws.materials import MATERIALS
 
 LAME = (200.0, 300.0)
 ELASTIC = {"lambda_pa": LAME[0], "mu_pa": LAME[1]}

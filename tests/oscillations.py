@@ -8,7 +8,7 @@ import numpy as np
 from problems_small import EDGE_M, hung_cube, nodes_where, vertex_markers
 
 from collocation_sysid.model.forces import Forces
-from collocation_sysid.program.natural_modes import Modes, natural_modes
+from collocation_sysid.program.modes.natural_modes import Modes, natural_modes
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 

@@ -14,8 +14,8 @@ import pytest
 from problems_small import smooth_poses, times
 
 from collocation_sysid import cli
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import write_poses_csv
 from collocation_sysid.result import run_record

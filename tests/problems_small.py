@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.selection import Box
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.selection import Box
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.model.schemes import SCHEMES

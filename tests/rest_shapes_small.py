@@ -9,12 +9,12 @@ from typing import Literal
 import numpy as np
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.selection import Indices
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.rest_shape import UnderGravity
-from collocation_sysid.fem.selection import Indices
-from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.problem.problem import Problem
-from collocation_sysid.program.initial_equilibrium import equilibrium
+from collocation_sysid.program.forward.initial_equilibrium import equilibrium
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import (
     Experiment,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from collocation_sysid.files import SCHEMA
+from collocation_sysid.common.files import SCHEMA
 from collocation_sysid.methods.solution import Timing
 from collocation_sysid.runs.result_content import (
     DynamicsResult,

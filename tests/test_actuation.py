@@ -10,12 +10,12 @@ from scipy.optimize import brentq
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.selection import Box, Named
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.selection import Box, Named
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.force_term import States
 from collocation_sysid.model.forces import Forces
-from collocation_sysid.program.initial_equilibrium import equilibrium
-from collocation_sysid.program.newton_solver import NewtonSolver
+from collocation_sysid.program.forward.initial_equilibrium import equilibrium
+from collocation_sysid.program.forward.newton_solver import NewtonSolver
 from collocation_sysid.recording import (
     Experiment,
     Grasp,

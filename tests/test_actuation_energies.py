@@ -12,9 +12,9 @@ from scipy.integrate import solve_bvp
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.selection import Ball, Box, Named
+from collocation_sysid.fem.meshes.selection import Ball, Box, Named
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.shape import EnclosedVolume, PolylineLength
-from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.recording.pressure import Pressure
 from collocation_sysid.recording.tendon import Tendon
 

@@ -13,7 +13,7 @@ from problem_files import TRUTH, pictures_drawn, run_command
 from problems_small import smooth_poses, times
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.shape import EnclosedVolume
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import write_poses_csv

@@ -12,7 +12,7 @@ from materials_small import COMPILED, ELASTIC, LAME, elastic, rounding
 from skfem.models.elasticity import linear_elasticity
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
 
 LAMBDA_PA, MU_PA = LAME
 

@@ -35,15 +35,17 @@ from collocation_sysid.model.forces import Forces
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment
-from collocation_sysid.statistics.consider_analysis import changed_residuals
-from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.systematic_effects import ASSUMPTIONS
-from collocation_sysid.statistics.uncertainty import uncertainty_at
-from collocation_sysid.statistics.uncertainty_budget import (
+from collocation_sysid.statistics.budget.consider_analysis import (
+    changed_residuals,
+)
+from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
+from collocation_sysid.statistics.budget.uncertainty_budget import (
     BudgetLine,
     VarianceSources,
     budget,
 )
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 VOLUME_M3, DENSITY_KG_M3 = EDGE_M**3, 30.0
 STIFF = {"lambda_pa": 1e5, "mu_pa": 1e5, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.0}
@@ -265,7 +267,7 @@ def test_air_is_part_of_the_model_unless_it_is_said_otherwise():
     script = (
         "import collocation_sysid as cs, numpy as np\n"
         "from collocation_sysid.problem.schema import EnvironmentSection\n"
-        "from collocation_sysid.fem.structured import box_mesh\n"
+        "from collocation_sysid.fem.meshes.structured import box_mesh\n"
         "body = cs.Body(box_mesh((.1,) * 3, (1,) * 3), density_kg_m3=30.0)\n"
         "grasp = cs.Grasp([0, 1, 2], cs.PoseSequence.fixed())\n"
         "seen = cs.Markers([0.0], [[[0.1, 0.1, 0.1]]], 1e-3, places_m=[[0.1, 0.1, 0.1]])\n"

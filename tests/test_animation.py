@@ -19,7 +19,7 @@ from problem_files import TRUTH, run_command, settings, write_problem
 from results_small import a_result, value
 from scipy.spatial.transform import Rotation
 
-from collocation_sysid.display import escape
+from collocation_sysid.common.display import escape
 from collocation_sysid.errors import InputError
 from collocation_sysid.result import animation
 from collocation_sysid.result.animation import (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -18,24 +19,8 @@ import collocation_sysid
 PACKAGE = Path(collocation_sysid.__file__).parent
 # As in CONTRIBUTING.md.
 LAYERS = (
-    {
-        "array_files",
-        "array_types",
-        "cluster",
-        "console",
-        "declarations",
-        "display",
-        "errors",
-    }
-    | {
-        "files",
-        "isolated_process",
-        "machine",
-        "pages",
-        "schema_tables",
-        "serialisation",
-    }
-    | {"signal_handling", "step_counting", "validated_types", "written_files"},
+    {"errors"},
+    {"common"},
     {"fem"},
     {"recording"},
     {"model"},
@@ -47,8 +32,7 @@ LAYERS = (
     {"runs"},
     {"result"},
     {"pipeline", "installation_check"},
-    {"live"},
-    {"plan"},
+    {"extras"},
     {"cli", "testing"},
     {"__main__"},
 )
@@ -115,8 +99,7 @@ CORE = ("fem", "recording", "model", "program", "methods", "statistics")
 OUTER = (
     "runs",
     "result",
-    "live",
-    "plan",
+    "extras",
     "cli",
     "testing",
     "pipeline",
@@ -162,7 +145,7 @@ def test_no_module_imports_the_package_by_its_name():
 def test_live_estimation_uses_a_small_interface_of_the_program():
     used = set()
     for name in MODULES:
-        if name.split(".")[0] != "live":
+        if not name.startswith("extras.live"):
             continue
         assert {
             each for each in imports(name) if each.startswith("program")
@@ -177,6 +160,44 @@ def test_live_estimation_uses_a_small_interface_of_the_program():
                 used |= {each.name for each in statement.names}
     assert "StreamingSweep" in used
     assert len(used) <= STREAMING_NAMES
+
+
+def imported_names(name: str, packages: tuple[str, ...]) -> dict[str, str]:
+    """Names that a module imports from the modules of some packages, with these modules."""
+    path = MODULES[name]
+    parts = name.split(".")
+    folder = parts if path.name == "__init__.py" else parts[:-1]
+    found = {}
+    for statement in ast.walk(tree_of(name)):
+        if not isinstance(statement, ast.ImportFrom) or statement.level == 0:
+            continue
+        base = folder[: len(folder) - statement.level + 1]
+        target = [*base, *(statement.module or "").split(".")]
+        if target[0] in packages:
+            found |= dict.fromkeys(
+                (each.name for each in statement.names), ".".join(target)
+            )
+    return found
+
+
+def test_extras_import_from_the_program_only_the_names_on_the_page_of_the_core():
+    page = (PACKAGE.parent / "docs" / "core.md").read_text()
+    (paragraph,) = (
+        part
+        for part in page.split("\n- ")
+        if "extras import only these names" in part
+    )
+    listed = set(re.findall(r"`(\w+)`", paragraph.split(":", 1)[1]))
+    extras = [name for name in MODULES if name.startswith("extras.")]
+    imported = {
+        name: module
+        for extra in extras
+        for name, module in imported_names(
+            extra, ("model", "program", "methods")
+        ).items()
+        if module != STREAMING
+    }
+    assert set(imported) == listed
 
 
 def test_the_contribution_guide_names_the_layers():

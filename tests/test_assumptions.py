@@ -25,11 +25,13 @@ from collocation_sysid import (
     simulate,
 )
 from collocation_sysid.fem.air import AIR_KG_M3
-from collocation_sysid.fem.constants import GAMMA_R
-from collocation_sysid.fem.materials import DAMPINGS, DampingLaw
+from collocation_sysid.fem.laws.constants import GAMMA_R
+from collocation_sysid.fem.laws.materials import DAMPINGS, DampingLaw
 from collocation_sysid.model.parameters import Parameters
-from collocation_sysid.statistics.consider_analysis import changed_residuals
-from collocation_sysid.statistics.systematic_effects import (
+from collocation_sysid.statistics.budget.consider_analysis import (
+    changed_residuals,
+)
+from collocation_sysid.statistics.budget.systematic_effects import (
     ASSUMPTIONS,
     ExperimentAtAnswer,
 )

@@ -9,13 +9,13 @@ import pytest
 from fits_small import Problem, autoregressive, problem
 from scipy.linalg import block_diag, toeplitz
 
-from collocation_sysid.statistics.autocorrelation import (
-    error_processes,
-    lagged_products,
-)
 from collocation_sysid.statistics.linearised import (
     LinearisedFit,
     factorise_information,
+)
+from collocation_sysid.statistics.residuals.autocorrelation import (
+    error_processes,
+    lagged_products,
 )
 
 LAG = 2

@@ -28,7 +28,7 @@ from problem_files import (
 )
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.problem import Problem
 
 POSES, MARKERS = "swing_motion.csv", "swing_markers.csv"

@@ -32,7 +32,7 @@ from collocation_sysid.fem.kernels.combine import (
     combine_with_numpy,
     compile_combiner,
 )
-from collocation_sysid.fem.materials import MATERIALS, neo_hookean
+from collocation_sysid.fem.laws.materials import MATERIALS, neo_hookean
 
 VARIABLE = "COLLOCATION_SYSID_EVALUATOR"
 

@@ -12,11 +12,11 @@ import pytest
 from problem_files import run_command
 
 from collocation_sysid import run
-from collocation_sysid.display import as_markdown, plain_text
+from collocation_sysid.common.display import as_markdown, plain_text
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.mesh import ElementNodes
-from collocation_sysid.fem.selection import Face
-from collocation_sysid.fem.structured import box_mesh, cylinder_of_edge
+from collocation_sysid.fem.meshes.mesh import ElementNodes
+from collocation_sysid.fem.meshes.selection import Face
+from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.new_problem import TEMPLATES
 from collocation_sysid.program.simulation import simulate
@@ -29,7 +29,7 @@ from collocation_sysid.recording.formats.units import si_factor
 from collocation_sysid.recording.time_tables import read_pressure
 from collocation_sysid.result.run_sections import run_report, run_summary
 from collocation_sysid.result.synthesis import write_data
-from collocation_sysid.statistics.modal_misspecifications import (
+from collocation_sysid.statistics.misspecification.modal_misspecifications import (
     find_misspecifications_by_modes,
 )
 

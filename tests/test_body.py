@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import ELEMENTS
-from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
 
 ROTATION_INVARIANT = [name for name in COMPILED if name != "linear"]
 EVALUATORS = ["simd", "casadi"]

@@ -27,29 +27,31 @@ from collocation_sysid import (
     solve,
     with_markers,
 )
-from collocation_sysid.display import plain_text
+from collocation_sysid.common.display import plain_text
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.recording.nuisance import KINDS
 from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.runs.result_content import Result
-from collocation_sysid.statistics.combined_intervals import combine
-from collocation_sysid.statistics.consider_analysis import (
+from collocation_sysid.statistics.budget.combined_intervals import combine
+from collocation_sysid.statistics.budget.consider_analysis import (
     changes_of_assumptions,
     changes_of_nuisances,
 )
-from collocation_sysid.statistics.discretisation_error import estimate_changes
-from collocation_sysid.statistics.estimates import Estimate
-from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.remedies import REMEDIES, remedy_for
-from collocation_sysid.statistics.systematic_effects import (
+from collocation_sysid.statistics.budget.discretisation_error import (
+    estimate_changes,
+)
+from collocation_sysid.statistics.budget.systematic_effects import (
     ASSUMPTIONS,
     Assumptions,
 )
-from collocation_sysid.statistics.uncertainty import uncertainty_at
-from collocation_sysid.statistics.uncertainty_budget import (
+from collocation_sysid.statistics.budget.uncertainty_budget import (
     VarianceSources,
     source_label,
 )
+from collocation_sysid.statistics.estimates import Estimate
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.remedies import REMEDIES, remedy_for
+from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 NOTHING = {name: "none" for name in Assumptions().deviations}
 

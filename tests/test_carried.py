@@ -14,11 +14,11 @@ from problems_small import GUESS, hung_cube
 from collocation_sysid.model.recursion import Recursion, RecursionTrajectory
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.experiment_iterate import ExperimentIterate
-from collocation_sysid.program.expression_patterns import (
+from collocation_sysid.program.lifted.expression_patterns import (
     ExpressionPattern,
     PatternIndices,
 )
-from collocation_sysid.program.lifted_variables import (
+from collocation_sysid.program.lifted.lifted_variables import (
     LiftedOffsets,
     LiftedVariables,
 )

@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
-from collocation_sysid.program.initial_equilibrium import equilibrium
+from collocation_sysid.program.forward.initial_equilibrium import equilibrium
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Nuisance
 

@@ -17,9 +17,9 @@ from catalogue import Catalogue, CatalogueEntry, catalogue_page
 from catalogue_sources import SOURCES
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.constants import unit_of
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.laws.constants import unit_of
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.recording import Experiment, Grasp, Markers
 from collocation_sysid.result.replay import MotionRecord
 

@@ -24,11 +24,11 @@ from problems_small import TRUTH, bar_in_two_hands, hung_cube
 from test_static import block
 
 from collocation_sysid.cli import common
-from collocation_sysid.console import PlainConsole
-from collocation_sysid.display import plain_text
+from collocation_sysid.common.console import PlainConsole
+from collocation_sysid.common.display import plain_text
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.numerical_damping import numerical_mode
 from collocation_sysid.model.schemes import SCHEMES, as_scheme
 from collocation_sysid.problem import Problem

@@ -41,7 +41,7 @@ from collocation_sysid.cli import (
     command_options,
     common,
 )
-from collocation_sysid.console import PlainConsole
+from collocation_sysid.common.console import PlainConsole
 from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.problem.problem_reading import read_problem_file
 from collocation_sysid.problem.schema import ProblemFile

@@ -27,7 +27,7 @@ from problems_small import (
 )
 
 import collocation_sysid as cs
-from collocation_sysid import cluster
+from collocation_sysid.common import cluster
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import experiment_executors
 from collocation_sysid.methods.experiment_executors import (

@@ -19,15 +19,15 @@ from problems_small import (
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.kernels.combine import combine_with_numpy
-from collocation_sysid.fem.moduli import (
+from collocation_sysid.fem.laws.moduli import (
     engineering_constants as engineering_moduli,
 )
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.model.schemes import SCHEMES
-from collocation_sysid.program import block_band
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.scheme_simulation import simulate_scheme
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
+from collocation_sysid.program.linear_algebra import block_band
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment
 

@@ -22,10 +22,10 @@ from results_small import a_result
 from rich.console import Console
 
 from collocation_sysid.cli import study_commands
+from collocation_sysid.common.serialisation import as_json
+from collocation_sysid.extras.studies import run_execution
+from collocation_sysid.extras.studies import study_progress as display
 from collocation_sysid.methods.solution import Iteration
-from collocation_sysid.plan import run_execution
-from collocation_sysid.plan import study_progress as display
-from collocation_sysid.serialisation import as_json
 
 KNOWN = [
     word

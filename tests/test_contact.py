@@ -21,15 +21,15 @@ from problems_small import (
 from scipy.optimize import brentq, minimize
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.contact import contact_terms
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.force_term import States
 from collocation_sysid.model.forces import Forces
-from collocation_sysid.program.contact_summary import friction_summaries
+from collocation_sysid.program.contact.contact_summary import friction_summaries
+from collocation_sysid.program.contact.step_contact import StepContact
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.program.step_contact import StepContact
 from collocation_sysid.recording import (
     Capsule,
     Cuboid,

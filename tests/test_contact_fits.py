@@ -10,8 +10,8 @@ import pytest
 from problems_small import GUESS, measured, pressed_cube
 
 import collocation_sysid as cs
-from collocation_sysid.display import plain_text
-from collocation_sysid.program.contact_summary import (
+from collocation_sysid.common.display import plain_text
+from collocation_sysid.program.contact.contact_summary import (
     ContactSummary,
     contact_summaries,
 )

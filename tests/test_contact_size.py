@@ -9,12 +9,16 @@ import pytest
 from test_contact_fits import DEPTHS_M, FLAT, TRUTH, poked
 
 import collocation_sysid as cs
-from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.recording import Experiment
-from collocation_sysid.statistics.consider_analysis import changed_residuals
-from collocation_sysid.statistics.discretisation_error import estimate_changes
+from collocation_sysid.statistics.budget.consider_analysis import (
+    changed_residuals,
+)
+from collocation_sysid.statistics.budget.discretisation_error import (
+    estimate_changes,
+)
+from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.systematic_effects import ASSUMPTIONS
 
 LARGER = 0.01
 (BODY_SCALE,) = (row for row in ASSUMPTIONS if row.name == "body_scale")

@@ -15,8 +15,10 @@ import collocation_sysid as cs
 from collocation_sysid.model.contact import contact_terms
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.recording import Experiment, Obstacle, Plane
-from collocation_sysid.statistics.consider_analysis import changed_residuals
-from collocation_sysid.statistics.systematic_effects import ASSUMPTIONS
+from collocation_sysid.statistics.budget.consider_analysis import (
+    changed_residuals,
+)
+from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
 
 YOUNG_PA = 1e4
 LAW = {

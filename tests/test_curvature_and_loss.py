@@ -21,10 +21,10 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.loss_curvature import exact_curvature
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.measurement_residual import (
     huber_as_least_squares,
 )
-from collocation_sysid.program.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment
 

@@ -11,11 +11,11 @@ import pytest
 from pydantic_core import PydanticUndefined
 
 from collocation_sysid import Nuisance
-from collocation_sysid.declarations import documented
+from collocation_sysid.common.declarations import documented
 from collocation_sysid.problem.nuisance_schema import KEYS, NuisanceSection
 from collocation_sysid.problem.validation_messages import _table_models
 from collocation_sysid.recording.nuisance import KINDS, NuisanceRow
-from collocation_sysid.statistics.systematic_effects import (
+from collocation_sysid.statistics.budget.systematic_effects import (
     ASSUMPTIONS,
     OF_KNOWN_SIGN,
     Assumptions,

@@ -18,7 +18,7 @@ from problems_small import (
 )
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.constants import is_density
+from collocation_sysid.fem.laws.constants import is_density
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.methods import METHODS
 from collocation_sysid.model.parameters import Parameters, Unknown

@@ -17,11 +17,11 @@ from scipy.spatial.transform import Rotation
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.nuisance_map import NuisanceMap
-from collocation_sysid.program.depth_camera_model import DepthCameraModel
-from collocation_sysid.program.surface_correspondences import (
+from collocation_sysid.program.depth.depth_camera_model import DepthCameraModel
+from collocation_sysid.program.depth.surface_correspondences import (
     SurfaceCorrespondences,
 )
-from collocation_sysid.program.visible_surface import VisibleSurface
+from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.statistics.uncertainty import uncertainty_at

@@ -9,11 +9,11 @@ from test_depth import MATRIX, NOISE_M, SHAPE, looking
 
 import collocation_sysid as cs
 from collocation_sysid.model.nuisance_map import NuisanceMap
-from collocation_sysid.program.depth_camera_model import DepthCameraModel
-from collocation_sysid.program.surface_correspondences import (
+from collocation_sysid.program.depth.depth_camera_model import DepthCameraModel
+from collocation_sysid.program.depth.surface_correspondences import (
     SurfaceCorrespondences,
 )
-from collocation_sysid.program.visible_surface import VisibleSurface
+from collocation_sysid.program.depth.visible_surface import VisibleSurface
 
 # A strip folded to a U that lies on its side: arms so far apart, the one behind longer.
 ARM_M, BEHIND_M, APART_M, THICK_M = 0.08, 0.12, 0.02, 0.008

@@ -10,9 +10,9 @@ from problems_small import smooth_poses, times
 from test_depth import MATRIX, NOISE_M, POSE, SHAPE, TRUTH, bar
 
 import collocation_sysid as cs
+from collocation_sysid.extras.studies.model_choice import reserve_test_data
 from collocation_sysid.methods.continuation import first_samples
-from collocation_sysid.plan.model_choice import reserve_test_data
-from collocation_sysid.program.visible_surface import VisibleSurface
+from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.result.run_record import replays
 from collocation_sysid.runs.check import check_problem
 

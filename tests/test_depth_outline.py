@@ -29,12 +29,12 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.methods.stiffness_scan import _other_starts
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.depth_camera_model import DepthCameraModel
-from collocation_sysid.program.depth_outline import no_depth_is_empty
-from collocation_sysid.program.surface_correspondences import (
+from collocation_sysid.program.depth.depth_camera_model import DepthCameraModel
+from collocation_sysid.program.depth.depth_outline import no_depth_is_empty
+from collocation_sysid.program.depth.surface_correspondences import (
     SurfaceCorrespondences,
 )
-from collocation_sysid.program.visible_surface import VisibleSurface
+from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.recording.depth_camera import (
     MOST_OUTLINE_IMAGES,
     samples_with_outlines,

@@ -26,9 +26,9 @@ from test_depth import (
 
 import collocation_sysid as cs
 from collocation_sysid.pipeline import run
-from collocation_sysid.program.depth_comparison import SurfaceComparison
+from collocation_sysid.program.depth.depth_comparison import SurfaceComparison
+from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.program.simulation import with_markers
-from collocation_sysid.program.visible_surface import VisibleSurface
 from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.result.animation import FilmFigure
 from collocation_sysid.result.depth_overlays import (
@@ -41,7 +41,7 @@ from collocation_sysid.result.pictures.depth_comparison_picture import (
     depth_picture,
 )
 from collocation_sysid.result.replay import MotionRecord
-from collocation_sysid.statistics.camera_misspecifications import (
+from collocation_sysid.statistics.misspecification.camera_misspecifications import (
     camera_hypotheses,
 )
 

@@ -21,25 +21,24 @@ from scipy.spatial.transform import Rotation
 from wrenches_small import wristed_cube
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.model.parameters import Parameter, Parameters, ThetaMap
-from collocation_sysid.plan.design import (
+from collocation_sysid.extras.design import (
     DesignCriterion,
     DesignOptions,
     HandMotion,
     Limits,
     motion_design,
 )
-from collocation_sysid.plan.design.design_folder import (
+from collocation_sysid.extras.design.design_folder import (
     PROBLEM_FILE,
     write_design,
 )
-from collocation_sysid.plan.design.evolution_search import minimise
-from collocation_sysid.plan.design.hand_motion import angular_motion
-from collocation_sysid.plan.design.motion_design import (
+from collocation_sysid.extras.design.evolution_search import minimise
+from collocation_sysid.extras.design.hand_motion import angular_motion
+from collocation_sysid.extras.design.motion_design import (
     MotionObjective,
     design_motion,
 )
-from collocation_sysid.plan.design.predicted_information import (
+from collocation_sysid.extras.design.predicted_information import (
     FutureRecording,
     LinearRecording,
     PredictedErrors,
@@ -47,10 +46,11 @@ from collocation_sysid.plan.design.predicted_information import (
     shared_information,
     symmetric_draws,
 )
-from collocation_sysid.plan.study_progress import DesignProgress
+from collocation_sysid.extras.studies.study_progress import DesignProgress
+from collocation_sysid.model.parameters import Parameter, Parameters, ThetaMap
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.scheme_simulation import simulate_scheme
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Grasp, PoseSequence
 from collocation_sysid.statistics.linearised import linearise_fit

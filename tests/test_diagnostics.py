@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from collocation_sysid.statistics.linearised import LinearisedFit, ResidualBlock
-from collocation_sysid.statistics.residual_diagnostics import (
+from collocation_sysid.statistics.residuals.residual_diagnostics import (
     MarkerDiagnosis,
     diagnose_markers,
 )

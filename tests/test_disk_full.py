@@ -20,7 +20,7 @@ from problem_files import (
     write_problem,
 )
 
-from collocation_sysid.files import replaced_file, write_text_file
+from collocation_sysid.common.files import replaced_file, write_text_file
 from collocation_sysid.result.run_writers import replaced_folder
 
 resource = pytest.importorskip("resource", reason="limits of POSIX")

@@ -10,8 +10,8 @@ import pytest
 from markdown_it import MarkdownIt
 from markdown_it.token import Token
 
-from collocation_sysid.console import PlainConsole
-from collocation_sysid.display import (
+from collocation_sysid.common.console import PlainConsole
+from collocation_sysid.common.display import (
     Cards,
     Items,
     Line,
@@ -27,8 +27,8 @@ from collocation_sysid.display import (
     on_terminal,
     plain_text,
 )
+from collocation_sysid.common.serialisation import as_json, content, read
 from collocation_sysid.errors import printable
-from collocation_sysid.serialisation import as_json, content, read
 
 NUMBERS = Table(
     "Estimates",

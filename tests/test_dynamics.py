@@ -21,7 +21,7 @@ from problems_small import (
 from collocation_sysid.fem.body import Body
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.scheme_simulation import simulate_scheme
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence
 
 THETA = as_theta(TRUTH)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from collocation_sysid.program.sparse_assembly import SparseAssembly
+from collocation_sysid.program.linear_algebra.sparse_assembly import (
+    SparseAssembly,
+)
 
 SHAPE = (5, 7)
 

@@ -11,13 +11,13 @@ from fits_small import PARAMETERS, Problem, autoregressive, problem
 from scipy.signal import lfilter
 from scipy.stats import binom, kstest
 
-from collocation_sysid.statistics.autocorrelation import (
-    analyse_dependence,
-    error_processes,
-)
 from collocation_sysid.statistics.linearised import (
     LinearisedFit,
     factorise_information,
+)
+from collocation_sysid.statistics.residuals.autocorrelation import (
+    analyse_dependence,
+    error_processes,
 )
 from collocation_sysid.statistics.uncertainty import (
     ErrorModel,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from collocation_sysid.errors import InputError, SimulationError
-from collocation_sysid.program.newton_solver import NewtonFailure
+from collocation_sysid.program.forward.newton_solver import NewtonFailure
 
 EXCEPTIONS = [
     SimulationError("a step failed", 0.03, 17),

@@ -28,9 +28,23 @@ from problems_small import (
 )
 
 from collocation_sysid.errors import InputError
+from collocation_sysid.extras.export import (
+    MAIN_FILES,
+    TARGETS,
+    IdentifiedBody,
+    parse_destination,
+    verify_export,
+    write_export,
+)
+from collocation_sysid.extras.export.export_target import equilibria
+from collocation_sysid.extras.export.identified import without_obstacles
+from collocation_sysid.extras.export.obstacle_shapes import (
+    Facets,
+    faceted_obstacles,
+)
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.regions import Region
-from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import (
@@ -45,20 +59,6 @@ from collocation_sysid.recording import (
     Solid,
     Sphere,
     Wrench,
-)
-from collocation_sysid.result.export import (
-    MAIN_FILES,
-    TARGETS,
-    IdentifiedBody,
-    parse_destination,
-    verify_export,
-    write_export,
-)
-from collocation_sysid.result.export.export_target import equilibria
-from collocation_sysid.result.export.identified import without_obstacles
-from collocation_sysid.result.export.obstacle_shapes import (
-    Facets,
-    faceted_obstacles,
 )
 
 needs_ccx = pytest.mark.skipif(

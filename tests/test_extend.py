@@ -20,7 +20,7 @@ from problems_small import GUESS, TRUTH, hung_cube
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.refinement import refine_body
+from collocation_sysid.fem.meshes.refinement import refine_body
 from collocation_sysid.methods import METHODS
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.program.simulation import simulate, with_markers

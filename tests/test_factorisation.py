@@ -7,9 +7,9 @@ from problems_small import TRUTH, box
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.pattern import SymmetricPattern
-from collocation_sysid.program.block_band import full_matrix
-from collocation_sysid.program.factorisation import Factoriser
-from collocation_sysid.program.supernodal import load_mkl
+from collocation_sysid.program.linear_algebra.block_band import full_matrix
+from collocation_sysid.program.linear_algebra.factorisation import Factoriser
+from collocation_sysid.program.linear_algebra.supernodal import load_mkl
 
 # On a bar the mesh graph is a narrow band; where every node meets every other, it is full.
 BAR = box((0.04, 0.04, 0.4), (1, 1, 10))
@@ -218,7 +218,8 @@ def test_factors_that_live_together_do_not_share_their_memory():
 
 def test_what_is_asked_for_and_not_installed_is_told(monkeypatch):
     monkeypatch.setattr(
-        "collocation_sysid.program.supernodal.load_mkl", lambda: None
+        "collocation_sysid.program.linear_algebra.supernodal.load_mkl",
+        lambda: None,
     )
     with pytest.raises(InputError, match=r"collocation-sysid\[large\]"):
         Factoriser(SMALL, np.arange(7), "supernodal")

@@ -15,8 +15,8 @@ from problems_small import IDEAL, point_markers, smooth_poses, times
 
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.constants import MU
-from collocation_sysid.fem.refinement import refine_body
+from collocation_sysid.fem.laws.constants import MU
+from collocation_sysid.fem.meshes.refinement import refine_body
 from collocation_sysid.fem.spatial_field import FieldModes, Laplacian
 from collocation_sysid.result.pictures.field_intervals import field_picture
 from collocation_sysid.result.replay import (
@@ -27,10 +27,12 @@ from collocation_sysid.result.replay import (
 )
 from collocation_sysid.runs.check.body_check import check_body
 from collocation_sysid.runs.forward_simulation import simulate_experiment
-from collocation_sysid.statistics.consider_analysis import (
+from collocation_sysid.statistics.budget.consider_analysis import (
     changes_of_assumptions,
 )
-from collocation_sysid.statistics.discretisation_error import estimate_changes
+from collocation_sysid.statistics.budget.discretisation_error import (
+    estimate_changes,
+)
 from collocation_sysid.statistics.field_estimates import (
     FieldEstimate,
     field_estimates,

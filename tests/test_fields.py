@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.result.element_fields import FIELD_NAMES, ElementFields
 
 LAMBDA_PA, MU_PA = 200.0, 300.0

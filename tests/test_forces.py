@@ -13,13 +13,13 @@ from test_density import parameters, with_core
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.meshes.selection import Box
 from collocation_sysid.fem.node_force import NodeForce
-from collocation_sysid.fem.selection import Box
 from collocation_sysid.model.force_term import States
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.model.parameters import Parameters, Unknown
-from collocation_sysid.program.block_band import full_matrix
 from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.linear_algebra.block_band import full_matrix
 from collocation_sysid.program.transcription import Transcription
 from collocation_sysid.recording import (
     Experiment,

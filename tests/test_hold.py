@@ -6,9 +6,9 @@ import pytest
 from problems_small import times, vertex_markers
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.selection import Box
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.selection import Box
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.runs.check.body_check import (
     GraspCheck,

@@ -24,19 +24,20 @@ from problem_files import (
     settings,
 )
 
-from collocation_sysid import machine
+from collocation_sysid.common import machine
+from collocation_sysid.common.isolated_process import (
+    Failed,
+    ProcessLimits,
+    run_isolated,
+)
+from collocation_sysid.common.signal_handling import INTERRUPTS, heed_interrupts
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.structured import (
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import (
     box_of_edge,
     count_box_elements,
     count_cylinder_elements,
     cylinder_of_edge,
-)
-from collocation_sysid.isolated_process import (
-    Failed,
-    ProcessLimits,
-    run_isolated,
 )
 from collocation_sysid.problem import Problem, loading, problem_size
 from collocation_sysid.recording import (
@@ -47,7 +48,6 @@ from collocation_sysid.recording import (
 from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.result import run_writers
 from collocation_sysid.runs.check import cost as memory
-from collocation_sysid.signal_handling import INTERRUPTS, heed_interrupts
 
 COMMAND_LINE = "from collocation_sysid import cli; cli.main()"
 
@@ -114,7 +114,7 @@ READ_ENDLESS = """
 import sys
 from collocation_sysid import isolated_process
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
 isolated_process.READING_S = 3
 for name in sys.argv[1:]:
     try:

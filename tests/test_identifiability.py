@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from problems_small import box
 
-from collocation_sysid.fem.moduli import ENGINEERING, LAME
+from collocation_sysid.fem.laws.moduli import ENGINEERING, LAME
 from collocation_sysid.model.parameters import Parameter, Parameters, ThetaMap
 from collocation_sysid.statistics.identifiability import (
     identifiability_sentences,

@@ -29,7 +29,7 @@ from test_explicit import of_branches, swung
 from wrenches_small import sensed, wristed_cube
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.moduli import engineering_constants
+from collocation_sysid.fem.laws.moduli import engineering_constants
 from collocation_sysid.methods.condensed_program import condense
 from collocation_sysid.methods.initial_point import (
     LARGEST_CORRECTION,

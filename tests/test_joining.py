@@ -19,7 +19,7 @@ from problems_small import (
     nodes_where,
 )
 
-from collocation_sysid.display import plain_text
+from collocation_sysid.common.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.nuisance_map import NuisanceMap
@@ -35,8 +35,8 @@ from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Force, Nuisance, PointMass
 from collocation_sysid.recording.loads import smooth_ramp
 from collocation_sysid.result.run_sections import run_summary
+from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.systematic_effects import Assumptions
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 TIP = nodes_where(box(), 2, 0.0)

@@ -14,8 +14,8 @@ from problems_small import IDEAL, point_markers, uneven_box
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import ELEMENTS
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment

@@ -19,9 +19,9 @@ from collocation_sysid import (
 from collocation_sysid.errors import InputError
 from collocation_sysid.problem.problem_options import UncertaintyOptions
 from collocation_sysid.program.simulation import with_wrenches
-from collocation_sysid.statistics.combined_intervals import combine
+from collocation_sysid.statistics.budget.combined_intervals import combine
+from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.estimates import Estimate
-from collocation_sysid.statistics.systematic_effects import Assumptions
 
 STATED = {"poisson": 0.3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 YOUNG_PA = 8e3

@@ -21,7 +21,7 @@ from test_gauge import accelerometer, instrumented, strain_gauge
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.live import (
+from collocation_sysid.extras.live import (
     Frame,
     FrameReader,
     LiveEstimator,
@@ -29,15 +29,15 @@ from collocation_sysid.live import (
     LiveUpdate,
     estimator,
 )
-from collocation_sysid.live.frame_buffer import FrameBuffer
-from collocation_sysid.live.sources import (
+from collocation_sysid.extras.live.frame_buffer import FrameBuffer
+from collocation_sysid.extras.live.sources import (
     frames_of_recording,
     paced_frames,
     receive_datagrams,
     update_as_json,
 )
-from collocation_sysid.live.time_budget import TimeBudget
-from collocation_sysid.live.window_pass import WindowPass
+from collocation_sysid.extras.live.time_budget import TimeBudget
+from collocation_sysid.extras.live.window_pass import WindowPass
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program import streaming_model, streaming_sweep

@@ -11,8 +11,8 @@ from problems_small import nodes_where
 from test_live import NO_TIME, frames_of
 
 import collocation_sysid as cs
-from collocation_sysid.live.estimator import LiveEstimator
-from collocation_sysid.live.live_model import model_from_problem
+from collocation_sysid.extras.live.estimator import LiveEstimator
+from collocation_sysid.extras.live.live_model import model_from_problem
 
 TRUTH = {"young_pa": 1e4, "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 0.3}
 UNKNOWN = {"young_pa": cs.Unknown(8e3), "gamma_r_s": cs.Unknown(0.015)}

@@ -22,9 +22,9 @@ from wrenches_small import POINT_M, SIGMA_N, SIGMA_NM, sensing
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.live import Frame, FrameReader, LiveEstimator
-from collocation_sysid.live.sources import frames_of_recording
-from collocation_sysid.live.window_pass import WindowPass
+from collocation_sysid.extras.live import Frame, FrameReader, LiveEstimator
+from collocation_sysid.extras.live.sources import frames_of_recording
+from collocation_sysid.extras.live.window_pass import WindowPass
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.program import streaming_model, streaming_sweep
 from collocation_sysid.recording import Nuisance, Wrench

@@ -23,7 +23,7 @@ from problems_small import (
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.schemes import SCHEMES
-from collocation_sysid.program.initial_equilibrium import equilibrium
+from collocation_sysid.program.forward.initial_equilibrium import equilibrium
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import (
     Experiment,

@@ -30,9 +30,9 @@ from problem_files import run_command, write_problem
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.cli import common
-from collocation_sysid.console import PlainConsole
+from collocation_sysid.common.console import PlainConsole
 from collocation_sysid.errors import InputError
-from collocation_sysid.live.frames import FrameReader
+from collocation_sysid.extras.live.frames import FrameReader
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import read_markers, read_poses, read_wrench
 from collocation_sysid.recording.formats.depth_files import read_depth

@@ -10,7 +10,7 @@ import pytest
 
 import collocation_sysid as cs
 from collocation_sysid.errors import SimulationError
-from collocation_sysid.program.loss_of_stability import (
+from collocation_sysid.program.forward.loss_of_stability import (
     BIOT_RATIO,
     StabilityLoss,
     _on_surface,

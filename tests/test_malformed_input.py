@@ -20,9 +20,9 @@ from problem_files import (
     settings,
 )
 
-from collocation_sysid.display import plain_text
+from collocation_sysid.common.display import plain_text
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.recording.formats import c3d
 from collocation_sysid.recording.marker_files import read_markers
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.program.observables import interpolation_matrix
 from collocation_sysid.recording import Markers, Placement, place_markers
 

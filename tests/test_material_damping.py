@@ -13,7 +13,7 @@ from problems_small import EDGE_M, IDEAL, box, nodes_where, uneven_box
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import ELEMENTS
-from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
 
 OBJECTIVE = [name for name in COMPILED if name != "linear"]
 # Small-strain constants (λ, μ) of `materials_small` [Pa], and γ_r [s].

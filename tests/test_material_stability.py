@@ -11,18 +11,18 @@ from materials_small import CONSTANTS, ELASTIC
 from problems_small import hung_cube
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.material_stability import (
+from collocation_sysid.fem.laws.material_stability import (
     is_examined,
     principal_stretches,
     stability_margins,
 )
-from collocation_sysid.fem.materials import (
+from collocation_sysid.fem.laws.materials import (
     MATERIALS,
     Material,
     as_material,
     neo_hookean,
 )
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.statistics.stability_concerns import (

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.constants import Constant
-from collocation_sysid.fem.materials import (
+from collocation_sysid.fem.laws.constants import Constant
+from collocation_sysid.fem.laws.materials import (
     MATERIALS,
     Material,
     as_material,

@@ -26,8 +26,8 @@ from skfem.helpers import ddot, div, dot, eye, sym_grad
 from test_against_scikit_fem import Library
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.program.collocation import Collocation

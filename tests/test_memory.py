@@ -12,7 +12,7 @@ from collocation_sysid.methods.comparison.shooting import Shooting
 from collocation_sysid.methods.continuation import Continuation
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import Collocation, ExperimentIterate
-from collocation_sysid.program.scheme_simulation import simulate_scheme
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.program.sweep import Sweep
 

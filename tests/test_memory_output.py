@@ -11,7 +11,7 @@ from problem_files import replace_text, run_command, settings
 from problems_small import measured_with, with_markers
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.constants import symbol_of
+from collocation_sysid.fem.laws.constants import symbol_of
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation

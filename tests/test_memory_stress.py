@@ -14,17 +14,17 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.materials import Prony
-from collocation_sysid.fem.memory import fading_coefficients
+from collocation_sysid.fem.laws.materials import Prony
+from collocation_sysid.fem.laws.memory import fading_coefficients
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.regions import Region
-from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.model.viscoelasticity import (
     FadingCoefficients,
     MemoryHistory,
     MemoryState,
 )
-from collocation_sysid.program.block_band import full_matrix
+from collocation_sysid.program.linear_algebra.block_band import full_matrix
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence
 

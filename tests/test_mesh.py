@@ -16,9 +16,9 @@ import pytest
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import EDGES
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.selection import Named
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.selection import Named
+from collocation_sysid.fem.meshes.structured import box_mesh
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 TWO_POINTS = np.vstack([CORNERS, [[1, 1, 1]]])
@@ -97,7 +97,7 @@ def test_hash_tells_meshes_apart(box):
 
 
 def test_meshio_is_imported_only_to_read_and_write():
-    code = "import sys, collocation_sysid.fem.mesh; sys.exit('meshio' in sys.modules)"
+    code = "import sys, collocation_sysid.fem.meshes.mesh; sys.exit('meshio' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 

@@ -19,14 +19,9 @@ from wrenches_small import fitted
 
 from collocation_sysid import Unknown
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.constants import usual_value
-from collocation_sysid.fem.materials import MATERIALS
-from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.model.parameters import Parameters
-from collocation_sysid.plan import PlannedRun, plan_models
-from collocation_sysid.plan.law_disagreements import law_table
-from collocation_sysid.plan.model_choice import (
+from collocation_sysid.extras.studies import PlannedRun, plan_models
+from collocation_sysid.extras.studies.law_disagreements import law_table
+from collocation_sysid.extras.studies.model_choice import (
     advice,
     evidence_from_fit,
     fit_record,
@@ -34,7 +29,7 @@ from collocation_sysid.plan.model_choice import (
     model_rows,
     reserve_test_data,
 )
-from collocation_sysid.plan.model_variants import (
+from collocation_sysid.extras.studies.model_variants import (
     as_inline_toml,
     file_variants,
     models,
@@ -43,9 +38,14 @@ from collocation_sysid.plan.model_variants import (
     parse_materials,
     variants,
 )
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.laws.constants import usual_value
+from collocation_sysid.fem.laws.materials import MATERIALS
+from collocation_sysid.fem.meshes.structured import box_mesh
+from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.scheme_simulation import simulate_scheme
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.recording import (
     Experiment,
     Markers,

@@ -11,12 +11,14 @@ from oscillations import oscillation, released_in_a_mode
 from problems_small import box, nodes_where
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.pattern import dofs_of
-from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.forces import Forces
-from collocation_sysid.program.modal_prediction import _oscillator_responses
-from collocation_sysid.program.natural_modes import Modes, natural_modes
+from collocation_sysid.program.modes.modal_prediction import (
+    _oscillator_responses,
+)
+from collocation_sysid.program.modes.natural_modes import Modes, natural_modes
 
 ELASTIC = np.array([200.0, 300.0, 0.0, 0.0])
 DENSITY = 30.0

@@ -14,7 +14,9 @@ from fits_small import PARAMETERS, Problem, problem
 from scipy.stats import binom, kstest
 
 from collocation_sysid.statistics.linearised import factorise_information
-from collocation_sysid.statistics.noise_level import estimate_noise_level
+from collocation_sysid.statistics.residuals.noise_level import (
+    estimate_noise_level,
+)
 from collocation_sysid.statistics.uncertainty import (
     ErrorModel,
     Uncertainty,

@@ -153,12 +153,12 @@ def test_a_notebook_uses_public_names_only(name: str) -> None:
 def test_internal_names_are_found() -> None:
     source = (
         "import collocation_sysid as cs\n"
-        "import collocation_sysid.fem.moduli\n"
+        "import collocation_sysid.fem.laws.moduli\n"
         "from collocation_sysid.runs.check import check_problem\n"
         "cs.run(cs.compute)\n"
     )
     expected = {
-        "collocation_sysid.fem.moduli",
+        "collocation_sysid.fem.laws.moduli",
         "collocation_sysid.runs.check",
         "cs.compute",
     }

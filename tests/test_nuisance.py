@@ -28,7 +28,9 @@ from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marker_association import MarkerAssociation
+from collocation_sysid.program.markers.marker_association import (
+    MarkerAssociation,
+)
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import (
     Experiment,

@@ -17,7 +17,9 @@ import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.contact import contact_terms
 from collocation_sysid.model.force_term import States
-from collocation_sysid.program.contact_summary import surface_gaps_and_pressures
+from collocation_sysid.program.contact.contact_summary import (
+    surface_gaps_and_pressures,
+)
 from collocation_sysid.recording import (
     write_markers_csv,
     write_poses_csv,

@@ -13,10 +13,10 @@ from rest_shapes_small import as_scanned
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.materials import MATERIALS, Material
-from collocation_sysid.fem.moduli import engineering_constants
+from collocation_sysid.fem.laws.materials import MATERIALS, Material
+from collocation_sysid.fem.laws.moduli import engineering_constants
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.spatial_field import Field
-from collocation_sysid.fem.structured import box_mesh
 
 POWER_LAWS = [
     name for name in MATERIALS if name.startswith(("ogden", "hyperfoam"))

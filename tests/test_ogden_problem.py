@@ -10,7 +10,7 @@ import pytest
 from problem_files import EXPERIMENT, PROBLEM, run_command
 from problems_small import smooth_poses, times
 
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import write_poses_csv
 from collocation_sysid.result.synthesis import Recipe, write_data
@@ -159,7 +159,7 @@ def test_terms_beyond_four_are_refused(tmp_path):
 
 def test_unstated_constants_have_distinct_starts():
     """Equal terms would have equal derivatives, and none could be told from another."""
-    from collocation_sysid.fem.constants import (
+    from collocation_sysid.fem.laws.constants import (
         ALPHA_TERMS,
         MU_TERMS,
         usual_value,

@@ -11,11 +11,11 @@ from problems_small import EDGE_M, TRUTH, point_markers
 from test_static import block
 
 import collocation_sysid as cs
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Wrench
 from collocation_sysid.statistics.assessment import Assessment, fit_concerns
-from collocation_sysid.statistics.residual_diagnostics import (
+from collocation_sysid.statistics.residuals.residual_diagnostics import (
     diagnose_markers,
     remove_outliers,
 )

@@ -15,7 +15,7 @@ from problems_small import GUESS, TRUTH, cube_with_gaps, hung_cube
 from test_nuisance import seen_with
 
 import collocation_sysid as cs
-from collocation_sysid.display import plain_text
+from collocation_sysid.common.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.nuisance_map import NuisanceMap

@@ -11,9 +11,9 @@ import pytest
 from problem_files import run_command
 
 from collocation_sysid.cli.markdown import TerminalPage
-from collocation_sysid.console import PlainConsole
-from collocation_sysid.display import plain_text
-from collocation_sysid.pages import page_files, page_text, page_url
+from collocation_sysid.common.console import PlainConsole
+from collocation_sysid.common.display import plain_text
+from collocation_sysid.common.pages import page_files, page_text, page_url
 from collocation_sysid.result.run_sections import _remedy_lines, remedy_command
 from collocation_sysid.statistics.concerns import TOPICS, Concern
 

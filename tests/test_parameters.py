@@ -8,10 +8,10 @@ from problems_small import box
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.moduli import engineering_constants
+from collocation_sysid.fem.laws.moduli import engineering_constants
+from collocation_sysid.fem.meshes.selection import Box
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.regions import Region
-from collocation_sysid.fem.selection import Box
-from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.parameters import (
     Parameter,
     Parameters,

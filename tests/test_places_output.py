@@ -20,7 +20,7 @@ from problem_files import (
 )
 
 import collocation_sysid as cs
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.result.pictures.mesh_pictures import mesh_picture
 from collocation_sysid.result.replay import read_run

@@ -26,7 +26,7 @@ from problems_small import (
 )
 from results_small import a_result, uncertainty, value
 
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.solution import (
     Iteration,
     Solution,
@@ -35,7 +35,7 @@ from collocation_sysid.methods.solution import (
 )
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.scheme_simulation import simulate_scheme
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.result.figure_style import (
     COLOUR_CYCLE,

@@ -12,7 +12,7 @@ import pytest
 
 from collocation_sysid import Problem, solve
 from collocation_sysid.errors import SimulationError
-from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 import get_pneumatic_arm as arm

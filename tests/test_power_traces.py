@@ -6,8 +6,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from collocation_sysid.fem.constants import LARGEST_EXPONENT
-from collocation_sysid.fem.power_traces import PowerTraces
+from collocation_sysid.fem.laws.constants import LARGEST_EXPONENT
+from collocation_sysid.fem.laws.power_traces import PowerTraces
 
 EXPONENTS = [
     -25.0,

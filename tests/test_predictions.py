@@ -13,14 +13,14 @@ from problems_small import TRUTH, hung_cube
 from scipy.interpolate import CubicSpline
 
 import collocation_sysid as cs
-from collocation_sysid.display import plain_text
-from collocation_sysid.program.depth_comparison import DepthError
-from collocation_sysid.program.visible_surface import VisibleSurface
+from collocation_sysid.common.display import plain_text
+from collocation_sysid.common.serialisation import as_json, read
+from collocation_sysid.program.depth.depth_comparison import DepthError
+from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.result.run_record import replays
 from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.runs.prediction import CopyError, nearest_recording_error
 from collocation_sysid.runs.result_content import Result
-from collocation_sysid.serialisation import as_json, read
 from collocation_sysid.statistics.assessment import prediction_concerns
 
 NOISE_M = 1e-3

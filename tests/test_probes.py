@@ -25,12 +25,12 @@ from collocation_sysid import (
     simulate,
     with_markers,
 )
-from collocation_sysid.display import plain_text
+from collocation_sysid.common.display import plain_text
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.runs.result_content import Result
-from collocation_sysid.statistics.deep_probes import WINDOWS, Probe
-from collocation_sysid.statistics.systematic_effects import Assumptions
+from collocation_sysid.statistics.budget.systematic_effects import Assumptions
+from collocation_sysid.statistics.probes.deep_probes import WINDOWS, Probe
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 

@@ -28,9 +28,9 @@ from problem_files import (
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.materials import MATERIALS, neo_hookean
+from collocation_sysid.fem.laws.materials import MATERIALS, neo_hookean
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.pattern import dofs_of
-from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.problem_reading import read_problem_file
 from collocation_sysid.problem.schema import ProblemFile

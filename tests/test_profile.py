@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from collocation_sysid.errors import InputError, SimulationError
-from collocation_sysid.statistics.profile_likelihood import (
+from collocation_sysid.statistics.probes.profile_likelihood import (
     THRESHOLD,
     compute_profile,
 )

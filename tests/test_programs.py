@@ -60,8 +60,8 @@ from test_wrench import pressed
 from wrenches_small import EVERYTHING, felt, sensing, wristed_cube
 
 import collocation_sysid as cs
+from collocation_sysid.fem.meshes.selection import Indices
 from collocation_sysid.fem.node_force import On
-from collocation_sysid.fem.selection import Indices
 from collocation_sysid.methods.comparison.shooting import (
     adjoint_gradient,
     simulate_variables,

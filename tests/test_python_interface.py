@@ -26,10 +26,10 @@ from problems_small import (
 )
 
 import collocation_sysid as cs
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.common.validated_types import Options
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.result.element_fields import ElementFields
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.validated_types import Options
 
 UNKNOWN = {
     "lambda_pa": 200.0,

@@ -244,7 +244,7 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     def fail(*_, **__):
         raise OSError("disk full")
 
-    monkeypatch.setattr("collocation_sysid.files.os.replace", fail)
+    monkeypatch.setattr("collocation_sysid.common.files.os.replace", fail)
     with pytest.raises(
         InputError, match=r"poses\.csv: cannot be written: disk full"
     ):

@@ -25,7 +25,7 @@ from problems_small import (
 )
 
 from collocation_sysid.errors import SimulationError
-from collocation_sysid.fem.moduli import engineering_constants
+from collocation_sysid.fem.laws.moduli import engineering_constants
 from collocation_sysid.methods.horizon import Horizon, Iterate
 from collocation_sysid.methods.initial_trajectories import (
     initial_variables,

@@ -22,12 +22,12 @@ from collocation_sysid.problem import (
 )
 from collocation_sysid.runs.numerical_error import refine
 from collocation_sysid.statistics.assessment import numerical_concerns
-from collocation_sysid.statistics.discretisation_error import (
+from collocation_sysid.statistics.budget.discretisation_error import (
     Refinement,
     discretisation_error,
 )
+from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.estimates import Estimate
-from collocation_sysid.statistics.systematic_effects import Assumptions
 
 FREE = ("mu_pa", "gamma_r_s")
 # Lower bounds of `write_problem`.

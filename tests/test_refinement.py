@@ -14,11 +14,11 @@ from problems_small import (
 )
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.refinement import refine_body, split_in_eight
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.refinement import refine_body, split_in_eight
+from collocation_sysid.fem.meshes.selection import Box
+from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_mesh
 from collocation_sysid.fem.regions import Region
-from collocation_sysid.fem.selection import Box
-from collocation_sysid.fem.structured import box_mesh, cylinder_mesh
 from collocation_sysid.recording import Grasp
 from collocation_sysid.recording.experiment_refinement import (
     refined_experiment as refined_experiment,

@@ -12,11 +12,11 @@ from materials_small import CONSTANTS, theta_for
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body, Linearisation
-from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.selection import Ball, Box, Indices, Named
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.regions import Region
-from collocation_sysid.fem.selection import Ball, Box, Indices, Named
-from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.program.block_band import full_matrix
+from collocation_sysid.program.linear_algebra.block_band import full_matrix
 
 EVALUATORS = ["simd", "casadi"]
 LENGTH_M = 0.03  # a large change of a position

@@ -20,10 +20,10 @@ from problem_files import (
 )
 from results_small import ROLLOUT, a_result
 
-from collocation_sysid.display import plain_text
+from collocation_sysid.common.display import plain_text
+from collocation_sysid.common.serialisation import as_json
 from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.runs.result_content import Result, SimulatedExperiment
-from collocation_sysid.serialisation import as_json
 from collocation_sysid.statistics.assessment import Assessment
 from collocation_sysid.statistics.concerns import TOPICS, Concern
 

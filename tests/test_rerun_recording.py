@@ -12,8 +12,8 @@ import pytest
 from problem_files import contents, run_command, write_problem
 
 import collocation_sysid as cs
-from collocation_sysid.result.export import rerun_recording
-from collocation_sysid.result.export.rerun_recording import (
+from collocation_sysid.extras.export import rerun_recording
+from collocation_sysid.extras.export.rerun_recording import (
     vertex_colours,
     write_rerun,
 )

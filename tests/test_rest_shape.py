@@ -23,21 +23,21 @@ from rest_shapes_small import (
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.selection import Indices
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.selection import Indices
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem.problem_options import UncertaintyOptions
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.initial_equilibrium import equilibrium
+from collocation_sysid.program.forward.initial_equilibrium import equilibrium
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.result.element_fields import ElementFields
-from collocation_sysid.statistics.consider_analysis import (
+from collocation_sysid.statistics.budget.consider_analysis import (
     changes_of_assumptions,
 )
+from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.systematic_effects import Assumptions
 
 SOFT = TRUTH | {"young_pa": 6e4}
 ELEMENTS = ["tet4", pytest.param("tet10", marks=pytest.mark.long), "tet10-p0"]
@@ -385,7 +385,7 @@ def test_a_generated_mesh_and_one_that_is_said_to_be_free_of_stress_have_no_such
 
 
 def test_a_smooth_error_of_the_surface_is_a_body_of_another_shape():
-    from collocation_sysid.statistics.shape_error import (
+    from collocation_sysid.statistics.budget.shape_error import (
         surface_modes,
         thickness_m,
     )
@@ -408,7 +408,7 @@ def test_a_smooth_error_of_the_surface_is_a_body_of_another_shape():
 
 
 def test_modes_of_the_surface_have_the_deviation_and_the_length_that_are_stated():
-    from collocation_sysid.statistics.shape_error import surface_modes
+    from collocation_sysid.statistics.budget.shape_error import surface_modes
 
     bar, none = straight_bar(), np.zeros(0, dtype=np.int64)
     on_surface = np.unique(bar.mesh.surface)
@@ -483,7 +483,7 @@ def test_a_scan_goes_from_the_file_to_the_body(tmp_path):
 
 
 def test_a_finer_mesh_keeps_what_is_stated():
-    from collocation_sysid.fem.refinement import refine_body
+    from collocation_sysid.fem.meshes.refinement import refine_body
 
     body = scanned_body()
     finer = refine_body(body)

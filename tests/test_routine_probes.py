@@ -31,7 +31,7 @@ from collocation_sysid import (
     Unknown,
     run,
 )
-from collocation_sysid.display import plain_text
+from collocation_sysid.common.display import plain_text
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
@@ -41,25 +41,25 @@ from collocation_sysid.result.probe_sections import (
 )
 from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.statistics.assessment import Assessment, probe_concerns
+from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.linearised import (
     gauss_newton_step,
     linearise_fit,
 )
-from collocation_sysid.statistics.relaxed_assumptions import (
+from collocation_sysid.statistics.probes.relaxed_assumptions import (
     EstimateChange,
     Probe,
     SolvedFit,
     has_monotonic_load,
     probed_changes,
 )
-from collocation_sysid.statistics.routine_probes import (
+from collocation_sysid.statistics.probes.routine_probes import (
     FALSE_ALARMS,
     RELEVANT,
     is_alarming,
     probed_deviations,
     routine_probes,
 )
-from collocation_sysid.statistics.systematic_effects import Assumptions
 from collocation_sysid.statistics.uncertainty import AUTO
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))

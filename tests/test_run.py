@@ -11,13 +11,15 @@ import pytest
 from problem_files import TRUTH, run_command, settings, write_problem
 
 from collocation_sysid import Problem, run
+from collocation_sysid.common.serialisation import as_json, content, read
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.recording import read_markers, write_markers_csv
 from collocation_sysid.runs.forward_simulation import ForwardSimulation
 from collocation_sysid.runs.result_content import Result
-from collocation_sysid.serialisation import as_json, content, read
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.profile_likelihood import profile_of_solution
+from collocation_sysid.statistics.probes.profile_likelihood import (
+    profile_of_solution,
+)
 
 NUISANCE = """
 [experiment.nuisance]

@@ -31,8 +31,8 @@ from collocation_sysid import (
     run,
     solve,
 )
-from collocation_sysid.fem.selection import Box
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.selection import Box
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.stiffness_scan import (
     _ScanState,
     _TrialSimulation,

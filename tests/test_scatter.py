@@ -9,7 +9,7 @@ from scipy.stats import binom, chi2, t
 
 from collocation_sysid.statistics.assessment import fit_concerns
 from collocation_sysid.statistics.linearised import LinearisedFit
-from collocation_sysid.statistics.recording_scatter import (
+from collocation_sysid.statistics.residuals.recording_scatter import (
     RecordingComparison,
     single_fits,
 )

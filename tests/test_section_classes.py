@@ -9,7 +9,8 @@ import pytest
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from collocation_sysid.declarations import documented, keys_of
+from collocation_sysid.common.declarations import documented, keys_of
+from collocation_sysid.common.schema_tables import Section
 from collocation_sysid.fem.spatial_field import Field
 from collocation_sysid.model.parameters import PARAMETER_KEYS, Unknown
 from collocation_sysid.problem import load_schema, recording_schema, schema
@@ -36,8 +37,7 @@ from collocation_sysid.recording.obstacle_solids import (
     Plane,
     Sphere,
 )
-from collocation_sysid.schema_tables import Section
-from collocation_sysid.statistics.systematic_effects import Assumptions
+from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 
 SECTIONS: dict[type, type[Section]] = {
     Field: schema.FieldSection,

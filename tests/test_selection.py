@@ -7,9 +7,9 @@ import pytest
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.selection import Ball, Box, Indices, Named
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.selection import Ball, Box, Indices, Named
+from collocation_sysid.fem.meshes.structured import box_mesh
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 

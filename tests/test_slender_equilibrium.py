@@ -16,10 +16,13 @@ from collocation_sysid import (
     TetMesh,
     box_mesh,
 )
-from collocation_sysid.program.factorisation import Factoriser
-from collocation_sysid.program.initial_equilibrium import equilibrium
-from collocation_sysid.program.newton_solver import NewtonOptions, NewtonSolver
-from collocation_sysid.program.retraction import Retraction
+from collocation_sysid.program.forward.initial_equilibrium import equilibrium
+from collocation_sysid.program.forward.newton_solver import (
+    NewtonOptions,
+    NewtonSolver,
+)
+from collocation_sysid.program.forward.retraction import Retraction
+from collocation_sysid.program.linear_algebra.factorisation import Factoriser
 
 SIZE_M = (0.18, 0.02, 0.02)
 CELLS = (18, 1, 3)

@@ -9,19 +9,19 @@ from problems_small import IDEAL, nodes_where, point_markers
 from scipy.sparse.linalg import ArpackNoConvergence
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.constants import GAMMA_R
 from collocation_sysid.fem.kernel import from_lower_triangle
-from collocation_sysid.fem.materials import DampingLaw
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.laws.constants import GAMMA_R
+from collocation_sysid.fem.laws.materials import DampingLaw
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.model.parameters import Parameter, Parameters
-from collocation_sysid.program import stability
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.simulation import simulate
-from collocation_sysid.program.stability import (
+from collocation_sysid.program.modes import stability
+from collocation_sysid.program.modes.stability import (
     find_instabilities,
     growth_rate_1_s,
 )
+from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.statistics.assessment import stability_concerns
 

@@ -23,10 +23,10 @@ from problems_small import (
 from scipy.optimize import brentq
 
 import collocation_sysid as cs
-from collocation_sysid.display import plain_text
+from collocation_sysid.common.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.comparison.shooting import Shooting
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.methods.interior_point import InteriorPoint
@@ -35,8 +35,8 @@ from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.pipeline import run
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.initial_equilibrium import equilibrium
-from collocation_sysid.program.newton_solver import NewtonSolver
+from collocation_sysid.program.forward.initial_equilibrium import equilibrium
+from collocation_sysid.program.forward.newton_solver import NewtonSolver
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import (
     Experiment,

@@ -11,14 +11,14 @@ from problem_files import write_problem
 from rich.console import Console
 
 import collocation_sysid as cs
-from collocation_sysid.fem.kernels import map_experiments
-from collocation_sysid.result import solve_progress
-from collocation_sysid.step_counting import (
+from collocation_sysid.common.step_counting import (
     StepUnit,
     complete_steps,
     counted_phase,
     listen_to_shares,
 )
+from collocation_sysid.fem.kernels import map_experiments
+from collocation_sysid.result import solve_progress
 
 
 def test_a_phase_reports_its_share_from_zero_to_its_end():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.structured import box_mesh, cylinder_mesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_mesh
 
 
 @pytest.fixture

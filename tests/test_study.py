@@ -12,11 +12,10 @@ import pytest
 from problem_files import TRUTH
 from results_small import a_result, value
 
-from collocation_sysid import cluster
+from collocation_sysid.common import cluster
+from collocation_sysid.common.serialisation import as_json, content
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.methods.solution import Iteration
-from collocation_sysid.plan import (
+from collocation_sysid.extras.studies import (
     PlannedRun,
     RunOptions,
     RunStore,
@@ -27,21 +26,22 @@ from collocation_sysid.plan import (
     run_execution,
     run_worker,
 )
-from collocation_sysid.plan.study_arguments import (
+from collocation_sysid.extras.studies.study_arguments import (
     parse_methods,
     parse_varied_keys,
     read_truth,
 )
-from collocation_sysid.plan.study_planning import shortened_keys
-from collocation_sysid.plan.study_progress import remaining_time_s
-from collocation_sysid.plan.study_rows import (
+from collocation_sysid.extras.studies.study_planning import shortened_keys
+from collocation_sysid.extras.studies.study_progress import remaining_time_s
+from collocation_sysid.extras.studies.study_rows import (
     SuccessCriterion,
     method_rows,
     run_row,
     wilson_interval,
 )
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.problem import Problem
-from collocation_sysid.serialisation import as_json, content
 
 NAMES = tuple(TRUTH)
 # Stands in for a run's process: it reads the run, and ends as its first argument says.

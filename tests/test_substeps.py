@@ -10,12 +10,12 @@ import pytest
 from problems_small import TRUTH, hung_cube
 
 import collocation_sysid as cs
-from collocation_sysid.live.live_model import model_from_problem
+from collocation_sysid.extras.live.live_model import model_from_problem
 from collocation_sysid.methods.solution import Method
 from collocation_sysid.pipeline import Run, run
 from collocation_sysid.problem import Problem
 from collocation_sysid.runs.numerical_error import refine
-from collocation_sysid.statistics.discretisation_error import (
+from collocation_sysid.statistics.budget.discretisation_error import (
     MOST_SUBSTEPS,
     Refinement,
     discretisation_error,

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem import surface
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.mesh_files import read_triangles
-from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.fem.surface import (
+from collocation_sysid.fem.meshes import surface
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh_files import read_triangles
+from collocation_sysid.fem.meshes.structured import box_mesh
+from collocation_sysid.fem.meshes.surface import (
     merge_coincident,
     tetrahedralize_surface,
 )

@@ -25,7 +25,7 @@ from collocation_sysid.model.equations_at_parameters import (
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program import sweep
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.scheme_simulation import simulate_scheme
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.stopwatch import Stopwatch
 from collocation_sysid.program.sweep import Sweep, Tangent
 

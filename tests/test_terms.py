@@ -12,8 +12,8 @@ from checks import relative_error
 from problems_small import bar_in_two_hands, measured_with
 
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.meshes.selection import Box
 from collocation_sysid.fem.regions import Region
-from collocation_sysid.fem.selection import Box
 from collocation_sysid.methods import METHODS
 from collocation_sysid.model.parameters import Parameters, Tied, Unknown
 from collocation_sysid.program.collocation import Collocation

@@ -6,8 +6,8 @@ import casadi as ca
 import pytest
 from materials_small import CONSTANTS, ELASTIC
 
-from collocation_sysid.fem.constants import GAMMA_R, Constant
-from collocation_sysid.fem.materials import (
+from collocation_sysid.fem.laws.constants import GAMMA_R, Constant
+from collocation_sysid.fem.laws.materials import (
     DAMPINGS,
     MATERIALS,
     DampingLaw,

@@ -7,7 +7,7 @@ import pytest
 from materials_small import COMPILED, CONSTANTS, ELASTIC
 
 from collocation_sysid.fem.elements import ELEMENTS
-from collocation_sysid.fem.materials import MATERIALS, Material
+from collocation_sysid.fem.laws.materials import MATERIALS, Material
 from collocation_sysid.testing import check_material
 
 # Materials with elements: each kind of energy with linear elements, each element with one material.

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import element_named
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import place_markers
 from collocation_sysid.result.run_writers import write_frames

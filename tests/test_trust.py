@@ -15,11 +15,11 @@ from fits_small import PARAMETERS, autoregressive, problem
 from problem_files import run_command, settings, write_problem
 
 from collocation_sysid import Run, UncertaintyOptions, run
-from collocation_sysid.display import plain_text
+from collocation_sysid.common.display import plain_text
+from collocation_sysid.common.serialisation import as_json, content, read
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.problem import Problem
 from collocation_sysid.result.run_sections import run_summary
-from collocation_sysid.serialisation import as_json, content, read
 from collocation_sysid.statistics.assessment import (
     GROSS_MISFIT,
     MISFIT,
@@ -31,9 +31,11 @@ from collocation_sysid.statistics.assessment import (
     rms_expected_from_noise_m,
     scheme_concerns,
 )
+from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.concerns import TOPICS, Concern
-from collocation_sysid.statistics.misspecification_hypothesis import Hypothesis
-from collocation_sysid.statistics.systematic_effects import Assumptions
+from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
+    Hypothesis,
+)
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))

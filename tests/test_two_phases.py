@@ -12,14 +12,14 @@ from checks import assert_derivative
 from problems_small import IDEAL, point_markers, smooth_poses, times
 
 import collocation_sysid as cs
+from collocation_sysid.extras.live.estimator import LiveEstimator
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.refinement import refine_body
+from collocation_sysid.fem.meshes.refinement import refine_body
 from collocation_sysid.fem.two_phase import (
     ElementLogarithms,
     PhaseSummary,
     TwoPhaseModes,
 )
-from collocation_sysid.live.estimator import LiveEstimator
 from collocation_sysid.runs.two_phases import solve_two_phases
 from collocation_sysid.statistics.field_estimates import (
     FieldEstimate,

@@ -17,11 +17,11 @@ from problems_small import (
 from scipy.stats import chi2
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.moduli import engineering_constants
+from collocation_sysid.fem.laws.moduli import engineering_constants
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.scheme_simulation import simulate_scheme
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.program.transcription import Transcription
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence

@@ -30,10 +30,10 @@ from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.model.recursion import RecursionTrajectory
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.collocation import Collocation, ExperimentIterate
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.observables import ObservedMotion, ReactionForces
-from collocation_sysid.program.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.program.wrench_observable import LOW_PASS
+from collocation_sysid.program.wrench.wrench_observable import LOW_PASS
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 
 

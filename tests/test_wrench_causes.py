@@ -18,11 +18,15 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import Nuisance, Wrench
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.assessment import cause_concerns
-from collocation_sysid.statistics.fit_misspecifications import (
+from collocation_sysid.statistics.misspecification.fit_misspecifications import (
     find_misspecifications,
 )
-from collocation_sysid.statistics.misspecification_hypothesis import rank
-from collocation_sysid.statistics.wrench_causes import wrench_mistakes
+from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
+    rank,
+)
+from collocation_sysid.statistics.misspecification.wrench_causes import (
+    wrench_mistakes,
+)
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from wrong_twins import WRENCH_FAULTS

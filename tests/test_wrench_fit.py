@@ -187,7 +187,7 @@ def test_a_run_tells_of_the_wrench(tmp_path: Path):
     assert "tare of fx [N]" in result["nuisance"]["hung cube"]
     with np.load(folder / "trajectory.npz") as stored:
         assert stored["wrench_1"].shape == (21, 19)
-    from collocation_sysid.display import plain_text
+    from collocation_sysid.common.display import plain_text
     from collocation_sysid.result.pictures.album import redraw_pictures
     from collocation_sysid.result.report import report_html
     from collocation_sysid.result.run_sections import run_report, run_summary

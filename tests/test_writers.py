@@ -9,11 +9,12 @@ import meshio
 import numpy as np
 import pytest
 
+from collocation_sysid.common.files import write_text_file
+from collocation_sysid.common.written_files import LIST_FILE, list_files
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import element_named
-from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.files import write_text_file
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.result.element_fields import ElementFields
 from collocation_sysid.result.run_writers import (
     replaced_folder,
@@ -21,7 +22,6 @@ from collocation_sysid.result.run_writers import (
     write_pvd,
     write_vtu,
 )
-from collocation_sysid.written_files import LIST_FILE, list_files
 
 MESH = box_mesh((0.1, 0.2, 0.3), (1, 2, 1))
 TET4 = element_named("tet4")

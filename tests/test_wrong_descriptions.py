@@ -15,8 +15,8 @@ from problems_small import GUESS, TRUTH, box, released_cube
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
@@ -25,10 +25,11 @@ from collocation_sysid.recording import Experiment, Grasp
 from collocation_sysid.runs.check import misspecification_hypotheses
 from collocation_sysid.runs.check.body_check import check_grasps, grasp_concerns
 from collocation_sysid.statistics.assessment import cause_concerns
-from collocation_sysid.statistics.fit_misspecifications import (
+from collocation_sysid.statistics.misspecification import fit_misspecifications
+from collocation_sysid.statistics.misspecification.fit_misspecifications import (
     find_misspecifications,
 )
-from collocation_sysid.statistics.plausibility import (
+from collocation_sysid.statistics.misspecification.plausibility import (
     material_hypothesis,
     size_and_density_hypotheses,
     step_hypotheses,
@@ -229,7 +230,9 @@ def test_a_short_exchange_is_left_to_hubers_loss():
 def test_of_markers_that_are_exchanged_nothing_is_fitted_again(monkeypatch):
     solution = solve(exchanged(soft("bar"), slice(20, None)))
     monkeypatch.setattr(
-        "collocation_sysid.statistics.fit_misspecifications.ReducedSpace", None
+        fit_misspecifications,
+        "ReducedSpace",
+        None,
     )
     assert [cause.cause for cause in find_misspecifications(solution)] == [
         "markers-exchanged"
@@ -248,11 +251,15 @@ def test_the_search_for_causes_is_bounded_by_what_the_fit_took(
             return found
 
     monkeypatch.setattr(
-        "collocation_sysid.statistics.fit_misspecifications.ReducedSpace",
+        fit_misspecifications,
+        "ReducedSpace",
         Counted,
     )
-    by_modes = "collocation_sysid.statistics.fit_misspecifications.find_misspecifications_by_modes"
-    monkeypatch.setattr(by_modes, lambda *_, **__: ())
+    monkeypatch.setattr(
+        fit_misspecifications,
+        "find_misspecifications_by_modes",
+        lambda *_, **__: (),
+    )
     assert find_misspecifications(solution)[0].cause == "marker-slip"
     assert len(sweeps) > 1
     assert (

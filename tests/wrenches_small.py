@@ -10,7 +10,7 @@ from problems_small import TRUTH, as_theta, hung_cube, measured_with
 
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.scheme_simulation import simulate_scheme
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.recording import Experiment, Nuisance, Wrench
 
 SIGMA_N, SIGMA_NM = 1e-3, 1e-4

@@ -11,11 +11,11 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
+from ..common.files import require_possible
+from ..common.validated_types import NotNegative, Options, Positive
 from ..errors import InputError
-from ..files import require_possible
-from ..live import LiveEstimator, LiveOptions
-from ..live.sources import read_problem
-from ..validated_types import NotNegative, Options, Positive
+from ..extras.live import LiveEstimator, LiveOptions
+from ..extras.live.sources import read_problem
 from .command_options import (
     AllowCode,
     OutputOptions,
@@ -80,8 +80,8 @@ def live(options: LiveCommand) -> None:
     qy, qz, qw, tip_x, tip_y, tip_z and so on. A line that is not a frame is reported and ignored,
     and the exit code is then 2. An empty datagram ends the recording.
     """
-    from ..live.frames import FrameReader
-    from ..live.sources import (
+    from ..extras.live.frames import FrameReader
+    from ..extras.live.sources import (
         decode_lines,
         receive_datagrams,
         update_as_json,
@@ -160,14 +160,14 @@ def replay(options: ReplayCommand) -> None:
     """Stream a recording as if it were being made, and estimate the parameters live."""
     from rich.live import Live
 
-    from ..display import on_terminal
-    from ..live import live_display
-    from ..live.sources import (
+    from ..common.display import on_terminal
+    from ..extras.live import live_display
+    from ..extras.live.sources import (
         frames_of_recording,
         paced_frames,
         without_garbage_of_startup,
     )
-    from ..live.sources import update_as_json as json_line
+    from ..extras.live.sources import update_as_json as json_line
 
     rate = options.rate
     film = options.film

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError, SimulationError
 from ..model.dynamics import Dynamics
 from ..model.nuisance_map import NuisanceMap
@@ -25,14 +25,14 @@ from ..model.schemes import MOST_STEPS, Scheme, as_scheme
 from ..recording.experiment import Experiment
 from ..recording.nuisance import Nuisance
 from .custom_sensor_residual import custom_sensor_residuals
-from .loss_of_stability import explain_failure
-from .newmark import simulate_newmark
-from .newton_solver import NewtonOptions
+from .forward.loss_of_stability import explain_failure
+from .forward.newmark import simulate_newmark
+from .forward.newton_solver import NewtonOptions
+from .forward.scheme_simulation import Progress, simulate_scheme
 from .observables import ObservedMotion, ReactionForces
-from .reaction_forces import forces_on_dofs, reaction_forces
-from .scheme_simulation import Progress, simulate_scheme
-from .wrench_observable import ReactionGrid, sensed_dofs
-from .wrench_residual import wrench_residuals
+from .wrench.reaction_forces import forces_on_dofs, reaction_forces
+from .wrench.wrench_observable import ReactionGrid, sensed_dofs
+from .wrench.wrench_residual import wrench_residuals
 
 # Name of the integrator that is no collocation scheme, and its order of accuracy.
 NEWMARK = "newmark"

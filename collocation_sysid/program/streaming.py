@@ -12,8 +12,8 @@ Modules outside `program` that follow a recording frame by frame import from her
   and samples later than `LARGEST_SAMPLE_DELAY` are not used.
 """
 
-from .lapack import one_blas_thread
 from .least_squares import SquareRootInformation
+from .linear_algebra.lapack import one_blas_thread
 from .measurement_residual import lagrange_weights
 from .streaming_model import StreamingModel, StreamStencil
 from .streaming_sweep import (

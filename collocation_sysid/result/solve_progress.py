@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from rich.console import Console, Group
 from rich.text import Text
 
-from ..console import Watched
-from ..display import Shown, Table, on_terminal
-from ..fem.constants import symbol_of
+from ..common.console import Watched
+from ..common.display import Shown, Table, on_terminal
+from ..common.step_counting import listen_to_shares
+from ..fem.laws.constants import symbol_of
 from ..methods.solution import Iteration
 from ..problem import Problem
-from ..step_counting import listen_to_shares
 
 # Number of latest iterations on the terminal: half of its 24 lines.
 SHOWN_ITERATIONS = 12
