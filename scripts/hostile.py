@@ -49,8 +49,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-import logs_small
-import problem_files
+from kit import logs, problem_files
 from studies import markdown
 
 from collocation_sysid import cli
@@ -441,8 +440,8 @@ def _with_bag(kind: str) -> Callable[[Path], object]:
             read_poses(folder / POSES),
             read_markers(folder / MARKERS),
         )
-        log = logs_small.bag(
-            folder / "log", logs_small.recorded(poses, table, kind), kind
+        log = logs.bag(
+            folder / "log", logs.recorded(poses, table, kind), kind
         )
         if log.is_dir():
             log = next(log.glob("*.db3"))
@@ -458,8 +457,8 @@ def _with_bag(kind: str) -> Callable[[Path], object]:
 def _with_dataset(folder: Path) -> None:
     """State the poses by joints of a dataset in Parquet and by a robot's description."""
     joints = {"turn": 20 * [0.0], "slide": 20 * [0.0]}
-    logs_small.dataset(folder / "robot", joints, episodes=1)
-    at_rest = logs_small.URDF.replace("0 0 0.5", "0 0 0").replace(
+    logs.dataset(folder / "robot", joints, episodes=1)
+    at_rest = logs.URDF.replace("0 0 0.5", "0 0 0").replace(
         "0.2 0 0", "0 0 0"
     )
     (folder / "arm.urdf").write_text(at_rest)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from problem_files import write_problem
-from problems_small import uneven_box
+from kit.problem_files import write_problem
+from kit.problems import uneven_box
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.mesh import TetMesh

@@ -47,7 +47,7 @@ FIRST_SCHEME_STEPS = 1
 MOST_AUTOMATIC_STEPS = 32
 # Largest error of node positions at the samples, relative to the way of the node that moves
 # farthest, that automatic refinement accepts. For a swung block it changes E by 0.4 %
-# (`tests/test_substeps.py`), which a run's interval for its own step covers.
+# (`tests/program/test_substeps.py`), which a run's interval for its own step covers.
 STEP_TOLERANCE = 1e-4
 # Error relative to the size of the body that is rounding of Newton's method.
 ROUNDING = 1e-9

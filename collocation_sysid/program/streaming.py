@@ -1,7 +1,7 @@
 """Interface of a streaming sweep: time marching along a recording that has no end yet.
 
 Modules outside `program` that follow a recording frame by frame import from here alone
-(`tests/test_architecture.py`):
+(`tests/project/test_architecture.py`):
 
 - `StreamingModel` is the program of a recording that arrives frame by frame, and `StreamStencil`
   the rows that samples of an instrument need;

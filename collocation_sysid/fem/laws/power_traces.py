@@ -23,7 +23,7 @@ rational functions of the invariants only. Exponents beyond ±1 follow by doubli
 tr C̄²ˢ = (tr C̄ˢ)² − 2 tr C̄⁻ˢ, which holds because det C̄ = 1.
 
 For principal stretches λ̄ from 0.2 to 5 the relative error of a trace is below 10⁻¹⁰ for |α| = 2 |s|
-up to 8, and below 10⁻⁹ up to 25 (`tests/test_power_traces.py`).
+up to 8, and below 10⁻⁹ up to 25 (`tests/fem/test_power_traces.py`).
 """
 
 from __future__ import annotations

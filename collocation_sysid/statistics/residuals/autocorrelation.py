@@ -11,7 +11,7 @@ with the autocorrelation ρ of one autoregressive process and the covariance Σ 
 corrected for. The order minimises Schwarz's criterion. Σ is estimated from the innovations, which
 are nearly independent in time.
 
-Compared with it on simulated fits (tests/test_error_coverage.py), a kernel estimate of B from the
+Compared with it on simulated fits (tests/truths/test_error_coverage.py), a kernel estimate of B from the
 scores of each time (Andrews 1991, prewhitened) covers 83–90 % where 95 % is nominal, and one
 without the correction of the residuals or without Σ fails for short records and shared errors.
 
