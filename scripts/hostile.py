@@ -440,9 +440,7 @@ def _with_bag(kind: str) -> Callable[[Path], object]:
             read_poses(folder / POSES),
             read_markers(folder / MARKERS),
         )
-        log = logs.bag(
-            folder / "log", logs.recorded(poses, table, kind), kind
-        )
+        log = logs.bag(folder / "log", logs.recorded(poses, table, kind), kind)
         if log.is_dir():
             log = next(log.glob("*.db3"))
         place = folder / f"trial{log.suffix}"
@@ -458,9 +456,7 @@ def _with_dataset(folder: Path) -> None:
     """State the poses by joints of a dataset in Parquet and by a robot's description."""
     joints = {"turn": 20 * [0.0], "slide": 20 * [0.0]}
     logs.dataset(folder / "robot", joints, episodes=1)
-    at_rest = logs.URDF.replace("0 0 0.5", "0 0 0").replace(
-        "0.2 0 0", "0 0 0"
-    )
+    at_rest = logs.URDF.replace("0 0 0.5", "0 0 0").replace("0.2 0 0", "0 0 0")
     (folder / "arm.urdf").write_text(at_rest)
     address = "robot#observation.state#arm.urdf#rad#base>tool"
     _state(folder, POSES, address)

@@ -1,4 +1,4 @@
-"""What the tests measure by: derivatives against central differences, and orders of convergence."""
+"""Comparison of derivatives with central differences, and orders of convergence."""
 
 from collocation_sysid.testing.finite_differences import (
     assert_derivative,

@@ -1,4 +1,4 @@
-"""Shared objects of tests: collocation_kinds."""
+"""Collocations of a cube of twelve nodes with every kind of parameters, scheme, start and layout."""
 
 from __future__ import annotations
 

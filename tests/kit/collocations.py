@@ -1,4 +1,4 @@
-"""Shared objects of tests: collocations."""
+"""Collocations of small problems with noise, by name."""
 
 from __future__ import annotations
 

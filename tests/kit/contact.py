@@ -1,4 +1,4 @@
-"""Shared objects of tests: contact."""
+"""Poses, grasps and a force sensor for bodies that touch obstacles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shared objects of tests: densities."""
+"""Bodies of two regions whose densities are parameters, and their parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shared objects of tests: depth."""
+"""A bar that hangs from one end, seen by a depth camera."""
 
 from __future__ import annotations
 

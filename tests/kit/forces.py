@@ -1,4 +1,4 @@
-"""Shared objects of tests: forces."""
+"""Two user-defined nodal forces: a bed with dashpots, and a pressure with damping along the normal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shared objects of tests: frames."""
+"""A swinging body and the frames of its recording, as live estimation takes them."""
 
 from __future__ import annotations
 

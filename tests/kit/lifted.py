@@ -1,4 +1,4 @@
-"""Shared objects of tests: lifted."""
+"""Bodies with several branches of memory, and collocations with lifted variables."""
 
 from __future__ import annotations
 

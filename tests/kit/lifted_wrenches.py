@@ -1,4 +1,4 @@
-"""Shared objects of tests: lifted_wrenches."""
+"""Experiments with instrumented grasps whose wrenches are lifted variables."""
 
 from __future__ import annotations
 

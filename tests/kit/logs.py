@@ -1,4 +1,4 @@
-"""Robot logs of a motion, as ROS 2, MCAP and LeRobot's tools write them."""
+"""Robot logs of a motion, as written by the tools of ROS 2, MCAP and LeRobot."""
 
 from __future__ import annotations
 

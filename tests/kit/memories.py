@@ -1,4 +1,4 @@
-"""The small experiments with bodies that have a memory."""
+"""Small experiments with viscoelastic bodies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shared objects of tests: nuisances."""
+"""Experiments whose markers are simulated with given nuisance parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A cube let go in one of its modes, and the oscillation that a simulation makes of it."""
+"""A cube released in one of its modes, and the frequency and damping of its simulated oscillation."""
 
 from __future__ import annotations
 

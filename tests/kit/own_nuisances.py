@@ -1,4 +1,4 @@
-"""Shared objects of tests: own_nuisances."""
+"""User-defined nuisance parameters of markers: a scale, a drifting clock, and a sag."""
 
 from __future__ import annotations
 

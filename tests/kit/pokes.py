@@ -1,4 +1,4 @@
-"""Shared objects of tests: pokes."""
+"""A soft block that a ball presses in, with the measured force."""
 
 from __future__ import annotations
 

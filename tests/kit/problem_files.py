@@ -1,4 +1,4 @@
-"""A tiny problem on disk, ways to edit it, and the command line run in this process."""
+"""A small problem on disk, edits of it, and the command line run in this process."""
 
 from __future__ import annotations
 

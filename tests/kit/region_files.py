@@ -1,4 +1,4 @@
-"""Shared objects of tests: region_files."""
+"""Edits of the small problem file that divide its body into two regions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A whole `Result` without a solve, for what is made of results."""
+"""A complete `Result` without a solve, for tests of output."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
-"""Shared objects of tests: scikit_fem."""
+"""Assembly by scikit-fem, in the order of unknowns of this package."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import skfem
 
 
@@ -59,10 +58,3 @@ class Library:
             .assemble(self.basis, u=u)
             .toarray()[np.ix_(self.dofs, self.dofs)]
         )
-
-
-@pytest.fixture
-def positions(small_mesh, rng) -> np.ndarray:
-    return small_mesh.points_m + rng.uniform(
-        -0.006, 0.006, small_mesh.points_m.shape
-    )

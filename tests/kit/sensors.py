@@ -1,4 +1,4 @@
-"""Shared objects of tests: sensors."""
+"""User-defined sensors: an accelerometer and a strain gauge."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shared objects of tests: sharing."""
+"""Recordings that share nuisance parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shared objects of tests: static."""
+"""A quarter of a block between platens, in static equilibrium."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shared objects of tests: terms."""
+"""Bodies of several materials and regions, with true values and guesses."""
 
 from __future__ import annotations
 

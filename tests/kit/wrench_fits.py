@@ -1,4 +1,4 @@
-"""Shared objects of tests: wrench_fits."""
+"""A swung cube with a measured wrench and noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shared objects of tests: wrench_kinds."""
+"""A cube on a plate, pressed by an instrumented platen."""
 
 from __future__ import annotations
 

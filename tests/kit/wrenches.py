@@ -1,4 +1,4 @@
-"""Small experiments whose grasps have sensors, with the wrenches that the truth gives them."""
+"""Small experiments with instrumented grasps, and their wrenches at the true parameters."""
 
 from __future__ import annotations
 

@@ -78,6 +78,13 @@ def quadratic(small_mesh) -> tuple[Library, Callable[..., Body]]:
     return library, make_body
 
 
+@pytest.fixture
+def positions(small_mesh, rng) -> np.ndarray:
+    return small_mesh.points_m + rng.uniform(
+        -0.006, 0.006, small_mesh.points_m.shape
+    )
+
+
 def test_neo_hookean_energy(make_body, library, positions):
     expected = library.scalar(energy_density, positions)
     found = make_body("neo-hookean").energy(positions, **ELASTIC)
