@@ -1,4 +1,4 @@
-"""The commands, in this process: what they print, how they end, and what they write."""
+"""The commands run in this process: output, exit codes and files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`compare-methods` and `sweep` from the command line: what they run, print, write and keep."""
+"""`compare-methods` and `sweep` from the command line: runs, output and files."""
 
 from __future__ import annotations
 

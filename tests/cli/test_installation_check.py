@@ -1,4 +1,4 @@
-"""The check of an installation: what it finds, and what it says where something is missing."""
+"""Report of `doctor` about complete and incomplete installations."""
 
 from __future__ import annotations
 

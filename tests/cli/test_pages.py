@@ -1,4 +1,4 @@
-"""Pages of the documentation in a terminal, and the messages and reports that lead to them."""
+"""Pages of the documentation in a terminal, and the references of messages and reports."""
 
 from __future__ import annotations
 

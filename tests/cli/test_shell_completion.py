@@ -1,4 +1,4 @@
-"""Scripts for completion, run by the shells they are for."""
+"""Completion scripts, run by their shells."""
 
 from __future__ import annotations
 

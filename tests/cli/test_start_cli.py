@@ -1,4 +1,4 @@
-"""The commands on a problem without guesses, and solves that start from an earlier answer."""
+"""Commands on a problem without guesses, and solves that start from an earlier answer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One description, seen in a terminal, a browser, Markdown and JSON."""
+"""One description rendered for a terminal, a browser, Markdown and JSON."""
 
 from __future__ import annotations
 

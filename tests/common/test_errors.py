@@ -1,4 +1,4 @@
-"""Exceptions of the package say the same in another process."""
+"""Exceptions keep their messages when they are pickled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Completed shares of phases, and the remaining time that a display makes of them."""
+"""Completed shares of phases, and the remaining time that displays derive from them."""
 
 from __future__ import annotations
 

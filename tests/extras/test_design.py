@@ -1,4 +1,4 @@
-"""Designed motions: what they keep to, what they are judged by, and what is written of them."""
+"""Designed motions: limits, criteria and files."""
 
 from __future__ import annotations
 

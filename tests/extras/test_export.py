@@ -1,4 +1,4 @@
-"""Exports: what files hold and say, and what simulators that are installed make of them."""
+"""Exports: content of the files, and results of installed simulators that read them."""
 
 from __future__ import annotations
 

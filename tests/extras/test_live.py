@@ -1,4 +1,4 @@
-"""Estimates frame by frame: the batch's information, its answer, and what frames may lack."""
+"""Live estimates: information and solution of the batch, and incomplete frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Live estimates of bodies that touch something, at rest or with poses that come with frames."""
+"""Live estimates of bodies in contact, at rest or with poses that arrive with frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The size of live residuals, how they hang together, and how much that widens intervals."""
+"""Size and correlation of live residuals, and wider intervals because of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Load cells while frames come: what they say to the batch, what they tell, what may be missing."""
+"""Load cells in live estimation, compared with the batch, also with missing values."""
 
 from __future__ import annotations
 

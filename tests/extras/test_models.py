@@ -1,4 +1,4 @@
-"""Which model? Variants of a problem, their evidence, what they predict, and the advice."""
+"""Model choice: variants of a problem, evidence, predictions and advice."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings for the Rerun viewer, read back with its own library."""
+"""Recordings for the Rerun viewer, read back by its library."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The studies of methods, on problems so small that they only show that the scripts work."""
+"""Study scripts run on very small problems."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Studies: what is planned, how a run's process is watched, and what the numbers say."""
+"""Studies: plans, supervision of worker processes, and summaries."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Length and volume as functions of the nodes, and bodies under them against other solutions."""
+"""Length and volume as functions of node positions, and the forces of tendons and pressures."""
 
 from __future__ import annotations
 

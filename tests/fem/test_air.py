@@ -1,4 +1,4 @@
-"""Air around a body: buoyancy, added mass and drag, their budget, and what users state."""
+"""Air around a body: buoyancy, added mass, drag, their budget and the keys that describe them."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Compiled kernels compared with CasADi, their cache, and failures of the compiler."""
+
 from __future__ import annotations
 
 import shutil

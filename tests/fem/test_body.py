@@ -1,3 +1,5 @@
+"""Forces, stiffness and derivatives of bodies, and the validation of their input."""
+
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Fields of the elements against what can be worked out by hand."""
+"""Element fields compared with values computed by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Kelvin and Voigt's damping: its stress, its limits and motions; see `test_testing_damping`."""
+"""Kelvin–Voigt damping: stress, limits and motions; see also `test_testing_damping`."""
 
 from __future__ import annotations
 

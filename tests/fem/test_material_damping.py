@@ -1,4 +1,4 @@
-"""Kelvin and Voigt's damping in material form: stress, potential and motion."""
+"""Kelvin–Voigt damping in material form: stress, potential and motion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Drucker's criterion: known limits of stability, and the warnings about materials beyond them."""
+"""Drucker's criterion: known limits of stability, and warnings."""
 
 from __future__ import annotations
 

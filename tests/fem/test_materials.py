@@ -1,3 +1,5 @@
+"""Energies and stresses of materials: derivatives, limits and closed forms."""
+
 from __future__ import annotations
 
 from itertools import product

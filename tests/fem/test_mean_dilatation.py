@@ -1,4 +1,4 @@
-"""Quadratic tetrahedra of one pressure, which do not lock near ν = 0.5."""
+"""Quadratic tetrahedra with constant pressure, which do not lock near ν = 0.5."""
 
 from __future__ import annotations
 

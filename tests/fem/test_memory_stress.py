@@ -1,4 +1,4 @@
-"""A material with memory against closed forms, and its stresses against differences."""
+"""Stresses of viscoelastic materials compared with closed forms and differences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The mesh: what it measures, how it is cleaned, refused, read and written."""
+"""Meshes: measures, cleaning, refusals and files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is kept compiled is executed: nothing that others could have written is used."""
+"""The cache of compiled kernels uses no file that others could have written."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Ogden's law and the compressible foam: closed forms, limits, coincident stretches, kernels."""
+"""Ogden's law and compressible foam: closed forms, limits, equal stretches and kernels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Traces of powers of the stretches without eigenvalues, against sums over the stretches."""
+"""Traces of powers of C without eigenvalues, compared with sums over the stretches."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Refined meshes: positions, volumes and transferred selections."""
+
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Bodies of several regions: materials, damping and densities of their own."""
+"""Bodies of several regions with their own materials, damping and densities."""
 
 from __future__ import annotations
 

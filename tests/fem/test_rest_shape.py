@@ -1,4 +1,4 @@
-"""A mesh made while its body hung: its stress-free shape, and what that does to forces and fits."""
+"""Stress-free shapes of meshes that were made under gravity: forces and identification."""
 
 from __future__ import annotations
 

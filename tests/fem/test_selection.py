@@ -1,4 +1,4 @@
-"""Node selections: what they choose, and how they refuse."""
+"""Node selections: results and refusals."""
 
 from __future__ import annotations
 

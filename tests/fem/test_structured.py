@@ -1,4 +1,4 @@
-"""Structured meshes: exact sizes, conforming elements."""
+"""Structured meshes: exact sizes and conforming elements."""
 
 from __future__ import annotations
 

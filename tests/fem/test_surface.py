@@ -1,4 +1,4 @@
-"""Closed surfaces: read, refused, filled with tetrahedra, and kept."""
+"""Closed surfaces: reading, refusals and tetrahedral meshes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The quadratic tetrahedron: what it reproduces exactly, and what it is better at."""
+"""The quadratic tetrahedron: exactness and convergence."""
 
 from __future__ import annotations
 

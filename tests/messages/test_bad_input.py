@@ -1,4 +1,4 @@
-"""Every slip of a user is met by one message, exit code 2, and nothing written."""
+"""Every mistake in the input gets one message and exit code 2, and no file is written."""
 
 from __future__ import annotations
 

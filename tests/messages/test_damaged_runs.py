@@ -1,4 +1,4 @@
-"""A damaged or foreign folder of results gets one line and exit code 2, from every command."""
+"""Damaged or foreign result folders get one message and exit code 2 from every command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A disk that is full: what was there stays, nothing is left half, the message names the file."""
+"""A full disk leaves existing files complete, and the message names the file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The script that damages input: what it counts, and that no case ends without a message."""
+"""The script that damages input: its counts, and that every case ends with a message."""
 
 from __future__ import annotations
 

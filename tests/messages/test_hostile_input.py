@@ -1,4 +1,4 @@
-"""Input that nobody means: pipes and devices, endless numbers and tables, studies without end."""
+"""Extreme input: pipes, devices, endless numbers and tables, unbounded studies."""
 
 from __future__ import annotations
 

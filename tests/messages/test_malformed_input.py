@@ -1,4 +1,4 @@
-"""Malformed keys, numbers, meshes and recordings: one short message, which no terminal obeys."""
+"""Malformed keys, numbers, meshes and recordings get one short, printable message."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The augmented Lagrangian finds the constrained optimum at moderate ρ."""
+"""The augmented Lagrangian reaches the constrained optimum at moderate penalty weights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""CasADi's other solvers by name: the same optimum, honest ends, and refusals that say why."""
+"""CasADi's other solvers by name: same optimum, correct status, and reasons for refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The conjugate gradient method on standard functions, beside SciPy's."""
+"""The conjugate gradient method on standard functions, compared with SciPy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One solve whose experiments are on the workers of a dask cluster."""
+"""A solve whose experiments run on workers of a Dask cluster."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Contact as complementarity, the limit of contact with an energy that is ever stiffer."""
+"""Contact as complementarity, the limit of increasingly stiff contact energies."""
 
 from __future__ import annotations
 

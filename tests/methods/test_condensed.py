@@ -1,4 +1,4 @@
-"""The program as IPOPT gets it: its derivatives, what it leaves out, and what is found with it."""
+"""The condensed program for IPOPT: derivatives, eliminated variables and solutions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Horizon continuation: cutting experiments, warm starts, and answers of the whole problem."""
+"""Horizon continuation: shortened experiments, warm starts and complete solutions."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""The interior-point method: options, solutions, statuses and initial points."""
+
 from __future__ import annotations
 
 import os

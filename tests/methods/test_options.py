@@ -1,4 +1,4 @@
-"""A method is its options: checked, documented, and replaceable by anything that solves."""
+"""Options of methods: validation, documentation and user-defined methods."""
 
 from __future__ import annotations
 

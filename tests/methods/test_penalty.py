@@ -1,4 +1,4 @@
-"""The penalty method: its merit function, inner solvers, schedules, and what slack they leave."""
+"""The penalty method: merit function, inner solvers, schedules and remaining violation."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""The reduced-space method: solutions, options, statuses and interruption."""
+
 from __future__ import annotations
 
 import os

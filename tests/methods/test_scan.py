@@ -1,4 +1,4 @@
-"""Solves without a guess: the scan of the stiffness, and the rescue of a guess that is no use."""
+"""Solves without a guess: the stiffness scan, and replacement of a useless guess."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An answer near incompressibility is looked for from another Poisson's ratio too."""
+"""Answers near incompressibility are also sought from another Poisson's ratio."""
 
 from __future__ import annotations
 

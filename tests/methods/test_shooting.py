@@ -1,4 +1,4 @@
-"""Single shooting: its gradients, its optimum, and what it says where it cannot simulate."""
+"""Single shooting: gradients, optimum, and messages when a simulation fails."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Experiments on threads of their own: the same numbers, whatever the number of threads."""
+"""Experiments on several threads give the same numbers for any number of threads."""
 
 import threading
 import time

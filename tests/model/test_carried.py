@@ -1,4 +1,4 @@
-"""What is carried from step to step, declared from outside by one expression."""
+"""A user-defined internal variable that follows a recursion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A force that carries something from step to step, declared from outside the package."""
+"""A user-defined force with an internal variable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Densities as parameters: derivatives, both methods, simulations, and what fixes their scale."""
+"""Densities as parameters: derivatives, methods, simulation and identifiability of the scale."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Equations of motion: residuals and derivatives of all schemes."""
+
 from __future__ import annotations
 
 from collections.abc import Sequence

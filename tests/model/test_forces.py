@@ -1,4 +1,4 @@
-"""Forces beside those of the elements: what they are, their derivatives, and those of inputs."""
+"""External forces and their derivatives, also by inputs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What else an experiment may not know of itself, and how it is found beside the material."""
+"""Nuisance parameters of experiments, and their identification beside the material."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The damping and the period error of schemes: formulae, and what simulations do."""
+"""Numerical damping and period error of schemes: formulas and simulations."""
 
 from __future__ import annotations
 

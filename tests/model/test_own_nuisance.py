@@ -1,4 +1,4 @@
-"""Nuisance parameters that a user adds from Python: what they do to a marker's reading or time."""
+"""User-defined nuisance parameters of marker positions and times."""
 
 from __future__ import annotations
 

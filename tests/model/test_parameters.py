@@ -1,3 +1,5 @@
+"""Parameters: guesses, bounds, priors, ties and transformations."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Time discretisation schemes: coefficients, orders and stability."""
+
 from __future__ import annotations
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Tendons and pressures in problem files: what is read, what is refused, and what is shown."""
+"""Tendons and pressures in problem files: accepted tables, messages and output."""
 
 from __future__ import annotations
 

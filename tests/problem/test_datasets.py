@@ -1,4 +1,4 @@
-"""Datasets by name: their experiments, their problem files, and copies of them."""
+"""Datasets by name: their experiments, problem files and copies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Classes with a field for each kind of nuisance parameter, or for each systematic effect."""
+"""Classes with one field for each nuisance parameter or systematic effect."""
 
 from __future__ import annotations
 

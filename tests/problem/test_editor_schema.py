@@ -1,4 +1,4 @@
-"""The schema of the problem file for editors: where it stands, and that it is the right one."""
+"""The JSON schema of the problem file for editors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Materials, regions and parameters by name in a problem file, through the command line."""
+"""Materials, regions and parameters by name in a problem file."""
 
 from __future__ import annotations
 

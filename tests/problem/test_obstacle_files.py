@@ -1,4 +1,4 @@
-"""Obstacles in problem files: what is read, what is refused, and where they are left out."""
+"""Obstacles in problem files: accepted tables, messages and defaults."""
 
 from __future__ import annotations
 

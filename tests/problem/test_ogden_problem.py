@@ -1,4 +1,4 @@
-"""Ogden's law and the foam in a problem file: identification, messages, check."""
+"""Ogden's law and foam in a problem file: identification, messages and `check`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a problem file says is what gets loaded."""
+"""Problem files: loaded values, defaults and messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables of a problem file: their keys, types and defaults are those that classes declare."""
+"""Tables of a problem file: keys, types and defaults of the declared classes."""
 
 from __future__ import annotations
 

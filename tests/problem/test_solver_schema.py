@@ -1,4 +1,4 @@
-"""[solver] of a problem file: every method has its table, which is what the method itself says."""
+"""The table [solver] of a problem file: keys of every method agree with its options."""
 
 from __future__ import annotations
 

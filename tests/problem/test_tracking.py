@@ -1,4 +1,4 @@
-"""Marker files in a problem: the gripper's markers, the camera's frame, labels and weights."""
+"""Marker files in a problem: gripper markers, camera frame, labels and weights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wrenches in files and in problem files, and what is said of wrong ones."""
+"""Wrenches in files and in problem files, and messages about wrong ones."""
 
 from __future__ import annotations
 

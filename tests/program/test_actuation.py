@@ -1,4 +1,4 @@
-"""Bodies that tendons and pressures drive, against other solutions."""
+"""Bodies under tendons and pressures, compared with closed-form and reference solutions."""
 
 from __future__ import annotations
 

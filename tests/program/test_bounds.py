@@ -1,4 +1,4 @@
-"""One mode tells one damping, not two; intervals must say so where the second is at its bound."""
+"""Intervals when one mode determines one damping constant and the other is at its bound."""
 
 from __future__ import annotations
 

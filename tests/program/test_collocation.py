@@ -1,3 +1,5 @@
+"""The nonlinear program: layout, derivatives, bounds and initial variables."""
+
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The physics of contact: what pushes, what rubs, and what comes to rest."""
+"""Physics of contact: pressure, friction and rest."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The budget of a body that is larger than its mesh, where obstacles touch it."""
+"""The budget entry of the size of a body that touches obstacles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the softness of contact does to forces, and the budget entry that allows for it."""
+"""The effect of contact stiffness on forces, and its budget entry."""
 
 from __future__ import annotations
 

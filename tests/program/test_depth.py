@@ -1,4 +1,4 @@
-"""Depth images and clouds of points: what is read, how it is fitted, and how sure that is."""
+"""Depth images and point clouds: reading, identification and uncertainty."""
 
 from __future__ import annotations
 

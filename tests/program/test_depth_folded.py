@@ -1,4 +1,4 @@
-"""Depth images of a body that hides parts of itself."""
+"""Depth images of a body that occludes parts of itself."""
 
 from __future__ import annotations
 

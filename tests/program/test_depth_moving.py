@@ -1,4 +1,4 @@
-"""A body that moves, seen by a depth camera alone: from the check to the run folder."""
+"""A moving body that only a depth camera observes, from `check` to the run folder."""
 
 from __future__ import annotations
 

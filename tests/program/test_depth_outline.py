@@ -1,4 +1,4 @@
-"""Outlines of bodies in depth images, several starts of a scan, and wrong units of depth."""
+"""Outlines in depth images, several starts of a scan, and wrong units of depth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Groups of entries in compressed columns: what is there already, what is new, and their values."""
+"""Groups of entries in compressed sparse columns."""
 
 from __future__ import annotations
 

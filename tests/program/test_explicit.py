@@ -1,4 +1,4 @@
-"""Memory as variables: the recursion of that program, and what methods find with it."""
+"""Material memory as lifted variables: recursion and solutions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wrenches as variables: the equations of that program, and what methods find with it."""
+"""Measured wrenches as lifted variables: equations and solutions."""
 
 from __future__ import annotations
 

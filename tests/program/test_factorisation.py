@@ -1,3 +1,5 @@
+"""Factorisation of time steps compared with dense and sparse solvers."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Readings of one's own: an accelerometer in the body, a strain gauge between two points."""
+"""User-defined sensors: an accelerometer in the body, a strain gauge between two points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One triangle says what all rows do: their sum of squares, best step, and errors."""
+"""Square-root information: sums of squares, steps and errors of all rows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Static paths that end because the body becomes unstable say so."""
+"""Static paths that end because the body becomes unstable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Along trajectories: derivatives forward and backward, and what is found again."""
+"""Viscoelastic memory along trajectories: derivatives and identification."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Natural modes against dense algebra, beam and rod theory, and simulated oscillations."""
+"""Natural modes compared with dense algebra, beam and rod theory, and simulations."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Every kind of program by one table: its matrices, its convex Hessian, and slopes along motions.
+"""Matrices of every kind of program, in one table: derivatives, convexity and sensitivities.
 
-A kind of force, reading, nuisance or memory that is added gets a line here.
+A new kind of force, sensor, nuisance parameter or memory needs a line in the table.
 """
 
 from __future__ import annotations

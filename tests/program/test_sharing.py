@@ -1,4 +1,4 @@
-"""Nuisance parameters that recordings share: markers glued once, one camera, one clamp."""
+"""Nuisance parameters that recordings share: markers, camera, clamp."""
 
 from __future__ import annotations
 

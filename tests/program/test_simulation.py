@@ -1,3 +1,5 @@
+"""Forward simulation: orders of schemes, options and messages."""
+
 from __future__ import annotations
 
 from dataclasses import replace

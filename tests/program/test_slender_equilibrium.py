@@ -1,4 +1,4 @@
-"""Static equilibrium of slender, nearly incompressible bodies that rotate far."""
+"""Static equilibrium of slender, nearly incompressible bodies with large rotations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bodies that nothing drives: what the damping does to their energy, and whether one is told."""
+"""Undriven bodies: decay of energy by damping, and warnings about unstable ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Static experiments: a block between platens, and what belongs to equilibria."""
+"""Static experiments: a block between platens, and properties of equilibria."""
 
 from __future__ import annotations
 

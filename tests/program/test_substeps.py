@@ -1,4 +1,4 @@
-"""How many steps a sample takes, and intervals that hold what the step still does."""
+"""Number of steps per sample, and intervals that include the time-step error."""
 
 from __future__ import annotations
 

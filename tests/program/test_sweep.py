@@ -1,3 +1,5 @@
+"""Sweeps: forward and backward solutions of the linearised equations of motion."""
+
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Models of several terms, identified: regions, and materials with constants of their own."""
+"""Identification of models with several regions and with user-defined materials."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far grasps turn within a step: what that does, when it is warned of, and what cures it."""
+"""Rotation of grasps within a time step: its effect, warnings and remedies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What grasps give the body, on the grid and along the equations of motion."""
+"""Reaction forces of grasps on the time grid and along the equations of motion."""
 
 from __future__ import annotations
 

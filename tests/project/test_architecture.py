@@ -1,4 +1,4 @@
-"""The folders show the architecture: each uses those before it, and nothing goes in circles."""
+"""Import order of the packages, the interface of the core, and unique class names."""
 
 from __future__ import annotations
 

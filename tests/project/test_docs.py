@@ -1,4 +1,4 @@
-"""Every code block of the README and of the documentation runs, or is valid."""
+"""Every code block of the README and of the documentation runs or is valid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The gallery's scripts run, and what they assert holds."""
+"""The scripts of the gallery run, and their assertions hold."""
 
 from __future__ import annotations
 

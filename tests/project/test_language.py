@@ -1,4 +1,4 @@
-"""Rules of CONTRIBUTING.md for docstrings and names that a program can check."""
+"""Rules of CONTRIBUTING.md for docstrings and names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tutorial's notebooks: their cells run, and each executed notebook is that of its script."""
+"""Cells of the tutorial's notebooks run, and executed notebooks agree with their scripts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Public names of the package: visible to type checkers, imported when they are used."""
+"""Public names of the package: visible to type checkers, imported when used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a release rests on: one version, types, and dependencies that state how old they may be."""
+"""Requirements of a release: one version, types, and lowest versions of dependencies."""
 
 from __future__ import annotations
 

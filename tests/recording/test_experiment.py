@@ -1,3 +1,5 @@
+"""Experiments: declared recordings, derived quantities and validation."""
+
 from __future__ import annotations
 
 from dataclasses import replace

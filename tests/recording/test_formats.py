@@ -1,4 +1,4 @@
-"""Marker files of every format, hand-made with the same two markers, and spoilt ones."""
+"""Marker files of every format with the same two markers, and damaged files."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Grasps: prescribed nodes, poses, offsets and validation."""
+
 from __future__ import annotations
 
 from dataclasses import replace

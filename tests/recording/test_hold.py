@@ -1,4 +1,4 @@
-"""What a grasp holds, and whether it is a matter of chance which nodes it holds."""
+"""The choice of grasped nodes, and its sensitivity to small displacements of the grasp."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Loads that join or leave at a time of which only so much is known."""
+"""Loads that join or leave at a time that is known only within a tolerance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Point masses, forces, and grasps that hold for a while."""
+"""Point masses, forces, and grasps that hold for a part of the recording."""
 
 from __future__ import annotations
 

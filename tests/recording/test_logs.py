@@ -1,4 +1,4 @@
-"""Topics of robots' logs in place of files."""
+"""Topics of robot logs in place of files."""
 
 from __future__ import annotations
 

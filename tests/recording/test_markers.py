@@ -1,3 +1,5 @@
+"""Markers: positions, missing samples, noise and validation."""
+
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Pose files: quaternions in whatever order, units, 4x4 matrices; plain columns: test_readers."""
+"""Pose files: orders of quaternions, units and 4 × 4 matrices; see also `test_readers`."""
 
 from __future__ import annotations
 

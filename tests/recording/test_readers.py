@@ -1,3 +1,5 @@
+"""Readers of marker and pose tables in plain columns."""
+
 from __future__ import annotations
 
 import numpy as np

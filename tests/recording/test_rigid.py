@@ -1,3 +1,5 @@
+"""Rigid transformations fitted to points."""
+
 from __future__ import annotations
 
 import numpy as np

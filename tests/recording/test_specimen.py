@@ -1,4 +1,4 @@
-"""Homogeneous specimens without a mesh: exact stresses, fits, files and mistakes in them."""
+"""Homogeneous specimens without a mesh: exact stresses, fits, files and mistakes."""
 
 from __future__ import annotations
 

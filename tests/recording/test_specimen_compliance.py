@@ -1,4 +1,4 @@
-"""Compliance of a test bench whose displacement gives the strain of a homogeneous specimen."""
+"""Compliance of a machine whose displacement gives the strain of a specimen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Laws in powers of the stretches, Ogden's and Hill's foam, in tests of homogeneous specimens."""
+"""Laws in powers of the stretches (Ogden, Hill's foam) in tests of homogeneous specimens."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Writers of markers, poses and wrenches, read back."""
+
 from __future__ import annotations
 
 import os

@@ -1,4 +1,4 @@
-"""Films, the web page and the 3-D view of a run, from its files."""
+"""Films, the web page and the 3-D view of a run, made from its files."""
 
 from __future__ import annotations
 

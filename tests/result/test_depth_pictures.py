@@ -1,4 +1,4 @@
-"""What is drawn of depth cameras, before a fit and after, and who is told to see nothing."""
+"""Pictures of depth cameras before and after a fit, and messages about empty images."""
 
 from __future__ import annotations
 

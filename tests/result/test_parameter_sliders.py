@@ -1,4 +1,4 @@
-"""Sliders over the parameters of a run, moved in Python as a notebook would."""
+"""Sliders over the parameters of a run, moved as in a notebook."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Pictures of runs: content, axes and labels."""
+
 from __future__ import annotations
 
 import os

@@ -1,4 +1,4 @@
-"""The HTML pages: what they say, and that a browser shows them whole."""
+"""HTML reports: content, and complete display in a browser."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `check` finds wrong with a problem, and what it advises."""
+"""Messages and advice of `check`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said of a memory: instantaneous moduli, and branches that were not found."""
+"""Output about memory: instantaneous moduli, and branches that were not identified."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Places of markers as they were found: in the record, the picture, the page and the terminal."""
+"""Estimated marker positions in records, pictures, pages and the terminal."""
 
 from __future__ import annotations
 

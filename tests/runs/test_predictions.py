@@ -1,4 +1,4 @@
-"""Predictions have a verdict of their own, and validation recordings two yardsticks."""
+"""Verdicts of predictions, and baselines of validation recordings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From arrays to an answer without a file, with schemes, methods and materials of one's own."""
+"""Identification from arrays without files, with user-defined schemes, methods and materials."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The numerical error of an answer: orders, extrapolation, intervals, and how it is told."""
+"""Numerical error of an answer: orders, extrapolation, intervals and output."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run finds beyond the material: nuisance, error bars and verdicts, up to its files."""
+"""Complete runs: nuisance parameters, error bars, verdicts and files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is assumed changes the residuals as a simulation with another body says."""
+"""Changes of residuals by systematic effects, compared with simulations of other bodies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Autocovariances of errors, of which the residuals of a fit show only a part."""
+"""Autocovariances of errors, estimated from residuals that contain only a part of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A block that a ball pokes: what its force tells, and what is said where it is stated wrongly."""
+"""Identification from the force of a ball that pokes a block, and wrong descriptions of it."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Diagnostics of the residuals of each marker."""
+
 from __future__ import annotations
 
 import numpy as np

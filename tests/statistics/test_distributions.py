@@ -1,3 +1,5 @@
+"""Quantiles and tail probabilities of distributions, compared with SciPy."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""A constant that differs from place to place: its prior, its slopes, and what data tell of it."""
+"""Spatially varying constants: prior, sensitivities and identification."""
 
 from __future__ import annotations
 

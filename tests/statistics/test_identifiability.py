@@ -1,3 +1,5 @@
+"""Directions in parameter space that the data do not determine."""
+
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Correction of estimates for systematic effects of known size: a machine that gives way."""
+"""Correction of estimates for systematic effects of known size: machine compliance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How large the errors are: found from the residuals, and intervals that follow them."""
+"""Noise levels estimated from residuals, and intervals that follow them."""
 
 from __future__ import annotations
 

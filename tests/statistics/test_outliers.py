@@ -1,4 +1,4 @@
-"""Single samples that spoil what residuals tell: named, and of no say in what the others are."""
+"""Single wrong samples are named and do not affect the analysis of the others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What noise of the poses does to the readings, and how it is judged."""
+"""The effect of noise of the poses on measurements, and its assessment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Probes tell which part of the data, or which assumption, makes a fit wrong that looks right."""
+"""Deep probes find the part of the data or the assumption that causes a hidden misfit."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Profile-likelihood intervals."""
+
 from __future__ import annotations
 
 import numpy as np

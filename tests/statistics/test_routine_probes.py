@@ -1,4 +1,4 @@
-"""Every solve tests whether the stiffness drifted and whether the clocks run at the same rate."""
+"""Routine probes of every solve: drift of stiffness and clock rates."""
 
 from __future__ import annotations
 

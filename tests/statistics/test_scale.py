@@ -1,4 +1,4 @@
-"""The scale of stiffness and mass: told by a known force or mass, and said where it is not."""
+"""Identifiability of the scale of stiffness and mass from known forces and masses."""
 
 from __future__ import annotations
 

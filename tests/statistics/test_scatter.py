@@ -1,4 +1,4 @@
-"""Recordings that share parameters may disagree on them by more than their noise."""
+"""Differences between recordings that share parameters, beyond their noise."""
 
 from __future__ import annotations
 

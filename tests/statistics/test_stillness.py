@@ -1,4 +1,4 @@
-"""Bodies at rest tell no damping, and that is said before and after solving."""
+"""Bodies at rest do not determine damping, and messages say so."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verdict in one word: faultless answers are good, hidden faults are found."""
+"""Verdicts: correct answers are good, and hidden faults are found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two materials with a sharp boundary: phases, contrast, and what is said where there are none."""
+"""Two materials with a sharp boundary: phases, contrast, and bodies without a boundary."""
 
 from __future__ import annotations
 

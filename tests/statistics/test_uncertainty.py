@@ -1,3 +1,5 @@
+"""Statistical intervals: covariances, correlated errors and parameters at bounds."""
+
 from __future__ import annotations
 
 from dataclasses import replace

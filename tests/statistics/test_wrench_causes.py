@@ -1,4 +1,4 @@
-"""Wrenches that are described wrongly are recognised."""
+"""Misspecification hypotheses about wrenches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fits with measured wrenches: methods, error bars, and what a run leaves behind."""
+"""Fits with measured wrenches: methods, error bars and run folders."""
 
 from __future__ import annotations
 

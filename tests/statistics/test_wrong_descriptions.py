@@ -1,4 +1,4 @@
-"""Descriptions that are wrong in a known way are recognised, and right ones are left in peace."""
+"""Wrong descriptions of known kinds are recognised, and correct ones are not accused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a user adds without touching the package: forces on nodes, in every method and in a file."""
+"""User-defined forces on nodes, in every method and in a problem file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`check_damping`: every damping law of the package passes, and each fault is one sentence."""
+"""`check_damping`: every damping law passes, and each fault is one sentence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`check_material`: every material of the package passes, and each fault is one sentence."""
+"""`check_material`: every material passes, and each fault is one sentence."""
 
 from __future__ import annotations
 

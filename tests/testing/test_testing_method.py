@@ -1,4 +1,4 @@
-"""`check_method`: every method of the package passes, and each fault is one sentence."""
+"""`check_method`: every method passes, and each fault is one sentence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`check_nuisance`: every nuisance parameter of the package passes, each fault is one sentence."""
+"""`check_nuisance`: every nuisance parameter passes, and each fault is one sentence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Comparisons of checks: what fails, and how the sentence names it."""
+"""Comparisons of the checks: which of them fail, and the sentences that name them."""
 
 from __future__ import annotations
 

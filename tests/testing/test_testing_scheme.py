@@ -1,4 +1,4 @@
-"""`check_scheme`: every scheme of the package passes, and each fault is one sentence."""
+"""`check_scheme`: every scheme passes, and each fault is one sentence."""
 
 from __future__ import annotations
 

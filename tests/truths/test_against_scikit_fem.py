@@ -1,4 +1,4 @@
-"""Forces and stiffness against an independent library, with stresses written by hand."""
+"""Forces and stiffness compared with scikit-fem, with stresses written by hand."""
 
 from __future__ import annotations
 

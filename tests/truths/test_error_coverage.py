@@ -1,4 +1,4 @@
-"""Error bars against fits whose errors are known: 95 % intervals must hold the truth that often."""
+"""Coverage of error bars for fits with known errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The measured pneumatic arm: its mesh, its recordings, and the effect of its reinforcement."""
+"""The measured pneumatic arm: mesh, recordings and the effect of its reinforcement."""
 
 from __future__ import annotations
 

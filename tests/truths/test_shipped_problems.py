@@ -1,4 +1,4 @@
-"""The problems that ship with the project, solved as a user solves them."""
+"""The problems of the project, solved as users solve them."""
 
 from __future__ import annotations
 
