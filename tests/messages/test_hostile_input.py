@@ -112,7 +112,7 @@ ENDLESS = {
 }
 READ_ENDLESS = """
 import sys
-from collocation_sysid import isolated_process
+from collocation_sysid.common import isolated_process
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes.mesh import TetMesh
 isolated_process.READING_S = 3
