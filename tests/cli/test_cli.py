@@ -102,6 +102,7 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     )
 
 
+@pytest.mark.long
 def test_the_answer_is_on_stdout_alone(solved):
     assert solved.outcome.code == 0
     assert solved.outcome.err == ""
@@ -272,6 +273,7 @@ def test_settings_change_the_run(tiny):
     assert json.loads(outcome.out)["title"] == "Other"
 
 
+@pytest.mark.long
 def test_a_run_that_does_not_converge_is_marked_and_takes_the_place_of_an_earlier_one(
     tiny,
 ):
@@ -331,6 +333,7 @@ def test_the_time_of_checks_is_none_of_the_search(tiny, monkeypatch):
     assert elapsed_s["search"] < took_s - wait_s
 
 
+@pytest.mark.long
 def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(
     tiny, monkeypatch
 ):
@@ -502,6 +505,7 @@ def test_an_interrupt_of_a_second_start_keeps_the_first_answer(
     )
 
 
+@pytest.mark.long
 def test_a_real_process_keeps_its_streams_apart(tiny):
     program = [
         sys.executable,
@@ -676,6 +680,7 @@ def test_a_simulation_beside_the_problem_keeps_what_others_wrote(tiny: Path):
     assert recording.read_text() == "precious"
 
 
+@pytest.mark.long
 def test_noise_follows_the_seed(tiny):
     def tracks(name: str, *options: str) -> np.ndarray:
         outcome = run_command(
@@ -722,6 +727,7 @@ def test_the_integrator_is_chosen(tiny):
     assert 1e-6 < np.abs(other - measured).max() < 5e-3
 
 
+@pytest.mark.long
 def test_a_simulation_that_breaks_down_says_when_and_where(tiny):
     soft = settings(
         "parameters.lambda_pa={ fixed = 1e-3 }", "parameters.mu_pa={ fixed = 1e-3 }",

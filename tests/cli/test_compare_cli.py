@@ -256,6 +256,7 @@ def test_an_interrupted_study_says_how_to_resume(tiny, stand_in, monkeypatch):
     )
 
 
+@pytest.mark.long
 def test_progress_is_one_line_on_a_terminal(tiny, stand_in, monkeypatch):
     shown = io.StringIO()
     monkeypatch.setattr(

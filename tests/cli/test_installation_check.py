@@ -48,6 +48,7 @@ def test_required_packages_are_those_of_the_metadata(report):
     assert list(versions) == sorted(versions)
 
 
+@pytest.mark.long
 def test_the_command_prints_the_report_and_json(report):
     shown = run_command("doctor")
     assert (shown.code, shown.err) == (0, "")
@@ -210,6 +211,7 @@ def test_threads_and_what_determines_them(monkeypatch, value, count, source):
     assert (threads.count, threads.source) == (count, source)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "module", ["casadi", "llvmlite", "packaging", "matplotlib"]
 )

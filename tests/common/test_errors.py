@@ -41,6 +41,7 @@ def test_an_exception_survives_pickling_with_all_it_carries(error: Exception):
     assert content(twin) == content(error)
 
 
+@pytest.mark.long
 def test_a_process_pool_hands_exceptions_on():
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         for k, error in enumerate(EXCEPTIONS):

@@ -696,6 +696,7 @@ def words(tiny, folder, *more: str) -> list[str]:
     ]
 
 
+@pytest.mark.long
 def test_the_folder_holds_a_problem_that_simulates_the_motion(tiny, tmp_path):
     done = run_command(*words(tiny, tmp_path, *settings(*AT_TRUTH)))
     assert done.code == 0, done.err
@@ -758,6 +759,7 @@ def test_poses_are_written_as_the_robot_has_them(tiny, tmp_path):
     )
 
 
+@pytest.mark.long
 def test_a_design_knows_where_the_files_of_the_problem_are(tiny, tmp_path):
     shutil.copytree(tiny.parent, tmp_path / "own")
     file = tmp_path / "own" / "problem.toml"
@@ -788,6 +790,7 @@ def test_an_interrupted_design_is_written_and_told(tiny, tmp_path, monkeypatch):
     ]
 
 
+@pytest.mark.long
 def test_recordings_that_count_stay_in_the_problem(tiny, tmp_path):
     done = run_command(*words(tiny, tmp_path, "--no-film", "--add", "--json"))
     assert done.code == 0, done.err

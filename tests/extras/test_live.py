@@ -142,6 +142,7 @@ def unknown(problem: cs.Problem) -> cs.Problem:
     return cs.Problem([replace(seen, markers=markers)], free, substeps=1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "problem",
     # Of this noise no marker ends so near an edge that rounding decides on which side.
@@ -167,6 +168,7 @@ def test_when_frames_end_the_estimate_settles_where_the_batch_ends(problem):
     assert update.relinearised > 0
 
 
+@pytest.mark.long
 def test_it_settles_at_the_batch_of_what_was_not_left_out():
     problem = replace(swing(), substeps=1)
     live = LiveEstimator(problem, NO_TIME)
@@ -280,6 +282,7 @@ def test_rows_leave_time_for_what_follows_them():
     assert budget.affordable_steps(2.5) == 1
 
 
+@pytest.mark.long
 def test_a_stream_looks_through_nothing_old_for_garbage(tiny, monkeypatch):
     frozen, take = [], LiveEstimator.process_frame
 
@@ -750,6 +753,7 @@ def test_readings_of_ones_own_say_what_they_say_to_the_batch(monkeypatch):
     np.testing.assert_allclose(ours / scale, batch / scale, atol=1e-8)
 
 
+@pytest.mark.long
 def test_truth_and_what_a_chip_does_not_know_of_itself_are_found_from_frames():
     problem = felt()
     live = LiveEstimator(problem, replace(NO_TIME, rows=8))
@@ -987,6 +991,7 @@ def test_frames_are_paced_and_catch_up_when_late():
     np.testing.assert_allclose(waited, [0.09, 0.03], atol=1e-12)
 
 
+@pytest.mark.long
 def test_the_commands_stream_frames_to_estimates(tiny, monkeypatch):
     lines = []
     problem = cs.Problem.read("problem.toml")
@@ -1032,6 +1037,7 @@ def test_the_commands_stream_frames_to_estimates(tiny, monkeypatch):
     ] == [each["t_s"] for each in expected]
 
 
+@pytest.mark.long
 def test_a_recording_is_replayed_and_filmed(tiny):
     ended = run_command(
         "replay", "problem.toml", "--rate", 0, "--film", "swing.gif"

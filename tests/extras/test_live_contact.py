@@ -85,6 +85,7 @@ def solved(name: str) -> tuple[cs.Problem, cs.Run]:
     return problem, cs.run(problem, seek_causes=False)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 def test_what_touches_the_body_is_followed_to_where_the_batch_ends(name: str):
     problem, batch = solved(name)

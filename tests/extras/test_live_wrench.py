@@ -126,6 +126,7 @@ def test_load_cells_say_what_they_say_to_the_batch(
     np.testing.assert_allclose(ours / scale, batch / scale, atol=1e-8)
 
 
+@pytest.mark.long
 def test_a_pass_that_turns_moves_what_a_load_cell_looks_at_along_its_slopes(
     monkeypatch,
 ):
@@ -166,6 +167,7 @@ def unweighed(problem: cs.Problem) -> cs.Problem:
     )
 
 
+@pytest.mark.long
 def test_a_load_cell_tells_the_scale_that_markers_do_not():
     problem = unweighed(weighed(tare=0.1))
     live = LiveEstimator(problem, replace(NO_TIME, rows=8))
@@ -204,6 +206,7 @@ def last_estimates(
     return live, np.array([each.value for each in update.estimates.values()])
 
 
+@pytest.mark.long
 def test_samples_of_a_load_cell_may_be_late_or_missing():
     problem = weighed()
     live = LiveEstimator(problem, NO_TIME)

@@ -131,6 +131,7 @@ def test_yeohs_material_is_recognised_at_large_strain(steps, tmp_path: Path):
     assert said.endswith("The difference is significant.")
 
 
+@pytest.mark.long
 def test_yeohs_is_not_preferred_on_data_of_a_neo_hookean(tmp_path: Path):
     neo_hookean, yeoh = rows = compared(
         soft_bar(tmp_path / "bar", "neo-hookean", {"a": 40})
@@ -175,6 +176,7 @@ def load_n(experiment: Experiment) -> np.ndarray:
     return part.observation.predict_wrenches(x)[0][:, 2]
 
 
+@pytest.mark.long
 def test_forces_rank_the_platens_where_there_are_no_markers():
     """Those that stick made the load; lubricated ones are made up for by a stiffer material."""
     rng, found = np.random.default_rng(5), {"xyz": [], "z": []}

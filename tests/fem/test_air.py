@@ -76,6 +76,7 @@ def fallen_m(experiment: Experiment, integrator: str) -> np.ndarray:
     return height_m - height_m[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("integrator", ["midpoint", "newmark"])
 def test_a_falling_cube_follows_the_equation_of_a_falling_point(integrator):
     dragged = 0.5 * AIR_KG_M3 * 0.25 * 6 * EDGE_M**2
@@ -250,6 +251,7 @@ def test_air_that_is_left_out_makes_damping_too_large_and_the_budget_has_no_air(
     assert not set(OF_AIR) & set(found.line.shares)
 
 
+@pytest.mark.long
 def test_air_that_was_not_there_makes_damping_too_small_and_the_budget_says_by_what():
     found = estimated(recorded(0.0, AIR_KG_M3))
     assert found.statistical95[1] < TRUTH[GAMMA_M]
@@ -262,6 +264,7 @@ def test_air_that_was_not_there_makes_damping_too_small_and_the_budget_says_by_w
 # What a user says and reads -----------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_air_is_part_of_the_model_unless_it_is_said_otherwise():
     """In a process of its own: the tests of this one are in a vacuum by default."""
     script = (

@@ -310,6 +310,7 @@ def assert_same(
         assert error <= tolerance * size, name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("material", COMPILED)
 def test_evaluators_agree(make_body, material, rng):
     assert_same(make_body(material, "simd"), make_body(material, "casadi"), rng)

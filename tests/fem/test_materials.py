@@ -241,6 +241,7 @@ def stiffening(F, lambda_pa, mu_pa):
     return 0.5 * lambda_pa * log_j**2 + 0.25 * mu_pa * (ca.exp(2 * strain) - 1)
 
 
+@pytest.mark.long
 def test_energy_written_by_the_user_passes_the_checks():
     check_material(stiffening, elements=["tet4", "tet10-p0"])
 

@@ -345,6 +345,7 @@ def mean_error(element: str, divisions: int) -> float:
     )
 
 
+@pytest.mark.long
 def test_near_incompressibility_the_displacement_converges_to_second_order():
     divisions = [3, 4, 6]
     errors = [mean_error(P0, n) for n in divisions]
@@ -383,12 +384,14 @@ def bar() -> Experiment:
     )
 
 
+@pytest.mark.long
 def test_reduced_space_finds_the_truth():
     found = ReducedSpace()(Collocation([bar()], GUESS)).parameters
     for name, value in TRUTH.items():
         assert found[name] == pytest.approx(value, rel=1e-6)
 
 
+@pytest.mark.long
 def test_with_noise_it_finds_an_optimum_of_the_whole_program(rng):
     tracks = bar().markers.positions_m
     noisy = with_markers(

@@ -299,6 +299,7 @@ def assert_alike(found: object, expected: object) -> None:
         ), name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "changes",
     [
@@ -336,6 +337,7 @@ def test_kernels_with_the_chain_rule_agree_with_those_without(
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["ogden-2", "hyperfoam-1"])
 def test_stresses_of_a_memory_agree_with_those_without_the_chain_rule(
     name, rng

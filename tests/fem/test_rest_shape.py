@@ -138,6 +138,7 @@ def test_forces_follow_from_the_energy_and_the_constants(element):
     )
 
 
+@pytest.mark.long
 def test_the_shape_follows_the_constants_of_every_region_and_a_free_density():
     mesh = box_mesh((0.12, 0.03, 0.03), (6, 2, 2))
     core = cs.Region("core", np.arange(40), density_kg_m3=800.0)

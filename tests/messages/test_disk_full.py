@@ -81,6 +81,7 @@ def test_a_page_is_there_whole_or_as_before(run: Path, tmp_path: Path):
     )
 
 
+@pytest.mark.long
 def test_pictures_and_films_are_there_whole_or_not_at_all(
     run: Path, tmp_path: Path
 ):
@@ -118,6 +119,7 @@ def test_a_problem_is_begun_whole_or_not_at_all(tmp_path: Path):
     assert not list(tmp_path.rglob("*.toml"))
 
 
+@pytest.mark.long
 def test_a_simulation_writes_all_its_files_or_none(tiny: Path):
     command = ["simulate", "problem.toml", "--out", "data", "--frames"]
     assert run_command(*command).code == 0
@@ -175,6 +177,7 @@ def test_the_message_names_the_folder_and_not_the_passing_one(tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 @pytest.mark.skipif(
     not Path("/dev/full").exists(), reason="no such device here"
 )

@@ -43,6 +43,7 @@ def test_an_end_has_the_outcome_that_a_user_sees(
     assert ended.outcome(is_clean) == outcome
 
 
+@pytest.mark.long
 def test_commands_end_in_a_fork_as_in_a_shell(tmp_path: Path):
     def crash() -> None:
         os.kill(os.getpid(), signal.SIGKILL)

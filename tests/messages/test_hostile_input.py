@@ -124,6 +124,7 @@ for name in sys.argv[1:]:
 """
 
 
+@pytest.mark.long
 def test_readers_that_do_not_find_the_end_of_a_mesh_are_stopped(tmp_path: Path):
     for name, content in ENDLESS.items():
         (tmp_path / name).write_text(content)
@@ -192,6 +193,7 @@ def test_lengths_in_a_depth_file_that_are_not_finite_are_missing_values(
     assert np.isfinite(image).sum() == 2
 
 
+@pytest.mark.long
 def test_an_array_that_its_header_states_too_large_is_refused(tmp_path: Path):
     array = np.zeros((20_000, 100, 100), dtype="u1")
     np.savez_compressed(tmp_path / "zeros.npz", depth_m=array)
@@ -214,6 +216,7 @@ def test_an_array_that_its_header_states_too_large_is_refused(tmp_path: Path):
     tracemalloc.stop()
 
 
+@pytest.mark.long
 @pipes
 @pytest.mark.parametrize(
     "name", ["log.bag", "log.db3", "log.mcap", "bag/part.db3"]
@@ -234,6 +237,7 @@ def test_a_log_that_is_a_pipe_is_refused(tiny: Path, name: str):
     assert "is a pipe; expected a regular file" in done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="descriptors of POSIX")
 def test_a_closed_standard_input_is_refused(tiny: Path):
     done = subprocess.run(
@@ -463,6 +467,7 @@ def test_so_it_is_on_the_command_line(
     )
 
 
+@pytest.mark.long
 def test_ten_thousand_markers_are_read_in_time(tiny: Path):
     names = [f"m{k}" for k in range(10_000)]
     tracks_m = np.zeros((3, len(names), 3))
@@ -578,6 +583,7 @@ def test_nor_does_one_while_the_commands_are_built():
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
+@pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_a_solver_that_hears_no_signal_is_left_behind(tiny: Path):
     done = ended(DEAF.format(name="SIGTERM", times=1))
@@ -586,6 +592,7 @@ def test_a_solver_that_hears_no_signal_is_left_behind(tiny: Path):
     assert result["status"] == "interrupted"
 
 
+@pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_two_signals_end_it_at_once(tiny: Path):
     done = ended(DEAF.format(name="SIGINT", times=2))
@@ -593,6 +600,7 @@ def test_two_signals_end_it_at_once(tiny: Path):
     assert not (tiny / "run").exists()
 
 
+@pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_a_signal_within_an_import_is_no_error_of_the_library(tiny: Path):
     done = ended(
@@ -612,6 +620,7 @@ def test_a_signal_within_an_import_is_no_error_of_the_library(tiny: Path):
     )
 
 
+@pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_a_second_signal_ends_an_import(tiny: Path):
     done = ended(CONVERTING.format(times=2, raised="os._exit(77)"))

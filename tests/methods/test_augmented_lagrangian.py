@@ -42,6 +42,7 @@ def test_the_true_parameters_are_recovered(name: str):
     np.testing.assert_allclose(found, list(TRUTH.values()), rtol=2e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["hung-cube", "bar-let-go"])
 def test_with_noise_it_is_the_optimum_of_the_reduced_space(name: str):
     collocation = collocation_of(name, noise_m=1e-3, steps=12)
@@ -58,6 +59,7 @@ def test_with_noise_it_is_the_optimum_of_the_reduced_space(name: str):
     assert solution.max_violation_relative < 1e-7
 
 
+@pytest.mark.long
 def test_explicit_grasps_have_multipliers_too():
     made = noisy(hung_cube(6))
     collocation = Collocation([made], GUESS, has_grasp_constraints=True)
@@ -66,6 +68,7 @@ def test_explicit_grasps_have_multipliers_too():
     assert solution.kkt_residual < 2e-6
 
 
+@pytest.mark.long
 def test_it_leaves_far_less_slack_than_a_penalty_of_the_same_weight():
     collocation = collocation_of("hung-cube", noise_m=1e-3, steps=6)
     paid = Penalty(
@@ -75,6 +78,7 @@ def test_it_leaves_far_less_slack_than_a_penalty_of_the_same_weight():
     assert multiplied.max_violation_n < 1e-3 * paid.max_violation_n
 
 
+@pytest.mark.long
 def test_gradients_alone_get_near_with_multipliers():
     collocation = collocation_of("released-cube", 0.0, 5)
     options = AugmentedLagrangian("cg-descent", rho=1e2, max_iterations=400)
@@ -82,6 +86,7 @@ def test_gradients_alone_get_near_with_multipliers():
     assert solution.rms_m < 0.05 * solution.history[0].rms_m
 
 
+@pytest.mark.long
 def test_a_rho_max_too_small_is_told():
     collocation = collocation_of("hung-cube", noise_m=1e-3, steps=6)
     options = AugmentedLagrangian(rho=1e1, rho_max=1e1, max_iterations=40)

@@ -75,6 +75,7 @@ def point() -> tuple[np.ndarray, np.ndarray]:
 # The answer
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_the_true_parameters_are_recovered(plugin: str):
     solution = solved(plugin)
@@ -219,6 +220,7 @@ def test_an_error_in_a_function_reaches_the_caller(plugin: str, monkeypatch):
         PLUGINS[plugin]()(cube(), start=point()[0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_the_history_is_what_was_watched(plugin: str):
     seen: list[Iteration] = []
@@ -301,6 +303,7 @@ def test_an_unknown_option_is_refused_in_the_solvers_words(plugin: str):
 # From a problem file
 
 
+@pytest.mark.long
 def test_a_solver_is_chosen_in_a_problem_file(tmp_path):
     file = write_problem(tmp_path, {"swing": 4})
     chosen = [

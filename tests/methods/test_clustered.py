@@ -92,6 +92,7 @@ def assert_alike(clustered: cs.Solution, threads: cs.Solution) -> None:
     assert clustered.notes == threads.notes
 
 
+@pytest.mark.long
 def test_a_run_on_workers_is_that_on_threads(there):
     problem = cs.Problem(several()[:3], GUESS, method=ReducedSpace())
     found, known = (
@@ -112,6 +113,7 @@ def test_a_run_on_workers_is_that_on_threads(there):
         )
 
 
+@pytest.mark.long
 def test_markers_without_places_are_read_in_the_same_elements(there):
     experiment = noisy(bar_with_nuisance())
     markers = replace(
@@ -126,6 +128,7 @@ def test_markers_without_places_are_read_in_the_same_elements(there):
         )
 
 
+@pytest.mark.long
 def test_what_comes_back_does_not_grow_with_the_recording(there, monkeypatch):
     sizes: list[int] = []
 
@@ -148,6 +151,7 @@ def test_what_comes_back_does_not_grow_with_the_recording(there, monkeypatch):
     assert most[1] < 1.02 * most[0] < 2000
 
 
+@pytest.mark.long
 def test_what_a_lost_worker_had_is_done_again(there):
     collocation = Collocation(several(), GUESS)
 
@@ -182,6 +186,7 @@ def assert_best_is_kept(solution: cs.Solution, why: str) -> None:
         np.testing.assert_allclose(part.x, x, atol=1e-9)
 
 
+@pytest.mark.long
 def test_without_workers_left_the_best_is_kept(there, monkeypatch):
     monkeypatch.setattr(experiment_executors, "LOOK_EVERY_S", 0.2)
 
@@ -197,6 +202,7 @@ def test_without_workers_left_the_best_is_kept(there, monkeypatch):
     assert_best_is_kept(solution, "No worker is left.")
 
 
+@pytest.mark.long
 def test_without_a_scheduler_left_the_best_is_kept(there, monkeypatch):
     monkeypatch.setattr(cluster, "CONNECT_WITHIN_S", 0.5)
 
@@ -233,6 +239,7 @@ thread.join()
 """
 
 
+@pytest.mark.long
 @pytest.mark.skipif(
     platform.libc_ver()[0] != "glibc", reason="another C library"
 )
@@ -247,6 +254,7 @@ def test_workers_keep_the_memory_of_arrays_that_come_and_go():
     assert after < 100
 
 
+@pytest.mark.long
 def test_an_interrupted_solve_keeps_its_best(there):
     lines: list[Iteration] = []
 

@@ -127,6 +127,7 @@ def answered(name: str) -> tuple[Experiment, Solution]:
     return experiment, solved(experiment)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", MADE)
 def test_it_is_what_an_ever_stiffer_energy_tends_to(name: str):
     experiment, answer = answered(name)
@@ -165,6 +166,7 @@ def test_nothing_is_entered_and_pressure_times_gap_is_small(name: str):
     )
 
 
+@pytest.mark.long
 def test_a_stiffness_is_that_of_an_ever_stiffer_energy():
     unknown = cs.Parameters.from_mapping({**TRUTH, "young_pa": cs.Unknown(7e3)})
     poked = stiffer(pressed(cs.Sphere(0.03, (0.03, 0.03, 0.06))), 10.0)

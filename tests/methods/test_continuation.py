@@ -118,6 +118,7 @@ def test_the_true_parameters_are_recovered(experiment: str, method: str):
     assert solution.kkt_residual < 3e-8
 
 
+@pytest.mark.long
 def test_interior_point_goes_on_from_the_positions_of_the_stage_before():
     collocation = cube()
     alone = {"initial": "simulation"}
@@ -232,6 +233,7 @@ def test_what_does_not_make_sense_is_refused(shares, stage, message):
 # From a problem file
 
 
+@pytest.mark.long
 def test_stages_are_chosen_in_a_problem_file(tmp_path):
     file = write_problem(tmp_path, {"swing": 16})
     chosen = [

@@ -81,6 +81,7 @@ def test_the_true_parameters_are_recovered(experiment: str, scheme: str):
     assert solution.max_violation_relative < 1e-7
 
 
+@pytest.mark.long
 def test_several_experiments_are_fitted_together():
     names = ("hung-cube", "bar-let-go", "cube-with-nuisance")
     made = [measured(SMALL_EXPERIMENTS[name]()) for name in names]
@@ -176,6 +177,7 @@ def soft_guess() -> Parameters:
     return Parameters((*soft, *GUESS.items[2:]))
 
 
+@pytest.mark.long
 def test_a_guess_that_cannot_be_simulated_starts_from_the_rigid_shape():
     collocation = Collocation([measured(hung_cube())], soft_guess())
     start, notes = initial_variables(collocation)
@@ -261,6 +263,7 @@ def test_the_initial_point_is_not_the_answer():
     assert not np.array_equal(solution.z, coarse.z)
 
 
+@pytest.mark.long
 def test_where_reduced_space_finds_no_motion_ipopt_starts_without_it():
     collocation = Collocation([measured(hung_cube())], soft_guess())
     solution = PRECISE(collocation)
@@ -323,6 +326,7 @@ def alone_from_the_guess(problem: Problem) -> Solution:
     return ALONE(associated_at_guess(problem.collocation()))
 
 
+@pytest.mark.long
 def test_distant_guesses_lead_to_the_optimum_of_reduced_space():
     problem = soft_bar()
     expected = solve(problem, ReducedSpace())
@@ -347,6 +351,7 @@ def test_a_finer_soft_bar_converges_from_distant_guesses_too():
     assert alone.iterations <= 25
 
 
+@pytest.mark.long
 def test_rows_of_the_equations_do_not_slow_the_steps_of_ipopt_alone():
     soft = soft_bar()
     wrong = {"mu_pa": 3 * SOFT["mu_pa"]}
@@ -357,6 +362,7 @@ def test_rows_of_the_equations_do_not_slow_the_steps_of_ipopt_alone():
     assert found.iterations <= 14
 
 
+@pytest.mark.long
 def test_from_the_answer_of_reduced_space_five_iterations_suffice(tmp_path):
     problem = soft_bar()
     answer = run(problem, ReducedSpace(), seek_causes=False)
@@ -378,6 +384,7 @@ def test_from_the_answer_of_reduced_space_five_iterations_suffice(tmp_path):
     assert re.match(found_by, note_of(again))
 
 
+@pytest.mark.long
 def test_a_start_with_finer_steps_is_continued_with_these():
     problem = soft_bar()
     answer = WarmStart.of(
@@ -426,6 +433,7 @@ UNKNOWN = {
 ITERATION = r"^ +\d+r?(?: +\S+){5} +(-|-?\d\S+) +\S+ +\S+ +\d+"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", UNKNOWN)
 def test_what_is_unknown_by_default_is_found_and_no_hessian_is_shifted(
     name: str, capfd
@@ -505,6 +513,7 @@ def test_unknown_options_are_refused(options: dict, message: str, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.long
 def test_nothing_is_printed(capfd):
     InteriorPoint()(Collocation([measured(hung_cube())], soft_guess()))
     assert capfd.readouterr() == ("", "")

@@ -100,6 +100,7 @@ def test_held_nodes_of_the_answer_are_where_their_grasps_are(rng):
 # The answer
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SMALL_EXPERIMENTS)
 def test_newton_steps_at_large_rho_find_the_truth(name: str):
     solution = replace(NEWTON, rho=1e5, violation=1e-6)(
@@ -111,6 +112,7 @@ def test_newton_steps_at_large_rho_find_the_truth(name: str):
     assert solution.kkt_residual < 1e-4
 
 
+@pytest.mark.long
 def test_the_slack_falls_as_one_over_rho_and_the_bias_with_it():
     collocation = collocation_of("hung-cube", noise_m=1e-4)
     weights, slacks, thetas = [1e5, 1e6, 1e7, 1e8], [], []
@@ -225,6 +227,7 @@ def test_an_interruption_keeps_the_last_and_best_iterate():
     assert solution.rms_m < 0.01 * solution.history[0].rms_m
 
 
+@pytest.mark.long
 def test_both_layouts_of_grasps_give_the_same_answer():
     made = noisy(hung_cube(), 1e-4)
     bounds, rows = (

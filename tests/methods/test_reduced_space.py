@@ -197,6 +197,7 @@ def test_memory_grows_no_faster_than_the_number_of_timesteps():
 # The start
 
 
+@pytest.mark.long
 def test_a_guess_that_cannot_be_simulated_is_a_status_that_tells_what_to_change():
     soft = [
         replace(item, guess=guess, lower=1e-4, upper=guess * 1.001)
@@ -252,6 +253,7 @@ def test_a_start_whose_positions_lead_nowhere_is_simulated_at_its_parameters():
     np.testing.assert_allclose(solution.theta, solved_cube().theta, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_few_starts_far_away_all_succeed():
     from study_starts import Case, guesses, hanging_cylinder, study
 

@@ -292,6 +292,7 @@ def test_an_unknown_tare_hides_no_stiffness():
     assert YOUNG_PA / 2 < young_pa < 2 * YOUNG_PA
 
 
+@pytest.mark.long
 def test_a_force_that_is_felt_late_is_waited_for():
     bench = unseen(
         block("z", t_s=np.arange(40.0), z_m=-0.001 * np.arange(40.0))
@@ -317,6 +318,7 @@ def test_a_guess_that_gives_more_force_than_there_is_is_replaced():
 # Solves
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "method", ["reduced-space", "shooting", "interior-point"]
 )
@@ -401,6 +403,7 @@ def test_a_body_that_can_never_be_simulated_is_refused():
         assert part in str(caught.value)
 
 
+@pytest.mark.long
 def test_with_a_guess_it_is_left_to_the_method():
     given = too_soft() | {
         n: Unknown(1.5e-4, 1e-4, 2e-4) for n in ("lambda_pa", "mu_pa")

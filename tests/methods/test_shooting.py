@@ -126,6 +126,7 @@ def test_hubers_loss_and_nuisance_parameters_have_the_same_optimum(gradient):
     np.testing.assert_allclose(solution.q, reference.q, atol=1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gradient", GRADIENTS)
 def test_experiments_are_fitted_together_up_to_a_bound(gradient):
     items = [
@@ -167,6 +168,7 @@ def test_it_starts_from_given_parameters():
 # Simulations that fail
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gradient", GRADIENTS)
 def test_a_guess_that_cannot_be_simulated_is_a_status(gradient):
     collocation = Collocation([measured(hung_cube())], softened(1000))

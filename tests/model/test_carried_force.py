@@ -86,6 +86,7 @@ def integrated(experiment: Experiment) -> np.ndarray:
     )
 
 
+@pytest.mark.long
 def test_motions_are_those_of_the_same_equations_solved_by_another_hand():
     experiment = tied()
     expected, off = integrated(experiment), []
@@ -116,6 +117,7 @@ def test_motions_are_those_of_the_same_equations_solved_by_another_hand():
         assert fine < 0.002 * felt
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "method", [m for m in METHODS if not m.startswith("casadi:")]
 )

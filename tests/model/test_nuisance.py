@@ -201,6 +201,7 @@ FOUND_BY = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "method"), FOUND_BY)
 def test_nuisance_is_found_beside_the_material(kind: str, method: str, rng):
     cube = replace(cube_with_gaps(14), nuisance=ONE_OF_EACH[kind])

@@ -86,6 +86,7 @@ def driven(made, tmp_path) -> Path:
     return tmp_path
 
 
+@pytest.mark.long
 def test_a_driven_box_is_read_solved_and_shown(driven):
     (experiment,) = Problem.read(driven / "problem.toml").experiments
     assert [actuator.name for actuator in experiment.actuators] == [

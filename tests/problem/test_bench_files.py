@@ -295,6 +295,7 @@ def test_experiments_share_what_they_do_not_say_themselves(tmp_path):
     np.testing.assert_allclose(overridden.experiments[0].t_s, [0, 0.3])
 
 
+@pytest.mark.long
 def test_loads_of_a_part_are_reported_for_the_whole_specimen(tmp_path):
     """As those of the same part whose file has its own loads, times four."""
     part = SHARED.replace(
@@ -506,6 +507,7 @@ def test_a_new_problem_of_each_kind_runs_as_it_is(
     assert low < (SWUNG["young_pa"] if kind == "swing" else YOUNG_PA) < high
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_recordings_of_templates_are_what_a_simulation_gives(
     tmp_path, kind
@@ -530,6 +532,7 @@ def test_the_recordings_of_templates_are_what_a_simulation_gives(
         )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["compression", "tension"])
 def test_a_simulated_bench_is_solved_by_its_own_problem(tmp_path, kind):
     shutil.copytree(TEMPLATES / kind, tmp_path / "measured")

@@ -122,6 +122,7 @@ def test_a_copy_of_a_simulated_recording_names_a_schema_beside_it(tmp_path):
     assert not (tmp_path / "LICENSE_Hyperelastics.md").exists()
 
 
+@pytest.mark.long
 def test_a_wheel_contains_the_datasets_with_their_licence(
     tmp_path, monkeypatch
 ):

@@ -51,6 +51,7 @@ def refusal(tiny: Path, *arguments: object) -> str:
     return outcome.err
 
 
+@pytest.mark.long
 def test_a_body_of_two_regions_is_simulated_and_identified(tiny):
     TWO_REGIONS(tiny)
     simulated = run_command(
@@ -155,6 +156,7 @@ def test_foreign_code_is_not_run_unless_it_is_allowed(tiny):
     assert not (tiny / "was_run").exists()
 
 
+@pytest.mark.long
 def test_a_material_of_the_users_own_is_identified_when_allowed(tiny):
     own, built_in = (tiny / "own", tiny / "built-in")
     reduced = settings("solver.method=reduced-space")
@@ -215,6 +217,7 @@ def test_a_file_that_gives_no_material_is_refused(
     assert expected in refusal(tiny, "--allow-code")
 
 
+@pytest.mark.long
 def test_a_study_runs_allowed_code_in_its_workers(tiny):
     OWN_MATERIAL(tiny)
     command = (

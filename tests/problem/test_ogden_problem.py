@@ -103,6 +103,7 @@ def test_the_exponent_is_not_determined_by_small_strains(tmp_path):
     assert found["at_bound"] or high - low > abs(found["value"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -134,6 +135,7 @@ def test_impossible_constants_are_refused(changes, message, tmp_path):
     assert outcome.err.count("\n") == 1
 
 
+@pytest.mark.long
 def test_a_missing_exponent_is_named(tmp_path):
     file = soft_bar(tmp_path, "ogden-1")
     file.write_text(file.read_text().replace("alpha_1 = {}\n", ""))
@@ -142,6 +144,7 @@ def test_a_missing_exponent_is_named(tmp_path):
     assert "alpha_1 is missing: the material ogden-1 of the body" in outcome.err
 
 
+@pytest.mark.long
 def test_check_warns_of_a_negative_shear_modulus(tmp_path):
     file = soft_bar(tmp_path, "ogden-1", mu_1_pa="40.0", kappa_pa="190.0")
     file.write_text(file.read_text().replace("alpha_1 = {}", "alpha_1 = -2.0"))
@@ -149,6 +152,7 @@ def test_check_warns_of_a_negative_shear_modulus(tmp_path):
     assert "unstable without any strain" in outcome.out + outcome.err
 
 
+@pytest.mark.long
 def test_terms_beyond_four_are_refused(tmp_path):
     file = soft_bar(tmp_path, "ogden-1")
     file.write_text(file.read_text().replace('"ogden-1"', '"ogden-5"'))

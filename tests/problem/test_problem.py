@@ -535,6 +535,7 @@ def test_loading_writes_nothing(tiny):
 # The problems that come with the project ----------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "path", SHIPPED, ids=lambda path: f"{path.parent.name}-{path.stem}"
 )

@@ -531,6 +531,7 @@ def mechanical_j(experiment: Experiment, seen, law) -> np.ndarray:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stiffer", [1.0, 10.0])
 @pytest.mark.parametrize(
     ("integrator", "options"),

@@ -39,6 +39,7 @@ from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 
+@pytest.mark.long
 def test_stiffness_is_found_with_the_camera_20_mm_and_10_degrees_off(rng):
     axis, way = np.array([0.1, 0.8, -0.6]), np.array([0.5, 0.6, 0.6])
     pose = moved(
@@ -89,6 +90,7 @@ def test_a_camera_sees_the_faces_that_are_turned_to_where_it_is_found_to_be(
     assert sighting.is_compared.sum() > 0.95 * len(depth.points_m[0])
 
 
+@pytest.mark.long
 def test_what_is_beside_the_body_is_left_out_and_counted(rng):
     image = noisy(rng)
     image[:20] = 0.34  # a wall above the bar, nearer than it

@@ -62,6 +62,7 @@ def run() -> cs.Run:
     return cs.run(problem(), seek_causes=False)
 
 
+@pytest.mark.long
 def test_the_interval_holds_the_truth_beside_what_the_step_does(run):
     low, high = run.interval("young_pa")
     assert low < MADE["young_pa"] < high
@@ -84,6 +85,7 @@ def test_all_images_are_kept_for_pictures_and_four_of_them_with_outlines(run):
     ]
 
 
+@pytest.mark.long
 def test_a_check_looks_at_the_first_images():
     findings = check_problem(problem())
     assert findings.derivatives_agree

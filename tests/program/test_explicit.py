@@ -89,6 +89,7 @@ def test_interior_point_finds_the_optimum_of_reduced_space(
     assert found.max_violation_relative < 1e-8
 
 
+@pytest.mark.long
 def test_regions_with_branches_of_their_own_are_told_apart():
     collocation = Collocation(
         [swung(of_regions(), REGIONS, 16)], guesses(REGIONS, 1.2)

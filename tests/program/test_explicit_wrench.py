@@ -124,6 +124,7 @@ METHODS = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "method", "tolerance"),
     METHODS,

@@ -124,6 +124,7 @@ def test_a_static_experiment_is_read_too():
     assert len(found) == len(positions)
 
 
+@pytest.mark.long
 def test_error_bars_and_verdict_know_them():
     made = noisy(swung())
     finished = run(Problem([made], GUESS), seek_causes=False)

@@ -73,6 +73,7 @@ def test_marched_trajectories_satisfy_the_equations(collocation: Collocation):
     assert np.abs(part.residual_n).max() < 1e-12 * part.segment.force_n
 
 
+@pytest.mark.long
 def test_sensitivities_are_those_of_simulations(collocation: Collocation):
     p = some_parameters(collocation)
     part = marched(collocation, p)

@@ -145,6 +145,7 @@ def test_a_point_mass_slows_a_bar_down():
     assert modes.frequencies_hz[0] == pytest.approx(expected, rel=0.03)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mode", [0, 2])
 @pytest.mark.parametrize(
     ("gamma_r_s", "gamma_m_1_s"), [(0.0, 0.0), (0.004, 0.0), (0.0, 2.0)]

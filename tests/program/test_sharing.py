@@ -127,6 +127,7 @@ def equilibria(count: int) -> Experiment:
     return replace(seen, markers=markers, nuisance=nuisance)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["reduced-space", "interior-point"])
 def test_recordings_that_share_all_are_one_recording(method: str):
     """Equilibria do not know of each other: what is cut in two is the same problem."""
@@ -366,6 +367,7 @@ def two(made, tmp_path) -> Path:
     return tmp_path
 
 
+@pytest.mark.long
 def test_a_file_shares_them_and_its_run_says_so_of_both(two: Path):
     done = run_command("solve", two / "problem.toml", "--out", two / "run")
     assert done.code == 0, done.err

@@ -360,6 +360,7 @@ def test_a_scheme_moves_the_grasp_in_parts_where_a_step_is_too_large():
 # Failures
 
 
+@pytest.mark.long
 def test_a_missing_rest_state_names_time_and_element():
     cube = hung_cube()
     with pytest.raises(

@@ -508,6 +508,7 @@ def bench(folder, zero_m: float = 1e-3) -> Path:
     return folder / "problem.toml"
 
 
+@pytest.mark.long
 def test_a_test_bench_without_markers_tells_stiffness_and_zero(tmp_path):
     found = run(cs.Problem.read(bench(tmp_path)), seek_causes=False)
     assert found.estimates["young_pa"].value == pytest.approx(1e5, rel=2e-3)

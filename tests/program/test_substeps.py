@@ -82,6 +82,7 @@ BLOCK = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("integrator", ["midpoint", "newmark"])
 def test_a_run_recovers_what_a_simulation_was_made_with_both_with_their_default_steps(
     integrator,
@@ -99,6 +100,7 @@ def test_a_run_recovers_what_a_simulation_was_made_with_both_with_their_default_
         assert holds(answer.interval(name), BLOCK[name])
 
 
+@pytest.mark.long
 def test_a_simulation_takes_as_many_steps_as_its_motion_needs_and_says_how_far_off_it_is():
     block = swung_block()
     chosen = cs.simulate(block, BLOCK, "midpoint")
@@ -183,6 +185,7 @@ def test_what_was_not_estimated_is_not_said_to_be_held():
 # As many as the error bars ask for
 
 
+@pytest.mark.long
 def test_as_many_steps_are_taken_as_leave_half_a_standard_error():
     finer = found(3e-4)
     left = finer.refinement

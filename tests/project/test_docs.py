@@ -60,6 +60,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("page", pages_with("python"))
 def test_python_blocks_of_a_page_run_one_after_the_other(
     page: Path, checkout: Path
@@ -93,6 +94,7 @@ SHORT = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("page", pages_with("console"))
 def test_commands_of_a_page_run(page: Path, checkout: Path):
     for block in blocks(page, "console"):
@@ -246,7 +248,7 @@ def test_the_front_page_shows_the_answer_that_the_readme_shows():
 
 def test_every_claim_beside_other_tools_has_a_test_or_a_script_that_is_there():
     page = (ROOT / "docs" / "compared.md").read_text()
-    shown = re.findall(r"`((?:tests|scripts)/\w+\.py)(?:::(\w+))?`", page)
+    shown = re.findall(r"`((?:tests|scripts)/[\w/]+\.py)(?:::(\w+))?`", page)
     assert len(shown) > 20
     for file, test in shown:
         assert f"def {test}(" in (ROOT / file).read_text() or not test

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections import Counter
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -14,6 +14,7 @@ import collocation_sysid
 
 PACKAGE = Path(collocation_sysid.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
+TESTS = Path(__file__).parents[1]
 
 # A summary that begins with one of these words has no subject of its own.
 WITHOUT_SUBJECT = re.compile(
@@ -30,19 +31,21 @@ def identifier(path: Path, node: ast.AST) -> str:
     return f"{path.relative_to(PACKAGE)}:{getattr(node, 'lineno', 1)}"
 
 
-def trees() -> Iterator[tuple[Path, ast.Module]]:
-    for path in FILES:
-        yield path, ast.parse(path.read_text())
+@cache
+def trees() -> list[tuple[Path, ast.Module]]:
+    return [(path, ast.parse(path.read_text())) for path in FILES]
 
 
-def summaries() -> Iterator[tuple[str, str]]:
+@cache
+def summaries() -> list[tuple[str, str]]:
     """Place and first docstring line of everything that the package documents."""
-    for path, tree in trees():
-        for node in ast.walk(tree):
-            if isinstance(node, Documented) and (
-                docstring := ast.get_docstring(node)
-            ):
-                yield identifier(path, node), docstring.split("\n")[0]
+    return [
+        (identifier(path, node), docstring.split("\n")[0])
+        for path, tree in trees()
+        for node in ast.walk(tree)
+        if isinstance(node, Documented)
+        and (docstring := ast.get_docstring(node))
+    ]
 
 
 def packed_names(function: ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
@@ -116,3 +119,21 @@ def test_no_function_packs_arguments_into_a_tuple():
                     and node.value.id in packed
                 ]
     assert packs == []
+
+
+def test_no_test_module_imports_another_one():
+    """What several tests share is in tests/kit."""
+    names = {path.stem for path in TESTS.glob("*/test_*.py")}
+    imported = [
+        f"{path.name}: {module}"
+        for path in TESTS.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom | ast.Import)
+        for module in (
+            [node.module]
+            if isinstance(node, ast.ImportFrom)
+            else [alias.name for alias in node.names]
+        )
+        if module in names
+    ]
+    assert imported == []

@@ -36,6 +36,7 @@ def test_the_changelog_tells_of_the_version():
     assert dated[0] == PROJECT["version"]
 
 
+@pytest.mark.long
 def test_the_wheel_explains_every_page_of_the_documentation(
     tmp_path: Path, monkeypatch
 ):

@@ -147,6 +147,7 @@ def with_errors(
     return with_readings(twin.experiment(material, twin.test), values)
 
 
+@pytest.mark.long
 def test_zero_of_the_strain_and_error_of_the_area_are_estimated():
     strain = np.linspace(0.01, 1.0, 30)
     twins = [
@@ -431,6 +432,7 @@ def mistaken(mistake):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mistake", ["true-stress", "compression", None])
 def test_a_refit_finds_mistakes_that_leave_a_plausible_curve(mistake):
     run = cs.run(
@@ -442,6 +444,7 @@ def test_a_refit_finds_mistakes_that_leave_a_plausible_curve(mistake):
     assert causes[:1] == ([f"specimen-{mistake}"] if mistake else [])
 
 
+@pytest.mark.long
 def test_a_refit_finds_percent_that_were_taken_for_ratios():
     rng = np.random.default_rng(4)
     strain = np.linspace(0.005, 0.08, 20)
@@ -457,6 +460,7 @@ def test_a_refit_finds_percent_that_were_taken_for_ratios():
     assert [each.cause for each in run.causes][:1] == ["specimen-percent"]
 
 
+@pytest.mark.long
 def test_a_refit_finds_kilopascals_beside_pascals():
     """Files are refused already when they are read; arrays in Python are not."""
     specimens = []
@@ -531,6 +535,7 @@ wrench = { sign = -1, sigma_n = 1e-3 }
 """
 
 
+@pytest.mark.long
 def test_a_motion_a_bench_and_a_specimen_share_the_parameters(tmp_path):
     path = write_problem(tmp_path, {"swing": 8})
     motion = path.read_text()
@@ -588,6 +593,7 @@ def test_memory_relaxes_at_the_rate_of_its_branch():
     assert rates == pytest.approx(np.full(10, 0.1), rel=0.05)
 
 
+@pytest.mark.long
 def test_compare_ranks_laws_by_held_out_specimens(tmp_path):
     stress_pa = {
         test: simulated(test, STRAIN)["stress"]

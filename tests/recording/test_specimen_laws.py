@@ -106,6 +106,7 @@ def notes_of(material, free, tests, validation=(), **fixed):
     ]
 
 
+@pytest.mark.long
 def test_one_kind_of_test_does_not_test_a_law_with_several_constants():
     mooney = ("c10_pa", "c01_pa")
     (note,) = notes_of("mooney-rivlin", mooney, ("uniaxial",))
@@ -156,6 +157,7 @@ def test_a_compression_test_with_lateral_stretch_determines_a_foam():
         assert high - low < 0.1 * FOAM[name]
 
 
+@pytest.mark.long
 def test_three_terms_fit_kawabatas_data_like_a_linear_regression():
     """With fixed exponents the stresses of an incompressible solid are linear in mu_p."""
     exponents = (1.3, 5.0, -2.0)

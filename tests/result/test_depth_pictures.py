@@ -177,6 +177,7 @@ def stated(folder: Path, pose: np.ndarray) -> Path:
     return folder / "problem.toml"
 
 
+@pytest.mark.long
 def test_check_draws_the_image_and_the_body_and_names_what_is_wrong(tmp_path):
     file = stated(tmp_path, INVERTED)
     checked = run_command("check", str(file), "--out", str(tmp_path / "seen"))
@@ -187,6 +188,7 @@ def test_check_draws_the_image_and_the_body_and_names_what_is_wrong(tmp_path):
     assert "points of 'front'" in checked.out
 
 
+@pytest.mark.long
 def test_check_draws_the_image_of_a_camera_that_looks_away_and_says_that_it_does(
     tmp_path,
 ):
@@ -201,6 +203,7 @@ def test_check_draws_the_image_of_a_camera_that_looks_away_and_says_that_it_does
     assert said == ["the body is not in view"]
 
 
+@pytest.mark.long
 def test_a_solve_in_which_no_point_of_a_camera_counts_is_saved_with_its_pictures(
     tmp_path,
 ):
@@ -280,6 +283,7 @@ def found():
     return fitted(noisy(np.random.default_rng(3)), POSE)
 
 
+@pytest.mark.long
 def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(
     found,
 ):

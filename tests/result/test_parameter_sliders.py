@@ -46,6 +46,7 @@ def identified(tie: bool = False) -> cs.Run:
     return cs.run(problem, "reduced-space", seek_causes=False)
 
 
+@pytest.mark.long
 def test_sliders_begin_at_the_estimates_within_their_ranges():
     run = identified()
     sliders = ParameterSliders.from_run(run).sliders
@@ -59,6 +60,7 @@ def test_sliders_begin_at_the_estimates_within_their_ranges():
     assert sliders["mu_pa"].description == "μ Pa"
 
 
+@pytest.mark.long
 def test_the_first_simulation_is_the_forward_simulation_of_the_run():
     run = identified()
     shown = ParameterSliders.from_run(run)
@@ -71,6 +73,7 @@ def test_the_first_simulation_is_the_forward_simulation_of_the_run():
     assert shown.message.value.startswith("markers: ")
 
 
+@pytest.mark.long
 def test_a_moved_slider_simulates_again():
     shown = ParameterSliders.from_run(identified())
     before = shown.simulation
@@ -83,6 +86,7 @@ def test_a_moved_slider_simulates_again():
     assert shown.message.value.startswith("markers: ")
 
 
+@pytest.mark.long
 def test_the_button_returns_to_the_estimates_with_one_simulation(monkeypatch):
     shown = ParameterSliders.from_run(identified())
     before = shown.simulation.rms_m
@@ -103,6 +107,7 @@ def test_the_button_returns_to_the_estimates_with_one_simulation(monkeypatch):
     assert shown.simulation.rms_m == before
 
 
+@pytest.mark.long
 def test_a_tied_parameter_follows_its_slider():
     run = identified(tie=True)
     shown = ParameterSliders.from_run(run)
@@ -164,6 +169,7 @@ def test_without_the_extra_the_error_names_it(monkeypatch):
         identified().interactive()
 
 
+@pytest.mark.long
 def test_a_run_needs_no_widgets():
     code = "import sys; import collocation_sysid.pipeline; assert 'ipywidgets' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

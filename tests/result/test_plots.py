@@ -186,6 +186,7 @@ def test_parameters_are_drawn_relative_to_the_truth_where_it_is_known():
     assert "truth" in axes.get_ylabel()
 
 
+@pytest.mark.long
 def test_parameters_to_draw_can_be_chosen_and_are_labelled_with_their_values():
     named = [
         replace(
@@ -532,6 +533,7 @@ def test_a_field_colours_each_shape_by_its_values_there():
             assert np.abs(expected - hue).max(axis=1).min() < 1e-6
 
 
+@pytest.mark.long
 def test_quadratic_bodies_are_drawn_by_their_corners(tmp_path):
     seen = replay(quadratic_bar)
     assert seen.surface.max() < len(seen.undeformed_m)
@@ -663,6 +665,7 @@ def test_modes_are_numbered_and_near_ones_together():
 # Files
 
 
+@pytest.mark.long
 def test_a_run_has_all_its_pictures(tmp_path):
     seen = replay()
     pictures = all_pictures([seen], told())
@@ -699,6 +702,7 @@ def test_validation_is_drawn_by_its_simulation():
     assert len(pictures["error_hung_cube"].axes[0].lines) == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("first", "wrong"), [(0, np.inf), (6, np.nan)])
 def test_what_went_astray_leaves_gaps(tmp_path, wrong, first):
     seen = replay()
@@ -721,6 +725,7 @@ def test_an_experiment_can_be_read_back_from_its_arrays():
     assert again.marker_names == list(seen.marker_names)
 
 
+@pytest.mark.long
 def test_drawing_needs_no_display_and_leaves_pyplot_alone():
     code = (
         "import sys, collocation_sysid as c; assert 'matplotlib' not in sys.modules;"
@@ -777,6 +782,7 @@ def test_letters_that_the_font_lacks_are_no_news(tmp_path):
     assert (tmp_path / "named.png").stat().st_size > 0
 
 
+@pytest.mark.long
 def test_commands_say_nothing_of_matplotlibs_own_files(tmp_path):
     code = "from collocation_sysid.cli import main; main()"
     beside = {

@@ -174,6 +174,7 @@ def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
     assert "τ prony_1" in checked.out
 
 
+@pytest.mark.long
 def test_a_problem_with_memory_is_solved_from_the_command_line(tiny):
     MEMORY(tiny)
     path, method = tiny / "problem.toml", "solver.method=interior-point"

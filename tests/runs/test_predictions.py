@@ -57,6 +57,7 @@ def predicted(softer: float) -> cs.Run:
     return cs.run(problem, seek_causes=False)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("softer", "verdict"), [(1.0, "good"), (0.75, "check"), (0.3, "doubtful")]
 )
@@ -165,6 +166,7 @@ def image_predicted(young_pa: float) -> cs.Run:
     return cs.run(problem, seek_causes=False)
 
 
+@pytest.mark.long
 def test_predicted_depth_is_compared_with_the_image_and_graded():
     right, wrong = image_predicted(1.5e5), image_predicted(0.3e5)
     good, bad = (
@@ -217,6 +219,7 @@ def test_points_that_are_nowhere_near_the_prediction_are_doubtful():
     assert "prediction/unseen" in [c.code for c in finished.trust.concerns]
 
 
+@pytest.mark.long
 def test_depth_of_a_validation_recording_is_compared_drawn_and_judged():
     fitted = recorded(ACROSS, name="fitted")
     away = recorded((0.0, -9.81, 0.0), name="away", validation=True)
@@ -269,6 +272,7 @@ def validated(late_s: float) -> cs.Run:
     return finished
 
 
+@pytest.mark.long
 def test_a_blind_prediction_has_the_nuisance_parameters_of_the_fitted_recordings():
     alike, other = validated(4e-3), validated(-4e-3)
     for finished in (alike, other):
@@ -308,6 +312,7 @@ def test_a_prediction_stands_beside_the_copy_of_a_fitted_recording():
     assert "the measurements of 'fitted' as the prediction: " in shown(alike)
 
 
+@pytest.mark.long
 def test_the_nearest_recording_is_copied_or_the_output_says_why_none_is():
     new = swing("new", 0.0, 1)
     near, far = swing("near", 1e-3, 2), swing("far", 8e-3, 3)

@@ -148,6 +148,7 @@ def refined(answer) -> Run:
     return refine(answer, levels=3)
 
 
+@pytest.mark.long
 def test_halving_the_step_leads_to_the_truth(refined):
     assert refined.refinement is not None
     for name in FREE:
@@ -219,6 +220,7 @@ def test_other_numbers_of_levels_are_refused(answer):
         refine(answer, levels=1)
 
 
+@pytest.mark.long
 def test_the_command_writes_into_the_run_folder(tmp_path):
     problem = write_problem(tmp_path, {"swing": 8})
     folder = tmp_path / "run"
@@ -257,6 +259,7 @@ def test_the_command_writes_into_the_run_folder(tmp_path):
     assert "half the edges" in Path(folder / "report.html").read_text()
 
 
+@pytest.mark.long
 def test_what_is_interrupted_keeps_the_levels_that_it_finished(
     tmp_path, monkeypatch
 ):
@@ -304,6 +307,7 @@ def test_what_is_interrupted_keeps_the_levels_that_it_finished(
     assert told["numerical_error"]["mesh"] is not None
 
 
+@pytest.mark.long
 def test_a_problem_may_ask_for_it(tmp_path):
     problem = write_problem(tmp_path, {"swing": 8})
     folder = tmp_path / "run"

@@ -172,6 +172,7 @@ def test_a_profile_agrees_with_the_error_bar_where_the_loss_is_round(finished):
     assert best == pytest.approx(solution.parameters["mu_pa"])
 
 
+@pytest.mark.long
 def test_a_profile_counts_the_prior_of_its_parameter(finished):
     solution, uncertainty = finished.solution, finished.uncertainty
     held = Parameters(
@@ -222,6 +223,7 @@ def test_the_terminal_shows_nuisance_verdicts_and_residuals(
     assert stored["rollout"]["experiments"]["turn"]["nuisance"]
 
 
+@pytest.mark.long
 def test_noise_may_be_estimated_and_profiles_asked_for(two, tmp_path):
     text = (two / "problem.toml").read_text()
     asked = '\n[uncertainty]\nnoise = "estimated"\nprofile = ["mu_pa"]\n'

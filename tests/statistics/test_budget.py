@@ -155,6 +155,7 @@ def test_every_assumption_has_a_remedy():
     assert "measure gravity_rad" in remedy_for("gravity_rad")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("huber", [None, 1.0])
 def test_a_considered_nuisance_moves_estimates_as_a_recording_that_is_off_by_it(
     huber,
@@ -251,6 +252,7 @@ def swings(*gamma_r_s: float) -> Problem:
     return Problem(recordings, GUESS, substeps=1, uncertainty=options)
 
 
+@pytest.mark.long
 def test_what_recordings_disagree_on_is_in_the_combined_interval():
     truths = (4e-3, 9e-3, 14e-3)
     unlike = run(swings(*truths), seek_causes=False)
@@ -260,12 +262,14 @@ def test_what_recordings_disagree_on_is_in_the_combined_interval():
     assert line.combined95[1] > truths[-1]
 
 
+@pytest.mark.long
 def test_recordings_that_agree_add_nothing():
     alike = run(swings(9e-3, 9e-3, 9e-3), seek_causes=False)
     for name, line in alike.budget.items():
         assert line.shares.get("between recordings", 0.0) < 0.4, name
 
 
+@pytest.mark.long
 def test_terminal_page_and_pictures_show_the_budget(finished, tmp_path):
     with pictures_drawn():
         folder = finished.save(tmp_path / "run", frames=False)

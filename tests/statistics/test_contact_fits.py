@@ -144,6 +144,7 @@ FORGOTTEN = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fault", ["friction", *FORGOTTEN])
 def test_wrong_friction_and_a_forgotten_obstacle_are_told(fault: str):
     stated = poked()
@@ -246,6 +247,7 @@ def test_what_friction_did_is_told_in_a_line_and_kept_in_the_result(tmp_path):
     assert Result.read(tmp_path / "run").fit == run.result.fit
 
 
+@pytest.mark.long
 def test_intervals_do_not_claim_the_step_where_something_is_touched_in_motion():
     seen = measured(pressed_cube(6))
     run = cs.run(cs.Problem([seen], GUESS), seek_causes=False)

@@ -146,6 +146,7 @@ def relaxing_bench() -> tuple[Experiment, dict[str, float]]:
     ), truth
 
 
+@pytest.mark.long
 def test_a_first_sample_that_is_no_rest_is_told():
     experiment, truth = relaxing_bench()
     unknown = {"mu_pa": 250.0, "prony_1.share": 0.3, "prony_1.tau_s": 3.0}

@@ -91,6 +91,7 @@ def told(solved: Run) -> list[str]:
     return [p.name for p in sorted(freed, key=lambda p: -p.chi_squared)]
 
 
+@pytest.mark.long
 def test_nothing_is_told_of_what_is_as_described():
     faultless = probed()
     assert [p.name for p in faultless.probes if p.kind == "window"] == list(
@@ -99,6 +100,7 @@ def test_nothing_is_told_of_what_is_as_described():
     assert not any(p.sentences for p in faultless.probes)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "off", "of"),
     [
@@ -132,6 +134,7 @@ def test_windows_of_time_have_the_stiffness_of_their_time():
     )
 
 
+@pytest.mark.long
 def test_each_of_several_recordings_says_what_it_has_alone():
     rng, swings = np.random.default_rng(2), []
     for k, damping in enumerate((5e-3, 9e-3)):
@@ -185,6 +188,7 @@ def test_terminal_page_and_file_have_the_probes(tmp_path):
     )
 
 
+@pytest.mark.long
 def test_a_solve_makes_two_probes_and_all_of_them_where_asked_to(tmp_path):
     file = write_problem(tmp_path, {"swing": 12})
     plain = run_command("solve", file, "--out", tmp_path / "plain", "--quiet")

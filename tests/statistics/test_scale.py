@@ -98,6 +98,7 @@ def test_one_of_two_recordings_with_a_known_mass_is_enough():
     )
 
 
+@pytest.mark.long
 def test_it_is_said_before_the_solve_and_in_the_verdict():
     found = problem(OPEN)
     said = "only the ratios of lambda_pa, mu_pa and density_kg_m3 are identifiable (E/ρ)"

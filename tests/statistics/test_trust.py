@@ -245,6 +245,7 @@ def judged(fault: str, seed: int = 100) -> Run:
     return run(problem, "reduced-space")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [100, slow(101)])
 def test_faultless_twins_are_good(seed):
     found = judged("none", seed)
@@ -308,6 +309,7 @@ def test_a_step_that_dominates_the_error_bars_is_corrected_and_to_be_checked(
     assert found.trust.verdict == verdict
 
 
+@pytest.mark.long
 def test_the_verdict_is_shown_stored_and_fed():
     found = judged("none")
     assert ", good: " in repr(found)

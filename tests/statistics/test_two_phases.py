@@ -95,6 +95,7 @@ def field_of(solution: cs.Solution) -> FieldEstimate:
     return field
 
 
+@pytest.mark.long
 def test_a_stiff_half_has_its_boundary_and_its_contrast():
     solution = answer(3.0)
     field = field_of(solution)
@@ -118,6 +119,7 @@ def test_a_stiff_half_has_its_boundary_and_its_contrast():
     )
 
 
+@pytest.mark.long
 def test_an_even_body_shows_no_second_material():
     field = field_of(answer(1.0))
     assert "field/one-phase" in [concern.code for concern in field.concerns]
@@ -213,6 +215,7 @@ def small_posterior(rng) -> tuple[ElementInformation, InternalFaces]:
     return data, InternalFaces(np.column_stack([row, row + 1]), np.ones(5), 6)
 
 
+@pytest.mark.long
 def test_samples_are_of_the_posterior_that_enumeration_gives(rng):
     data, faces = small_posterior(rng)
     settings = SamplerSettings(

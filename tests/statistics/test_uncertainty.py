@@ -225,6 +225,7 @@ def test_covariance_is_that_of_the_weighted_least_squares_problem():
                                expected / np.outer(deviations, deviations), atol=1e-4)  # fmt: skip
 
 
+@pytest.mark.long
 def test_normalised_errors_of_noisy_twins_follow_their_distribution():
     sigma_m, twins = 1e-5, 20
     experiment = measured(hung_cube(8, divisions=(1, 1, 2)))

@@ -144,6 +144,7 @@ def test_tare_clock_lag_and_tool_are_found():
     np.testing.assert_allclose(relative_errors(solution), 0, atol=0.01)
 
 
+@pytest.mark.long
 def test_a_run_tells_of_the_wrench(tmp_path: Path):
     experiment = swung(1, Nuisance.none(tare=10.0, sensor_time_s=0.002), 20)
     problem = Problem(

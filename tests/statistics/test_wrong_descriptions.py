@@ -71,12 +71,14 @@ def _twin(name: str, kind: str, seed: int) -> Problem:
 # Before solving -----------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize(("kind", "seed"), [("soft", 1), ("stiff", 0)])
 def test_a_right_description_is_not_doubted(name: str, kind: str, seed: int):
     assert misspecification_hypotheses(_twin(name, kind, seed)) == ()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize("fault", BEFORE)
 def test_a_wrong_description_is_named_before_solving(
@@ -106,12 +108,14 @@ def test_the_order_and_signs_of_the_tracks_axes_are_stated(rng):
     )
 
 
+@pytest.mark.long
 def test_a_body_held_still_after_it_is_let_go_undeformed_may_swing():
     tracks = simulate(released_cube(20), TRUTH, "newmark").markers_m
     given = Problem([with_markers(released_cube(20), tracks)], GUESS)
     assert misspecification_hypotheses(given) == ()
 
 
+@pytest.mark.long
 def test_an_unstable_simulation_is_named_after_solving(rng):
     reset = TRACK_FAULTS["simulation reset after NaN"](soft("bar"), rng)
     answer = run(reset)
@@ -161,6 +165,7 @@ def with_zero(experiment: Experiment, zero: str) -> Experiment:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", BODIES)
 def test_a_late_clock_comes_with_its_lag_and_sign(name: str, rng):
     for fault, said in (
@@ -224,6 +229,7 @@ def test_a_short_exchange_is_left_to_hubers_loss():
     assert misspecification_hypotheses(replace(brief, huber=3.0)) == ()
 
 
+@pytest.mark.long
 def test_of_markers_that_are_exchanged_nothing_is_fitted_again(monkeypatch):
     solution = solve(exchanged(soft("bar"), slice(20, None)))
     monkeypatch.setattr(
@@ -236,6 +242,7 @@ def test_of_markers_that_are_exchanged_nothing_is_fitted_again(monkeypatch):
     ]
 
 
+@pytest.mark.long
 def test_the_search_for_causes_is_bounded_by_what_the_fit_took(
     monkeypatch, rng
 ):
@@ -402,6 +409,7 @@ def test_a_good_fit_has_no_cause(name: str):
     assert find_misspecifications(solve(soft(name))) == ()
 
 
+@pytest.mark.long
 def test_a_clock_that_is_estimated_is_told(rng):
     problem = FAULTS["clock 10 ms late"](soft("bar"), rng)
     reasons = run(problem).trust.reasons

@@ -62,6 +62,7 @@ def seen(
     return with_markers(experiment, tracks + noise)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "method", [m for m in METHODS if not m.startswith("casadi:")]
 )
@@ -127,6 +128,7 @@ def test_newmarks_rule_moves_it_alike():
     assert moved > 2e-4
 
 
+@pytest.mark.long
 def test_its_interval_holds_the_truth_and_the_report_names_it():
     problem = cs.Problem(
         [seen(in_fluid(20), sigma=1e-4)], parameters=parameters(25.0)
@@ -200,6 +202,7 @@ def with_force(function: str = "drag"):
     )
 
 
+@pytest.mark.long
 def test_a_force_in_a_file_is_simulated_and_identified(tiny):
     with_force()(tiny)
     write("mine.py", MINE)(tiny)

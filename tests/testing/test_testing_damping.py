@@ -43,6 +43,7 @@ AVERAGED = [
 CASES += [pytest.param(*each, marks=pytest.mark.long) for each in AVERAGED]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("law", "material", "element"), CASES)
 def test_every_law_passes(law: str, material: str, element: str):
     is_objective = law != "rayleigh" and material != "linear"

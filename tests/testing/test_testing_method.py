@@ -17,6 +17,7 @@ PENALTY = Penalty.name
 REDUCED = ReducedSpace()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_passes(name: str):
     if name == PENALTY:

@@ -77,6 +77,7 @@ def assert_covers(share: float) -> None:
     assert low <= share <= high
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "phi"),
     [*product(PROBLEMS, (0.0, 0.85)), ("one marker, 40 samples", 0.5)],
@@ -92,6 +93,7 @@ def test_intervals_hold_the_truth_with_the_sigma_given(phi):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("phi", [0.0, 0.85])
 def test_intervals_allow_for_errors_that_markers_share(phi):
     of = problem((100,), markers=3)
@@ -102,6 +104,7 @@ def test_intervals_allow_for_errors_that_markers_share(phi):
     )
 
 
+@pytest.mark.long
 def test_textbook_intervals_fail_where_errors_persist():
     count = 150
     for name in ("one marker, 40 samples", "no offsets"):

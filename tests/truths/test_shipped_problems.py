@@ -122,6 +122,7 @@ def test_table1_recovers_the_truth(
 WRIST = {"young_pa": 2.5e4, "density_kg_m3": 120.0}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "felt", [True, False], ids=["with the sensor", "without"]
 )
