@@ -1,8 +1,9 @@
-"""Completed share of the current phase of a computation, for progress displays.
+"""Completed share of the current phase of a computation, and its state, for progress displays.
 
 A phase states how many steps of which unit it consists of, loops report the steps that they
 complete, and a display listens. Reports outside of a phase, or in a phase of another unit, have no
 effect. Threads take part if they run in a copy of the context (`contextvars.copy_context`).
+Iterations whose number is not known in advance report a state instead, such as their residual.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from enum import StrEnum, auto
 
 # Called with the completed share of a phase: 0 when it begins, at most 1, and None when it ended.
 ShareListener = Callable[[float | None], None]
+# Called with a function that describes the state of an iteration in words.
+StateListener = Callable[[Callable[[], str]], None]
 
 
 class StepUnit(StrEnum):
@@ -48,6 +51,9 @@ class _Phase:
 _listener: ContextVar[ShareListener | None] = ContextVar(
     "share_listener", default=None
 )
+_state_listener: ContextVar[StateListener | None] = ContextVar(
+    "state_listener", default=None
+)
 _phase: ContextVar[_Phase | None] = ContextVar("phase", default=None)
 
 
@@ -59,6 +65,23 @@ def listen_to_shares(listener: ShareListener) -> Iterator[None]:
         yield
     finally:
         _listener.reset(token)
+
+
+@contextmanager
+def listen_to_states(listener: StateListener) -> Iterator[None]:
+    """Call `listener`, a `StateListener`, with each state that is reported in the block."""
+    token = _state_listener.set(listener)
+    try:
+        yield
+    finally:
+        _state_listener.reset(token)
+
+
+def report_state(describe: Callable[[], str]) -> None:
+    """Report the state of an iteration; `describe` is called only if the state is displayed."""
+    listener = _state_listener.get()
+    if listener is not None:
+        listener(describe)
 
 
 @contextmanager

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import re
 import time
 
 import numpy as np
 import pytest
 from kit.problem_files import write_problem
+from kit.problems import TRUTH, as_theta, hung_cube
 from rich.console import Console
 
 import collocation_sysid as cs
@@ -16,8 +18,15 @@ from collocation_sysid.common.step_counting import (
     complete_steps,
     counted_phase,
     listen_to_shares,
+    listen_to_states,
+    report_state,
 )
 from collocation_sysid.fem.kernels import map_experiments
+from collocation_sysid.program.forward.initial_equilibrium import equilibrium
+from collocation_sysid.program.forward.newton_solver import (
+    NewtonOptions,
+    NewtonSolver,
+)
 from collocation_sysid.result import solve_progress
 
 
@@ -174,6 +183,39 @@ def test_a_terminal_shows_the_elapsed_time_of_a_phase_without_a_share(
         progress._activity_with_time()
         == "finding the error bars: 50%, about 5 s left"
     )
+
+
+def test_a_terminal_shows_the_state_of_a_long_iteration(monkeypatch):
+    now_s = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    console = Console(file=io.StringIO())
+    with solve_progress.SolveProgress(console, quiet=True) as progress:
+        progress.say("simulating")
+        report_state(lambda: "residual 1 N")
+        assert progress._activity_with_time() == "simulating"
+        now_s = 103.0
+        shown = progress._activity_with_time()
+        assert shown == "simulating, residual 1 N (3 s so far)"
+        progress.say("finding the error bars")
+        report_state(lambda: "residual 2 N")
+        assert "residual" not in progress._activity_with_time()
+
+
+def test_an_equilibrium_reports_its_load_steps_and_residuals():
+    states = []
+    bar = hung_cube()
+    solver = NewtonSolver(bar, NewtonOptions(max_iterations=3))
+    theta = as_theta(TRUTH)
+    with listen_to_states(lambda describe: states.append(describe())):
+        equilibrium(bar, theta, solver=solver)
+    number = r"(\S+)"
+    form = rf"equilibrium at {number}% of the load, residual {number} N"
+    loads, residuals = zip(
+        *(map(float, re.fullmatch(form, state).groups()) for state in states),
+        strict=True,
+    )
+    assert loads[-1] == 100.0
+    assert residuals[-1] < 1e-6 * max(residuals)
 
 
 def test_a_live_display_is_refreshed_without_a_new_message(monkeypatch):

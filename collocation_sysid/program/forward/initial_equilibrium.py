@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array
+from ...common.step_counting import report_state
 from ...model.contact import Contact
 from ...model.forces import Forces
 from ...model.viscoelasticity import with_start_memory
@@ -110,6 +111,9 @@ def _solve_equilibrium(
         def linearise(state: Array) -> tuple[Array, Array, Array]:
             # Nothing moves: there is no skew part.
             at = loaded.linearise(state, zero_velocity)
+            report_state(
+                lambda: _describe_state(share, at.force[0][solver.free])
+            )
             return at.force[0], -at.by_position[0], NONE
 
         # Grasps that are off are there at the end: the way there may be any.
@@ -144,6 +148,22 @@ def _solve_equilibrium(
             what="finding the rest state",
             static=True,
         ) from failure
+
+
+def _describe_state(share: float, force_n: Array) -> str:
+    """Return the load step and the residual of the search for an equilibrium in words.
+
+    Parameters
+    ----------
+    share : float
+        Share of loads and displacements that are applied in the current load step.
+    force_n : (free,) array
+        Forces on the free dofs [N], which are zero in equilibrium.
+    """
+    residual_n = float(np.abs(force_n).max(initial=0.0))
+    return (
+        f"equilibrium at {share:.1%} of the load, residual {residual_n:.1e} N"
+    )
 
 
 def _without_contact(forces: Forces, shape: Array) -> Array:
