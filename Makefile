@@ -9,7 +9,7 @@ ALONE := COLLOCATION_SYSID_THREADS=1 OMP_NUM_THREADS=1
 
 TRIED := build/tried
 
-.PHONY: help solve test test-long test-dependencies check bench docs dist clean
+.PHONY: help solve test test-quick test-long test-dependencies check bench docs dist clean
 
 help: ## list these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-17s %s\n", $$1, $$2 }' Makefile
@@ -18,11 +18,17 @@ solve: $(CORE) ## identify the foam cylinder's parameters
 	@$(BIN)/collocation-sysid solve problems/foam_cylinder/recording.toml --out $(RUN)
 	@echo "Plots, result.json and ParaView frames are in $(RUN)/"
 
+# Tests of a test process; the slowest of them are printed.
+PYTEST := $(ALONE) $(BIN)/python -m pytest -n auto --dist worksteal --durations 10 --durations-min 1
+
 test: $(DEV) ## run the tests
-	@$(ALONE) $(BIN)/python -m pytest -n auto --dist worksteal
+	@$(PYTEST)
+
+test-quick: $(DEV) ## run the tests of bodies, recordings and parameters, and of the structure: about a minute
+	@$(PYTEST) tests/fem tests/recording tests/model tests/common tests/project/test_architecture.py
 
 test-long: $(DEV) ## run whole runs, the notebook and the gallery
-	@$(ALONE) $(BIN)/python -m pytest -n auto --dist worksteal -m "long and not slow"
+	@$(PYTEST) -m "long and not slow"
 
 test-dependencies: ## run the tests with the lowest dependencies, and with the newest
 	@mkdir -p build && $(PYTHON) scripts/lowest_dependencies.py > build/lowest.txt && : > build/newest.txt

@@ -6,7 +6,7 @@
 >>> run.parameters, run.interval("mu_pa")             # doctest: +SKIP
 """
 
-from . import signal_handling as _starting  # noqa: F401  (before all that takes time to import)
+from .common import signal_handling as _starting  # noqa: F401  (before all that takes time to import)
 
 # isort: split
 import ast as _ast
@@ -19,18 +19,19 @@ from typing import Any as _Any
 # The public names. Type checkers and editors read these imports; at run time `__getattr__` imports
 # a module when one of its names is used, because the import of all takes seconds.
 if TYPE_CHECKING:
-    from . import datasets, live, testing
+    from . import datasets, testing
     from .errors import InputError, SimulationError
+    from .extras import live
     from .fem.body import Body
-    from .fem.constants import Constant
-    from .fem.materials import DampingLaw, Material, Prony
-    from .fem.mesh import TetMesh
+    from .fem.laws.constants import Constant
+    from .fem.laws.materials import DampingLaw, Material, Prony
+    from .fem.meshes.mesh import TetMesh
+    from .fem.meshes.selection import Ball, Box, Face, Indices, Named
+    from .fem.meshes.structured import box_mesh, cylinder_mesh
     from .fem.node_force import NodeForce
     from .fem.regions import Region
     from .fem.rest_shape import UnderGravity
-    from .fem.selection import Ball, Box, Face, Indices, Named
     from .fem.spatial_field import Field
-    from .fem.structured import box_mesh, cylinder_mesh
     from .methods.comparison.casadi_nlp import Sleqp, SqpMethod
     from .methods.comparison.penalty import AugmentedLagrangian, Penalty
     from .methods.comparison.shooting import Shooting
@@ -78,7 +79,7 @@ if TYPE_CHECKING:
         place_markers,
     )
     from .runs.numerical_error import refine
-    from .statistics.systematic_effects import Assumptions
+    from .statistics.budget.systematic_effects import Assumptions
 
     __version__: str
 
@@ -164,6 +165,14 @@ __all__ = [
 ]
 
 
+# Public names that are packages themselves.
+_SUBPACKAGES = {
+    "datasets": ".datasets",
+    "live": ".extras.live",
+    "testing": ".testing",
+}
+
+
 def _modules_of_names() -> dict[str, str]:
     """Return the module of each public name, from the imports for type checkers above."""
     tree = _ast.parse(_Path(__file__).read_text(encoding="utf-8"))
@@ -173,11 +182,10 @@ def _modules_of_names() -> dict[str, str]:
         if isinstance(each, _ast.If) and _is_for_types(each)
     )
     imports = (each for each in block.body if isinstance(each, _ast.ImportFrom))
-    return {
-        a.name: f".{each.module or a.name}"
-        for each in imports
-        for a in each.names
+    modules = {
+        a.name: f".{each.module}" for each in imports for a in each.names
     }
+    return modules | _SUBPACKAGES
 
 
 def _is_for_types(block: _ast.If) -> bool:
@@ -200,9 +208,7 @@ if not TYPE_CHECKING:
                 f"module {__name__!r} has no attribute {name!r}"
             )
         module = _import_module(_MODULES[name], __name__)
-        attribute = (
-            module if _MODULES[name] == f".{name}" else getattr(module, name)
-        )
+        attribute = module if name in _SUBPACKAGES else getattr(module, name)
         return globals().setdefault(name, attribute)
 
 

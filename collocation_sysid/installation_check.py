@@ -332,7 +332,7 @@ def available_solvers() -> Solvers | None:
     try:
         import casadi as ca
 
-        from .program.supernodal import load_mkl
+        from .program.linear_algebra.supernodal import load_mkl
     except ImportError:
         return None
     return Solvers(
@@ -406,7 +406,7 @@ def kernel_state() -> Kernels | None:
 
 def thread_state() -> Threads:
     """Return the number of threads and what determines it."""
-    from .machine import machine_memory_mb
+    from .common.machine import machine_memory_mb
 
     variable = "COLLOCATION_SYSID_THREADS"
     override = os.environ.get(variable, "")
@@ -456,8 +456,8 @@ def _identify_small_body() -> tuple[str, bool]:
     import numpy as np
 
     from .fem.body import Body
-    from .fem.selection import Box
-    from .fem.structured import box_mesh
+    from .fem.meshes.selection import Box
+    from .fem.meshes.structured import box_mesh
     from .model.parameters import Unknown
     from .pipeline import solve
     from .problem import Problem

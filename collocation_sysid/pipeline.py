@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .display import plain_text
+from .common.display import plain_text
+from .common.step_counting import StepUnit, counted_phase
 from .errors import InputError, SimulationError
 from .fem.two_phase import TwoPhaseModes
 from .methods.experiment_executors import connect_executor
@@ -34,23 +35,31 @@ from .runs.solving import (
 )
 from .runs.warm_start import WarmStart
 from .statistics.assessment import rotation_step_concerns
-from .statistics.consider_analysis import (
+from .statistics.budget.consider_analysis import (
     ResidualChanges,
     changes_of_assumptions,
 )
-from .statistics.deep_probes import deep_probes, routine_probes_with_steps
-from .statistics.discretisation_error import MOST_SUBSTEPS
-from .statistics.fit_misspecifications import find_misspecifications
+from .statistics.budget.discretisation_error import MOST_SUBSTEPS
+from .statistics.budget.uncertainty_budget import VarianceSources
 from .statistics.linearised import LinearisedFit, linearise_fit
+from .statistics.misspecification.fit_misspecifications import (
+    find_misspecifications,
+)
 from .statistics.pose_noise import with_pose_noise
-from .statistics.profile_likelihood import Profile, profile_of_solution
-from .statistics.relaxed_assumptions import Probe, SolvedFit, probed_changes
-from .statistics.residual_diagnostics import diagnose_markers
-from .statistics.routine_probes import probed_deviations
+from .statistics.probes.deep_probes import (
+    deep_probes,
+    routine_probes_with_steps,
+)
+from .statistics.probes.profile_likelihood import Profile, profile_of_solution
+from .statistics.probes.relaxed_assumptions import (
+    Probe,
+    SolvedFit,
+    probed_changes,
+)
+from .statistics.probes.routine_probes import probed_deviations
+from .statistics.residuals.residual_diagnostics import diagnose_markers
 from .statistics.specimen_notes import one_kind_notes
 from .statistics.uncertainty import Uncertainty, uncertainty_from_fit
-from .statistics.uncertainty_budget import VarianceSources
-from .step_counting import StepUnit, counted_phase
 
 if TYPE_CHECKING:
     from ipywidgets import Widget  # an extra

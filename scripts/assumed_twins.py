@@ -1,7 +1,7 @@
 """Twins of a recording of which something that is assumed is wrong, by sizes that are known.
 
 Each is simulated anew with the body as it would be: another mesh, density, law or air. `OFF` are
-the names of `statistics.systematic_effects`, with their components.
+the names of `statistics.budget.systematic_effects`, with their components.
 """
 
 from __future__ import annotations
@@ -27,9 +27,11 @@ from collocation_sysid import (
     with_markers,
 )
 from collocation_sysid.fem.air import DRAG_COEFFICIENT, FACING_SHARE
-from collocation_sysid.fem.constants import GAMMA_R
-from collocation_sysid.fem.materials import DAMPINGS, DampingLaw, rayleigh
-from collocation_sysid.statistics.systematic_effects import OBJECTIVE_DAMPINGS
+from collocation_sysid.fem.laws.constants import GAMMA_R
+from collocation_sysid.fem.laws.materials import DAMPINGS, DampingLaw, rayleigh
+from collocation_sysid.statistics.budget.systematic_effects import (
+    OBJECTIVE_DAMPINGS,
+)
 
 Array = NDArray[np.float64]
 SCHEME, AXES = "midpoint", "xyz"

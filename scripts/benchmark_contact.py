@@ -17,7 +17,7 @@ import numpy as np
 import collocation_sysid as cs
 from collocation_sysid.model.contact import contact_terms
 from collocation_sysid.model.dynamics import Dynamics
-from collocation_sysid.program.scheme_simulation import simulate_scheme
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.sweep import Sweep
 
 EDGE_M, STEP_S, SCHEME = 0.1, 0.01, "bdf2"

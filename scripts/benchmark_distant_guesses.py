@@ -25,7 +25,7 @@ from synthetic import Swing
 
 from collocation_sysid import pipeline
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.parameters import Unknown

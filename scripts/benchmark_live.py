@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 from twins import SOFT, twin
 
-from collocation_sysid.live import Frame, LiveEstimator, LiveOptions
-from collocation_sysid.live.sources import (
+from collocation_sysid.extras.live import Frame, LiveEstimator, LiveOptions
+from collocation_sysid.extras.live.sources import (
     frames_of_recording,
     without_garbage_of_startup,
 )

@@ -25,7 +25,7 @@ from collocation_sysid import (
     Problem,
     Unknown,
 )
-from collocation_sysid.program.scheme_simulation import simulate_scheme
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.sweep import Sweep
 
 FILE = Path(__file__).parents[1] / "problems/table1/problem.toml"

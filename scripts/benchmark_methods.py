@@ -38,8 +38,8 @@ from collocation_sysid import (
     Parameters,
     simulate,
 )
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.structured import cylinder_mesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import cylinder_mesh
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.experiment_executors import DaskExecutor
 from collocation_sysid.methods.interior_point import InteriorPoint

@@ -19,9 +19,9 @@ import numpy as np
 from benchmark_methods import PAPER_SIZE, experiment_of
 
 from collocation_sysid import Body, Collocation, Parameters, Unknown
-from collocation_sysid.fem.structured import cylinder_mesh
+from collocation_sysid.fem.meshes.structured import cylinder_mesh
 from collocation_sysid.model.dynamics import Dynamics
-from collocation_sysid.program.scheme_simulation import simulate_scheme
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.stopwatch import Stopwatch
 from collocation_sysid.program.sweep import Sweep
 

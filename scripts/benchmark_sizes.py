@@ -23,9 +23,11 @@ import numpy as np
 from benchmark_methods import PARAMETERS, TRUTH, cylinder, swung
 
 from collocation_sysid import Body, Collocation
-from collocation_sysid.program.factorisation import Choice
-from collocation_sysid.program.newton_solver import NewtonOptions
-from collocation_sysid.program.scheme_simulation import continue_simulation
+from collocation_sysid.program.forward.newton_solver import NewtonOptions
+from collocation_sysid.program.forward.scheme_simulation import (
+    continue_simulation,
+)
+from collocation_sysid.program.linear_algebra.factorisation import Choice
 from collocation_sysid.program.stopwatch import Stopwatch
 from collocation_sysid.program.sweep import Sweep
 

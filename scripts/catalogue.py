@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 
-from collocation_sysid.fem.constants import symbol_of
+from collocation_sysid.fem.laws.constants import symbol_of
 
 # Readable units: smallest magnitude, factor from the SI unit, and name; the largest first.
 READABLE_UNITS = {

@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import collocation_sysid as cs
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.result.element_fields import ElementFields
 from collocation_sysid.result.pictures.projection import ParallelCamera
 from collocation_sysid.result.pictures.scene import (

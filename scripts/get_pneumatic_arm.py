@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.recording.marker_files import read_markers
 
 FOLDER = Path(__file__).parents[1] / "problems" / "pneumatic_arm"

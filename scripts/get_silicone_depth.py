@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 
-from collocation_sysid.array_types import Array
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.common.array_types import Array
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 
 FOLDER = Path(__file__).parents[1] / "problems" / "silicone_depth"
 IMAGES = ("h_e_c", "h_m_c", "h_em_c", "t_em_c")

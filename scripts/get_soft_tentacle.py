@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.structured import cylinder_mesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import cylinder_mesh
 
 FOLDER = Path(__file__).parents[1] / "problems" / "soft_tentacle"
 # The group of columns in each file that is the base marker, then M1 to M4.

@@ -15,7 +15,7 @@ import sys
 import urllib.request
 from pathlib import Path
 
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 
 FOLDER = Path(__file__).parents[1] / "problems" / "srl_beam"
 COMMIT = "5010a6983e4e4baf82e810ed16ddc4013e0106cb"

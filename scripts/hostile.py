@@ -49,17 +49,16 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-import logs_small
-import problem_files
+from kit import logs, problem_files
 from studies import markdown
 
 from collocation_sysid import cli
+from collocation_sysid.extras.export import TARGETS
 from collocation_sysid.fem.kernels import jit
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.recording import read_markers, read_poses
 from collocation_sysid.recording.formats import topics  # noqa: F401
 from collocation_sysid.result import run_record
-from collocation_sysid.result.export import TARGETS
 from collocation_sysid.result.pictures import all_pictures  # noqa: F401
 from collocation_sysid.runs import check  # noqa: F401
 
@@ -441,9 +440,7 @@ def _with_bag(kind: str) -> Callable[[Path], object]:
             read_poses(folder / POSES),
             read_markers(folder / MARKERS),
         )
-        log = logs_small.bag(
-            folder / "log", logs_small.recorded(poses, table, kind), kind
-        )
+        log = logs.bag(folder / "log", logs.recorded(poses, table, kind), kind)
         if log.is_dir():
             log = next(log.glob("*.db3"))
         place = folder / f"trial{log.suffix}"
@@ -458,10 +455,8 @@ def _with_bag(kind: str) -> Callable[[Path], object]:
 def _with_dataset(folder: Path) -> None:
     """State the poses by joints of a dataset in Parquet and by a robot's description."""
     joints = {"turn": 20 * [0.0], "slide": 20 * [0.0]}
-    logs_small.dataset(folder / "robot", joints, episodes=1)
-    at_rest = logs_small.URDF.replace("0 0 0.5", "0 0 0").replace(
-        "0.2 0 0", "0 0 0"
-    )
+    logs.dataset(folder / "robot", joints, episodes=1)
+    at_rest = logs.URDF.replace("0 0 0.5", "0 0 0").replace("0.2 0 0", "0 0 0")
     (folder / "arm.urdf").write_text(at_rest)
     address = "robot#observation.state#arm.urdf#rad#base>tool"
     _state(folder, POSES, address)

@@ -33,14 +33,14 @@ from catalogue import (
 from catalogue_sources import ROOT, SOURCES, CatalogueSource
 
 import collocation_sysid as cs
-from collocation_sysid.array_types import Array
+from collocation_sysid.common.array_types import Array
+from collocation_sysid.common.files import RESULT_FILE, write_text_file
+from collocation_sysid.common.serialisation import as_json, read
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.constants import is_damping, unit_of
+from collocation_sysid.fem.laws.constants import is_damping, unit_of
 from collocation_sysid.fem.regions import BodyPart
-from collocation_sysid.files import RESULT_FILE, write_text_file
 from collocation_sysid.result.replay import MotionRecord, read_run
 from collocation_sysid.runs.result_content import ReportedEstimate, Result
-from collocation_sysid.serialisation import as_json, read
 
 JSON_FILE = ROOT / "docs" / "catalogue.json"
 PAGE_FILE = ROOT / "docs" / "catalogue.md"

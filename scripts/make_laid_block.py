@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import (

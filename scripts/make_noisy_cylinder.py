@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from synthetic import Swing, exchanged, measure, occluded, unmeasured
 
-from collocation_sysid.fem.structured import cylinder_mesh
+from collocation_sysid.fem.meshes.structured import cylinder_mesh
 from collocation_sysid.recording import (
     Experiment,
     place_markers,

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.mesh_checks import orient_elements
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh_checks import orient_elements
 
 FILE = (
     Path(__file__).parents[1]

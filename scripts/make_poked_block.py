@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.files import write_text_file
+from collocation_sysid.common.files import write_text_file
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, PoseSequence, Wrench

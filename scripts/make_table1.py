@@ -10,7 +10,7 @@ from pathlib import Path
 
 from synthetic import Swing, measure, unmeasured
 
-from collocation_sysid.fem.structured import cylinder_mesh
+from collocation_sysid.fem.meshes.structured import cylinder_mesh
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import write_markers_csv
 

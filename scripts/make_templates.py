@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from collocation_sysid.array_types import Array
+from collocation_sysid.common.array_types import Array
+from collocation_sysid.common.files import write_text_file
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.selection import Box
-from collocation_sysid.fem.structured import cylinder_of_edge
-from collocation_sysid.files import write_text_file
+from collocation_sysid.fem.meshes.selection import Box
+from collocation_sysid.fem.meshes.structured import cylinder_of_edge
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.new_problem import TEMPLATES
 from collocation_sysid.program.simulation import simulate

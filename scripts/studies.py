@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from collocation_sysid.plan import (
+from collocation_sysid.extras.studies import (
     PlannedRun,
     RunOptions,
     RunStore,
@@ -16,7 +16,11 @@ from collocation_sysid.plan import (
     plan_comparison,
     run_all,
 )
-from collocation_sysid.plan.study_rows import Row, SuccessCriterion, run_row
+from collocation_sysid.extras.studies.study_rows import (
+    Row,
+    SuccessCriterion,
+    run_row,
+)
 from collocation_sysid.problem import Problem
 
 TRUTH = {

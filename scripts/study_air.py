@@ -2,7 +2,7 @@
 
 Twins of a foam cylinder of 30 kg/m³ that hangs from a swung hand in air of 1.2 kg/m³, with white
 noise on its markers. Drag, added mass and buoyancy of each twin differ from those of the model by
-shares drawn from their standard deviations in `statistics.systematic_effects`; the fit has the air
+shares drawn from their standard deviations in `statistics.budget.systematic_effects`; the fit has the air
 of the model, the default nuisance parameters, and a budget of these three rows (or of all
 assumptions that `study_faults` draws, with --all). With --vacuum the fit leaves the air out, as a
 user does who says that there is none.

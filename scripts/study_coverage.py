@@ -30,7 +30,7 @@ from scipy.stats import binom, norm
 from study_starts import TRUTH, hanging_cylinder, parameters
 from synthetic import swing
 
-from collocation_sysid.fem.moduli import engineering_constants
+from collocation_sysid.fem.laws.moduli import engineering_constants
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_markers

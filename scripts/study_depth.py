@@ -25,7 +25,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
-from collocation_sysid.program.visible_surface import VisibleSurface
+from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.runs.several_starts import SAME_LOSS, robust_loss
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 

@@ -18,14 +18,14 @@ import numpy as np
 from make_foam_cylinder import FOLDER, SWING, TRUTH
 from scipy.spatial.transform import Rotation
 
-from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.plan.design import (
+from collocation_sysid.extras.design import (
     Design,
     DesignCriterion,
     DesignOptions,
     Limits,
     design_motion,
 )
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_markers

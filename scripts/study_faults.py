@@ -39,18 +39,20 @@ from collocation_sysid.recording import (
     Nuisance,
     PoseSequence,
 )
-from collocation_sysid.statistics.consider_analysis import changed_residuals
-from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.systematic_effects import (
+from collocation_sysid.statistics.budget.consider_analysis import (
+    changed_residuals,
+)
+from collocation_sysid.statistics.budget.systematic_effects import (
     ASSUMPTIONS,
     Assumption,
 )
-from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_at
-from collocation_sysid.statistics.uncertainty_budget import (
+from collocation_sysid.statistics.budget.uncertainty_budget import (
     BudgetLine,
     VarianceSources,
     budget,
 )
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_at
 
 Array = NDArray[np.float64]
 Generator = np.random.Generator

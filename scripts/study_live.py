@@ -18,8 +18,8 @@ from collections import Counter
 import numpy as np
 from twins import SOFT, twin
 
-from collocation_sysid.live import LiveEstimator, LiveOptions, LiveUpdate
-from collocation_sysid.live.sources import frames_of_recording
+from collocation_sysid.extras.live import LiveEstimator, LiveOptions, LiveUpdate
+from collocation_sysid.extras.live.sources import frames_of_recording
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem

@@ -28,8 +28,8 @@ from studies import (
 )
 from synthetic import swing
 
-from collocation_sysid.fem.structured import cylinder_mesh
-from collocation_sysid.plan.study_rows import Row, wilson_interval
+from collocation_sysid.extras.studies.study_rows import Row, wilson_interval
+from collocation_sysid.fem.meshes.structured import cylinder_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import write_poses_csv
 from collocation_sysid.result.synthesis import Recipe, write_data

@@ -28,8 +28,12 @@ from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
 from collocation_sysid.runs.check import misspecification_hypotheses
-from collocation_sysid.statistics.misspecification_hypothesis import rank
-from collocation_sysid.statistics.wrench_causes import wrench_mistakes
+from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
+    rank,
+)
+from collocation_sysid.statistics.misspecification.wrench_causes import (
+    wrench_mistakes,
+)
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
 # Of the twelve places of the poked block two are enough.

@@ -17,7 +17,7 @@ import numpy as np
 from twins import random_poses
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem

@@ -20,7 +20,7 @@ import numpy as np
 
 from collocation_sysid import Problem, run
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.constants import symbol_of
+from collocation_sysid.fem.laws.constants import symbol_of
 from collocation_sysid.runs.result_content import ReportedEstimate
 
 PROBLEMS = Path(__file__).parents[1] / "problems"

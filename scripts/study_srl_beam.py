@@ -21,7 +21,7 @@ from get_srl_beam import FOLDER, ORIGIN_M, SIZE_M
 from numpy.typing import NDArray
 
 from collocation_sysid import Problem, Solution, solve
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import ExperimentIterate
 from collocation_sysid.statistics.estimates import Estimate
@@ -29,7 +29,9 @@ from collocation_sysid.statistics.identifiability import (
     identifiability_sentences,
 )
 from collocation_sysid.statistics.linearised import LinearisedFit, linearise_fit
-from collocation_sysid.statistics.residual_diagnostics import diagnose_markers
+from collocation_sysid.statistics.residuals.residual_diagnostics import (
+    diagnose_markers,
+)
 from collocation_sysid.statistics.uncertainty import (
     Uncertainty,
     uncertainty_from_fit,

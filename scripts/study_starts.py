@@ -29,11 +29,14 @@ from synthetic import HANGING, Swing, swing
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.structured import box_mesh, cylinder_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_mesh
 from collocation_sysid.model.parameters import Parameter, Parameters, Unknown
 from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.program.factorisation import Factor, Factoriser
+from collocation_sysid.program.linear_algebra.factorisation import (
+    Factor,
+    Factoriser,
+)
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance
 from collocation_sysid.statistics.linearised import linearise_fit

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from studies import HEADS, TRUTH, Variant, markdown, number, run_variants, save
 
-from collocation_sysid.plan.study_rows import Row
+from collocation_sysid.extras.studies.study_rows import Row
 
 PROBLEM = (
     Path(__file__).parents[1] / "problems" / "table1" / "problem_scheme.toml"

@@ -27,20 +27,20 @@ from wrong_twins import FAULTS
 from collocation_sysid import Run, run
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.structured import box_mesh, cylinder_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_mesh
 from collocation_sysid.methods.stiffness_scan import typical_constants
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem, UncertaintyOptions
 from collocation_sysid.problem.recording_reader import require_plausible_markers
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers
-from collocation_sysid.statistics.fit_misspecifications import (
+from collocation_sysid.statistics.budget.systematic_effects import Assumptions
+from collocation_sysid.statistics.misspecification.fit_misspecifications import (
     find_misspecifications,
 )
-from collocation_sysid.statistics.plausibility import (
+from collocation_sysid.statistics.misspecification.plausibility import (
     size_and_density_hypotheses,
 )
-from collocation_sysid.statistics.systematic_effects import Assumptions
 
 # With fewer steps the scheme, not a mistake, would be what is recognised.
 SAMPLES, STEP_S, SUBSTEPS, SIGMA_M = 60, 0.01, 3, 1e-3

@@ -29,7 +29,7 @@ from collocation_sysid import (
     simulate,
     with_markers,
 )
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.program.simulation import with_wrenches
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import (

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from problem_files import write_problem
-from problems_small import uneven_box
+from kit.problem_files import write_problem
+from kit.problems import uneven_box
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.recording import environment
 from collocation_sysid.result import run_record, solve_progress
 

@@ -27,8 +27,8 @@ from rich.text import Text
 from typer.core import TyperGroup
 from typer.main import get_command, get_command_from_info
 
+from ..common.signal_handling import heed_interrupts, leave
 from ..errors import InputError, SimulationError, hint_at
-from ..signal_handling import heed_interrupts, leave
 from .common import (
     EXIT_BAD_INPUT,
     EXIT_INTERRUPTED,

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..display import Table
+from ..common.display import Table
+from ..common.serialisation import as_json
 from ..errors import InputError
-from ..serialisation import as_json
 from .command_options import AsJson, Quiet, command
 from .common import error_console, print_result
 
 if TYPE_CHECKING:
-    from ..benchmark import Score
+    from ..extras.benchmark import Score
 
 commands = typer.Typer()
 
@@ -64,7 +64,7 @@ def benchmark(options: BenchmarkCommand) -> None:
 
     The exit code is 0, and 2 if the folder is no benchmark or a prediction is missing or invalid.
     """
-    from ..benchmark import score_benchmark
+    from ..extras.benchmark import score_benchmark
 
     if options.folder is None:
         _list_bodies(options)
@@ -80,8 +80,8 @@ def benchmark(options: BenchmarkCommand) -> None:
 
 def _list_bodies(options: BenchmarkCommand) -> None:
     """Print the bodies; refuse options that need a folder."""
-    from ..benchmark import BODIES
-    from ..benchmark.identified_constants import catalogue_entry
+    from ..extras.benchmark import BODIES
+    from ..extras.benchmark.identified_constants import catalogue_entry
 
     if options.write or options.body is not None:
         where = "--write" if options.write else "--body"
@@ -125,8 +125,8 @@ def _write_bodies(options: BenchmarkCommand, folder: Path) -> None:
     """Write the benchmark folder, and print its path and the bodies that were left out."""
     from rich.progress import Progress
 
-    from ..benchmark import BODIES, write_benchmark
-    from ..benchmark.benchmark_bodies import chosen_bodies
+    from ..extras.benchmark import BODIES, write_benchmark
+    from ..extras.benchmark.benchmark_bodies import chosen_bodies
 
     chosen = chosen_bodies(options.body)
     with Progress(
@@ -200,7 +200,7 @@ def score_tables(scores: Sequence[Score]) -> list[Table]:
 
 def score_warnings(scores: Sequence[Score]) -> list[str]:
     """Return a warning for each prediction that is worse than the undeformed body."""
-    from ..benchmark.scores import PREDICTION, UNDEFORMED
+    from ..extras.benchmark.scores import PREDICTION, UNDEFORMED
 
     trivial = {
         (each.body, each.recording): each.rms

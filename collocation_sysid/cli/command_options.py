@@ -32,12 +32,12 @@ import typer
 from rich.text import Text
 from typer.models import OptionInfo, ParameterInfo
 
-from ..declarations import attributes
-from ..display import Shown
+from ..common.declarations import attributes
+from ..common.display import Shown
+from ..common.files import require_run_folder
+from ..common.serialisation import as_json
+from ..common.validated_types import Options
 from ..errors import InputError
-from ..files import require_run_folder
-from ..serialisation import as_json
-from ..validated_types import Options
 from .common import error_console, print_result
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 import typer
 from rich.text import Text
 
-from ..console import PlainConsole
-from ..display import Shown, on_terminal, plain_text
+from ..common.console import PlainConsole
+from ..common.display import Shown, on_terminal, plain_text
 
 error_console = PlainConsole(stderr=True)
 

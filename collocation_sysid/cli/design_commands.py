@@ -8,11 +8,11 @@ from typing import cast
 
 import typer
 
+from ..common.files import require_possible, run_name
 from ..errors import InputError
-from ..files import require_possible, run_name
-from ..plan.design import DesignCriterion, DesignOptions, Limits
-from ..plan.design import design_motion as designed
-from ..plan.design.predicted_information import Kind, Over
+from ..extras.design import DesignCriterion, DesignOptions, Limits
+from ..extras.design import design_motion as designed
+from ..extras.design.predicted_information import Kind, Over
 from ..result.run_writers import require_replaceable
 from .command_options import (
     OneExperiment,
@@ -75,13 +75,13 @@ def design(options: DesignCommand) -> None:
     after, pictures, a film and a problem file that simulates the motion. Ctrl-C stops the search
     and keeps the best motion so far.
     """
-    from ..plan.design.design_folder import (
+    from ..extras.design.design_folder import (
         DESIGN_FILE,
         design_json,
         write_design,
     )
-    from ..plan.design.design_page import design_summary
-    from ..plan.study_progress import DesignProgress
+    from ..extras.design.design_page import design_summary
+    from ..extras.studies.study_progress import DesignProgress
 
     folder = options.out or Path("runs") / f"{run_name(options.problem)}-design"
     names = (

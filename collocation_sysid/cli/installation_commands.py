@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from ..display import Line, Shown, Table, labelled, number
+from ..common.display import Line, Shown, Table, labelled, number
 from ..installation_check import (
     Dependency,
     InstallationReport,

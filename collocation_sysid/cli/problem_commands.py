@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING
 import typer
 from rich.text import Text
 
+from ..common.files import replaced_file, require_possible, run_name
+from ..common.serialisation import as_json
+from ..common.signal_handling import INTERRUPTS
 from ..errors import SimulationError
-from ..files import replaced_file, require_possible, run_name
 from ..methods import require_method
 from ..methods.solution import Status
 from ..pipeline import Run, run
@@ -22,8 +24,6 @@ from ..result.run_writers import require_replaceable
 from ..result.synthesis import Recipe, write_data
 from ..runs.check import check_problem, quick_check
 from ..runs.result_content import Result
-from ..serialisation import as_json
-from ..signal_handling import INTERRUPTS
 from .command_options import (
     OutputFolder,
     OutputOptions,

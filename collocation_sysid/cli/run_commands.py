@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
+from ..common.files import require_possible, write_text_file
+from ..common.serialisation import as_json, content
 from ..errors import InputError
-from ..files import require_possible, write_text_file
-from ..serialisation import as_json, content
 from .command_options import (
     AllowCode,
     AsJson,
@@ -26,7 +26,7 @@ from .command_options import (
 from .common import error_console, interruption_exit, print_result
 
 if TYPE_CHECKING:
-    from ..result.export import (
+    from ..extras.export import (
         ExportDestination,
     )  # which takes a second to import
 
@@ -119,8 +119,8 @@ def export(options: ExportCommand) -> None:
 
     The format rerun is a recording of the motion, of all experiments or one, for the Rerun viewer.
     """
-    from ..result.export import MAIN_FILES, parse_destination
-    from ..result.export.rerun_recording import TARGET as RECORDING
+    from ..extras.export import MAIN_FILES, parse_destination
+    from ..extras.export.rerun_recording import TARGET as RECORDING
 
     destination = parse_destination(
         options.to, MAIN_FILES, run_folder=options.run_folder, out=options.out
@@ -135,7 +135,7 @@ def _export_body(
     options: ExportCommand, destination: ExportDestination
 ) -> None:
     """Write the body of a run for a simulator, and print what the simulator cannot express."""
-    from ..result.export import (
+    from ..extras.export import (
         TARGETS,
         IdentifiedBody,
         comparison_table,
@@ -187,7 +187,7 @@ def _export_recording(
     InputError
         With the option --verify, because a recording predicts nothing, and as `write_rerun`.
     """
-    from ..result.export.rerun_recording import RECORDING_FILE, write_rerun
+    from ..extras.export.rerun_recording import RECORDING_FILE, write_rerun
 
     if options.verify:
         raise InputError(

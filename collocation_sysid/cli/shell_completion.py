@@ -82,9 +82,9 @@ def completion_script(shell: str, root: Any) -> str:
 
 def named_values() -> dict[str, dict[str, tuple[str, ...]]]:
     """Return the possible values of texts, by command and parameter."""
+    from ..common.pages import page_files
+    from ..extras.export import MAIN_FILES
     from ..methods import METHODS
-    from ..pages import page_files
-    from ..result.export import MAIN_FILES
 
     return {
         "solve": {"method": tuple(METHODS)},

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
+from ..common.files import require_possible
+from ..common.validated_types import NotNegative, Options, Positive
 from ..errors import InputError
-from ..files import require_possible
-from ..live import LiveEstimator, LiveOptions, LiveUpdate
-from ..live.sources import read_problem
-from ..validated_types import NotNegative, Options, Positive
+from ..extras.live import LiveEstimator, LiveOptions, LiveUpdate
+from ..extras.live.sources import read_problem
 from .command_options import (
     AllowCode,
     OutputOptions,
@@ -27,8 +27,8 @@ from .command_options import (
 from .common import EXIT_BAD_INPUT, error_console, print_result
 
 if TYPE_CHECKING:
-    from ..live.frames import Frame
-    from ..live.live_recording import LiveRecording
+    from ..extras.live.frames import Frame
+    from ..extras.live.live_recording import LiveRecording
 
 commands = typer.Typer()
 
@@ -62,7 +62,7 @@ class LiveEstimationOptions(Options):
             Also if the file of --rerun cannot be written.
         """
         if self.rerun is not None:
-            from ..live.live_recording import require_recordable
+            from ..extras.live.live_recording import require_recordable
 
             require_recordable(self.rerun)
         budget_s = None if self.budget_ms is None else 1e-3 * self.budget_ms
@@ -77,7 +77,7 @@ class LiveEstimationOptions(Options):
         if self.rerun is None:
             yield None
             return
-        from ..live.live_recording import LiveRecording
+        from ..extras.live.live_recording import LiveRecording
 
         written = LiveRecording(self.rerun, estimator.model.experiment)
         try:
@@ -135,8 +135,8 @@ def live(options: LiveCommand) -> None:
     qy, qz, qw, tip_x, tip_y, tip_z and so on. A line that is not a frame is reported and ignored,
     and the exit code is then 2. An empty datagram ends the recording.
     """
-    from ..live.frames import FrameReader
-    from ..live.sources import (
+    from ..extras.live.frames import FrameReader
+    from ..extras.live.sources import (
         decode_lines,
         receive_datagrams,
         update_as_json,
@@ -218,14 +218,14 @@ def replay(options: ReplayCommand) -> None:
     """Stream a recording as if it were being made, and estimate the parameters live."""
     from rich.live import Live
 
-    from ..display import on_terminal
-    from ..live import live_display
-    from ..live.sources import (
+    from ..common.display import on_terminal
+    from ..extras.live import live_display
+    from ..extras.live.sources import (
         frames_of_recording,
         paced_frames,
         without_garbage_of_startup,
     )
-    from ..live.sources import update_as_json as json_line
+    from ..extras.live.sources import update_as_json as json_line
 
     rate = options.rate
     film = options.film

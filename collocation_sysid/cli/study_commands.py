@@ -9,9 +9,10 @@ from pathlib import Path
 
 import typer
 
+from ..common.files import require_possible, run_name
+from ..common.validated_types import Positive
 from ..errors import InputError
-from ..files import require_possible, run_name
-from ..plan import (
+from ..extras.studies import (
     PlannedRun,
     RunOptions,
     RunStore,
@@ -21,22 +22,25 @@ from ..plan import (
     plan_sweep,
     run_all,
 )
-from ..plan.model_variants import (
+from ..extras.studies.model_variants import (
     models,
     parse_branches,
     parse_dampings,
     parse_materials,
 )
-from ..plan.study_arguments import parse_methods, parse_varied_keys, read_truth
-from ..plan.study_kinds import (
+from ..extras.studies.study_arguments import (
+    parse_methods,
+    parse_varied_keys,
+    read_truth,
+)
+from ..extras.studies.study_kinds import (
     METHOD_STUDY,
     MODEL_STUDY,
     STUDY_TITLES,
     SWEEP_STUDY,
 )
-from ..plan.study_rows import SuccessCriterion
+from ..extras.studies.study_rows import SuccessCriterion
 from ..problem import Problem
-from ..validated_types import Positive
 from .command_options import (
     OutputFolder,
     OutputOptions,
@@ -287,14 +291,14 @@ def _run_study(
     InputError
         If the folder cannot be made or written in.
     """
-    from ..plan.study_page import (
+    from ..extras.studies.study_page import (
         load_report,
         plan_table,
         report_json,
         study_tables,
         write_report,
     )
-    from ..plan.study_progress import StudyProgress
+    from ..extras.studies.study_progress import StudyProgress
 
     name = run_name(options.problem)
     folder = options.out or Path("runs") / f"{name}-{kind}"

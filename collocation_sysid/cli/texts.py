@@ -12,11 +12,11 @@ from typing import Annotated, Any
 
 import typer
 
-from ..console import PlainConsole
-from ..display import Shown, Table
+from ..common.console import PlainConsole
+from ..common.display import Shown, Table
+from ..common.pages import page_files, page_text, page_title
+from ..common.serialisation import as_json
 from ..errors import InputError, located, require_among
-from ..pages import page_files, page_text, page_title
-from ..serialisation import as_json
 from .command_options import AsJson, command
 from .common import error_console, print_result
 

@@ -13,7 +13,7 @@ problem file and tables, which ``collocation-sysid new NAME --dataset DATASET`` 
 
 from __future__ import annotations
 
-from ..fem.materials import Energy, Material
+from ..fem.laws.materials import Energy, Material
 from ..recording import Experiment, Specimen
 from ..recording.specimen_files import SpecimenLayout, read_specimen
 from .dataset_files import DATASETS, dataset_file, read_problem

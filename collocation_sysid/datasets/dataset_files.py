@@ -9,8 +9,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from ..common.files import replaced_file, require_possible, write_text_file
 from ..errors import InputError, hint_at
-from ..files import replaced_file, require_possible, write_text_file
 from ..problem import Problem
 from ..problem.editor_schema import (
     SCHEMA_FILE,

@@ -8,7 +8,7 @@ Air of density ρ_a at rest exerts three forces on a body of volume V:
   convex body A is a quarter of its surface on average over directions (Cauchy).
 
 V is the volume of the undeformed body, lumped at its nodes like the mass. The coefficients c_m and
-c_d depend on shape and motion; they are accurate to some 40 %, see `statistics.systematic_effects`.
+c_d depend on shape and motion; they are accurate to some 40 %, see `statistics.budget.systematic_effects`.
 This module provides the constants and the drag force; `model.weight` applies buoyancy and added
 mass.
 """
@@ -21,8 +21,8 @@ from functools import cache
 import casadi as ca
 import numpy as np
 
-from ..array_types import Array
-from .mesh import ElementNodes
+from ..common.array_types import Array
+from .meshes.mesh import ElementNodes
 from .node_force import ForceContext, LocatedForce, NodeForce, surface_shares
 
 # Air at 20 °C and sea level, half humid [kg/m³].

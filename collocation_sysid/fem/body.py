@@ -27,14 +27,16 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError
 from .air import placed_unit_drag
-from .constants import DENSITY, Constant
 from .discretisation import Discretisation
-from .materials import DampingLaw, Energy, Material, Prony
-from .memory import MemoryInput
-from .mesh import TetMesh
+from .laws.constants import DENSITY, Constant
+from .laws.materials import DampingLaw, Energy, Material, Prony
+from .laws.memory import MemoryInput
+from .laws.stress import StressEvaluator
+from .meshes.mesh import TetMesh
+from .meshes.selection import Selection
 from .node_force import LocatedForce, NodeForce
 from .pattern import JointPattern, SymmetricPattern
 from .regions import BodyPart, ConstantsModel, Region, Theta, parts_from_regions
@@ -44,9 +46,7 @@ from .rest_shape import (
     UnderGravity,
     require_supported,
 )
-from .selection import Selection
 from .spatial_field import Field, FieldModes
-from .stress import StressEvaluator
 from .two_phase import PhaseSamples, TwoPhaseModes
 
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from .body import Body
 from .force_points import ForcePoints
-from .selection import Selection
+from .meshes.selection import Selection
 
 # Number of vectors of a contact point: from the frame's origin to it and to the ends of three axes.
 VECTORS_PER_POINT = 4

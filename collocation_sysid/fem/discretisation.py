@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..errors import InputError
 from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS, PointLaw, energy_kernel
@@ -26,8 +26,9 @@ from .kernels import (
     KernelBatch,
     available_threads,
 )
-from .memory import MemoryInput, MemoryLayout
-from .mesh import ElementNodes, TetMesh
+from .laws.memory import MemoryInput, MemoryLayout
+from .meshes.mesh import ElementNodes, TetMesh
+from .meshes.selection import Selection
 from .node_force import NodeForce
 from .pattern import (
     SymmetricPattern,
@@ -37,7 +38,6 @@ from .pattern import (
 )
 from .regions import BodyPart, ConstantsModel, Theta
 from .rest_shape import InverseEquilibrium
-from .selection import Selection
 from .spatial_field import FieldAssembly
 
 # Outputs with columns for θ; a field adds derivatives by the logarithm of each cell.

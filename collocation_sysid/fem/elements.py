@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError
 
 # Corners at the ends of the edge of each mid node, nodes 4 to 9: VTK's and meshio's order.

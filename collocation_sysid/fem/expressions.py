@@ -34,8 +34,8 @@ import casadi as ca
 
 from .elements import Element
 from .kernel import Derivative, ElementKernel, Outputs, Pieces, QuadraturePoint
-from .materials import DampingLaw, Material
-from .mean_dilatation import averaging_kernel
+from .laws.materials import DampingLaw, Material
+from .laws.mean_dilatation import averaging_kernel
 from .rest_point_layout import RestPointLayout
 
 # Number of kernels of each kind kept in memory, shared by bodies of the same law and element.

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from .pattern import SymmetricPattern, dofs_of
 
 # Number of cached matrices: four for each of the latest eight choices of instances, namely the

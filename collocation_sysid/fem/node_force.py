@@ -18,13 +18,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
+from ..common.files import reason
 from ..errors import InputError, hint_at
-from ..files import reason
-from .constants import Constant, constant_named
 from .force_points import ForcePoints
-from .mesh import ElementNodes
-from .selection import Indices, Selection
+from .laws.constants import Constant, constant_named
+from .meshes.mesh import ElementNodes
+from .meshes.selection import Indices, Selection
 
 Law = Callable[..., Any]
 On = Literal["nodes", "faces"]

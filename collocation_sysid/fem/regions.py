@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..errors import InputError, hint_at
-from .constants import (
+from .laws.constants import (
     CONTRAST,
     DENSITY,
     GAMMA_M,
@@ -25,7 +25,7 @@ from .constants import (
     Constant,
     is_field_coefficient,
 )
-from .materials import (
+from .laws.materials import (
     DampingLaw,
     Energy,
     Material,
@@ -34,10 +34,10 @@ from .materials import (
     as_damping,
     as_material,
 )
-from .mesh import TetMesh
-from .moduli import ConstantSource, elastic_names, find_source
+from .laws.moduli import ConstantSource, elastic_names, find_source
+from .meshes.mesh import TetMesh
+from .meshes.selection import Selection
 from .node_force import NodeForce
-from .selection import Selection
 from .spatial_field import TWO_PHASE, Field, FieldModes
 from .two_phase import TwoPhaseModes
 

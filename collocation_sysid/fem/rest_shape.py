@@ -29,13 +29,13 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 from scipy.sparse.linalg import splu
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..errors import InputError, SimulationError
-from .materials import Material
-from .mesh import ElementNodes
+from .laws.materials import Material
+from .meshes.mesh import ElementNodes
+from .meshes.selection import Selection
 from .regions import BodyPart
 from .rest_point_layout import RestPointLayout
-from .selection import Selection
 
 # Number of cached stress-free shapes: of an iterate, of its neighbours for difference quotients,
 # and of the previous iterate.

@@ -22,7 +22,7 @@ from itertools import permutations
 import numpy as np
 import scipy.sparse as sp
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from .pattern import SymmetricPattern
 
 # The lower triangle of a symmetric (3, 3), column after column.

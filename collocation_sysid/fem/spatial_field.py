@@ -26,14 +26,20 @@ import scipy.sparse as sp
 from annotated_types import MinLen
 from scipy.sparse.linalg import eigsh, splu
 
-from ..array_types import Array, Index
-from ..declarations import declaration, key
+from ..common.array_types import Array, Index
+from ..common.declarations import declaration, key
+from ..common.schema_tables import ByForm
+from ..common.validated_types import AtLeastOne, Positive, Text
 from ..errors import InputError
-from ..schema_tables import ByForm
-from ..validated_types import AtLeastOne, Positive, Text
-from .constants import DENSITY, YOUNG, Constant, field_coefficient, is_modulus
 from .elements import ELEMENTS, reference_geometry
-from .mesh import TetMesh
+from .laws.constants import (
+    DENSITY,
+    YOUNG,
+    Constant,
+    field_coefficient,
+    is_modulus,
+)
+from .meshes.mesh import TetMesh
 
 # Parameter of a field of stiffness: all moduli of the material vary with it.
 ALL_MODULI = YOUNG.name

@@ -14,10 +14,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..errors import InputError
-from .constants import CONTRAST, DENSITY, Constant, field_coefficient
-from .mesh import TetMesh
+from .laws.constants import CONTRAST, DENSITY, Constant, field_coefficient
+from .meshes.mesh import TetMesh
 from .spatial_field import SMOOTH, Field, FieldModes
 
 

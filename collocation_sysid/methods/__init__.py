@@ -27,7 +27,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from ..declarations import documented
+from ..common.declarations import documented
 from ..errors import InputError, require_among
 from .comparison.casadi_nlp import refusal_reason
 from .continuation import STAGES, Continuation

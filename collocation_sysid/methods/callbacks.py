@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..fem.rest_shape import RestShapeError
 from ..program.collocation import Collocation, convert_variables
 from .solve_recorder import Recorder

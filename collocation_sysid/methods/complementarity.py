@@ -13,12 +13,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError
-from ..fem.selection import Indices
+from ..fem.meshes.selection import Indices
 from ..model.contact import contact_terms
 from ..program.collocation import Collocation
-from ..program.contact_summary import smallest_gaps
+from ..program.contact.contact_summary import smallest_gaps
 from ..recording.experiment import Experiment
 from ..recording.obstacle import Obstacle
 from .solution import Solution

@@ -25,7 +25,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..program.collocation import Collocation
 from ..program.transcription import Transcription
 from ..recording.nuisance import TIME

@@ -13,13 +13,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
-from ..array_types import Array
+from ..common.array_types import Array
+from ..common.validated_types import Options
 from ..errors import InputError, hint_at
 from ..program.collocation import Collocation
 from ..recording.depth_camera import until_all_cameras_see
 from ..recording.experiment import Experiment
 from ..recording.time_tables import FEWEST_SHARED_SAMPLES
-from ..validated_types import Options
 from .comparison.casadi_nlp import Sleqp, SqpMethod
 from .comparison.penalty import AugmentedLagrangian, Penalty
 from .comparison.shooting import Shooting

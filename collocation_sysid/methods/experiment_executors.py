@@ -17,13 +17,13 @@ from importlib.metadata import version
 from typing import Any, Protocol, TypeVar
 from weakref import WeakKeyDictionary
 
-from ..cluster import connected, distributed
+from ..common.cluster import connected, distributed
+from ..common.files import reason
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.kernels import map_experiments, run_single_threaded
-from ..files import reason
 from ..program.collocation import Collocation
-from ..program.marker_association import MarkerAssociation
+from ..program.markers.marker_association import MarkerAssociation
 from ..program.transcription import Transcription
 from ..recording.experiment import Experiment
 from .solution import Status

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import SimulationError
 from ..program.collocation import Collocation
-from ..program.factorisation import Choice
-from ..program.lapack import one_blas_thread
 from ..program.least_squares import SquareRootInformation
+from ..program.linear_algebra.factorisation import Choice
+from ..program.linear_algebra.lapack import one_blas_thread
 from ..program.stopwatch import Stopwatch
 from ..program.sweep import Sweep
 from .experiment_executors import ExperimentExecutor, LocalExecutor

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse.linalg as spla
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import SimulationError
 from ..program.collocation import Collocation, convert_variables
 from .condensed_program import CondensedCollocation

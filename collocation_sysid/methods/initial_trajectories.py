@@ -11,14 +11,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import SimulationError
 from ..fem.kernels import map_experiments
 from ..model.forces import Forces
 from ..program.collocation import Collocation, ExperimentIterate
-from ..program.initial_equilibrium import initial_state
-from ..program.newton_solver import NewtonOptions, NewtonSolver
-from ..program.scheme_simulation import continue_simulation, simulate_scheme
+from ..program.forward.initial_equilibrium import initial_state
+from ..program.forward.newton_solver import NewtonOptions, NewtonSolver
+from ..program.forward.scheme_simulation import (
+    continue_simulation,
+    simulate_scheme,
+)
 from ..program.stopwatch import Stopwatch
 from ..program.transcription import Transcription
 

@@ -14,11 +14,8 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import BeforeValidator
 
-from ..array_types import Array
-from ..errors import located
-from ..program.collocation import Collocation
-from ..recording.experiment import Experiment
-from ..validated_types import (
+from ..common.array_types import Array
+from ..common.validated_types import (
     Count,
     Finite,
     NotNegative,
@@ -27,6 +24,9 @@ from ..validated_types import (
     StrictInteger,
     Text,
 )
+from ..errors import located
+from ..program.collocation import Collocation
+from ..recording.experiment import Experiment
 from . import nlpsol
 from .callbacks import NlpFunctions
 from .complementarity import require_frictionless, solve_complementarity

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError
 from ..program.collocation import Collocation
 from ..program.least_squares import SquareRootInformation

@@ -13,8 +13,8 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator
 
+from ..common.validated_types import Options, Positive
 from ..errors import InputError, hint_at
-from ..validated_types import Options, Positive
 
 T = TypeVar("T", bound="Options")
 

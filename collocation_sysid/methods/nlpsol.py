@@ -14,10 +14,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
+from ..common.signal_handling import ABANDONED_THREAD, raises_interrupt
 from ..errors import InputError
 from ..program.collocation import Collocation, convert_variables
-from ..signal_handling import ABANDONED_THREAD, raises_interrupt
 from .callbacks import HessianValues, IterationMonitor, NlpFunctions
 from .condensed_program import complete_multipliers
 from .initial_point import InitialMultipliers

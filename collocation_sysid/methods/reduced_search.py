@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
+from ..common.validated_types import Count, Options, Positive
 from ..errors import SimulationError
-from ..program.factorisation import Choice
-from ..validated_types import Count, Options, Positive
+from ..program.linear_algebra.factorisation import Choice
 from .horizon import Horizon, Iterate
 from .loss_curvature import exact_curvature, secant_update, with_curvature
 from .method_options import FEWEST, SHARES, Shares, samples_in_share

@@ -29,11 +29,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.kernels import concurrent_count
 from ..program.collocation import Collocation
-from ..program.lapack import one_blas_thread
+from ..program.linear_algebra.lapack import one_blas_thread
 from ..program.sweep import Sweep
 from .experiment_executors import ExperimentExecutor, LocalExecutor
 from .initial_trajectories import complete_variables, simulate_trajectories

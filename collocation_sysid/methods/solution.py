@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..array_types import Array, root_mean
+from ..common.array_types import Array, root_mean
 from ..errors import InputError, SimulationError, hint_at
 from ..fem.kernels import map_experiments
 from ..program.collocation import Collocation, ExperimentIterate, Violation

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import SimulationError
-from ..fem.constants import is_field_coefficient
+from ..fem.laws.constants import is_field_coefficient
 from ..program.collocation import Collocation
 from ..program.stopwatch import Stopwatch
 from .initial_trajectories import initial_variables

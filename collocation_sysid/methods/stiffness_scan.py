@@ -21,14 +21,14 @@ from itertools import groupby
 
 import numpy as np
 
-from ..array_types import Array, root_mean
+from ..common.array_types import Array, root_mean
+from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, SimulationError
-from ..fem.constants import is_modulus, usual_value
+from ..fem.laws.constants import is_modulus, usual_value
 from ..model.parameters import Parameter, Parameters
 from ..program.collocation import Collocation, ExperimentIterate
-from ..program.newton_solver import NewtonOptions
+from ..program.forward.newton_solver import NewtonOptions
 from ..program.transcription import Transcription
-from ..step_counting import StepUnit, complete_steps, counted_phase
 from .initial_trajectories import simulate_trajectories
 from .method_options import SHARES, samples_in_share
 

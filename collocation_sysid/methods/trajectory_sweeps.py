@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import SimulationError
 from ..program.collocation import ExperimentIterate
+from ..program.forward.newton_solver import NewtonOptions
+from ..program.forward.scheme_simulation import continue_simulation
 from ..program.least_squares import SquareRootInformation
 from ..program.measurement_residual import huber_as_least_squares
-from ..program.newton_solver import NewtonOptions
-from ..program.scheme_simulation import continue_simulation
 from ..program.sweep import Sweep, Tangent
 from ..program.transcription import Transcription
 from .initial_trajectories import continue_trajectory

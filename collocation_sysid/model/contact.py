@@ -41,11 +41,11 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..fem.body import Body
 from ..fem.contact_surface import VECTORS_PER_POINT, ContactSurface
 from ..fem.force_points import ForcePoints
-from ..fem.moduli import engineering_constants
+from ..fem.laws.moduli import engineering_constants
 from ..recording.experiment import Experiment
 from ..recording.obstacle import Obstacle
 from .force_term import AssemblyIndices, States

@@ -23,7 +23,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..fem.body import Body, Linearisation
 from ..fem.pattern import SymmetricPattern
 from ..recording.experiment import Experiment

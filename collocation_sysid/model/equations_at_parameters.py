@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..fem.body import SecondDerivatives
 from .dynamics import Dynamics
 from .grasp_constraint import PrescribedDisplacements

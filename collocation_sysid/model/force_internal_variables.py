@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..fem.body import SecondDerivatives
 from .force_term import States
 from .forces import Forces

@@ -16,7 +16,7 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..fem.body import Linearisation, SecondDerivatives
 from ..fem.pattern import SymmetricPattern
 

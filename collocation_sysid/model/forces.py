@@ -17,9 +17,9 @@ from itertools import accumulate
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..fem.body import Body, Linearisation, SecondDerivatives
-from ..fem.memory import MemoryInput
+from ..fem.laws.memory import MemoryInput
 from ..fem.pattern import JointPattern, SymmetricPattern
 from ..recording.experiment import Experiment
 from .contact import Contact, contact_terms

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..fem.kernels import COMPILING, Instances, make_instance_evaluator
 
 Expression = Callable[[ca.SX, ca.SX], ca.SX]

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..recording.experiment import Experiment
 from ..recording.grasp import prescribed_dofs
 from ..recording.nuisance import OBSTACLE_TILT, OBSTACLE_TIME, NuisanceRow

@@ -16,7 +16,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..recording.actuator import Actuator
 from ..recording.experiment import Experiment
 from ..recording.loads import smooth_ramp

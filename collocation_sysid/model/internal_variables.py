@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from .force_internal_variables import ForceHistory, ForcePreviousState
 from .forces import Forces
 from .viscoelasticity import MemoryHistory, MemoryState

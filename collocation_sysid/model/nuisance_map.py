@@ -24,10 +24,10 @@ from typing import Any, NamedTuple, TypeVar, get_args
 import casadi as ca
 import numpy as np
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
+from ..common.files import reason
 from ..errors import InputError
-from ..fem.constants import unit_of, without_unit
-from ..files import reason
+from ..fem.laws.constants import unit_of, without_unit
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp, prescribed_nodes
 from ..recording.loads import Force, LoadTime, PointMass

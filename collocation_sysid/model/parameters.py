@@ -17,10 +17,11 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
+from ..common.validated_types import Finite, Positive
 from ..errors import InputError, hint_at
 from ..fem.body import Body
-from ..fem.constants import (
+from ..fem.laws.constants import (
     INSTANTANEOUS,
     Scale,
     constant_named,
@@ -30,8 +31,7 @@ from ..fem.constants import (
     usual_value,
     without_region,
 )
-from ..fem.moduli import ENGINEERING, engineering_constants
-from ..validated_types import Finite, Positive
+from ..fem.laws.moduli import ENGINEERING, engineering_constants
 from .generated_functions import GeneratedFunction
 
 

@@ -19,7 +19,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..fem.air import unit_drag
 from ..fem.body import Body, Linearisation, SecondDerivatives
 from ..fem.force_points import ForcePoints

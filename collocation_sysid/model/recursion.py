@@ -18,7 +18,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from .generated_functions import GeneratedFunction
 
 Expression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]

@@ -1,6 +1,6 @@
 """Memory of a viscoelastic body along a motion, with derivatives forward and backward in time.
 
-Use this module for the Prony branches of a material (see `fem.memory`). The internal variables that
+Use this module for the Prony branches of a material (see `fem.laws.memory`). The internal variables that
 evaluation k passes to the next one are, for each branch,
 
     m_k = d_k m_{k−1} + a_k S_k,   d_k = e_{k+1},   a_k = e_{k+1} c_k − c_{k+1},
@@ -30,9 +30,9 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..fem.body import Body, SecondDerivatives
-from ..fem.memory import MemoryInput, MemoryLayout, fading_coefficients
+from ..fem.laws.memory import MemoryInput, MemoryLayout, fading_coefficients
 from .forces import Forces
 from .generated_functions import GeneratedFunction
 from .recursion import Recursion

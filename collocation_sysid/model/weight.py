@@ -22,7 +22,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..fem.air import ADDED_MASS_SHARE
 from ..fem.body import Body, Linearisation, SecondDerivatives
 from ..fem.regions import Theta

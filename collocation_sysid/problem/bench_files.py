@@ -12,7 +12,7 @@ from pathlib import PurePath
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.body import Body
 from ..recording import Experiment, Grasp

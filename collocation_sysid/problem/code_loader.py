@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+from ..common.files import reason, require_regular
 from ..errors import InputError, hint_at, located
-from ..fem.materials import Energy, Material
+from ..fem.laws.materials import Energy, Material
 from ..fem.node_force import NodeForce
-from ..files import reason, require_regular
 from ..recording.formats.logs import stored_files
 from ..recording.node_selection import selection_from_section
 from ..recording.nuisance import NuisanceRow

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.constants import DENSITY, MASS, is_density, without_region
+from ..fem.laws.constants import DENSITY, MASS, is_density, without_region
 from .schema import ObjectSection, ParameterSection, RegionSection
 
 Sections = Mapping[str, ParameterSection | float]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 
-from ..pages import documentation_url
+from ..common.pages import documentation_url
 from .schema import ProblemFile
 
 SCHEMA_FILE = "schema.json"

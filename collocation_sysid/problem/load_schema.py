@@ -8,10 +8,10 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
+from ..common.schema_tables import Section, Vector, require_one
+from ..common.validated_types import Finite, NotNegative, Positive, Text
 from ..recording import Force, PointMass, Pressure, Tendon
 from ..recording.node_selection import Nodes
-from ..schema_tables import Section, Vector, require_one
-from ..validated_types import Finite, NotNegative, Positive, Text
 
 
 class PointMassSection(Section):

@@ -8,28 +8,37 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from ..declarations import keys_of
+from ..common.declarations import keys_of
+from ..common.schema_tables import Section, declared_in
 from ..errors import InputError, located
 from ..fem.body import Body
-from ..fem.constants import FRICTION, GAMMA_M, GAMMA_R, Constant, constant_named
-from ..fem.mesh import TetMesh
-from ..fem.regions import Region
-from ..fem.rest_shape import UnderGravity
-from ..fem.spatial_field import Field
-from ..fem.structured import (
+from ..fem.laws.constants import (
+    FRICTION,
+    GAMMA_M,
+    GAMMA_R,
+    Constant,
+    constant_named,
+)
+from ..fem.meshes.mesh import TetMesh
+from ..fem.meshes.structured import (
     box_of_edge,
     count_box_elements,
     count_cylinder_elements,
     cylinder_of_edge,
 )
+from ..fem.regions import Region
+from ..fem.rest_shape import UnderGravity
+from ..fem.spatial_field import Field
 from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Specimen
 from ..recording.homogeneous_deformation import DEFORMATIONS
 from ..recording.node_selection import selection_from_section
 from ..recording.specimen import cell_body
 from ..recording.specimen_checks import require_equal_units
-from ..schema_tables import Section, declared_in
-from ..statistics.plausibility import SIZES_M, size_and_density_hypotheses
+from ..statistics.misspecification.plausibility import (
+    SIZES_M,
+    size_and_density_hypotheses,
+)
 from .code_loader import CodeLoader, existing_file
 from .density_guesses import with_declared_densities, with_guessed_densities
 from .load_schema import LOADS

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError
 from ..recording import (
     MarkerTable,

@@ -6,8 +6,8 @@ import json
 import shutil
 from pathlib import Path
 
+from ..common.files import replaced_file, require_possible, write_text_file
 from ..errors import InputError
-from ..files import replaced_file, require_possible, write_text_file
 from .editor_schema import (
     SCHEMA_FILE,
     schema_text,

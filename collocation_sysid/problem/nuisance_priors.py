@@ -10,9 +10,9 @@ from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, model_validator
 
+from ..common.schema_tables import Section, used_keys
+from ..common.validated_types import Positive
 from ..recording.nuisance import SCOPE, SCOPE_TEXT
-from ..schema_tables import Section, used_keys
-from ..validated_types import Positive
 
 
 def _require_scope(word: str) -> str:

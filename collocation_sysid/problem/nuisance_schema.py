@@ -8,10 +8,10 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import Field
 
+from ..common.schema_tables import ByForm, Section
+from ..common.validated_types import Text
 from ..recording import Nuisance
 from ..recording.nuisance import KINDS, NuisanceRow
-from ..schema_tables import ByForm, Section
-from ..validated_types import Text
 from .nuisance_priors import (
     CalibrationDistortionPrior,
     CalibrationScalePrior,

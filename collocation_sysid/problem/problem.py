@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from ..array_types import Array
-from ..declarations import declaration, key
+from ..common.array_types import Array
+from ..common.declarations import declaration, key
 from ..errors import InputError, located
 from ..fem.body import Body
 from ..fem.spatial_field import FieldModes
@@ -24,7 +24,9 @@ from ..program.collocation import Collocation
 from ..program.shared_nuisances import nuisance_indices
 from ..program.simulation import require_steps
 from ..recording import Experiment
-from ..statistics.plausibility import size_and_density_hypotheses
+from ..statistics.misspecification.plausibility import (
+    size_and_density_hypotheses,
+)
 from ..statistics.scale_identifiability import scale_concerns, static_concerns
 from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from ..statistics.shape_error import CORRELATION
-from ..statistics.systematic_effects import CORRELATION_KEY, Assumptions
+from ..common.validated_types import Options, Positive, Text
+from ..statistics.budget.shape_error import CORRELATION
+from ..statistics.budget.systematic_effects import CORRELATION_KEY, Assumptions
 from ..statistics.uncertainty import ErrorModel
-from ..validated_types import Options, Positive, Text
 
 
 @dataclass(frozen=True)

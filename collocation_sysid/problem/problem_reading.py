@@ -12,8 +12,8 @@ from typing import Any
 import tomli_w
 from pydantic import ValidationError
 
+from ..common.files import require_regular
 from ..errors import InputError, excerpt, located
-from ..files import require_regular
 from .schema import ProblemFile
 from .validation_messages import explain_validation_error
 

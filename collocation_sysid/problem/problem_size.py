@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..display import duration
+from ..common.display import duration
+from ..common.machine import machine_memory_mb
 from ..errors import InputError
-from ..machine import machine_memory_mb
 
 Say = Callable[[str], None]
 

@@ -12,8 +12,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..array_types import Array
-from ..declarations import keys_of
+from ..common.array_types import Array
+from ..common.declarations import keys_of
+from ..common.schema_tables import declared_in
 from ..errors import InputError, hint_at, located
 from ..fem.body import Body
 from ..methods.stiffness_scan import typical_constants
@@ -44,8 +45,9 @@ from ..recording.formats.units import METRES_PER_UNIT
 from ..recording.poses import require_determined_motion
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.time_tables import is_within_experiment, read_custom_sensor
-from ..schema_tables import declared_in
-from ..statistics.modal_misspecifications import find_misspecifications_by_modes
+from ..statistics.misspecification.modal_misspecifications import (
+    find_misspecifications_by_modes,
+)
 from .bench_files import strain_length_m
 from .code_loader import CodeLoader, existing_file
 from .load_schema import LOADS

@@ -6,16 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from ..recording.depth_camera import Background, PoseMatrix
-from ..recording.experiment import EARTH_M_S2, Kind, StartRule
-from ..recording.grasp import Axes
-from ..recording.markers import Places
-from ..recording.measured_wrench import Frame
-from ..recording.node_selection import Nodes
-from ..recording.placement import AttachmentRule
-from ..recording.solid_sections import SolidSection
-from ..schema_tables import ByForm, Section, Unit, Vector, used_keys
-from ..validated_types import (
+from ..common.schema_tables import ByForm, Section, Unit, Vector, used_keys
+from ..common.validated_types import (
     AtLeastOne,
     Boundless,
     Finite,
@@ -24,6 +16,14 @@ from ..validated_types import (
     Positive,
     Text,
 )
+from ..recording.depth_camera import Background, PoseMatrix
+from ..recording.experiment import EARTH_M_S2, Kind, StartRule
+from ..recording.grasp import Axes
+from ..recording.markers import Places
+from ..recording.measured_wrench import Frame
+from ..recording.node_selection import Nodes
+from ..recording.placement import AttachmentRule
+from ..recording.solid_sections import SolidSection
 from .load_schema import (
     ForceSection,
     PointMassSection,

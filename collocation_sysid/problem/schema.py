@@ -6,15 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
-from ..errors import InputError
-from ..fem.constants import Scale
-from ..fem.elements import ELEMENTS
-from ..fem.materials import DAMPINGS, MATERIALS
-from ..fem.spatial_field import ALL_MODULI, SMOOTH, Lengths, Prior
-from ..model.schemes import MOST_STEPS, SCHEMES
-from ..recording.environment import usual_air_density
-from ..recording.node_selection import Nodes
-from ..schema_tables import (
+from ..common.schema_tables import (
     Among,
     ByForm,
     Section,
@@ -23,8 +15,7 @@ from ..schema_tables import (
     require_one,
     used_keys,
 )
-from ..statistics.systematic_effects import Assumptions
-from ..validated_types import (
+from ..common.validated_types import (
     AtLeastOne,
     Count,
     Finite,
@@ -33,6 +24,15 @@ from ..validated_types import (
     Positive,
     Text,
 )
+from ..errors import InputError
+from ..fem.elements import ELEMENTS
+from ..fem.laws.constants import Scale
+from ..fem.laws.materials import DAMPINGS, MATERIALS
+from ..fem.spatial_field import ALL_MODULI, SMOOTH, Lengths, Prior
+from ..model.schemes import MOST_STEPS, SCHEMES
+from ..recording.environment import usual_air_density
+from ..recording.node_selection import Nodes
+from ..statistics.budget.systematic_effects import Assumptions
 from .problem_options import RolloutOptions, UncertaintyOptions
 from .recording_schema import ExperimentSection
 from .solver_schema import SolverSection

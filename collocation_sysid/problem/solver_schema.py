@@ -12,6 +12,8 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core.core_schema import no_info_plain_validator_function
 
+from ..common.schema_tables import Among, Section
+from ..common.validated_types import Options, Positive
 from ..errors import InputError
 from ..methods import METHODS, method_options_schema
 from ..methods.comparison.casadi_nlp import Sleqp, SqpMethod, refusal_reason
@@ -22,8 +24,6 @@ from ..methods.interior_point import InteriorPoint
 from ..methods.method_options import method_from_options
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Method
-from ..schema_tables import Among, Section
-from ..validated_types import Options, Positive
 
 OPTIONS = {
     method: [field.name for field in fields(kind)]

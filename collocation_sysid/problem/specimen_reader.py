@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..errors import InputError, located
 from ..fem.body import Body
 from ..recording import Experiment, Specimen

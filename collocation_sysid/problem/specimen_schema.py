@@ -6,10 +6,17 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from ..common.schema_tables import Among, ByForm, require_one
+from ..common.validated_types import (
+    AtLeastOne,
+    Boundless,
+    Count,
+    Flag,
+    Positive,
+    Text,
+)
 from ..recording.homogeneous_deformation import TESTS
 from ..recording.specimen import AREA_ERROR, LATERAL_SIGMA, STRAIN_ZERO
-from ..schema_tables import Among, ByForm, require_one
-from ..validated_types import AtLeastOne, Boundless, Count, Flag, Positive, Text
 from .recording_schema import NamedSection
 
 Prior = Annotated[Literal["none"] | Positive, ByForm(str)]

@@ -10,8 +10,8 @@ from typing import Any, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from ..common.validated_types import expected as wanted
 from ..errors import InputError, excerpt, hint_at
-from ..validated_types import expected as wanted
 from .schema import SPECIMEN_TAG, ProblemFile, with_experiment_defaults
 from .specimen_schema import SpecimenSection
 

@@ -40,17 +40,17 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..errors import InputError
 from ..model.parameters import Parameters
 from ..model.schemes import Scheme
 from ..recording.experiment import Experiment
 from .experiment_iterate import ExperimentIterate
-from .lifted_variables import LiftedOffsets, LiftedVariables
-from .lifting import lift_variables
-from .marker_association import MarkerAssociation
+from .lifted.lifted_variables import LiftedOffsets, LiftedVariables
+from .lifted.lifting import lift_variables
+from .linear_algebra.sparse_assembly import SparseAssembly
+from .markers.marker_association import MarkerAssociation
 from .shared_nuisances import nuisance_indices, shared_charts
-from .sparse_assembly import SparseAssembly
 from .transcription import RowWeights, SegmentOffsets, Transcription
 
 

@@ -15,14 +15,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..model.nuisance_map import NuisanceMap
 from ..recording.custom_sensor import Gauge
 from ..recording.experiment import Experiment
 from ..recording.nuisance import GAUGE
 from ..recording.placement import place_markers
 from ..recording.sample_times import TIME_TOLERANCE_S
-from .marker_association import MarkerAssociation
+from .markers.marker_association import MarkerAssociation
 from .measurement_residual import (
     GROUP,
     Channel,
@@ -32,7 +32,7 @@ from .measurement_residual import (
     neighbouring_times,
 )
 from .observables import ObservedMotion, PointPositions
-from .wrench_observable import GraspWrench, ReactionGrid
+from .wrench.wrench_observable import GraspWrench, ReactionGrid
 
 # Grid times around a sample, for positions, velocities and accelerations.
 NEIGHBOURS = 5

@@ -13,14 +13,14 @@ from functools import cached_property
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..fem.body import Linearisation
 from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.internal_variables import AnyHistory
-from .depth_residual import DepthResidual
+from .depth.depth_residual import DepthResidual
+from .depth.outline_residual import OutlineResidual
 from .observables import ObservedMotion
 from .observation import Observation
-from .outline_residual import OutlineResidual
 from .transcription import Transcription
 
 

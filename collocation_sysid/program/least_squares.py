@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import get_lapack_funcs
 from scipy.optimize import lsq_linear
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 
 # Triangles are so small that NumPy's checks would take longer than the work.
 _names = ("geqrf", "trtrs", "trtri", "trcon")

@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from .measurement_residual import MeasurementResidual
 from .observables import PointPositions, SparseEntries
 

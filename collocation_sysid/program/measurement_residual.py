@@ -22,11 +22,11 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..model.generated_functions import GeneratedFunction
 from ..model.nuisance_map import NuisanceMap
 from .observables import ObservableDerivatives, PointPositions, SparseEntries
-from .wrench_observable import GraspWrench, ReactionGrid
+from .wrench.wrench_observable import GraspWrench, ReactionGrid
 
 # Numbers of a vector [x, y, z], whose residuals share a weight of Huber's loss.
 GROUP = 3

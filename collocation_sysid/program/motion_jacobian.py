@@ -14,11 +14,11 @@ from functools import cached_property
 
 import numpy as np
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..fem.body import Linearisation
 from ..fem.pattern import SymmetricPattern
 from ..model.dynamics import Dynamics
-from .block_band import (
+from .linear_algebra.block_band import (
     BandBlock,
     BlockBand,
     BlockTerm,

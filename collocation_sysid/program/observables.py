@@ -18,9 +18,9 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..recording.grasp import Grasp
-from .marker_association import MarkerAssociation, ShapeFunctions
+from .markers.marker_association import MarkerAssociation, ShapeFunctions
 
 
 @dataclass(frozen=True, eq=False)

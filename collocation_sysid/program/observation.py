@@ -15,18 +15,18 @@ from functools import partial
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.internal_variables import AnyHistory
-from .block_band import Submatrix
+from .linear_algebra.block_band import Submatrix
 from .observables import ObservedMotion, ReactionForces
-from .reaction_forces import (
+from .transcription import Transcription
+from .wrench.reaction_forces import (
     GraspForces,
     forces_on_dofs,
     reaction_changes,
     reaction_forces,
 )
-from .transcription import Transcription
 
 
 @dataclass(frozen=True, eq=False)

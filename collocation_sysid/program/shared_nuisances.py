@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..errors import InputError
 from ..model.nuisance_map import NuisanceEntry, NuisanceMap
 from ..recording.experiment import Experiment
 from ..recording.nuisance import PLACE, POSE_TURN, NuisanceRow
-from .marker_association import MarkerAssociation
+from .markers.marker_association import MarkerAssociation
 
 # What a chart has for each marker.
 OF_MARKERS = (

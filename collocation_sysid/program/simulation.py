@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError, SimulationError
 from ..model.dynamics import Dynamics
 from ..model.nuisance_map import NuisanceMap
@@ -25,14 +25,14 @@ from ..model.schemes import MOST_STEPS, Scheme, as_scheme
 from ..recording.experiment import Experiment
 from ..recording.nuisance import Nuisance
 from .custom_sensor_residual import custom_sensor_residuals
-from .loss_of_stability import explain_failure
-from .newmark import simulate_newmark
-from .newton_solver import NewtonOptions
+from .forward.loss_of_stability import explain_failure
+from .forward.newmark import simulate_newmark
+from .forward.newton_solver import NewtonOptions
+from .forward.scheme_simulation import Progress, simulate_scheme
 from .observables import ObservedMotion, ReactionForces
-from .reaction_forces import forces_on_dofs, reaction_forces
-from .scheme_simulation import Progress, simulate_scheme
-from .wrench_observable import ReactionGrid, sensed_dofs
-from .wrench_residual import wrench_residuals
+from .wrench.reaction_forces import forces_on_dofs, reaction_forces
+from .wrench.wrench_observable import ReactionGrid, sensed_dofs
+from .wrench.wrench_residual import wrench_residuals
 
 # Name of the integrator that is no collocation scheme, and its order of accuracy.
 NEWMARK = "newmark"
@@ -47,7 +47,7 @@ FIRST_SCHEME_STEPS = 1
 MOST_AUTOMATIC_STEPS = 32
 # Largest error of node positions at the samples, relative to the way of the node that moves
 # farthest, that automatic refinement accepts. For a swung block it changes E by 0.4 %
-# (`tests/test_substeps.py`), which a run's interval for its own step covers.
+# (`tests/program/test_substeps.py`), which a run's interval for its own step covers.
 STEP_TOLERANCE = 1e-4
 # Error relative to the size of the body that is rounding of Newton's method.
 ROUNDING = 1e-9

@@ -1,7 +1,7 @@
 """Interface of a streaming sweep: time marching along a recording that has no end yet.
 
 Modules outside `program` that follow a recording frame by frame import from here alone
-(`tests/test_architecture.py`):
+(`tests/project/test_architecture.py`):
 
 - `StreamingModel` is the program of a recording that arrives frame by frame, and `StreamStencil`
   the rows that samples of an instrument need;
@@ -12,8 +12,8 @@ Modules outside `program` that follow a recording frame by frame import from her
   and samples later than `LARGEST_SAMPLE_DELAY` are not used.
 """
 
-from .lapack import one_blas_thread
 from .least_squares import SquareRootInformation
+from .linear_algebra.lapack import one_blas_thread
 from .measurement_residual import lagrange_weights
 from .streaming_model import StreamingModel, StreamStencil
 from .streaming_sweep import (

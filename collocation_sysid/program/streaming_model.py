@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array, Index
-from ..fem.constants import GAMMA_M, without_region
+from ..common.array_types import Array, Index
+from ..fem.laws.constants import GAMMA_M, without_region
 from ..model.dynamics import StencilRow
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
@@ -24,16 +24,16 @@ from ..recording.poses import Poses, PoseSequence
 from .collocation import Collocation
 from .custom_sensor_residual import NEIGHBOURS as GAUGE_NEIGHBOURS
 from .custom_sensor_residual import observed_points
-from .grasp_reactions import DELAY_STEPS, Sensor
+from .forward.newton_solver import NewtonOptions, NewtonSolver
 from .least_squares import SquareRootInformation
-from .marker_residual import NEIGHBOURS, MarkerResidual
+from .markers.marker_residual import NEIGHBOURS, MarkerResidual
 from .measurement_residual import MeasurementResidual
-from .newton_solver import NewtonOptions, NewtonSolver
 from .observables import PointPositions
 from .sweep import Sweep
 from .transcription import Transcription
-from .wrench_observable import GraspWrench
-from .wrench_residual import NEIGHBOURS as WRENCH_NEIGHBOURS
+from .wrench.grasp_reactions import DELAY_STEPS, Sensor
+from .wrench.wrench_observable import GraspWrench
+from .wrench.wrench_residual import NEIGHBOURS as WRENCH_NEIGHBOURS
 
 if TYPE_CHECKING:
     from ..fem.kernels.skyline import FactorMemory

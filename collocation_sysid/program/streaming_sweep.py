@@ -18,17 +18,16 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..fem.body import Linearisation
 from ..model.dynamics import StencilRow
 from ..recording.poses import Poses
-from .grasp_reactions import DELAY_STEPS, GraspReactions
-from .initial_equilibrium import initial_state
+from .forward.initial_equilibrium import initial_state
+from .forward.newton_solver import NewtonFailure, simulation_error
+from .forward.scheme_simulation import RowEquations, extrapolate, solve_row
 from .least_squares import SquareRootInformation
 from .measurement_residual import huber_as_least_squares, lagrange_weights
-from .newton_solver import NewtonFailure, simulation_error
 from .observables import ObservableDerivatives, ObservedMotion
-from .scheme_simulation import RowEquations, extrapolate, solve_row
 from .streaming_model import ROW_TOLERANCE, ROWS_PER_CHUNK, StreamingModel
 from .sweep import (
     FactorisedStep,
@@ -37,6 +36,7 @@ from .sweep import (
     PrescribedColumns,
     SweepColumns,
 )
+from .wrench.grasp_reactions import DELAY_STEPS, GraspReactions
 
 # Largest correction of a row, divided by the size of the body, after which the row is not
 # linearised again: the next correction would be about its square.

@@ -29,7 +29,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
+from ..common.step_counting import StepUnit, complete_steps
 from ..errors import SimulationError
 from ..fem.body import Linearisation
 from ..model.dynamics import Dynamics, StencilRow, weighted_sum_of_past
@@ -37,13 +38,12 @@ from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.force_internal_variables import ForceForwardColumns
 from ..model.internal_variables import AnyHistory
 from ..model.viscoelasticity import MemoryForwardColumns
-from ..step_counting import StepUnit, complete_steps
-from .block_band import Submatrix
-from .factorisation import Choice, Factor, Factoriser
-from .lapack import one_blas_thread
-from .reaction_forces import GraspForces
+from .linear_algebra.block_band import Submatrix
+from .linear_algebra.factorisation import Choice, Factor, Factoriser
+from .linear_algebra.lapack import one_blas_thread
 from .stopwatch import Stopwatch
 from .transcription import Transcription
+from .wrench.reaction_forces import GraspForces
 
 if TYPE_CHECKING:
     from ..fem.kernels.skyline import FactorMemory
@@ -359,7 +359,7 @@ class Sweep:
     stopwatch : Stopwatch, optional
         Accumulates the time spent; a new one by default.
     factorisation : {"auto", "band", "sparse", "supernodal"}
-        Choice of factorisation, see `program.factorisation`.
+        Choice of factorisation, see `program.linear_algebra.factorisation`.
     """
 
     def __init__(

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..fem.body import Body, Linearisation, SecondDerivatives
 from ..fem.pattern import SymmetricPattern
 from ..model.dynamics import Dynamics, StencilRow
@@ -33,28 +33,28 @@ from ..model.parameters import Parameters, ThetaMap
 from ..model.schemes import Scheme
 from ..recording.experiment import Experiment
 from ..recording.nuisance import TIME
-from .block_band import (
+from .custom_sensor_residual import (
+    CustomSensorResidual,
+    custom_sensor_residuals,
+)
+from .depth.depth_camera_model import DepthCameraModel
+from .depth.depth_residual import DepthResidual
+from .depth.outline_residual import OutlineResidual
+from .linear_algebra.block_band import (
     BandBlock,
     BlockBand,
     BlockTerm,
     full_skew_values,
     skew_block_band,
 )
-from .custom_sensor_residual import (
-    CustomSensorResidual,
-    custom_sensor_residuals,
-)
-from .depth_camera_model import DepthCameraModel
-from .depth_residual import DepthResidual
 from .local_loss import LocalLoss
-from .marker_association import MarkerAssociation
-from .marker_residual import MarkerResidual
+from .markers.marker_association import MarkerAssociation
+from .markers.marker_residual import MarkerResidual
 from .measurement_residual import MeasurementResidual
 from .motion_jacobian import MotionJacobian, shifted_back
-from .outline_residual import OutlineResidual
 from .shared_nuisances import NuisanceIndices
-from .wrench_observable import ReactionGrid, sensed_dofs
-from .wrench_residual import WrenchResidual, wrench_residuals
+from .wrench.wrench_observable import ReactionGrid, sensed_dofs
+from .wrench.wrench_residual import WrenchResidual, wrench_residuals
 
 T = TypeVar("T", bound=np.generic)
 # Of what two stencils (p, q) of an evaluation make of its two matrices.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar
 
 import casadi as ca
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.shape import EnclosedVolume, PolylineLength
 from .loads import TimeSeries

@@ -12,12 +12,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..array_types import Array
-from ..declarations import declaration, identity, key
+from ..common.array_types import Array
+from ..common.declarations import declaration, identity, key
+from ..common.files import reason
+from ..common.schema_tables import Vector
+from ..common.validated_types import AtLeastOne, Positive, Text
 from ..errors import InputError
-from ..files import reason
-from ..schema_tables import Vector
-from ..validated_types import AtLeastOne, Positive, Text
 from .checked_arrays import read_only_floats
 from .measured_wrench import Frame
 from .sample_times import first_unordered_time

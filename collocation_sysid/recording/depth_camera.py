@@ -13,12 +13,12 @@ from typing import Any, ClassVar, Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..array_types import Array
-from ..declarations import declaration, identity, key
+from ..common.array_types import Array
+from ..common.declarations import declaration, identity, key
+from ..common.schema_tables import Vector
+from ..common.validated_types import Finite, Positive
 from ..errors import InputError
-from ..fem.selection import Selection
-from ..schema_tables import Vector
-from ..validated_types import Finite, Positive
+from ..fem.meshes.selection import Selection
 from .checked_arrays import read_only_floats
 from .node_selection import Nodes, selection_from_section
 from .poses import PoseSequence

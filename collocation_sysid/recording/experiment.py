@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..array_types import Array, Index
-from ..declarations import declaration, identity, key
+from ..common.array_types import Array, Index
+from ..common.declarations import declaration, identity, key
+from ..common.schema_tables import Vector
+from ..common.validated_types import Flag, NotNegative
 from ..errors import InputError
-from ..schema_tables import Vector
-from ..validated_types import Flag, NotNegative
 from .actuator import Actuator
 from .checked_arrays import float_converter, read_only_floats
 from .custom_sensor import Gauge

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from ..array_types import Array
-from ..fem.refinement import refine_nodes
+from ..common.array_types import Array
+from ..fem.meshes.refinement import refine_nodes
 from .experiment import Experiment
 from .placement import place_markers
 

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Literal, Self, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..array_types import Array, Index
-from ..declarations import declaration, identity, key
+from ..common.array_types import Array, Index
+from ..common.declarations import declaration, identity, key
+from ..common.validated_types import Finite, NotNegative
 from ..errors import InputError
-from ..fem.selection import Selection
-from ..validated_types import Finite, NotNegative
+from ..fem.meshes.selection import Selection
 from .measured_wrench import Wrench
 from .node_selection import (
     Nodes,

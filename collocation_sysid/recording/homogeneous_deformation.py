@@ -15,8 +15,8 @@ from typing import cast
 
 import numpy as np
 
-from ..array_types import Array
-from ..fem.mesh import TetMesh
+from ..common.array_types import Array
+from ..fem.meshes.mesh import TetMesh
 from .grasp import Axes
 
 # Distance of the nodes from the origin [m]: answers do not depend on it.

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..array_types import Array, Index
-from ..declarations import Key, declaration, key
+from ..common.array_types import Array, Index
+from ..common.declarations import Key, declaration, key
+from ..common.schema_tables import Vector
+from ..common.validated_types import Finite, Positive, Text
 from ..errors import InputError
-from ..fem.selection import Selection
-from ..schema_tables import Vector
-from ..validated_types import Finite, Positive, Text
+from ..fem.meshes.selection import Selection
 from .checked_arrays import read_only_floats
 from .node_selection import (
     Nodes,

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..array_types import Array
-from ..declarations import declaration, key
+from ..common.array_types import Array
+from ..common.declarations import declaration, key
 from ..errors import InputError, hint_at, listed
 from .checked_arrays import float_converter, read_only_tracks
 from .formats import c3d, motive, plain_csv, qualisys, trc

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..array_types import Array, Index
-from ..declarations import Key, declaration, identity, key
+from ..common.array_types import Array, Index
+from ..common.declarations import Key, declaration, identity, key
+from ..common.validated_types import Positive
 from ..errors import InputError
-from ..validated_types import Positive
 from .checked_arrays import float_converter, read_only_floats, read_only_tracks
 from .placement import AttachmentRule, LocatedBody, Placement, place_markers
 

@@ -7,11 +7,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..array_types import Array
-from ..declarations import declaration, key
+from ..common.array_types import Array
+from ..common.declarations import declaration, key
+from ..common.schema_tables import Vector
+from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
-from ..schema_tables import Vector
-from ..validated_types import AtLeastOne, Positive
 from .checked_arrays import float_converter, read_only_floats
 from .sample_times import first_unordered_time
 

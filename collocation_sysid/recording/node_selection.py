@@ -9,11 +9,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import model_validator
 
-from ..array_types import Index
+from ..common.array_types import Index
+from ..common.schema_tables import ByForm, Corner, Section, Vector, require_one
+from ..common.validated_types import Positive, StrictInteger, Text
 from ..errors import InputError
-from ..fem.selection import Ball, Box, Face, FaceName, Indices, Named, Selection
-from ..schema_tables import ByForm, Corner, Section, Vector, require_one
-from ..validated_types import Positive, StrictInteger, Text
+from ..fem.meshes.selection import (
+    Ball,
+    Box,
+    Face,
+    FaceName,
+    Indices,
+    Named,
+    Selection,
+)
 from .checked_arrays import read_only_nodes
 
 if TYPE_CHECKING:

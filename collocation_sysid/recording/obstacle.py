@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..array_types import Array, Index
-from ..declarations import declaration, key
+from ..common.array_types import Array, Index
+from ..common.declarations import declaration, key
+from ..common.validated_types import NotNegative, Positive, Text
 from ..errors import InputError
-from ..fem.constants import FRICTION, Constant, constant_named
 from ..fem.contact_surface import ContactSurface
-from ..fem.selection import Selection
-from ..validated_types import NotNegative, Positive, Text
+from ..fem.laws.constants import FRICTION, Constant, constant_named
+from ..fem.meshes.selection import Selection
 from .grasp import Grasp
 from .node_selection import Nodes, selection_from_section
 from .obstacle_solids import KINDS, Solid, orthogonal_axes

@@ -9,11 +9,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..array_types import Array
-from ..declarations import declaration, key
+from ..common.array_types import Array
+from ..common.declarations import declaration, key
+from ..common.schema_tables import Vector
+from ..common.validated_types import NotNegative, Positive
 from ..errors import InputError
-from ..schema_tables import Vector
-from ..validated_types import NotNegative, Positive
 from .checked_arrays import float_converter
 
 # Added to squared distances [m²]: the square root has no derivative at zero.

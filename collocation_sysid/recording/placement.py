@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..errors import InputError
 from .checked_arrays import point_text, read_only_floats, read_only_nodes
 

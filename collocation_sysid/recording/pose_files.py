@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..array_files import load_arrays
-from ..array_types import Array
+from ..common.array_files import load_arrays
+from ..common.array_types import Array
+from ..common.files import DAMAGE
 from ..errors import InputError
-from ..files import DAMAGE
 from .formats.columns import TIME, find_column, name_and_unit
 from .formats.text import (
     Row,

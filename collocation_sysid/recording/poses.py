@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline, PPoly
 from scipy.spatial.transform import Rotation
 
-from ..array_types import Array, Index
-from ..declarations import declaration, key
+from ..common.array_types import Array, Index
+from ..common.declarations import declaration, key
 from ..errors import InputError
 from .checked_arrays import float_converter, read_only_floats
 from .sample_times import TIME_TOLERANCE_S, first_unordered_time

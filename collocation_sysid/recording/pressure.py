@@ -9,13 +9,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..array_types import Array, Index
-from ..declarations import Key, declaration, key
+from ..common.array_types import Array, Index
+from ..common.declarations import Key, declaration, key
+from ..common.validated_types import Finite, NotNegative, Text
 from ..errors import InputError
-from ..fem.refinement import split_faces_in_four
-from ..fem.selection import Indices, Selection, rows_of_faces
+from ..fem.meshes.refinement import split_faces_in_four
+from ..fem.meshes.selection import Indices, Selection, rows_of_faces
 from ..fem.shape import EnclosedVolume
-from ..validated_types import Finite, NotNegative, Text
 from .actuator import Actuator, BodyMeasure
 from .loads import TimeSeries
 from .node_selection import Nodes, selection_from_section

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..array_types import Array
-from ..files import replaced_file
+from ..common.array_types import Array
+from ..common.files import replaced_file
 from .marker_files import MarkerTable
 from .pose_files import POSE_COLUMNS
 from .poses import PoseSequence

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError
 from .checked_arrays import read_only_floats, read_only_tracks
 from .marker_files import MarkerTable

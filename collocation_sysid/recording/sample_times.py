@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError
 
 # Largest deviation of a time step from the mean step, as a share of it.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pydantic import model_validator
 
-from ..schema_tables import Section, Vector, declared_in, require_one
-from ..validated_types import NotNegative, Positive
+from ..common.schema_tables import Section, Vector, declared_in, require_one
+from ..common.validated_types import NotNegative, Positive
 from .obstacle_solids import KINDS, Solid
 
 

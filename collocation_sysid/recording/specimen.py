@@ -12,12 +12,12 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from ..array_types import Array
-from ..declarations import declaration, key
+from ..common.array_types import Array
+from ..common.declarations import declaration, key
+from ..common.validated_types import NotNegative, Positive
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.materials import DampingLaw, Energy, Material, Prony
-from ..validated_types import NotNegative, Positive
+from ..fem.laws.materials import DampingLaw, Energy, Material, Prony
 from .checked_arrays import float_converter
 from .custom_sensor import Gauge, Look
 from .experiment import Experiment

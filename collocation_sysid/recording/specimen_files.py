@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..errors import InputError
 from .experiment import Experiment
 from .formats.columns import (

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.ogden import is_power_law
+from ..fem.laws.ogden import is_power_law
 
 # Smallest principal stretch at which laws in powers of the stretches are accurate to 0.1 %.
 SMALLEST_POWER_STRETCH = 0.05
@@ -18,7 +18,7 @@ def require_evaluable_law(
 ) -> None:
     """Raise an `InputError` if stretches leave the range in which the law is evaluated accurately.
 
-    Laws in powers of the stretches integrate over invariants, see `fem.power_traces`.
+    Laws in powers of the stretches integrate over invariants, see `fem.laws.power_traces`.
 
     Parameters
     ----------

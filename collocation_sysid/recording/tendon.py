@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from ..array_types import Array
-from ..declarations import Key, declaration, key
+from ..common.array_types import Array
+from ..common.declarations import Key, declaration, key
+from ..common.schema_tables import Vector
+from ..common.validated_types import NotNegative, Text
 from ..errors import InputError
 from ..fem.shape import PolylineLength
-from ..schema_tables import Vector
-from ..validated_types import NotNegative, Text
 from .actuator import Actuator, BodyMeasure
 from .checked_arrays import float_converter, point_text
 from .loads import TimeSeries

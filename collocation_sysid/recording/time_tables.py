@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError, hint_at
 from .formats.columns import (
     DISPLACEMENT,

@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from ..array_types import Array
+from ..common.array_types import Array
+from ..common.files import replaced_file, safe_name
 from ..errors import InputError, require_among
-from ..files import replaced_file, safe_name
 from .figure_style import (
     BLACK,
     BLUE,

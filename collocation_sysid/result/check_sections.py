@@ -10,8 +10,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ..display import Line, Shown, Table, duration, labelled
-from ..fem.constants import symbol_of, unit_of
+from ..common.display import Line, Shown, Table, duration, labelled
+from ..fem.laws.constants import symbol_of, unit_of
 from ..runs.check import (
     BodyCheck,
     CheckResult,

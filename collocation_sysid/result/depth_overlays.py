@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..model.nuisance_map import NuisanceMap
-from ..program.depth_camera_model import DepthCameraModel
-from ..program.depth_comparison import SurfaceComparison
-from ..program.visible_surface import VisibleSurface
+from ..program.depth.depth_camera_model import DepthCameraModel
+from ..program.depth.depth_comparison import SurfaceComparison
+from ..program.depth.visible_surface import VisibleSurface
 from ..recording.experiment import Experiment
 from .pictures.album import save_pictures, with_unique_names
 from .pictures.depth_comparison_picture import depth_picture

@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..fem.body import Body
 from ..fem.elements import Element
 from ..fem.expressions import PointLaw, kernel_from_outputs, quadrature_point

@@ -21,7 +21,7 @@ from matplotlib.ticker import (
     NullLocator,
 )
 
-from ..fem.constants import symbol_of
+from ..fem.laws.constants import symbol_of
 
 # Okabe & Ito's palette, distinguishable with any colour vision.
 BLACK = "#000000"

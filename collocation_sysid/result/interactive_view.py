@@ -16,9 +16,9 @@ from typing import Any
 import meshio
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
+from ..common.files import damage_refused, is_own
 from ..errors import InputError, require_among
-from ..files import damage_refused, is_own
 from .animation import experiment_named
 from .figure_style import BLACK, VERMILION
 from .pictures.projection import ParallelCamera

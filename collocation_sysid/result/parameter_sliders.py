@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..array_types import Array
-from ..display import number
+from ..common.array_types import Array
+from ..common.display import number
 from ..errors import InputError, SimulationError, require_among
-from ..fem.constants import is_field_coefficient, symbol_with_unit
+from ..fem.laws.constants import is_field_coefficient, symbol_with_unit
 from ..model.parameters import Parameters
 from ..problem import Problem
 from ..program.transcription import Transcription

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from ..display import Table, TitledParts, short
+from ..common.display import Table, TitledParts, short
 from ..errors import listed
-from ..fem.constants import symbol_of
+from ..fem.laws.constants import symbol_of
 from ..runs.result_content import Result
-from ..statistics.relaxed_assumptions import EstimateChange, Probe
-from ..statistics.uncertainty_budget import source_label
+from ..statistics.budget.uncertainty_budget import source_label
+from ..statistics.probes.relaxed_assumptions import EstimateChange, Probe
 
 # Measures of stiffness, the most important first.
 STIFFNESS_NAMES = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array
+from ..common.array_types import Array
+from ..common.files import RESULT_FILE, damage_refused, require_own
 from ..errors import InputError
-from ..fem.constants import symbol_of, without_region
 from ..fem.elements import EDGES
-from ..files import RESULT_FILE, damage_refused, require_own
+from ..fem.laws.constants import symbol_of, without_region
 from ..recording.experiment import Experiment
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.specimen_files import specimen_strains

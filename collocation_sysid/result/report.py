@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from ..display import (
+from ..common.display import (
     Items,
     Line,
     Picture,
@@ -23,8 +23,8 @@ from ..display import (
     escape,
     own_pictures,
 )
-from ..files import damage_refused, read_json
-from ..serialisation import read
+from ..common.files import damage_refused, read_json
+from ..common.serialisation import read
 
 SUMMARY_FILE = "summary.json"
 CAPTIONS = {

@@ -14,18 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
+from ..common.files import RESULT_FILE, write_text_file
+from ..common.serialisation import as_json
 from ..errors import InputError
 from ..fem.body import Body
-from ..files import RESULT_FILE, write_text_file
-from ..program.contact_summary import surface_gaps_and_pressures
-from ..program.depth_comparison import SurfaceComparison
+from ..program.contact.contact_summary import surface_gaps_and_pressures
+from ..program.depth.depth_comparison import SurfaceComparison
 from ..recording.experiment import Experiment
 from ..runs.forward_simulation import ForwardSimulation
 from ..runs.result_builder import build_result
 from ..runs.result_content import Result
 from ..runs.solved_problem import SolvedProblem
-from ..serialisation import as_json
 from .element_fields import ElementFields
 from .replay import MotionRecord
 from .run_writers import replaced_folder, write_frames

@@ -11,24 +11,24 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from ..common.files import RESULT_FILE, replaced_file, require_own
+from ..common.serialisation import as_json, read
 from ..errors import InputError
-from ..files import RESULT_FILE, replaced_file, require_own
 from ..model.parameters import Parameters
 from ..problem import Problem
 from ..runs.numerical_error import solve_refined
 from ..runs.result_content import ReportedEstimate, Result
 from ..runs.verdict import combined_concerns
 from ..runs.warm_start import WarmStart
-from ..serialisation import as_json, read
 from ..statistics.assessment import NUMERICAL, Assessment, numerical_concerns
-from ..statistics.combined_intervals import combine
-from ..statistics.discretisation_error import (
+from ..statistics.budget.combined_intervals import combine
+from ..statistics.budget.discretisation_error import (
     DiscretisationError,
     Refinement,
     RefinementLevel,
 )
+from ..statistics.budget.uncertainty_budget import NUMERICAL as DISCRETISATION
 from ..statistics.estimates import Estimate
-from ..statistics.uncertainty_budget import NUMERICAL as DISCRETISATION
 from .replay import damaged_run_refused
 from .run_record import REFINEMENT_FILE
 

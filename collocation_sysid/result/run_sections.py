@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..display import (
+from ..common.display import (
     Cards,
     Line,
     Listing,
@@ -27,18 +27,18 @@ from ..display import (
     own_pictures,
     short,
 )
+from ..common.files import is_own
+from ..common.pages import explain_command, page_url
+from ..common.serialisation import content
 from ..errors import listed
-from ..fem.constants import symbol_of, symbol_with_unit, unit_of
-from ..files import is_own
-from ..pages import explain_command, page_url
-from ..program.depth_comparison import DepthError
+from ..fem.laws.constants import symbol_of, symbol_with_unit, unit_of
+from ..program.depth.depth_comparison import DepthError
 from ..recording.nuisance import in_readable_unit
 from ..runs.prediction import PredictionErrors
 from ..runs.result_content import Elapsed, Result, SimulatedExperiment
-from ..serialisation import content
 from ..statistics.assessment import Assessment
+from ..statistics.budget.uncertainty_budget import main_sources, source_label
 from ..statistics.concerns import Concern, topics_of
-from ..statistics.uncertainty_budget import main_sources, source_label
 from .probe_sections import (
     DEEPER_CHECK_ADVICE,
     STIFFNESS_NAMES,

@@ -22,10 +22,10 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..common.files import RESULT_FILE, naming
+from ..common.written_files import LIST_FILE, foreign_files, list_files
 from ..errors import InputError
 from ..fem.elements import Element
-from ..files import RESULT_FILE, naming
-from ..written_files import LIST_FILE, foreign_files, list_files
 from .element_fields import ElementFields
 
 VTK_CELL_TYPES = ("tetra", "tetra10")  # by meshio's names

@@ -1,7 +1,8 @@
 """Progress of a solve: a live table of iterations on a terminal, occasional lines elsewhere.
 
 The remaining time is shown for phases whose work can be counted, see `step_counting`, and the
-elapsed time for all others, such as a search: the number of its iterations is not known.
+elapsed time for all others, such as a search: the number of its iterations is not known. A search
+for an equilibrium that takes seconds shows its load step and residual.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ from dataclasses import dataclass
 from rich.console import Console, Group
 from rich.text import Text
 
-from ..console import Watched
-from ..display import Shown, Table, on_terminal
-from ..fem.constants import symbol_of
+from ..common.console import Watched
+from ..common.display import Shown, Table, on_terminal
+from ..common.step_counting import listen_to_shares, listen_to_states
+from ..fem.laws.constants import symbol_of
 from ..methods.solution import Iteration
 from ..problem import Problem
-from ..step_counting import listen_to_shares
 
 # Number of latest iterations on the terminal: half of its 24 lines.
 SHOWN_ITERATIONS = 12
@@ -122,6 +123,7 @@ class SolveProgress(Watched):
         self._lines: list[Iteration] = []
         self._doing = activity
         self._remaining = ""
+        self._state: Callable[[], str] | None = None
         self._activity_began_s = time.monotonic()
         self._phase_began_s = self._activity_began_s
         self._last_share = 0.0
@@ -139,6 +141,7 @@ class SolveProgress(Watched):
             self.line(f"note: {note}")
         super().__enter__()
         self._contexts.enter_context(listen_to_shares(self.share))
+        self._contexts.enter_context(listen_to_states(self.state))
         self._activity_began_s = time.monotonic()
         self._phase_began_s = self._activity_began_s
         if self._heartbeat is not None:
@@ -175,6 +178,8 @@ class SolveProgress(Watched):
             return
         if done == 0 or done < self._last_share:
             self._phase_began_s = now_s
+        if done > self._last_share:
+            self._state = None
         self._last_share = done
         if now_s - self._share_shown_s < SHARE_INTERVAL_S:
             return
@@ -184,11 +189,22 @@ class SolveProgress(Watched):
         )
         self._redraw()
 
+    def state(self, describe: Callable[[], str]) -> None:
+        """Store the state of an iteration, which is shown while the current activity lasts.
+
+        Parameters
+        ----------
+        describe : callable
+            Returns the state in words.
+        """
+        self._state = describe
+
     def _update_activity(self, activity: str, line: str = "") -> None:
         """Update the display with the current activity, and print `line` if verbose."""
         if activity != self._doing:
             self._activity_began_s = time.monotonic()
         self._doing = activity
+        self._state = None
         if self.verbose and line:
             self.console.print(Text(line), soft_wrap=True)
         self._redraw()
@@ -200,20 +216,22 @@ class SolveProgress(Watched):
 
     def _activity_with_time(self) -> str:
         """Return the current activity with its share and remaining time, or its elapsed time."""
-        if self._remaining:
-            return f"{self._doing}{self._remaining}"
         elapsed_s = time.monotonic() - self._activity_began_s
-        elapsed = (
-            f" ({elapsed_s:.0f} s so far)"
-            if elapsed_s >= FIRST_ELAPSED_S
-            else ""
-        )
-        return f"{self._doing}{elapsed}"
+        is_long = elapsed_s >= FIRST_ELAPSED_S
+        state = self._state_in_words() if is_long else ""
+        if self._remaining:
+            return f"{self._doing}{self._remaining}{state}"
+        elapsed = f" ({elapsed_s:.0f} s so far)" if is_long else ""
+        return f"{self._doing}{state}{elapsed}"
 
     def _activity_with_iterations(self) -> str:
         """Return the current activity with the number of iterations so far, for the `Heartbeat`."""
         done = f", {len(self._lines)} iterations" if self._lines else ""
-        return f"{self._doing}{self._remaining}{done}"
+        return f"{self._doing}{self._remaining}{done}{self._state_in_words()}"
+
+    def _state_in_words(self) -> str:
+        """Return the state of the current iteration after a comma; "" if there is none."""
+        return f", {self._state()}" if self._state is not None else ""
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,16 @@ from pathlib import Path
 
 import numpy as np
 
+from ..common.files import replaced_file
+from ..common.validated_types import Count, NotNegative, Options, Positive
+from ..common.written_files import (
+    LIST_FILE,
+    hashes_of,
+    is_written_here,
+    list_as_text,
+    listed_hashes,
+)
 from ..errors import InputError, require_among
-from ..files import replaced_file
 from ..model.schemes import SCHEMES
 from ..problem import Problem
 from ..problem.bench_files import (
@@ -37,14 +45,6 @@ from ..recording import (
 )
 from ..recording.recording_writers import write_columns_csv
 from ..recording.specimen_files import SpecimenLayout, specimen_columns
-from ..validated_types import Count, NotNegative, Options, Positive
-from ..written_files import (
-    LIST_FILE,
-    hashes_of,
-    is_written_here,
-    list_as_text,
-    listed_hashes,
-)
 from .run_writers import (
     FRAMES_FILE,
     replaced_folder,

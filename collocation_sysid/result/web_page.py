@@ -19,9 +19,9 @@ import numpy as np
 from matplotlib import colormaps
 from numpy.typing import NDArray
 
-from ..array_types import Array
-from ..display import escape
-from ..files import write_text_file
+from ..common.array_types import Array
+from ..common.display import escape
+from ..common.files import write_text_file
 from .pictures.projection import ParallelCamera
 from .replay import MotionRecord
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
+from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, SimulationError
 from ..fem.kernels import map_experiments
 from ..methods.complementarity import with_contact_energy
@@ -17,20 +18,19 @@ from ..model.schemes import MOST_STEPS, as_scheme
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
 from ..program.custom_sensor_residual import custom_sensor_residuals
-from ..program.depth_comparison import DepthError, SurfaceComparison
+from ..program.depth.depth_comparison import DepthError, SurfaceComparison
 from ..program.observables import ObservedMotion, ReactionForces
 from ..program.simulation import Trajectory, simulate
 from ..program.transcription import Transcription
-from ..program.wrench_observable import ReactionGrid
+from ..program.wrench.wrench_observable import ReactionGrid
 from ..recording import Experiment
-from ..statistics.discretisation_error import (
+from ..statistics.budget.discretisation_error import (
     Refinement,
     change_in_observations,
     discretisation_errors,
 )
 from ..statistics.estimates import Estimate
 from ..statistics.linearised import LinearisedFit, parameter_values
-from ..step_counting import StepUnit, complete_steps, counted_phase
 from .prediction import (
     CopyError,
     InstrumentMisfit,

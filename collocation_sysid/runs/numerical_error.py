@@ -7,13 +7,13 @@ from dataclasses import replace
 from typing import TypeVar
 
 from ..errors import InputError
-from ..fem.refinement import refine_body
+from ..fem.meshes.refinement import refine_body
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..recording import experiment_refinement
-from ..statistics.discretisation_error import (
+from ..statistics.budget.discretisation_error import (
     Refinement,
     RefinementLevel,
     discretisation_errors,

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..array_types import Array, root_mean
+from ..common.array_types import Array, root_mean
 from ..methods.solution import Solution, custom_sensor_rms, wrench_rms
-from ..program.depth_comparison import DepthError
+from ..program.depth.depth_comparison import DepthError
 from ..program.transcription import Transcription
 from ..recording import Experiment
 from ..recording.sample_times import TIME_TOLERANCE_S

@@ -10,19 +10,19 @@ from importlib.metadata import version
 import casadi
 import numpy as np
 
-from ..array_types import Array, root_mean
-from ..display import short
-from ..fem.constants import GAMMA_R, is_field_coefficient
-from ..files import SCHEMA
+from ..common.array_types import Array, root_mean
+from ..common.display import short
+from ..common.files import SCHEMA
+from ..common.serialisation import copy_fields
+from ..fem.laws.constants import GAMMA_R, is_field_coefficient
 from ..methods.solution import custom_sensor_rms, pooled_wrench_rms
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
-from ..program.contact_summary import friction_summaries
-from ..program.depth_comparison import DepthError
+from ..program.contact.contact_summary import friction_summaries
+from ..program.depth.depth_comparison import DepthError
 from ..recording.experiment import Experiment
 from ..recording.nuisance import GAUGE, JOINING, PLACE, TARE, in_readable_unit
-from ..serialisation import copy_fields
 from ..statistics.field_estimates import FieldEstimate
 from ..statistics.identifiability import identifiability_sentences
 from ..statistics.scale_identifiability import relative_scale_note

@@ -6,22 +6,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ..array_types import Array
-from ..display import short
+from ..common.array_types import Array
+from ..common.display import short
+from ..common.files import RESULT_FILE, damage_refused, read_json
+from ..common.serialisation import optional, read
 from ..errors import InputError
-from ..fem.constants import is_field_coefficient, symbol_of, unit_of
+from ..fem.laws.constants import is_field_coefficient, symbol_of, unit_of
 from ..fem.spatial_field import FieldResolution
 from ..fem.two_phase import PhaseSummary
-from ..files import RESULT_FILE, damage_refused, read_json
 from ..methods.solution import Iteration, Timing
-from ..program.contact_summary import FrictionSummary
-from ..program.depth_comparison import DepthError
-from ..serialisation import optional, read
+from ..program.contact.contact_summary import FrictionSummary
+from ..program.depth.depth_comparison import DepthError
 from ..statistics.assessment import Assessment
-from ..statistics.discretisation_error import DiscretisationError, known_kinds
+from ..statistics.budget.discretisation_error import (
+    DiscretisationError,
+    known_kinds,
+)
 from ..statistics.estimates import Estimate, IntervalCoordinate
-from ..statistics.relaxed_assumptions import Probe
-from ..statistics.residual_diagnostics import MarkerDiagnosis
+from ..statistics.probes.relaxed_assumptions import Probe
+from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
 from ..statistics.uncertainty import MarkerPlace
 from .prediction import CopyError, PredictionErrors
 
@@ -43,7 +46,7 @@ class ReportedEstimate(Estimate):
         The optimum of the discretised problem, without the correction; None in a study's summary.
     systematic : float or None
         Standard deviation of the systematic effects in the coordinate of the estimate, see
-        `statistics.uncertainty_budget`.
+        `statistics.budget.uncertainty_budget`.
     known_effect : float or None
         Correction for known effects, such as the compliance of a machine, in the coordinate of the
         estimate; None if there is none.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, hint_at
-from ..fem.constants import is_field_coefficient, unit_of
+from ..fem.laws.constants import is_field_coefficient, unit_of
 from ..methods.solution import Solution
 from ..model.parameters import Parameters
 from ..problem import Problem
@@ -21,19 +21,26 @@ from ..statistics.assessment import (
     numerical_concerns,
     probe_concerns,
 )
-from ..statistics.combined_intervals import combine
+from ..statistics.budget.combined_intervals import combine
+from ..statistics.budget.discretisation_error import (
+    DiscretisationError,
+    Refinement,
+)
+from ..statistics.budget.uncertainty_budget import (
+    BudgetLine,
+    VarianceSources,
+    budget,
+)
 from ..statistics.concerns import Concern
-from ..statistics.discretisation_error import DiscretisationError, Refinement
 from ..statistics.estimates import Estimate
 from ..statistics.field_estimates import FieldEstimate, field_estimates
 from ..statistics.identifiability import identifiability_sentences
 from ..statistics.linearised import DerivedModuli
-from ..statistics.misspecification_hypothesis import Hypothesis
-from ..statistics.profile_likelihood import Profile
-from ..statistics.relaxed_assumptions import Probe
-from ..statistics.residual_diagnostics import MarkerDiagnosis
+from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
+from ..statistics.probes.profile_likelihood import Profile
+from ..statistics.probes.relaxed_assumptions import Probe
+from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
 from ..statistics.uncertainty import MarkerPlace, Uncertainty, marker_places
-from ..statistics.uncertainty_budget import BudgetLine, VarianceSources, budget
 from .check.modes_check import ModesCheck
 from .forward_simulation import ForwardSimulation
 from .result_content import Elapsed, ReportedEstimate

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError
-from ..fem.constants import usual_value, without_region
+from ..fem.laws.constants import usual_value, without_region
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
 from ..methods.initial_trajectories import associated_at_guess
 from ..methods.reduced_space import ReducedSpace
@@ -20,9 +20,11 @@ from ..methods.stiffness_scan import Scan, rescue, start_problem
 from ..model.parameters import Parameters
 from ..problem import Problem
 from ..program.collocation import Collocation
-from ..statistics.camera_misspecifications import require_depth_units
 from ..statistics.field_estimates import field_estimates_at
 from ..statistics.linearised import parameter_values
+from ..statistics.misspecification.camera_misspecifications import (
+    require_depth_units,
+)
 from .check.cost import require_memory
 from .several_starts import follow_starts
 from .two_phases import solve_two_phases

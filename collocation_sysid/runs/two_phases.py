@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.constants import CONTRAST, field_coefficient
+from ..fem.laws.constants import CONTRAST, field_coefficient
 from ..fem.two_phase import (
     ElementLogarithms,
     PhaseSamples,
@@ -30,7 +30,7 @@ from ..fem.two_phase import (
 from ..methods.solution import Solution
 from ..problem import Problem
 from ..program.collocation import Collocation
-from ..program.marker_association import MarkerAssociation
+from ..program.markers.marker_association import MarkerAssociation
 from ..recording.experiment import Experiment
 from ..statistics.field_estimates import mean_logarithm
 from ..statistics.linearised import (

@@ -6,15 +6,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ..array_types import root_mean
+from ..common.array_types import root_mean
 from ..errors import SimulationError
 from ..methods.solution import Solution, Status, pooled_wrench_rms
 from ..model.parameters import Parameters
 from ..model.schemes import as_scheme
 from ..problem import Problem
-from ..program.contact_summary import contact_summaries_of_parts
-from ..program.depth_comparison import DepthError, SurfaceComparison
-from ..program.stability import find_instabilities
+from ..program.contact.contact_summary import contact_summaries_of_parts
+from ..program.depth.depth_comparison import DepthError, SurfaceComparison
+from ..program.modes.stability import find_instabilities
 from ..recording.grasp_rotation import DOUBTFUL_ANGLE_RAD
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN, TIME
 from ..statistics.assessment import (
@@ -33,17 +33,17 @@ from ..statistics.assessment import (
     scheme_concerns,
     stability_concerns,
 )
+from ..statistics.budget.uncertainty_budget import source_label
 from ..statistics.concerns import Concern
-from ..statistics.plausibility import (
+from ..statistics.misspecification.plausibility import (
     material_hypothesis,
     size_and_density_hypotheses,
 )
 from ..statistics.remedies import remedy_for
-from ..statistics.residual_diagnostics import MarkerDiagnosis
+from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
 from ..statistics.scale_identifiability import scale_concerns
 from ..statistics.stability_concerns import strain_stability_concerns
 from ..statistics.uncertainty import Uncertainty
-from ..statistics.uncertainty_budget import source_label
 from .check.modes_check import ModesCheck, check_modes
 from .forward_simulation import ForwardSimulation
 from .result_content import ReportedEstimate

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
+from ..common.files import RESULT_FILE, damage_refused
 from ..errors import InputError
-from ..files import RESULT_FILE, damage_refused
 from ..methods.initial_trajectories import simulate_trajectories
 from ..methods.solution import Solution
 from ..problem import Problem

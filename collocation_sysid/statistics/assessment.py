@@ -13,25 +13,25 @@ from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
-from ..array_types import Array
-from ..display import short
+from ..common.array_types import Array
+from ..common.display import short
 from ..errors import listed
-from ..fem.constants import symbol_of, unit_of
-from ..program.contact_summary import ContactSummary
-from ..program.stability import Instability
+from ..fem.laws.constants import symbol_of, unit_of
+from ..program.contact.contact_summary import ContactSummary
+from ..program.modes.stability import Instability
 from ..recording.experiment import Experiment
 from ..recording.grasp_rotation import WARNING_ANGLE_RAD, fastest_rotation
+from .budget.discretisation_error import Refinement
+from .budget.uncertainty_budget import source_label
 from .concerns import Concern, concern_if
-from .discretisation_error import Refinement
 from .distributions import chi2_sf, normal_isf
 from .estimates import Estimate, display_name
-from .misspecification_hypothesis import Hypothesis
-from .noise_level import NoiseLevel
-from .relaxed_assumptions import Probe
-from .residual_diagnostics import MOST_WILD, MarkerDiagnosis
-from .routine_probes import is_alarming
+from .misspecification.misspecification_hypothesis import Hypothesis
+from .probes.relaxed_assumptions import Probe
+from .probes.routine_probes import is_alarming
+from .residuals.noise_level import NoiseLevel
+from .residuals.residual_diagnostics import MOST_WILD, MarkerDiagnosis
 from .uncertainty import Uncertainty
-from .uncertainty_budget import source_label
 
 Verdict = Literal["good", "check", "doubtful"]
 

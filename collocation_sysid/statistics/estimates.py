@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array
-from ..fem.constants import (
+from ..common.array_types import Array
+from ..fem.laws.constants import (
     MODE,
     SHARE,
     TAU,
@@ -26,10 +26,10 @@ from ..fem.constants import (
     without_region,
 )
 from ..model.parameters import Parameter, Parameters
-from .autocorrelation import Dependence
 from .linearised import DerivedModuli, LinearisedFit
-from .noise_level import Noise, NoiseLevel
-from .recording_scatter import RecordingComparison
+from .residuals.autocorrelation import Dependence
+from .residuals.noise_level import Noise, NoiseLevel
+from .residuals.recording_scatter import RecordingComparison
 
 Mask = NDArray[np.bool_]
 

@@ -23,9 +23,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..fem.body import Body
-from ..fem.moduli import engineering_constants
+from ..fem.laws.moduli import engineering_constants
 from ..fem.spatial_field import ALL_MODULI, FieldModes
 from ..fem.two_phase import PhaseSummary, TwoPhaseModes
 from ..model.generated_functions import GeneratedFunction

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import listed
-from ..fem.constants import is_field_coefficient, without_region
-from ..fem.moduli import ELASTIC
+from ..fem.laws.constants import is_field_coefficient, without_region
+from ..fem.laws.moduli import ELASTIC
 from .estimates import CONFOUNDED, Estimate
 from .uncertainty import Uncertainty
 

@@ -22,16 +22,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..fem.kernels import map_experiments
 from ..model.parameters import ThetaMap
 from ..program.collocation import Collocation, ExperimentIterate
-from ..program.lapack import one_blas_thread
 from ..program.least_squares import SquareRootInformation
+from ..program.linear_algebra.lapack import one_blas_thread
 from ..program.measurement_residual import huber_as_weights
 from ..program.observation import ObservableResponse
-from ..program.reaction_forces import GraspForces
 from ..program.sweep import Sweep
+from ..program.wrench.reaction_forces import GraspForces
 
 
 def sensitivities(collocation: Collocation, z: Array) -> list[Array]:

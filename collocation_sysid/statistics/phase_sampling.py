@@ -26,8 +26,8 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from ..array_types import Array, Index
-from ..fem.mesh import TetMesh
+from ..common.array_types import Array, Index
+from ..fem.meshes.mesh import TetMesh
 
 
 @dataclass(frozen=True)

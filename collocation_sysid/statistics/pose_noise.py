@@ -16,13 +16,13 @@ import numpy as np
 from scipy.interpolate import CubicSpline, interp1d
 from scipy.special import binom
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..program.collocation import Collocation, ExperimentIterate
-from ..program.lapack import one_blas_thread
+from ..program.linear_algebra.lapack import one_blas_thread
 from ..program.sweep import Sweep, SweepColumns
 from ..recording.grasp import Grasp
 from ..recording.poses import PoseSequence
-from .consider_analysis import propagate_columns
+from .budget.consider_analysis import propagate_columns
 from .linearised import LinearisedFit
 
 # Samples of D η.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from .uncertainty_budget import BETWEEN, NOISE, NUISANCES, NUMERICAL
+from .budget.uncertainty_budget import BETWEEN, NOISE, NUISANCES, NUMERICAL
 
 LAW = "law"
 

@@ -11,10 +11,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import listed
 from ..fem.body import Body
-from ..fem.constants import (
+from ..fem.laws.constants import (
     DENSITY,
     is_damping,
     is_density,

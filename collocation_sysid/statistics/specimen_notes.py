@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from ..fem.constants import without_region
+from ..fem.laws.constants import without_region
 from ..model.parameters import Parameters
 from ..recording.experiment import Experiment
 

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..fem.body import Body
-from ..fem.material_stability import (
+from ..fem.laws.material_stability import (
     is_examined,
     principal_stretches,
     stability_margins,

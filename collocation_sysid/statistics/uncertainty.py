@@ -25,19 +25,13 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import Array
+from ..common.array_types import Array
+from ..common.validated_types import Options
 from ..errors import InputError
-from ..fem.constants import constant_named, is_damping
+from ..fem.laws.constants import constant_named, is_damping
 from ..model.parameters import Parameters
 from ..program.collocation import Collocation, ExperimentIterate
-from ..program.lapack import one_blas_thread
-from ..validated_types import Options
-from .autocorrelation import (
-    Dependence,
-    analyse_dependence,
-    error_processes,
-    score_covariance,
-)
+from ..program.linear_algebra.lapack import one_blas_thread
 from .distributions import student_ppf
 from .estimates import (
     UNDETERMINED,
@@ -59,21 +53,27 @@ from .linearised import (
     least_squares_of_fit,
     linearise_fit,
 )
-from .noise_level import (
+from .pose_noise import with_pose_noise
+from .residuals.autocorrelation import (
+    Dependence,
+    analyse_dependence,
+    error_processes,
+    score_covariance,
+)
+from .residuals.noise_level import (
     Noise,
     NoiseLevel,
     disturbance_samples,
     estimate_noise_level,
     project_errors,
 )
-from .pose_noise import with_pose_noise
-from .recording_scatter import (
+from .residuals.recording_scatter import (
     RecordingComparison,
     blocks_by_recording,
     compare_recordings,
     single_fits,
 )
-from .residual_diagnostics import Outlier, remove_outliers
+from .residuals.residual_diagnostics import Outlier, remove_outliers
 
 Errors = Literal["independent", "autocorrelated"]
 

@@ -9,8 +9,8 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from ..array_types import Array
-from ..fem.materials import (
+from ..common.array_types import Array
+from ..fem.laws.materials import (
     DampingLaw,
     Energy,
     Material,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..array_types import Array
+from ..common.array_types import Array
 
 # Default step of a difference, relative to the direction: its truncation error, of fourth order,
 # and its rounding error are then both about 1e-12 of a smooth function.

@@ -12,10 +12,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.constants import Constant
+from ..fem.laws.constants import Constant
 from ..fem.node_force import (
     CONTEXT_OFFSETS,
     CONTEXT_SIZE,

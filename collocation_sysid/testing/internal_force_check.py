@@ -15,10 +15,10 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..fem.body import Body
-from ..fem.materials import DampingLaw, Material
-from ..program.block_band import full_matrix
+from ..fem.laws.materials import DampingLaw, Material
+from ..program.linear_algebra.block_band import full_matrix
 from .property_check import EXACT, PropertyCheck
 from .small_problems import DENSITY_KG_M3, uneven_box, usual_constants
 

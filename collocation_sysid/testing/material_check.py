@@ -12,10 +12,10 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..fem.body import Body
-from ..fem.constants import Constant
-from ..fem.materials import DAMPINGS, Energy, Material, as_material
+from ..fem.laws.constants import Constant
+from ..fem.laws.materials import DAMPINGS, Energy, Material, as_material
 from ..problem.code_loader import CodeLoader
 from ..problem.schema import CodeSection
 from .internal_force_check import check_internal_forces

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.structured import box_mesh
+from ..fem.meshes.structured import box_mesh
 from ..methods.method_options import method_from_options
 from ..methods.solution import Iteration, Method, Solution
 from ..model.parameters import Parameters, Unknown

@@ -10,13 +10,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..fem.body import Body
 from ..model.nuisance_map import NuisanceMap
 from ..problem.code_loader import CodeLoader
 from ..problem.nuisance_schema import CustomNuisanceSection
 from ..program.collocation import Collocation
-from ..program.marker_residual import MarkerResidual
+from ..program.markers.marker_residual import MarkerResidual
 from ..recording.experiment import Experiment
 from ..recording.nuisance import KINDS, Nuisance, NuisanceRow
 from .program_derivatives import check_program

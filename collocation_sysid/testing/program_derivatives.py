@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..program.collocation import Collocation
 from .property_check import PropertyCheck
 from .small_problems import shaken_variables

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..errors import SimulationError
 from ..fem.body import Body
-from ..fem.structured import box_mesh
+from ..fem.meshes.structured import box_mesh
 from ..model.schemes import Scheme, Stencil, as_scheme
 from ..program.simulation import simulate
 from .finite_differences import observed_order

@@ -11,10 +11,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..array_types import Array
+from ..common.array_types import Array
 from ..fem.body import Body
-from ..fem.mesh import TetMesh
-from ..fem.structured import box_mesh
+from ..fem.meshes.mesh import TetMesh
+from ..fem.meshes.structured import box_mesh
 from ..problem.code_loader import CodeLoader
 from ..program.collocation import Collocation
 from ..recording.custom_sensor import GRASP_INPUTS, POINT_INPUTS, Gauge, Look

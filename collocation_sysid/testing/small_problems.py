@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..array_types import Array, Index
+from ..common.array_types import Array, Index
 from ..fem.body import Body
-from ..fem.constants import Constant, is_modulus, usual_value
-from ..fem.mesh import TetMesh
-from ..fem.structured import box_mesh
+from ..fem.laws.constants import Constant, is_modulus, usual_value
+from ..fem.meshes.mesh import TetMesh
+from ..fem.meshes.structured import box_mesh
 from ..model.parameters import Parameters, Unknown
 from ..program.collocation import Collocation
 from ..recording import Experiment, Grasp, Markers, Nuisance, PoseSequence

@@ -51,7 +51,7 @@ from .threads import (
 )
 
 if TYPE_CHECKING:
-    from ...array_types import Index
+    from ...common.array_types import Index
     from .skyline import SkylineFactorisation
 
 __all__ = [

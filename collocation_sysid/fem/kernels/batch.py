@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from ...array_types import Array
+from ...common.array_types import Array
 from ...errors import InputError
 from ..kernel import ElementKernel
 from ..pattern import dofs_of

@@ -9,11 +9,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...array_types import Array, Index
+from ...common.array_types import Array, Index
 
 
 class CombinationPlan(Protocol):
-    """Plan of the combinations, see `program.block_band.CombinePlan`."""
+    """Plan of the combinations, see `program.linear_algebra.block_band.CombinePlan`."""
 
     @property
     def first_task(self) -> Index:

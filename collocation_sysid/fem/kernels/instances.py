@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...array_types import Array
+from ...common.array_types import Array
 
 # Number of instances of one CasADi map; more instances are evaluated in blocks, because creating a
 # map takes longer than evaluating it.

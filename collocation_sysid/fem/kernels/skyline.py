@@ -19,7 +19,7 @@ import numpy as np
 from llvmlite import ir
 from numpy.typing import NDArray
 
-from ...array_types import Array, Index
+from ...common.array_types import Array, Index
 from .instructions import FUSE
 from .jit import (
     DOUBLE,

@@ -26,9 +26,9 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from ...array_types import Array
+from ...common.array_types import Array
+from ...common.validated_types import Count, Options, Positive
 from ...program.collocation import Collocation
-from ...validated_types import Count, Options, Positive
 from .. import nlpsol
 from ..callbacks import HessianValues, NlpFunctions
 from ..solution import Solution, Status, Watch

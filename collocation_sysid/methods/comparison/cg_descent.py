@@ -19,7 +19,7 @@ from typing import Literal
 
 import numpy as np
 
-from ...array_types import Array
+from ...common.array_types import Array
 
 ValueAndGradient = Callable[[Array], tuple[float, Array]]
 

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import Bounds, OptimizeResult
 from scipy.optimize import minimize as scipy_minimise
 
-from ...array_types import Array
+from ...common.array_types import Array
 from .cg_descent import CgDescentOptions
 from .cg_descent import minimise_cg_descent as cg_descent
 from .levenberg_marquardt import (

@@ -20,10 +20,10 @@ import scipy.sparse as sp
 from scipy.linalg import cholesky, get_lapack_funcs, solve_triangular
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from ...array_types import Array, Index
+from ...common.array_types import Array, Index
 from ...errors import InputError
-from ...program.lapack import cholesky_in_place, one_blas_thread
 from ...program.least_squares import SquareRootInformation
+from ...program.linear_algebra.lapack import cholesky_in_place, one_blas_thread
 from .merit import MeritFunction, PenaltyProblem
 
 (_pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=np.float64)

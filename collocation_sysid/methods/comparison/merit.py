@@ -4,7 +4,7 @@
 
 with loss and constraints in the scaling of the NLP and y = 0 for a penalty. Positions of grasped
 nodes, history variables of materials with memory and measured wrenches are variables with
-constraints of their own (see `program.lifting`). Variables with equal bounds, such as a given
+constraints of their own (see `program.lifted.lifting`). Variables with equal bounds, such as a given
 start, are constant.
 """
 
@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 
-from ...array_types import Array, Index
+from ...common.array_types import Array, Index
 from ...program.collocation import Collocation, convert_variables
 from ...program.stopwatch import Stopwatch
 

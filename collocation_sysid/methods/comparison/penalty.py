@@ -24,10 +24,16 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from ...array_types import Array
+from ...common.array_types import Array
+from ...common.validated_types import (
+    AboveOne,
+    AtLeastOne,
+    Count,
+    Options,
+    Positive,
+)
 from ...errors import InputError
 from ...program.collocation import Collocation
-from ...validated_types import AboveOne, AtLeastOne, Count, Options, Positive
 from ..solution import Solution, Status, Watch
 from ..solve_recorder import Recorder, SearchEnded
 from .inner import FIRST_ORDER, Inner, minimise_merit

@@ -23,11 +23,11 @@ from typing import ClassVar, Literal
 import numpy as np
 from scipy.optimize import least_squares, minimize
 
-from ...array_types import Array
+from ...common.array_types import Array
+from ...common.validated_types import Count, Options, Positive
 from ...errors import SimulationError
 from ...program.collocation import Collocation
 from ...program.stopwatch import Stopwatch
-from ...validated_types import Count, Options, Positive
 from ..horizon import Horizon
 from ..initial_trajectories import complete_variables, simulate_trajectories
 from ..solution import Solution, Status, Watch, constraint_multipliers

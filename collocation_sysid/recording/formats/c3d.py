@@ -9,8 +9,8 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
+from ...common.isolated_process import Failed, ProcessLimits, run_isolated
 from ...errors import InputError
-from ...isolated_process import Failed, ProcessLimits, run_isolated
 from .raw_tracks import LabelChooser, RawTracks
 from .units import length_unit_of_text
 

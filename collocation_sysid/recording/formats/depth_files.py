@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from ...array_files import load_array, load_arrays
-from ...array_types import Array
+from ...common.array_files import load_array, load_arrays
+from ...common.array_types import Array
+from ...common.files import reason, require_regular
 from ...errors import InputError, located
-from ...files import reason, require_regular
 from . import ply
 from .depth_messages import (
     ENCODINGS,

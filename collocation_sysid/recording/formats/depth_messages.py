@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ...array_types import Array
+from ...common.array_types import Array
+from ...common.files import reason
 from ...errors import InputError
-from ...files import reason
 
 # Of pixels: integers count, floats are metres.
 ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}

@@ -19,9 +19,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ...array_types import Array
+from ...common.array_types import Array
+from ...common.files import reason, require_regular
 from ...errors import InputError, hint_at
-from ...files import reason, require_regular
 
 TOPIC_SEPARATOR = "#"
 # Of the positions of joints.

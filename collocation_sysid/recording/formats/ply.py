@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...array_types import Array
+from ...common.array_types import Array
 from ...errors import InputError
-from ...fem.meshio_reader import read_content
+from ...fem.meshes.meshio_reader import read_content
 
 # More bytes of header than any program writes.
 LONGEST_HEADER = 100_000

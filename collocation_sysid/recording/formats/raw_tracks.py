@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from ...array_types import Array
+from ...common.array_types import Array
 from ...errors import InputError
 from .text import (
     Row,

@@ -18,9 +18,9 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
-from ...array_types import Array
+from ...common.array_types import Array
+from ...common.files import require_regular
 from ...errors import InputError, excerpt, located
-from ...files import require_regular
 from ..sample_times import first_unordered_time
 from .logs import TopicAddress
 from .topics import topic_as_csv

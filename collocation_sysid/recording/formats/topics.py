@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from ...array_types import Array
+from ...common.array_types import Array
+from ...common.files import require_regular
 from ...errors import InputError, hint_at
-from ...files import require_regular
 from .depth_messages import depth_kind, is_camera_model
 from .logs import Log, TopicAddress, open_log, require_packages, require_topic
 

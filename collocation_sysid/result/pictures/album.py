@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from ...array_types import Array
-from ...files import replaced_file, safe_name
+from ...common.array_types import Array
+from ...common.files import replaced_file, safe_name
+from ...common.step_counting import StepUnit, complete_steps, counted_phase
 from ...recording.measured_wrench import COMPONENTS, UNITS
 from ...runs.result_content import Result
-from ...step_counting import StepUnit, complete_steps, counted_phase
 from ..figure_style import RESOLUTION_DPI
 from ..replay import MotionRecord, damaged_run_refused, read_run
 from .confidence import (

@@ -11,10 +11,10 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from scipy.stats import chi2, norm
 
-from ...array_types import Array
+from ...common.array_types import Array
 from ...runs.result_content import Result
+from ...statistics.budget.uncertainty_budget import main_sources, source_label
 from ...statistics.estimates import correlation_from_covariance
-from ...statistics.uncertainty_budget import main_sources, source_label
 from ..figure_style import (
     BLACK,
     BLUE,

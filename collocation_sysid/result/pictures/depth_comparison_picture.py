@@ -12,7 +12,7 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ...array_types import Array
+from ...common.array_types import Array
 from ..figure_style import PAGE_MM, SMALL_PT, VERMILION
 
 # Millimetres in an inch, the unit of lengths in Matplotlib.

@@ -10,9 +10,9 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
-from ...array_types import Array
-from ...fem.constants import symbol_with_unit
-from ...fem.mesh import boundary_of
+from ...common.array_types import Array
+from ...fem.laws.constants import symbol_with_unit
+from ...fem.meshes.mesh import boundary_of
 from ..figure_style import PAGE_MM, SMALL_PT
 from ..replay import MotionRecord
 from .projection import ParallelCamera

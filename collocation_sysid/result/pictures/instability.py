@@ -7,7 +7,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from ...program.loss_of_stability import StabilityLoss
+from ...program.forward.loss_of_stability import StabilityLoss
 from ..figure_style import PAGE_MM, SMALL_PT
 from .projection import ParallelCamera
 from .scene import (

@@ -12,7 +12,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from ...array_types import Array
+from ...common.array_types import Array
 from ...program.collocation import Collocation
 from ...runs.check.derivatives import shortened_experiment
 from ..figure_style import (

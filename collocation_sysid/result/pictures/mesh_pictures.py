@@ -13,8 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from ...array_types import Array
-from ...fem.mesh_checks import edge_lengths, mean_ratios
+from ...common.array_types import Array
+from ...fem.meshes.mesh_checks import edge_lengths, mean_ratios
 from ..figure_style import (
     BLUE,
     COLUMN_MM,

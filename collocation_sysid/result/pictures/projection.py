@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ...array_types import Array
+from ...common.array_types import Array
 
 Triangles = NDArray[np.integer]
 

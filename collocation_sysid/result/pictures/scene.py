@@ -15,7 +15,7 @@ from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
-from ...array_types import Array
+from ...common.array_types import Array
 from ..figure_style import BLACK, BLUE, SMALL_PT, VERMILION, fixed_figure
 from .projection import ParallelCamera, Triangles
 

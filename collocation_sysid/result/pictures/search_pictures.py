@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ...array_types import Array
-from ...fem.constants import unit_of
+from ...common.array_types import Array
+from ...fem.laws.constants import unit_of
 from ...methods.solution import Iteration
 from ..figure_style import (
     BLACK,

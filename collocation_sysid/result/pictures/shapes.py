@@ -15,7 +15,7 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ...array_types import Array, Index
+from ...common.array_types import Array, Index
 from ...errors import InputError, hint_at
 from ...fem.body import Body
 from ..element_fields import ElementFields

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import periodogram
 
-from ...array_types import Array
+from ...common.array_types import Array
 from ..figure_style import (
     BLACK,
     BLUE,

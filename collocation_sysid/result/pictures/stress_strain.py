@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ...array_types import Array
+from ...common.array_types import Array
 from ..figure_style import (
     BLACK,
     COLUMN_MM,

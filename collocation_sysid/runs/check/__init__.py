@@ -12,7 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-from ...array_types import Array
+from ...common.array_types import Array
+from ...common.serialisation import content
 from ...methods.initial_trajectories import initial_variables
 from ...methods.reduced_space import ReducedSpace
 from ...methods.stiffness_scan import (
@@ -24,26 +25,35 @@ from ...methods.stiffness_scan import (
 from ...model.schemes import as_scheme
 from ...problem import Problem
 from ...program.collocation import Collocation
-from ...program.contact_summary import contact_summaries_of_parts
-from ...program.stability import Instability, find_instabilities
-from ...serialisation import content
+from ...program.contact.contact_summary import contact_summaries_of_parts
+from ...program.modes.stability import Instability, find_instabilities
 from ...statistics.assessment import (
     contact_concerns,
     rotation_step_concerns,
     stability_concerns,
 )
-from ...statistics.camera_misspecifications import camera_hypotheses
+from ...statistics.budget.discretisation_error import MOST_SUBSTEPS
 from ...statistics.concerns import Concern
-from ...statistics.discretisation_error import MOST_SUBSTEPS
-from ...statistics.misspecification_hypothesis import Hypothesis, rank
-from ...statistics.modal_misspecifications import (
+from ...statistics.misspecification.camera_misspecifications import (
+    camera_hypotheses,
+)
+from ...statistics.misspecification.misspecification_hypothesis import (
+    Hypothesis,
+    rank,
+)
+from ...statistics.misspecification.modal_misspecifications import (
     find_misspecifications_by_modes,
 )
-from ...statistics.placement_causes import placement_mistakes
-from ...statistics.plausibility import size_and_density_hypotheses
+from ...statistics.misspecification.placement_causes import placement_mistakes
+from ...statistics.misspecification.plausibility import (
+    size_and_density_hypotheses,
+)
+from ...statistics.misspecification.wrench_causes import (
+    CHECKED_SAMPLES,
+    wrench_mistakes,
+)
 from ...statistics.scale_identifiability import scale_concerns, static_concerns
 from ...statistics.stability_concerns import strain_stability_concerns
-from ...statistics.wrench_causes import CHECKED_SAMPLES, wrench_mistakes
 from .body_check import (
     BodyCheck,
     ElementShape,

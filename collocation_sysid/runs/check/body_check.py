@@ -8,12 +8,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from ...array_types import Array
+from ...common.array_types import Array
 from ...fem.body import Body
-from ...fem.constants import is_field_coefficient
-from ...fem.mesh import TetMesh
-from ...fem.mesh_checks import edge_lengths, mean_ratios
-from ...fem.moduli import engineering_constants
+from ...fem.laws.constants import is_field_coefficient
+from ...fem.laws.moduli import engineering_constants
+from ...fem.meshes.mesh import TetMesh
+from ...fem.meshes.mesh_checks import edge_lengths, mean_ratios
 from ...fem.spatial_field import FieldResolution
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp

@@ -9,14 +9,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...array_types import Array
+from ...common.array_types import Array
+from ...common.machine import machine_memory_mb
 from ...errors import InputError, SimulationError
-from ...machine import machine_memory_mb
 from ...methods.interior_point import InteriorPoint
 from ...methods.reduced_space import ReducedSpace, memory_mb
 from ...problem import Problem
 from ...program.collocation import Collocation
-from ...program.factorisation import Choice
+from ...program.linear_algebra.factorisation import Choice
 from ...program.sweep import Sweep
 from ...statistics.concerns import Concern
 from .derivatives import (

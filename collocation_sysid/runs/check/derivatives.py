@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from ...array_types import Array
+from ...common.array_types import Array
 from ...model.contact import contact_terms
 from ...problem import Problem
 from ...program.collocation import Collocation, convert_variables

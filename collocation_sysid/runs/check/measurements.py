@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...array_types import Array
+from ...common.array_types import Array
 from ...recording.experiment import Experiment
 from ...statistics.concerns import Concern, concern_if
 from .body_check import BodyCheck

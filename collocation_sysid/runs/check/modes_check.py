@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...array_types import Array
+from ...common.array_types import Array
 from ...errors import SimulationError
 from ...model.forces import Forces
 from ...model.numerical_damping import (
@@ -19,9 +19,9 @@ from ...model.numerical_damping import (
     substeps_needed,
 )
 from ...model.schemes import Scheme
-from ...program.initial_equilibrium import equilibrium
-from ...program.natural_modes import Modes, natural_modes
-from ...program.newton_solver import NewtonSolver
+from ...program.forward.initial_equilibrium import equilibrium
+from ...program.forward.newton_solver import NewtonSolver
+from ...program.modes.natural_modes import Modes, natural_modes
 from ...recording.experiment import Experiment
 from ...statistics.concerns import Concern, concern_if
 

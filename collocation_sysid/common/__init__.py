@@ -1,0 +1,11 @@
+"""General modules without mathematics, which all packages use and which import no package.
+
+- `declarations`, `schema_tables`, `validated_types`: classes that users state in Python or in a
+  problem file, and their checks.
+- `files`, `array_files`, `written_files`: reading and writing of files, completely or not at all.
+- `serialisation`: results as JSON; `display`: output as text, HTML and Markdown; `console`:
+  terminal output; `pages`: pages of the documentation.
+- `signal_handling`, `isolated_process`: interrupts, and work in a process of its own.
+- `step_counting`: progress of long operations; `machine`: available memory; `cluster`: Dask.
+- `array_types`: array types for annotations.
+"""

@@ -1,0 +1,539 @@
+"""Plain description of output (sentences, tables, pictures, sections) and its rendering.
+
+The same description is rendered for terminals, HTML and Markdown, and written as JSON by
+`tree.update_as_json`. Styles are words: good, check, doubtful, strong, quiet, code.
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from html import escape as escape_html
+from io import StringIO
+from math import isfinite
+from pathlib import Path
+from urllib.parse import quote
+
+from rich.cells import cell_len
+from rich.console import (
+    Console,
+    ConsoleOptions,
+    Group,
+    RenderableType,
+    RenderResult,
+)
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from ..errors import printable
+from .console import PlainConsole
+from .files import is_own
+from .serialisation import optional
+
+COLOURS = {
+    "good": "green",
+    "check": "yellow",
+    "doubtful": "red",
+    "strong": "bold",
+    "quiet": "dim",
+}
+# Markup of Markdown: anywhere in a text, at its beginning, and as the number of a list item.
+MARKUP = re.compile(
+    r"[\\`*\[\]|~]|<(?=[A-Za-z/!?])|&(?=#?\w+;)|(?<![^\W_])_|_(?![^\W_])"
+)
+MARKUP_AT_START = re.compile(r"^(?:#(?=#*(?:\s|$))|[-+](?=[-\s]|$)|[=>])")
+NUMBER_AT_START = re.compile(r"^(\d{1,9})(?=[.)](?:\s|$))")
+BACKTICKS = re.compile(r"`+")
+# Width of plain text [characters]: wide enough that no line is wrapped.
+WIDE = 200
+# Tables with more columns than this break their headings into two lines.
+MANY = 5
+# Cells with longer texts [characters] get a wider column in HTML.
+LONG = 24
+# Pictures wider than this can be moved sideways on a phone rather than shrunk.
+WIDE_PX = 1000
+
+
+@dataclass(frozen=True)
+class Span:
+    """Piece of a sentence; `to` is the target of a link, "" for none."""
+
+    text: str
+    style: str = ""
+    to: str = ""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A sentence; `name` is the anchor to which links may point, "" for none."""
+
+    text: str | tuple[Span, ...]
+    style: str = ""
+    name: str = ""
+
+    @property
+    def spans(self) -> tuple[Span, ...]:
+        """The sentence as pieces, each with a style of its own."""
+        return (Span(self.text),) if isinstance(self.text, str) else self.text
+
+
+@dataclass(frozen=True)
+class Items:
+    """List of sentences, one per line."""
+
+    texts: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Table with columns of names (left), of numbers (right aligned) and of long texts (last).
+
+    Attributes
+    ----------
+    title : str
+    heads : tuple of str
+        Column headings; empty for none.
+    rows : tuple of tuple of str
+    names, texts : int
+        Number of name columns at the beginning, and of text columns at the end.
+    faint : tuple of int
+        Indices of rows that are shown with less emphasis.
+    note_column : int
+        Number of columns at the end that are omitted in terminals.
+    """
+
+    title: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    names: int = 1
+    texts: int | None = optional()
+    faint: tuple[int, ...] | None = optional()
+    style: str | None = optional()
+    note_column: int | None = optional()
+
+    def __post_init__(self) -> None:
+        columns = {len(row) for row in self.rows} | (
+            {len(self.heads)} if self.heads else set()
+        )
+        if len(columns) > 1:
+            raise ValueError(
+                f"the table {self.title!r} has rows of another length"
+            )
+
+    def is_number(self, column: int) -> bool:
+        """Return whether a column contains numbers."""
+        columns = len(self.heads) or max(map(len, self.rows), default=0)
+        return self.names <= column < columns - (self.texts or 0)
+
+
+@dataclass(frozen=True)
+class Cards:
+    """The most important numbers; each item has name, value and remark."""
+
+    items: tuple[tuple[str, str, str], ...]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG with a caption."""
+
+    file: Path
+    caption: str
+
+
+@dataclass(frozen=True)
+class Listing:
+    """Long preformatted text, such as a file, below a title."""
+
+    title: str
+    text: str
+
+
+@dataclass(frozen=True)
+class TitledParts:
+    """Group of parts with a title and optionally a style."""
+
+    title: str
+    parts: tuple[Shown, ...]
+    level: int = 2
+    style: str = ""
+
+
+Shown = str | Line | Items | Table | Cards | Picture | Listing | TitledParts
+
+
+def flattened_parts(parts: Iterable[Shown]) -> Iterator[Shown]:
+    """Yield the parts of all sections without their titles, for terminals."""
+    for part in parts:
+        yield from (
+            flattened_parts(part.parts)
+            if isinstance(part, TitledParts)
+            else (part,)
+        )
+
+
+def own_pictures(folder: Path) -> list[Path]:
+    """Return the PNG files of a folder, sorted; links that lead out of the folder are ignored."""
+    return sorted(file for file in folder.glob("*.png") if is_own(folder, file))
+
+
+def short(value: float) -> str:
+    """Return a number with two digits, without a power of ten from 100 on."""
+    return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
+
+
+def number(value: float | None, digits: int = 5) -> str:
+    """Return a number with at most `digits` digits; a dash for None, NaN and infinity."""
+    if value is None or not isfinite(value):
+        return "–"
+    return f"{value:.{digits}g}".replace("e-0", "e-").replace("e+0", "e")
+
+
+def millimetres(metres: float | None) -> str:
+    """Return a length [m] in millimetres with three digits; a dash for None and NaN."""
+    return (
+        "–"
+        if metres is None or not isfinite(metres)
+        else f"{1e3 * metres:.3g} mm"
+    )
+
+
+def duration(time_s: float | None) -> str:
+    """Return a rounded duration with its unit; "an unknown time" for None."""
+    if time_s is None:
+        return "an unknown time"
+    for unit, seconds in (("h", 3600), ("min", 60)):
+        if time_s >= 2 * seconds:
+            return f"{time_s / seconds:.2g} {unit}"
+    return f"{time_s:.1g} s" if time_s < 10 else f"{time_s:.0f} s"
+
+
+def labelled(title: str, rows: dict[str, str]) -> Table:
+    """Return a table of two columns: names and texts."""
+    return Table(
+        title,
+        (),
+        rows=tuple((f"  {name} ", text) for name, text in rows.items()),
+        texts=1,
+    )
+
+
+# Terminal -----------------------------------------------------------------------------------------
+
+
+def on_terminal(parts: Shown | Iterable[Shown]) -> RenderableType:
+    """Return parts as a rich renderable: text is wrapped between words, and no word is broken.
+
+    Longer words go beyond the terminal's edge where they are printed with ``crop=False``.
+    """
+    if isinstance(parts, Shown):
+        return _on_terminal(parts)
+    return Group(*map(_on_terminal, parts))
+
+
+def plain_text(parts: Shown | Iterable[Shown], width: int = WIDE) -> str:
+    """Return parts as plain text without colours; each row of a table is one line."""
+    file = StringIO()
+    # Without these options rich would display the text in a Jupyter notebook, instead of writing
+    # it to the file, and FORCE_COLOR would add colours.
+    console = PlainConsole(
+        file=file,
+        width=width,
+        force_jupyter=False,
+        force_terminal=False,
+        color_system=None,
+    )
+    console.print(on_terminal(parts), crop=False)
+    return "\n".join(line.rstrip() for line in file.getvalue().splitlines())
+
+
+def _on_terminal(part: Shown) -> RenderableType:
+    match part:
+        case str():
+            return _text(part)
+        case Line():
+            pieces = ((span.text, _colour(span.style)) for span in part.spans)
+            return UnbrokenWords(
+                Text.assemble(*pieces, style=_colour(part.style))
+            )
+        case Items():
+            return _text("\n".join(f"- {text}" for text in part.texts))
+        case Table():
+            return _titled(part.title, TerminalTable(part))
+        case Cards():
+            rows = tuple(
+                (what, f"{value} ({note})") for what, value, note in part.items
+            )
+            return TerminalTable(Table("", (), rows=rows, texts=1))
+        case Picture():
+            return _text(f"{part.caption} {part.file}")
+        case Listing():
+            return Group(_text(part.title, "bold"), _text(part.text))
+        case TitledParts():
+            return _titled(part.title, *map(_on_terminal, part.parts))
+
+
+def _titled(title: str, *parts: RenderableType) -> RenderableType:
+    return Group(_text(title, "bold"), *parts) if title else Group(*parts)
+
+
+def _text(text: str, style: str = "") -> UnbrokenWords:
+    return UnbrokenWords(Text(text, style=style))
+
+
+@dataclass(frozen=True)
+class UnbrokenWords:
+    """Text wrapped between words; a word longer than a line goes beyond the terminal's edge."""
+
+    text: Text
+
+    def __rich_console__(
+        self, console: Console, options: ConsoleOptions
+    ) -> RenderResult:
+        """Yield the lines of the text for rich."""
+        for line in self.text.split(allow_blank=True):
+            breaks = [0]
+            for word in re.finditer(r"\S+", line.plain):
+                before = line.plain[breaks[-1] : word.start()]
+                with_word = line.plain[breaks[-1] : word.end()]
+                if before.strip() and cell_len(with_word) > options.max_width:
+                    breaks.append(word.start())
+            for piece in line.divide(breaks[1:]):
+                piece.rstrip()
+                piece.no_wrap = True
+                piece.overflow = "ignore"
+                yield piece
+
+
+def _colour(style: str) -> str:
+    return " ".join(COLOURS.get(word, "") for word in style.split())
+
+
+@dataclass(frozen=True)
+class TerminalTable:
+    """A table as rich shows it; off a terminal, where others read lines, no head or row has two."""
+
+    table: Table
+
+    def __rich_console__(
+        self, console: Console, options: ConsoleOptions
+    ) -> RenderResult:
+        """Yield the table as one of rich."""
+        yield _rich_table(self.table, parted=console.is_terminal)
+
+
+def _rich_table(table: Table, *, parted: bool) -> RichTable:
+    # Rows that speak for themselves are nearer to what they say.
+    shown = (
+        RichTable(box=None, pad_edge=False)
+        if table.heads
+        else RichTable.grid(padding=(0, 1))
+    )
+    columns = (len(table.heads) or max(map(len, table.rows), default=0)) - (
+        table.note_column or 0
+    )
+    for place, head in enumerate((table.heads or ("",) * columns)[:columns]):
+        number = table.is_number(place)
+        cells = [row[place] for row in table.rows if place < len(row)]
+        if not parted:
+            pass
+        elif (
+            number and columns > MANY
+        ):  # names of materials are parted where they have a hyphen
+            head = head.replace("-", "-\n")
+        elif not number:  # dotted keys may take two lines
+            head = head.replace(".", ".\n", 1)
+        fills_width = place == 0 and (table.texts or 0) > (
+            table.note_column or 0
+        )
+        side = "right" if number else "left"
+        longest_word = max(
+            map(cell_len, " ".join((head, *cells)).split()), default=0
+        )
+        shown.add_column(
+            head, justify=side, min_width=longest_word, no_wrap=fills_width
+        )
+    for row in table.rows:
+        cells = (
+            row[:columns]
+            if parted
+            else (cell.replace("\n", "; ") for cell in row[:columns])
+        )
+        shown.add_row(
+            *(Text(cell, style=_colour(table.style or "")) for cell in cells)
+        )
+    return shown
+
+
+# HTML ---------------------------------------------------------------------------------------------
+
+
+def as_html(part: Shown) -> str:
+    """Return a part as HTML; text is escaped."""
+    match part:
+        case str():
+            return f"<p>{escape(part)}</p>\n"
+        case Line():
+            name = f' id="{escape(part.name)}"' if part.name else ""
+            return f"<p{name}{_class(part.style)}>{''.join(map(_span, part.spans))}</p>\n"
+        case Items():
+            lines = (f"<li>{escape(text)}</li>\n" for text in part.texts)
+            return f"<ul>\n{''.join(lines)}</ul>\n"
+        case Table():
+            title = f"<h2>{escape(part.title)}</h2>\n" if part.title else ""
+            return f'{title}<div class="scroll"><table>\n{_html_rows(part)}</table></div>\n'
+        case Cards():
+            cards = (
+                f'<div class="card"><span>{escape(what)}</span><b>{escape(value)}</b>'
+                f"<span>{escape(note)}</span></div>\n"
+                for what, value, note in part.items
+            )
+            return f'<div class="cards">\n{"".join(cards)}</div>\n'
+        case Picture():
+            content = part.file.read_bytes()
+            caption = escape(part.caption)
+            wide = _class(
+                "wide" if int.from_bytes(content[16:20]) > WIDE_PX else ""
+            )  # its header
+            data = f"data:image/png;base64,{base64.b64encode(content).decode('ascii')}"
+            return (
+                f'<figure><div class="scroll"><img{wide} src="{data}" alt="{caption}"></div>\n'
+                f"<figcaption{wide}>{caption}</figcaption></figure>\n"
+            )
+        case Listing():
+            title = escape(part.title)
+            text = escape(part.text)
+            return f"<details><summary>{title}</summary><pre>{text}</pre></details>\n"
+        case TitledParts():
+            inner = "".join(map(as_html, part.parts))
+            if part.style:
+                return f"<div{_class(part.style)}>\n{inner}</div>\n"
+            return (
+                f"<h{part.level}>{escape(part.title)}</h{part.level}>\n{inner}"
+            )
+
+
+def escape(text: str) -> str:
+    """Return a text for HTML: markup is escaped, control characters become visible marks."""
+    return escape_html(printable(text)).replace("&#x27;", "&#39;")
+
+
+def _class(style: str) -> str:
+    return f' class="{escape(style)}"' if style else ""
+
+
+def _span(span: Span) -> str:
+    text = escape(span.text)
+    if span.to:
+        return f'<a href="{escape(span.to)}">{text}</a>'
+    if span.style in ("strong", "code"):
+        return f"<{span.style}>{text}</{span.style}>"
+    return f"<span{_class(span.style)}>{text}</span>" if span.style else text
+
+
+def _html_rows(table: Table) -> str:
+    head = "".join(
+        f"<th{_class('n' if table.is_number(k) else '')}>{escape(each)}</th>"
+        for k, each in enumerate(table.heads)
+    )
+    rows = [f"<tr>{head}</tr>\n"] if head else []
+    for number, row in enumerate(table.rows):
+        cells = []
+        for k, cell in enumerate(row):
+            kind = "th" if k == 0 and not head else "td"
+            wide = "wide" if len(cell) > LONG and not table.is_number(k) else ""
+            style = "n" if table.is_number(k) else wide
+            cells.append(f"<{kind}{_class(style)}>{escape(cell)}</{kind}>")
+        faint = _class("quiet" if number in (table.faint or ()) else "")
+        rows.append(f"<tr{faint}>{''.join(cells)}</tr>\n")
+    return "".join(rows)
+
+
+# Markdown -----------------------------------------------------------------------------------------
+
+
+def as_markdown(parts: Sequence[Shown]) -> str:
+    """For a paper's appendix or an issue; pictures are links to their files."""
+    return "\n\n".join(filter(None, map(_markdown, parts))) + "\n"
+
+
+def _markdown(part: Shown) -> str:
+    match part:
+        case str():
+            return escape_markdown(part)
+        case Line():
+            return "".join(map(_markdown_span, part.spans))
+        case Items():
+            return "\n".join(
+                f"- {escape_markdown(text)}" for text in part.texts
+            )
+        case Table():
+            columns = range(
+                len(part.heads) or max(map(len, part.rows), default=0)
+            )
+            heads = part.heads or ("",) * len(columns)
+            rule = tuple(
+                "---:" if part.is_number(k) else "---" for k in columns
+            )
+            head, *rows = (
+                map(escape_markdown, line) for line in (heads, *part.rows)
+            )
+            table = "\n".join(
+                f"| {' | '.join(line)} |" for line in (head, rule, *rows)
+            )
+            return (
+                f"## {escape_markdown(part.title)}\n\n{table}"
+                if part.title
+                else table
+            )
+        case Cards():
+            cards = (
+                f"{what}: {value} ({note})" for what, value, note in part.items
+            )
+            return "\n".join(f"- {escape_markdown(card)}" for card in cards)
+        case Picture():
+            return (
+                f"![{escape_markdown(part.caption)}]({quote(part.file.name)})"
+            )
+        case Listing():
+            fence = _longer_than_any("```", part.text)
+            return f"{escape_markdown(part.title)}:\n\n{fence}\n{printable(part.text)}\n{fence}"
+        case TitledParts():
+            heading = f"{'#' * part.level} {escape_markdown(part.title)}"
+            title = heading if part.title else ""
+            return "\n\n".join(
+                filter(None, (title, *map(_markdown, part.parts)))
+            )
+
+
+def escape_markdown(text: str) -> str:
+    """Text as one line of Markdown that a reader shows as it is: no markup, HTML or links."""
+    line = MARKUP.sub(r"\\\g<0>", " ".join(printable(text).split()))
+    return NUMBER_AT_START.sub(r"\1\\", MARKUP_AT_START.sub(r"\\\g<0>", line))
+
+
+def _markdown_span(span: Span) -> str:
+    text = span.text.strip()
+    if not text or span.style not in ("strong", "code"):
+        return _enclosing_ticks(span.text, escape_markdown(text))
+    if span.style == "strong":
+        return _enclosing_ticks(span.text, f"**{escape_markdown(text)}**")
+    fence = _longer_than_any("`", text)
+    pad = " " if "`" in text else ""
+    code = " ".join(printable(text).split())
+    return _enclosing_ticks(span.text, f"{fence}{pad}{code}{pad}{fence}")
+
+
+def _enclosing_ticks(text: str, shown: str) -> str:
+    """Keep the spaces with which a piece of a sentence begins and ends."""
+    before = " " if text[:1].isspace() else ""
+    after = " " if text[-1:].isspace() else ""
+    return f"{before}{shown}{after}"
+
+
+def _longer_than_any(fence: str, text: str) -> str:
+    """Return a fence of backticks that the text does not have."""
+    longest = max(map(len, BACKTICKS.findall(text)), default=0)
+    return fence if longest < len(fence) else "`" * (longest + 1)

@@ -1,0 +1,112 @@
+"""Pages of the documentation, for readers who have the package and no checkout of its repository.
+
+A wheel contains the pages (`force-include` in pyproject.toml); in a checkout they are in docs/.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+
+_IN_WHEEL = Path(__file__).parents[1] / "documentation"
+_IN_CHECKOUT = Path(__file__).parents[2] / "docs"
+# Pages that Sphinx alone can show: lists of links and of names.
+_FOR_SPHINX = ("index", "api")
+# Label and topic of a link; the topic is empty where the link is to a section of the same page.
+_LINK_TO_PAGE = re.compile(
+    r"\[([^\]]*)\]\((?:(?:[\w.-]+/)*(\w+)\.md(?:#[\w-]*)?|#[\w-]+)\)"
+)
+
+
+def documentation_folder() -> Path:
+    """Return the folder of the pages: that of the wheel, or docs/ in a checkout."""
+    return _IN_WHEEL if _IN_WHEEL.is_dir() else _IN_CHECKOUT
+
+
+@cache
+def page_files() -> dict[str, Path]:
+    """Return the file of each page by its topic, which is the file's name, in alphabetical order.
+
+    The dictionary is empty where neither a wheel nor a checkout is installed.
+    """
+    files = (
+        *documentation_folder().glob("howto/*.md"),
+        *documentation_folder().glob("*.md"),
+    )
+    return {
+        file.stem: file
+        for file in sorted(files, key=_topic)
+        if _topic(file) not in _FOR_SPHINX
+    }
+
+
+def _topic(file: Path) -> str:
+    return file.stem
+
+
+def page_title(topic: str) -> str:
+    """Return the first heading of a page; `topic` is a key of `page_files`."""
+    with page_files()[topic].open(encoding="utf-8") as page:
+        return page.readline().removeprefix("# ").strip()
+
+
+def page_text(topic: str) -> str:
+    """Return a page as Markdown, with links to other pages replaced by their topics.
+
+    Parameters
+    ----------
+    topic : str
+        A key of `page_files`.
+    """
+
+    def named(link: re.Match[str]) -> str:
+        label, other = link.groups()
+        if other in page_files() and other != topic:
+            return f"{label or page_title(other)} (`explain {other}`)"
+        return label if other in (None, topic) else link[0]
+
+    return _LINK_TO_PAGE.sub(
+        named, page_files()[topic].read_text(encoding="utf-8")
+    )
+
+
+def explain_command(*topics: str) -> str:
+    """Return the command that shows pages in a terminal."""
+    return " ".join(("collocation-sysid explain", *topics))
+
+
+def page_url(topic: str) -> str | None:
+    """Return the address of a page on the web; None if the project states none.
+
+    The base is the address that `documentation_url` returns.
+    """
+    base = documentation_url()
+    if base is None:
+        return None
+    page = (
+        page_files()[topic]
+        .relative_to(documentation_folder())
+        .with_suffix(".html")
+    )
+    return f"{base}/{page.as_posix()}"
+
+
+def documentation_url() -> str | None:
+    """Return the address of the documentation without a final slash; None if the project states
+    none.
+
+    It is the address that `project.urls` of pyproject.toml calls "Documentation".
+    """
+    from importlib.metadata import PackageNotFoundError, metadata  # slow
+
+    try:
+        project_urls = (
+            metadata("collocation-sysid").get_all("Project-URL") or []
+        )
+    except PackageNotFoundError:
+        return None
+    urls = dict(each.split(", ", 1) for each in project_urls)
+    return (
+        urls["Documentation"].rstrip("/") if "Documentation" in urls else None
+    )

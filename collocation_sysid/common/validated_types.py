@@ -1,0 +1,133 @@
+"""Types with ranges for user input, and the base class of method options.
+
+Values are checked by pydantic without conversion: TOML distinguishes text, numbers and truth
+values, so that "30" or true in place of a number is a mistake.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import Annotated, Any, ClassVar, get_type_hints
+
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
+
+from ..errors import InputError, hint_at
+
+# Magnitudes of meaningful input; their squares are still finite, nonzero floating-point numbers.
+SMALLEST = 1e-100
+# Largest magnitude.
+LARGEST = 1e100
+
+
+def _of_usual_size(value: float) -> float:
+    if value and not SMALLEST <= abs(value) <= LARGEST:
+        sizes = f"zero, or a size from {SMALLEST:g} to {LARGEST:g}"
+        raise ValueError(f"found {value:g}; expected {sizes}")
+    return value
+
+
+_Usual = AfterValidator(_of_usual_size)
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False), _Usual]
+Positive = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, gt=0), _Usual
+]
+NotNegative = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, ge=0), _Usual
+]
+AboveOne = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, gt=1), _Usual
+]
+OneOrMore = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, ge=1), _Usual
+]
+Boundless = Annotated[float, Field(strict=True)]
+StrictInteger = Annotated[int, Field(strict=True)]
+Count = Annotated[int, Field(strict=True, ge=0)]
+AtLeastOne = Annotated[int, Field(strict=True, ge=1)]
+Flag = Annotated[bool, Field(strict=True)]
+Text = Annotated[str, Field(min_length=1)]
+
+_EXPECTED = {
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "bool_type": "true or false, without quotes",
+    "string_type": "text in quotes",
+    "string_too_short": "a text that is not empty",
+    "finite_number": "a finite number",
+    "greater_than": "a number above {gt:g}",
+    "greater_than_equal": "a number of at least {ge:g}",
+    "dict_type": "a table",
+    "mapping_type": "a table",
+    "tuple_type": "a list",
+}
+
+
+def expected(fault: Mapping[str, Any]) -> str:
+    """Return what was expected in place of an invalid value, for an error message.
+
+    Parameters
+    ----------
+    fault : mapping
+        One entry of pydantic's `ValidationError.errors()`.
+    """
+    if fault["type"] == "value_error":
+        return str(fault["ctx"]["error"]).partition("expected ")[2]
+    if fault["type"] in _EXPECTED:
+        return _EXPECTED[fault["type"]].format(**fault.get("ctx", {}))
+    return fault["msg"].removeprefix("Input should be ")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Base class of methods and option groups: frozen dataclasses that check the types of their
+    fields.
+
+    Raises
+    ------
+    InputError
+        On construction, if a value does not have the type of its field.
+    """
+
+    name: ClassVar[str]
+    # Whether a method can only start from parameters with which everything can be simulated.
+    needs_complete_start: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        for name, adapter in _adapters(type(self)).items():
+            value = getattr(self, name)
+            try:
+                object.__setattr__(self, name, adapter.validate_python(value))
+            except ValidationError as error:
+                raise _refusal(
+                    name, value, error.errors(include_url=False)[0]
+                ) from error
+
+
+@cache
+def _adapters(kind: type[Options]) -> dict[str, TypeAdapter[Any]]:
+    types = get_type_hints(kind, include_extras=True)
+    return {
+        field.name: TypeAdapter(types[field.name]) for field in fields(kind)
+    }
+
+
+def _refusal(name: str, value: Any, fault: Mapping[str, Any]) -> InputError:
+    """Return the error for an invalid value; it names the entry if the value is a table."""
+    for part in fault["loc"]:
+        if isinstance(value, Mapping) and part in value:
+            name = f"{name}.{part}"
+            value = value[part]
+    if fault["type"] == "value_error":
+        return InputError(str(fault["ctx"]["error"]), None, where=name)
+    choices = re.findall(
+        "'(.*?)'",
+        fault["ctx"]["expected"] if "literal" in fault["type"] else "",
+    )
+    hint = hint_at(str(value), choices)
+    return InputError(
+        f"found {value!r}; expected {expected(fault)}{hint}", None, where=name
+    )

@@ -1,0 +1,7 @@
+"""Optional features that use the core and a solved problem; nothing else depends on them.
+
+- `live`: estimation while the recording is being made.
+- `studies`: plans of many runs, comparisons of methods and of models.
+- `design`: motions that determine the parameters best.
+- `export`: identified bodies and motions in the formats of simulators and viewers.
+"""

@@ -1,0 +1,337 @@
+"""Benchmark folders: files of the bodies that users of any simulator read without this package."""
+
+from __future__ import annotations
+
+import csv
+import io
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...common.files import SCHEMA, safe_name, write_text_file
+from ...common.serialisation import as_json
+from ...errors import InputError
+from ...fem.meshes.mesh import TetMesh
+from ...fem.meshes.structured import box_mesh
+from ...problem import Problem
+from ...program.simulation import simulate
+from ...recording import Experiment
+from ...recording.homogeneous_deformation import AXES, CELL_SIZE_M
+from ...recording.placement import LocatedBody
+from ...recording.recording_writers import write_columns_csv, write_poses_csv
+from ...recording.specimen_files import specimen_strains
+from ...result.run_writers import replaced_folder
+from .benchmark_bodies import BenchmarkBody
+from .benchmark_content import BODY_FILE, CONTENT_FILE
+from .body_description import (
+    FOLDER_README,
+    body_readme,
+    damping_description,
+    law_description,
+)
+from .identified_constants import CatalogueEntry, catalogue_entry
+from .signals import SAMPLE_KEY, RecordingSignals
+
+README_FILE = "README.md"
+LICENCE_FILE = "LICENSE.md"
+# Divisions of the cube that stands for a body without a mesh: any mesh has the same stresses.
+CUBE_DIVISIONS = (1, 1, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class BodyTask:
+    """Content of the folder of one body, before it is written.
+
+    Attributes
+    ----------
+    body : BenchmarkBody
+    entry : CatalogueEntry
+    problem : Problem
+    values : mapping of name to float
+        Values of all parameters of the problem.
+    signals : mapping of recording name to RecordingSignals
+    """
+
+    body: BenchmarkBody
+    entry: CatalogueEntry
+    problem: Problem
+    values: dict[str, float]
+    signals: dict[str, RecordingSignals]
+
+    @classmethod
+    def simulated(
+        cls, body: BenchmarkBody, progress: Callable[[float], None] | None
+    ) -> BodyTask:
+        """Return the task of a body, with simulations of its recordings.
+
+        `progress` is called with the completed share of each simulation, from 0 to 1.
+        """
+        problem = body.read_problem()
+        entry = catalogue_entry(body.entry)
+        values = _parameter_values(problem, entry)
+        signals = {}
+        for experiment in _recordings(problem, body):
+            trajectory = simulate(
+                experiment,
+                experiment.body.theta_from_values(values),
+                timestep_s=problem.rollout.timestep_s,
+                progress=progress,
+            )
+            signals[experiment.name] = RecordingSignals.from_trajectory(
+                experiment, trajectory
+            )
+        return cls(body, entry, problem, values, signals)
+
+    @property
+    def experiments(self) -> list[Experiment]:
+        """Recordings to be predicted."""
+        return _recordings(self.problem, self.body)
+
+
+def write_benchmark(
+    bodies: Sequence[BenchmarkBody],
+    folder: str | Path,
+    progress: Callable[[float], None] | None = None,
+) -> Path:
+    """Write a folder with all that a simulator needs to predict the recordings of the bodies.
+
+    The folder of each body has its mesh, the motion of its grasps, the times and points to be
+    predicted, the constants with combined 95 % intervals, the measurements, a simulation by this
+    package, and a README with the format of the predictions.
+
+    Parameters
+    ----------
+    bodies : sequence of BenchmarkBody
+        At least one.
+    folder : str or Path
+        An earlier benchmark folder is replaced, if nothing was added to it or changed in it.
+    progress : callable, optional
+        Called with the completed share of each simulation, from 0 to 1.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    InputError
+        If there are no bodies, the data of a body are missing, or the folder has other files.
+    SimulationError
+        If a simulation fails; nothing is written then.
+    """
+    if not bodies:
+        raise InputError(
+            "found no body whose data are on this computer; install the package again"
+        )
+    with replaced_folder(
+        folder, marker_file=CONTENT_FILE, content_word="benchmark"
+    ) as draft:
+        for body in bodies:
+            task = BodyTask.simulated(body, progress)
+            _write_body(task, draft / body.name)
+        content = {
+            "schema": SCHEMA,
+            "bodies": [body.name for body in bodies],
+        }
+        write_text_file(draft / CONTENT_FILE, as_json(content) + "\n")
+        write_text_file(draft / README_FILE, FOLDER_README)
+    return Path(folder)
+
+
+def _recordings(problem: Problem, body: BenchmarkBody) -> list[Experiment]:
+    """Return the experiments of a problem that the benchmark asks to predict."""
+    return [
+        each for each in problem.experiments if each.name in body.recordings
+    ]
+
+
+def _parameter_values(
+    problem: Problem, entry: CatalogueEntry
+) -> dict[str, float]:
+    """Return the values of all parameters: those of the catalogue, else the fixed ones.
+
+    Raises
+    ------
+    InputError
+        If a parameter has neither.
+    """
+    identified = {each.name: each.value for each in entry.constants}
+    values = {}
+    for item in problem.parameters.items:
+        value = identified.get(item.name, item.guess if item.is_fixed else None)
+        if value is None:
+            raise InputError(
+                "has no value in the catalogue and is not fixed; expected one of both",
+                problem.path,
+                where=f"parameters.{item.name}",
+            )
+        values[item.name] = value
+    return values
+
+
+def _write_body(task: BodyTask, folder: Path) -> None:
+    """Write the folder of a body."""
+    mesh = _mesh(task.experiments[0])
+    folder.mkdir()
+    if (licence := task.body.licence_file) is not None:
+        shutil.copyfile(licence, folder / LICENCE_FILE)
+    mesh.write(folder / "mesh.vtu")
+    write_columns_csv(
+        folder / "nodes.csv",
+        dict(zip(("x_m", "y_m", "z_m"), mesh.points_m.T, strict=True)),
+    )
+    corners = (f"node_{k}" for k in range(1, 5))
+    write_columns_csv(
+        folder / "tetrahedra.csv",
+        dict(zip(corners, mesh.tetrahedra.T, strict=True)),
+    )
+    content = _body_content(task)
+    content["recordings"] = [
+        _write_recording(task, experiment, folder=folder)
+        for experiment in task.experiments
+    ]
+    write_text_file(folder / BODY_FILE, as_json(content) + "\n")
+    write_text_file(folder / README_FILE, body_readme(content))
+
+
+def _mesh(experiment: Experiment) -> TetMesh:
+    """Return the mesh of a body; a cube for a material test without a mesh."""
+    if experiment.specimen is None:
+        return experiment.body.mesh
+    return box_mesh((CELL_SIZE_M,) * 3, CUBE_DIVISIONS, (0.0, 0.0, 0.0))
+
+
+def _body_content(task: BodyTask) -> dict[str, Any]:
+    """Return what is written about a body as JSON, without its recordings."""
+    experiment = task.experiments[0]
+    body = experiment.body
+    theta = body.theta_from_values(task.values)
+    (part,) = body.parts
+    (density,) = body.densities(theta)
+    is_motion = not experiment.is_static
+    return {
+        "schema": SCHEMA,
+        "body": task.body.name,
+        "catalogue_entry": task.body.entry,
+        "specimen": task.entry.specimen,
+        "source": task.entry.source,
+        "licence": task.entry.licence,
+        "is_measured": task.entry.is_measured,
+        "note": task.body.note,
+        "identified_from": task.entry.fitted_recordings,
+        "law": part.material.name,
+        "energy": law_description(part.material.name),
+        "damping": part.damping.name if is_motion else None,
+        "damping_force": damping_description(part.damping.name)
+        if is_motion
+        else None,
+        "element": body.element.name if experiment.specimen is None else None,
+        "density_kg_m3": density if experiment.specimen is None else None,
+        "constants": [asdict(each) for each in task.entry.constants],
+    }
+
+
+def _write_recording(
+    task: BodyTask, experiment: Experiment, folder: Path
+) -> dict[str, Any]:
+    """Write the tables of a recording, and return what is written about it as JSON."""
+    signals = task.signals[experiment.name]
+    measured = signals.measured
+    name = safe_name(experiment.name)
+    files = {
+        role: f"{name}_{role}.csv"
+        for role in ("times", "measured", "simulated", "undeformed")
+    }
+    write_columns_csv(folder / files["times"], {measured.key: measured.keys})
+    for role in ("measured", "simulated", "undeformed"):
+        write_columns_csv(folder / files[role], getattr(signals, role).table)
+    content = {
+        "name": experiment.name,
+        "file_name": name,
+        "is_held_out": task.body.are_held_out,
+        "kind": experiment.kind,
+        "start": None if experiment.is_static else experiment.start,
+        "gravity_m_s2": experiment.gravity_m_s2,
+        "air_density_kg_m3": experiment.air_density_kg_m3,
+        "quantity": measured.quantity,
+        "key": measured.key,
+        "columns": measured.columns,
+        "sigma": signals.sigma,
+        "files": files,
+    }
+    if experiment.specimen is not None:
+        files["stretches"] = f"{name}_stretches.csv"
+        write_columns_csv(folder / files["stretches"], _stretches(experiment))
+        return content
+    if measured.quantity == "markers":
+        files["markers"] = f"{name}_markers.csv"
+        write_text_file(folder / files["markers"], _marker_table(experiment))
+    else:
+        content["symmetry"] = experiment.symmetry
+    content["grasps"] = _write_grasps(experiment, folder=folder, name=name)
+    return content
+
+
+def _write_grasps(
+    experiment: Experiment, folder: Path, name: str
+) -> list[dict[str, Any]]:
+    """Write the nodes and poses of the grasps, and return what is written about them as JSON."""
+    grasps = []
+    corner_count = len(experiment.body.mesh.points_m)
+    for number, grasp in enumerate(experiment.grasps, start=1):
+        nodes_file = f"{name}_grasp_{number}_nodes.csv"
+        nodes = grasp.nodes[grasp.nodes < corner_count]
+        write_columns_csv(folder / nodes_file, {"node": nodes})
+        is_moving = len(grasp.poses.t_s) > 1
+        poses_file = f"{name}_grasp_{number}_poses.csv" if is_moving else None
+        if poses_file is not None:
+            write_poses_csv(folder / poses_file, grasp.poses)
+        grasps.append(
+            {"nodes": nodes_file, "axes": grasp.axes, "poses": poses_file}
+        )
+    return grasps
+
+
+def _marker_table(experiment: Experiment) -> str:
+    """Return a CSV table of the markers: place on the undeformed body, element, and weights of its
+    corners.
+    """
+    body = experiment.body
+    places_m = experiment.markers.predict_positions(body.nodes_m)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    weights = [f"weight_{k}" for k in range(1, 5)]
+    writer.writerow(["marker", "x_m", "y_m", "z_m", "tetrahedron", *weights])
+    located = LocatedBody(body.nodes_m, body)
+    for name, place_m in zip(experiment.markers.names, places_m, strict=True):
+        cell, _ = located.nearest_cell(place_m)
+        (shares,) = located.barycentric(place_m, np.array([cell]))
+        numbers = [f"{value:.12g}" for value in (*place_m, cell, *shares)]
+        writer.writerow([name, *numbers])
+    return text.getvalue()
+
+
+def _stretches(experiment: Experiment) -> dict[str, Array]:
+    """Return the stretches of a material test along x, y and z by column; NaN where the stretch is
+    free and the stress vanishes.
+    """
+    deformation = experiment.specimen
+    assert deformation is not None
+    assert not deformation.is_shear
+    first, second = specimen_strains(experiment)
+    samples = np.arange(1.0, len(first) + 1)
+    table = {SAMPLE_KEY: samples}
+    for axis in AXES:
+        stretch = np.ones(len(first))
+        stretch += first * (axis * 2 in deformation.first)
+        stretch += second * (axis * 2 in deformation.second)
+        if axis in deformation.free:
+            stretch = np.full(len(first), np.nan)
+        table[f"stretch_{axis}"] = stretch
+    return table

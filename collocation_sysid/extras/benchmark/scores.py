@@ -1,0 +1,183 @@
+"""Scores of predictions: errors relative to the deflection and to the stated noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...errors import InputError, listed, require_among
+from .benchmark_content import BenchmarkContent, StoredRecording
+from .prediction_files import (
+    PREDICTION_SUFFIXES,
+    find_prediction,
+    prediction_name,
+    read_prediction,
+)
+from .signals import AXES, Signal
+
+PREDICTION = "prediction"
+SIMULATION = "collocation_sysid"
+UNDEFORMED = "undeformed body"
+
+
+@dataclass(frozen=True)
+class Score:
+    """Errors of one prediction of one recording.
+
+    Attributes
+    ----------
+    body, recording : str
+    source : str
+        "prediction", "collocation_sysid" for the forward simulation of this package, or
+        "undeformed body" for the undeformed body, which its grasp moves rigidly and has no loads.
+    quantity : {"markers", "forces", "stresses"}
+    unit : str
+        Unit of the errors: m, N or Pa.
+    is_held_out : bool
+        Whether the constants were identified without the recording.
+    count : int
+        Number of measured positions of markers, or of loads.
+    rms : float
+        RMS distance of predicted and measured markers, or RMS difference of loads.
+    largest : float
+        Largest distance or difference.
+    deflection_share : float
+        `rms` relative to the largest deflection, which is the largest error of the undeformed body.
+    sigmas : float
+        RMS of the differences over their stated standard deviations.
+    rms_without_offsets : float or None
+        RMS distance of the markers if the mean difference of each is subtracted, which errors of
+        marker positions on the body do not change much; None for loads.
+    """
+
+    body: str
+    recording: str
+    source: str
+    quantity: str
+    unit: str
+    is_held_out: bool
+    count: int
+    rms: float
+    largest: float
+    deflection_share: float
+    sigmas: float
+    rms_without_offsets: float | None
+
+
+UNITS = {"markers": "m", "forces": "N", "stresses": "Pa"}
+
+
+def score_benchmark(folder: str | Path, body: str | None = None) -> list[Score]:
+    """Score the predictions in a benchmark folder.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder that `write_benchmark` wrote, with a prediction file of each recording added to the
+        folder of its body.
+    body : str, optional
+        Only this body; all by default.
+
+    Returns
+    -------
+    list of Score
+        For each recording the prediction, the forward simulation of this package, and the
+        undeformed body.
+
+    Raises
+    ------
+    InputError
+        If the folder is no benchmark or was changed, or if a prediction is missing or invalid.
+    """
+    content = BenchmarkContent.read(Path(folder))
+    names = content.bodies
+    if body is not None:
+        require_among(body, names, content.folder, where="--body")
+        names = (body,)
+    recordings = [each for each in content.recordings if each.body in names]
+    files = _prediction_files(content.folder, recordings)
+    scores = []
+    for recording, file in zip(recordings, files, strict=True):
+        prediction = read_prediction(file, recording.signals.measured)
+        signals = {
+            PREDICTION: prediction,
+            SIMULATION: recording.signals.simulated,
+            UNDEFORMED: recording.signals.undeformed,
+        }
+        scores += [
+            score(recording, source, predicted=signal)
+            for source, signal in signals.items()
+        ]
+    return scores
+
+
+def _prediction_files(
+    folder: Path, recordings: list[StoredRecording]
+) -> list[Path]:
+    """Return the prediction file of each recording; refuse a folder without one of them."""
+    files = []
+    missing = []
+    for recording in recordings:
+        file = find_prediction(folder / recording.body, recording.name)
+        if file is None:
+            name = prediction_name(recording.name)
+            missing.append(f"{recording.body}/{name}{PREDICTION_SUFFIXES[0]}")
+        else:
+            files.append(file)
+    if missing:
+        raise InputError(
+            f"found no {listed(missing)}; expected a prediction of each recording, as .csv or .npz, "
+            "see README.md; --body NAME scores one body",
+            folder,
+        )
+    return files
+
+
+def score(recording: StoredRecording, source: str, predicted: Signal) -> Score:
+    """Return the score of a prediction of a recording; `source` states who predicted it."""
+    signals = recording.signals
+    measured = signals.measured
+    errors = _errors(predicted, measured)
+    distances = _distances(errors, measured)
+    deflections = _distances(_errors(signals.undeformed, measured), measured)
+    without_offsets = None
+    if measured.quantity == "markers":
+        centred = errors - np.nanmean(errors, axis=0)
+        without_offsets = _rms(_distances(centred, measured))
+    return Score(
+        body=recording.body,
+        recording=recording.name,
+        source=source,
+        quantity=measured.quantity,
+        unit=UNITS[measured.quantity],
+        is_held_out=recording.is_held_out,
+        count=distances.size,
+        rms=_rms(distances),
+        largest=float(distances.max()),
+        deflection_share=_rms(distances) / float(deflections.max()),
+        sigmas=_rms((errors / signals.sigma)[np.isfinite(errors)]),
+        rms_without_offsets=without_offsets,
+    )
+
+
+def _errors(predicted: Signal, measured: Signal) -> Array:
+    """Return predicted minus measured values (T, C); NaN where nothing was measured."""
+    return predicted.values - measured.values
+
+
+def _distances(errors: Array, measured: Signal) -> Array:
+    """Return the known distances of markers, or the known magnitudes of the differences of loads."""
+    sizes = np.abs(errors)
+    if measured.quantity == "markers":
+        sizes = np.linalg.norm(
+            errors.reshape(len(errors), -1, len(AXES)), axis=2
+        )
+    return sizes[np.isfinite(sizes)]
+
+
+def _rms(values: Array) -> float:
+    """Return the root of the mean square of values."""
+    return float(np.sqrt(np.mean(values**2)))

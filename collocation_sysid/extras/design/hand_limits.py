@@ -1,0 +1,300 @@
+"""Limits of the robot and views of the cameras (limits.toml), and scaling of motions to
+satisfy them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field, ValidationError, model_validator
+
+from ...common.array_types import Array
+from ...common.schema_tables import Section, Vector
+from ...common.validated_types import AtLeastOne, Positive
+from ...errors import InputError
+from ...problem.problem_reading import parse_toml, read_text
+from ...problem.validation_messages import explain_validation_error
+from .hand_motion import HandMotion, angular_motion
+
+# Peaks are sought on a grid; between its points they may be this much larger.
+WITHIN = 1 - 6e-3
+# Factor that keeps a motion within its limits in spite of rounding.
+TIGHTER = 1 - 1e-4
+# A peak beyond this share of its limit is at it.
+REACHED = 0.98
+
+
+class CameraSection(Section):
+    """A camera, described by its cone of view."""
+
+    position_m: Vector = Field(
+        description="Position [x, y, z] of the camera in the world frame of the poses."
+    )
+    looks_at_m: Vector = Field(
+        description="A point [x, y, z] that appears in the middle of its image."
+    )
+    field_of_view_deg: Positive = Field(
+        lt=180,
+        description="Full angle of the cone of view: that of the image's shorter side.",
+    )
+
+    @model_validator(mode="after")
+    def _require_direction(self) -> CameraSection:
+        """Raise `ValueError` if the camera has no direction."""
+        if self.position_m == self.looks_at_m:
+            raise ValueError("looks_at_m is position_m; expected another point")
+        return self
+
+
+class Limits(Section):
+    """limits.toml: what the hand may do, and where markers are seen.
+
+    The hand is the middle of the grasped nodes.
+    """
+
+    workspace_m: tuple[Vector, Vector] = Field(
+        description="Lower and upper corner, [[x, y, z], [x, y, z]], of the region in which the "
+        "hand may be, in the world frame of the poses."
+    )
+    speed_m_s: Positive = Field(description="Largest speed of the hand.")
+    acceleration_m_s2: Positive = Field(
+        description="Largest acceleration of the hand."
+    )
+    rotation_deg: Positive = Field(
+        lt=180,
+        description="Largest angle between its orientation and that of the start.",
+    )
+    angular_speed_deg_s: Positive = Field(description="Largest angular speed.")
+    angular_acceleration_deg_s2: Positive = Field(
+        description="Largest angular acceleration."
+    )
+    frequency_hz: Positive | None = Field(
+        None,
+        description="Largest frequency in the motion; a tenth of the sampling rate by default.",
+    )
+    markers_box_m: tuple[Vector, Vector] | None = Field(
+        None, description="Lower and upper corner of a box, [[x, y, z], [x, y, z]], in which the "
+        "markers must stay."
+    )  # fmt: skip
+    camera: list[CameraSection] = Field(
+        default_factory=list,
+        description="[[camera]] tables: the markers must stay in their fields of view.",
+    )
+    cameras_per_marker: AtLeastOne = Field(
+        2, description="Number of cameras that must have each marker in view."
+    )
+
+    @model_validator(mode="after")
+    def _require_consistent(self) -> Limits:
+        """Raise `ValueError` for corners in the wrong order, or too few cameras."""
+        for key in ("workspace_m", "markers_box_m"):
+            corners = getattr(self, key)
+            if (
+                corners is not None
+                and not (np.array(corners[0]) < corners[1]).all()
+            ):
+                raise ValueError(f"{key} has the corners {list(map(list, corners))}; expected the "
+                                 "lower one first, below the other along every axis")  # fmt: skip
+        if self.camera and self.cameras_per_marker > len(self.camera):
+            raise ValueError(
+                f"cameras_per_marker = {self.cameras_per_marker}, but there are "
+                f"{len(self.camera)} cameras; expected at most that many"
+            )
+        return self
+
+    @classmethod
+    def read(cls, path: str | Path) -> Limits:
+        """Read limits.toml.
+
+        Raises
+        ------
+        InputError
+            Naming the file, the key or line, what was found and what was expected.
+        """
+        file = Path(path)
+        content = parse_toml(read_text(file, "a file of limits (TOML)"), file)
+        try:
+            return cls.model_validate(content)
+        except ValidationError as error:
+            raise explain_validation_error(
+                error, content, path=file, root=cls
+            ) from error
+
+    def bounds_from(self, hand_m: Array) -> HandBounds:
+        """Return the limits of a hand that starts at a position (3,) in the poses' world [m].
+
+        Raises
+        ------
+        InputError
+            If it starts outside the workspace.
+        """
+        low, high = (np.array(corner) - hand_m for corner in self.workspace_m)
+        if not ((low < 0) & (high > 0)).all():
+            at, *corners = (
+                f"[{', '.join(f'{each:.4g}' for each in place)}]"
+                for place in (hand_m, *self.workspace_m)
+            )
+            raise InputError(
+                f"the hand starts at {at}, which is not between {' and '.join(corners)}; expected "
+                "a workspace that contains the start",
+                None,
+                where="workspace_m",
+            )
+        return HandBounds(self, low, high_m=high)
+
+    def out_of_view(self, markers_m: Array) -> float:
+        """Return how far markers (T, M, 3) [m] leave the views; zero if all are in view.
+
+        Distances beyond the box are relative to its diagonal; those beyond a camera's cone are
+        angles [rad]. The largest is returned.
+        """
+        worst = 0.0
+        if self.markers_box_m is not None:
+            low, high = (np.array(corner) for corner in self.markers_box_m)
+            beyond = np.maximum(low - markers_m, markers_m - high).max(
+                initial=0.0
+            )
+            worst = float(beyond / np.linalg.norm(high - low))
+        if self.camera and markers_m.size:
+            beyond = np.sort(
+                [_beyond_cone(camera, markers_m) for camera in self.camera],
+                axis=0,
+            )
+            worst = max(worst, float(beyond[self.cameras_per_marker - 1].max()))
+        return worst
+
+
+def _beyond_cone(camera: CameraSection, points_m: Array) -> Array:
+    """Return the angles (…) [rad] by which points (…, 3) [m] are outside the cone of a camera's
+    field of view; negative inside.
+    """
+    position_m = np.array(camera.position_m)
+    ray = points_m - position_m
+    axis = np.array(camera.looks_at_m) - position_m
+    cosine = (
+        ray
+        @ axis
+        / (np.linalg.norm(ray, axis=-1) * np.linalg.norm(axis) + 1e-300)
+    )
+    return (
+        np.arccos(np.clip(cosine, -1.0, 1.0))
+        - np.radians(camera.field_of_view_deg) / 2
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class HandBounds:
+    """Limits of a hand with a known initial position.
+
+    Attributes
+    ----------
+    limits : Limits
+        Limits.
+    low_m, high_m : (3,) array
+        Corners of the workspace relative to the initial position [m].
+    """
+
+    limits: Limits
+    low_m: Array
+    high_m: Array
+
+    @property
+    def reach(self) -> tuple[Array, Array, Array]:
+        """Largest translation [m] and rotation [rad], (2,), and the same of their first and second
+        derivatives by time.
+        """
+        limits = self.limits
+        farthest = np.maximum(-self.low_m, self.high_m).max()
+        angular_rate = limits.angular_speed_deg_s
+        growth = limits.angular_acceleration_deg_s2
+        return (
+            np.array([farthest, np.radians(limits.rotation_deg)]),
+            np.array([limits.speed_m_s, np.radians(angular_rate)]),
+            np.array([limits.acceleration_m_s2, np.radians(growth)]),
+        )
+
+    def shares(self, motion: HandMotion) -> dict[str, float]:
+        """Return the largest values of a motion as shares of the limits, by name of the limit."""
+        course = motion.derivatives(motion.grid_s)
+        return self._translation_shares(*course) | self._rotation_shares(
+            *course
+        )
+
+    def _translation_shares(self, *course: Array) -> dict[str, float]:
+        """Return the largest translation, speed and acceleration as shares of their limits, by name
+        of the limit.
+
+        Parameters
+        ----------
+        course : three (T, 6) arrays
+            Coordinates of a motion, their first and their second derivatives, in SI units.
+        """
+        shift, rate, curvature = (each[:, :3] for each in course)
+        limits = self.limits
+        return {
+            "workspace_m": float(
+                np.maximum(shift / self.low_m, shift / self.high_m).max()
+            ),
+            "speed_m_s": _largest_norm(rate) / limits.speed_m_s,
+            "acceleration_m_s2": _largest_norm(curvature)
+            / limits.acceleration_m_s2,
+        }
+
+    def _rotation_shares(self, *course: Array) -> dict[str, float]:
+        """Return the largest rotation, angular speed and angular acceleration as shares of their
+        limits, by name of the limit.
+
+        Parameters
+        ----------
+        course : three (T, 6) arrays
+            Coordinates of a motion, their first and their second derivatives, in SI units.
+        """
+        turn = course[0][:, 3:]
+        limits = self.limits
+        largest = map(
+            _largest_norm,
+            (turn, *angular_motion(*(each[:, 3:] for each in course))),
+        )
+        names = (
+            "rotation_deg",
+            "angular_speed_deg_s",
+            "angular_acceleration_deg_s2",
+        )
+        pairs = zip(names, largest, strict=True)
+        return {
+            name: np.degrees(peak) / getattr(limits, name)
+            for name, peak in pairs
+        }
+
+    def scale_to_limits(self, motion: HandMotion) -> HandMotion:
+        """Return the motion with translations and rotations reduced so that every limit is
+        satisfied.
+
+        A motion that satisfies all limits is unchanged. Peaks of translations are proportional to
+        their scale, those of rotations nearly.
+        """
+        course = motion.derivatives(motion.grid_s)
+        shift = WITHIN / max(
+            WITHIN, *self._translation_shares(*course).values()
+        )
+        return motion.scaled(shift, self._rotation_scale(course))
+
+    def _rotation_scale(self, course: tuple[Array, Array, Array]) -> float:
+        """Return the factor, at most 1, of the rotation vectors with which all limits of the
+        rotation are satisfied; `course` has coordinates and derivatives (T, 6).
+        """
+        scale = 1.0
+        while (
+            largest := max(
+                self._rotation_shares(*(scale * c for c in course)).values()
+            )
+        ) > WITHIN:
+            scale *= TIGHTER * WITHIN / largest
+        return scale
+
+
+def _largest_norm(vectors: Array) -> float:
+    """Return the largest norm of vectors (T, 3)."""
+    return float(np.linalg.norm(vectors, axis=1).max())

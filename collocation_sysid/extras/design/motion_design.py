@@ -1,0 +1,546 @@
+"""Search for the motion with the smallest error bars, within limits and over a prior of θ.
+
+Use `design_motion`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...common.validated_types import AboveOne, AtLeastOne, Count, Options
+from ...errors import InputError, SimulationError, require_among
+from ...model.parameters import ThetaMap
+from ...problem import Problem
+from ...program.simulation import Trajectory, simulate, with_markers
+from ...recording import Experiment, PoseSequence
+from ...runs.solving import solve
+from ...statistics.linearised import linearise_fit
+from .evolution_search import SearchResult, Watch, minimise
+from .hand_limits import REACHED, HandBounds, Limits
+from .hand_motion import HandMotion
+from .predicted_information import (
+    DesignCriterion,
+    FutureRecording,
+    LinearRecording,
+    PredictedErrors,
+    SimulatedMotion,
+    prior_draws,
+    shared_information,
+    symmetric_draws,
+)
+
+Say = Callable[[str], None]
+
+# Beyond any logarithm of an error bar: of motions that break a rule, those come first that break
+# it least.
+FORBIDDEN = 1e3
+# Motions that are tried to first order, which takes milliseconds each, for each simulated one.
+TO_FIRST_ORDER = 10
+# Motions evaluated to first order between two reports of the progress.
+NEWS = 500
+# Largest memory of the first-order prediction [GB]; with more, motions are simulated only.
+MOST_GIGABYTES = 1.0
+
+
+@dataclass(frozen=True)
+class DesignOptions(Options):
+    """Options of the search for a motion.
+
+    Attributes
+    ----------
+    evaluations : int
+        Number of motions that are simulated, after a first-order evaluation of ten times as many.
+    pairs : int
+        Number of pairs of draws from the prior.
+    spread : float
+        Factor by which guesses without a prior may be wrong.
+    waves : int
+        Number of waves of each of the six coordinates.
+    seed : int
+        Seed of the search and of the draws.
+    """
+
+    evaluations: AtLeastOne = 300
+    pairs: Count = 1
+    spread: AboveOne = 1.5
+    waves: AtLeastOne = 1
+    seed: Count = 0
+
+
+WORST = DesignCriterion()
+USUAL = DesignOptions()
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorBars:
+    """Relative error bars, by name.
+
+    Attributes
+    ----------
+    values : mapping of str to float
+        Parameters and moduli at the middle of the prior.
+    relative : mapping of str to float
+        Their standard errors over these.
+    lowest, highest : mapping of str to float
+        Smallest and largest relative errors over the draws of θ.
+    """
+
+    values: Mapping[str, float]
+    relative: Mapping[str, float]
+    lowest: Mapping[str, float]
+    highest: Mapping[str, float]
+
+    @classmethod
+    def from_draws(cls, errors: list[PredictedErrors]) -> ErrorBars:
+        """Return the error bars at the first draw, the middle, with the lowest and the highest over
+        all draws.
+        """
+        each = [error.relative for error in errors]
+        lowest, highest = (
+            {n: pick(e[n] for e in each) for n in each[0]}
+            for pick in (min, max)
+        )
+        return cls(errors[0].values, each[0], lowest, highest)
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Designed motion with its predicted uncertainty.
+
+    Attributes
+    ----------
+    recording : FutureRecording
+        Recording to be made.
+    motion : HandMotion
+        Motion of the hand.
+    experiment : Experiment
+        Experiment to be recorded, with simulated markers instead of measured ones.
+    predicted : Trajectory
+        Simulation at the middle of the prior.
+    criterion : DesignCriterion
+        Criterion that was minimised.
+    before : ErrorBars or None
+        Error bars of the existing recordings, if they are used, else of the problem's own motion;
+        None if that could not be simulated.
+    after : ErrorBars
+        Error bars with the new recording, and with the existing ones if they are used.
+    added : bool
+        Whether the existing recordings are used.
+    limits : Limits
+        Limits of the robot.
+    shares : mapping of str to float
+        Largest value over the limit, by name of the limit.
+    best : SearchResult
+        Result of the search.
+    draws : int
+        Number of draws of θ.
+    """
+
+    recording: FutureRecording
+    motion: HandMotion
+    experiment: Experiment
+    predicted: Trajectory
+    criterion: DesignCriterion
+    before: ErrorBars | None
+    after: ErrorBars
+    added: bool
+    limits: Limits
+    shares: Mapping[str, float]
+    best: SearchResult
+    draws: int
+
+    @property
+    def poses(self) -> PoseSequence:
+        """Poses of the hand along the designed motion."""
+        return self.experiment.grasps[0].poses
+
+    @property
+    def active_limits(self) -> list[str]:
+        """Names of the limits that the motion reaches."""
+        return [name for name, share in self.shares.items() if share > REACHED]
+
+    @property
+    def minimised_error(self) -> float:
+        """Relative error bar that was minimised."""
+        return float(np.exp(self.best.value))
+
+
+@dataclass(frozen=True, eq=False)
+class MotionObjective:
+    """Objective of the search: size of the error bars of a motion.
+
+    Attributes
+    ----------
+    recording : FutureRecording
+        Recording to be designed.
+    limits : Limits
+        Limits of the robot.
+    criterion : DesignCriterion
+        Criterion.
+    draws : list of (nq,) array
+        Draws of q, the middle of the prior first.
+    known_information : (nq, nq) array
+        Information of the existing recordings.
+    """
+
+    recording: FutureRecording
+    limits: Limits
+    criterion: DesignCriterion
+    draws: list[Array]
+    known_information: Array
+
+    @cached_property
+    def bounds(self) -> HandBounds:
+        """Limits relative to the initial position."""
+        return self.recording.bounds(self.limits)
+
+    @cached_property
+    def constants(self) -> ThetaMap:
+        """Map from q to the constants of the body."""
+        recording = self.recording
+        return ThetaMap(recording.problem.parameters, recording.template.body)
+
+    def motion(self, coefficients: Array) -> HandMotion:
+        """Return the motion for coefficients (d,), scaled so that it satisfies all limits."""
+        recording = self.recording
+        free = HandMotion.from_coefficients(
+            coefficients,
+            float(recording.since_start_s[-1]),
+            recording.highest_hz(self.limits),
+            self.bounds.reach,
+        )
+        return self.bounds.scale_to_limits(free)
+
+    def errors(self, information: Array | float, q: Array) -> PredictedErrors:
+        """Return the error bars at the parameters q (nq,) from existing recordings, priors, and
+        additional information (nq, nq), or 0 for none.
+        """
+        parameters = self.recording.problem.parameters
+        return PredictedErrors.from_information(
+            self.known_information + information, parameters, self.constants, q
+        )
+
+    def first_guess(self, options: DesignOptions, say: Say) -> SearchResult:
+        """Return the motion with the smallest error bars to first order in the motion, as a start
+        of the search.
+
+        The result has no coefficients if a wrench is measured too, the memory would be too large,
+        or the simulation fails. `say` is called with the progress.
+        """
+        sensed = self.recording.template.grasps[0].wrench is not None
+        if sensed or LinearRecording.gigabytes(self.recording) > MOST_GIGABYTES:
+            return SearchResult()
+        middle = self.draws[0]
+        count = TO_FIRST_ORDER * options.evaluations
+        try:
+            linear = LinearRecording.from_simulations(self.recording, middle)
+        except SimulationError:
+            return SearchResult()
+
+        def report(number: int, size: float) -> None:
+            """Report the progress now and then."""
+            if number % NEWS == 0:
+                size = 100 * np.exp(size)
+                say(
+                    f"first-order evaluation: {number} of {count} motions, smallest error bar "
+                    f"{size:.3g} %"
+                )
+
+        def value(coefficients: Array, _: float) -> float:
+            """Return the logarithm of the error bar to first order."""
+            information = linear.information(self.motion(coefficients))
+            return self.criterion.log_size(self.errors(information, middle))
+
+        size = HandMotion.coefficient_count(options.waves)
+        return minimise(
+            value, size, evaluations=count, seed=options.seed, watch=report
+        )
+
+    def value(self, coefficients: Array, bound: float) -> float:
+        """Return the logarithm of the error bar of a motion; `FORBIDDEN` or more if a simulation
+        fails or a marker leaves the views.
+
+        If the value at the middle of the prior exceeds `bound`, it is returned, and the other draws
+        are not simulated.
+
+        Parameters
+        ----------
+        coefficients : (d,) array
+            Coefficients of the motion.
+        bound : float
+            Bound beyond which the value need not be exact.
+        """
+        experiment = self.recording.experiment(
+            self.recording.poses(self.motion(coefficients))
+        )
+        sizes = []
+        for q in self.draws:
+            try:
+                result = self.recording.simulate_motion(experiment, q)
+            except SimulationError as failure:
+                simulated_share = (
+                    failure.time_s - experiment.t_s[0]
+                ) / experiment.duration_s
+                return FORBIDDEN * (3 - min(1.0, simulated_share))
+            if (excess := self.limits.out_of_view(result.markers_m)) > 0:
+                return FORBIDDEN * (1 + excess / (1 + excess))
+            sizes.append(
+                self.criterion.log_size(self.errors(result.information, q))
+            )
+            if len(sizes) == 1 and sizes[0] > bound:
+                break
+        return self.criterion.combine_draws(sizes)
+
+
+def design_motion(
+    problem: Problem,
+    limits: Limits,
+    duration_s: float,
+    criterion: DesignCriterion = WORST,
+    options: DesignOptions = USUAL,
+    *,
+    experiment: str | None = None,
+    add: bool = False,
+    watch: Watch | None = None,
+    say: Say = lambda _: None,
+) -> Design:
+    """Find the motion of the grasp that minimises the error bars.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem with an experiment that defines body, grasp, markers, noise, nuisance parameters and
+        the initial pose of the hand.
+    limits : Limits
+        Limits of the robot.
+    duration_s : float
+        Duration of the motion [s].
+    criterion : DesignCriterion
+        Criterion to minimise.
+    options : DesignOptions
+        Options of the search.
+    experiment : str, optional
+        Name of the experiment; the first that is not static by default.
+    add : bool
+        Whether the new recording complements the existing ones: the parameters are then estimated
+        from these first, and θ is drawn around the estimates according to their error bars.
+        Otherwise the existing recordings are not used, and θ is drawn around the guesses.
+    watch : callable, optional
+        Function that is called with the number of motions and the logarithm of the smallest error
+        bar.
+    say : callable, optional
+        Function that is called with the present activity.
+
+    Raises
+    ------
+    InputError
+        For a problem without guesses, an experiment that cannot be designed, limits that exclude
+        the start, unknown names, recordings that cannot be fitted, and if no motion keeps the body
+        simulable and the markers in view.
+    """
+    if not 0 < duration_s < np.inf:
+        raise InputError(
+            f"found {duration_s:g}; expected a number of seconds above 0",
+            None,
+            where="--duration",
+        )
+    recording = FutureRecording(
+        problem, _select_experiment(problem, experiment), duration_s=duration_s
+    )
+    recording.bounds(limits)
+    recording.highest_hz(limits)
+    if not problem.parameters.free:
+        raise InputError(
+            "every parameter is fixed; expected one to estimate", problem.path
+        )
+    if add:
+        say("identifying the parameters from the existing recordings")
+        draws, known = _draws_from_recordings(problem, options)
+    else:
+        _require_guesses(problem)
+        draws = prior_draws(
+            problem.parameters,
+            options.spread,
+            pairs=options.pairs,
+            seed=options.seed,
+        )
+        known = np.zeros((len(draws[0]),) * 2)
+    judge = MotionObjective(
+        recording,
+        limits,
+        criterion=criterion,
+        draws=draws,
+        known_information=known,
+    )
+    criterion.require_known(judge.errors(0.0, draws[0]))
+    first = judge.first_guess(options, say)
+    say("searching for a motion")
+    evaluations = 1 if first.is_interrupted else options.evaluations
+    best = minimise(
+        judge.value,
+        HandMotion.coefficient_count(options.waves),
+        evaluations=evaluations,
+        seed=options.seed,
+        watch=watch,
+        start=first.coefficients,
+    )
+    best.is_interrupted |= first.is_interrupted
+    if best.coefficients is None or best.value >= FORBIDDEN:
+        raise InputError(_no_motion_message(best), problem.path)
+    say("simulating the best motion")
+    return _evaluate_design(judge, best, add=add)
+
+
+def _evaluate_design(
+    judge: MotionObjective, best: SearchResult, add: bool
+) -> Design:
+    """Return the design with the best motion, its error bars and its simulation; `best` must have
+    coefficients.
+    """
+    assert best.coefficients is not None
+    recording = judge.recording
+    motion = judge.motion(best.coefficients)
+    experiment = recording.experiment(recording.poses(motion))
+    results = [recording.simulate_motion(experiment, q) for q in judge.draws]
+    after = _error_bars(judge, results)
+    problem = recording.problem
+    values = problem.parameters.values(judge.draws[0])
+    predicted = simulate(
+        experiment, values, problem.scheme, substeps=problem.first_substeps
+    )
+    return Design(
+        recording,
+        motion,
+        experiment=with_markers(experiment, predicted.markers_m),
+        predicted=predicted,
+        criterion=judge.criterion,
+        before=_before(judge, add),
+        after=after,
+        added=add,
+        limits=judge.limits,
+        shares=judge.bounds.shares(motion),
+        best=best,
+        draws=len(judge.draws),
+    )
+
+
+def _before(judge: MotionObjective, add: bool) -> ErrorBars | None:
+    """Return the error bars to compare with: those of the existing recordings if the new one is
+    added, else those of the motion in the problem; None if that has no motion or cannot be
+    simulated.
+    """
+    if add:
+        return ErrorBars.from_draws([judge.errors(0.0, q) for q in judge.draws])
+    recording = judge.recording
+    template = recording.template
+    if len(template.grasps[0].poses.t_s) < 2:
+        return None
+    shipped = replace(recording, duration_s=template.duration_s)
+    try:
+        simulations = [
+            shipped.simulate_motion(template, q) for q in judge.draws
+        ]
+    except SimulationError:
+        return None
+    return _error_bars(judge, simulations)
+
+
+def _error_bars(
+    judge: MotionObjective, results: list[SimulatedMotion]
+) -> ErrorBars:
+    """Return the error bars of a motion, together with existing recordings and priors, from its
+    information at all draws of q.
+    """
+    pairs = zip(results, judge.draws, strict=True)
+    return ErrorBars.from_draws(
+        [judge.errors(each.information, q) for each, q in pairs]
+    )
+
+
+def _draws_from_recordings(
+    problem: Problem, options: DesignOptions
+) -> tuple[list[Array], Array]:
+    """Solve the existing recordings; return draws (nq,) of the parameters q around the estimate,
+    the estimate first, and the information (nq, nq) of the recordings.
+
+    q are the solver's coordinates: logarithms, or values of linear parameters. Poorly determined
+    parameters are drawn no wider than `options.spread`.
+
+    Raises
+    ------
+    InputError
+        If the solve does not converge.
+    KeyboardInterrupt
+        If it is interrupted.
+    """
+    solution = solve(problem)
+    solution.unless_interrupted()
+    if not solution.status.converged:
+        raise InputError(
+            f"the existing recordings could not be fitted ({solution.status.value}), so that a "
+            "motion cannot be designed in addition to them; solve the problem first, or leave "
+            "out --add",
+            problem.path,
+        )
+    known = shared_information(linearise_fit(solution.collocation, solution.z))
+    constants = ThetaMap(problem.parameters, problem.experiments[0].body)
+    errors = PredictedErrors.from_information(
+        known, problem.parameters, constants, solution.q
+    )
+    # Where they tell next to nothing of a parameter, as far about the answer as about a guess.
+    largest_deviation = np.log(options.spread)
+    deviations = np.sqrt(np.diag(errors.covariance))
+    factors = np.minimum(1.0, largest_deviation / deviations)
+    root = factors[:, None] * np.linalg.cholesky(errors.covariance)
+    return symmetric_draws(
+        problem.parameters,
+        solution.q,
+        root=root,
+        pairs=options.pairs,
+        seed=options.seed,
+    ), known
+
+
+def _select_experiment(problem: Problem, name: str | None) -> Experiment:
+    """Return the experiment with a name, or the first that is not static for None."""
+    moving = [each for each in problem.experiments if not each.is_static]
+    if not moving:
+        raise InputError(
+            "every experiment is static; expected one that moves", problem.path
+        )
+    if name is None:
+        return moving[0]
+    named = {each.name: each for each in moving}
+    require_among(name, named, source=problem.path, where="--experiment")
+    return named[name]
+
+
+def _require_guesses(problem: Problem) -> None:
+    """Raise `InputError` if a parameter has no guess."""
+    if names := problem.parameters.names_without_guess:
+        key = f"parameters.{names[0]}"
+        raise InputError(
+            "has no guess, but a motion is designed for a value of each parameter; expected "
+            f"--set {key}.guess=VALUE, or --add to identify it first",
+            problem.path,
+            where=key,
+        )
+
+
+def _no_motion_message(best: SearchResult) -> str:
+    """Return why no motion was found."""
+    tried = f"none of the {len(best.history)} motions that were tried"
+    if best.value >= 2 * FORBIDDEN:
+        return (
+            f"{tried} could be simulated to its end; lower acceleration and speed in the limits, "
+            "or raise transcription.substeps"
+        )
+    return (
+        f"{tried} keeps the markers in view; widen markers_box_m or the cameras' "
+        "field_of_view_deg, or narrow workspace_m"
+    )

@@ -1,0 +1,633 @@
+"""Predicted information of a future recording about the shared parameters q, for a given motion.
+
+The recording is simulated with the scheme that will be used to fit it. With the slopes S of its
+residuals with respect to q and its nuisance parameters φ, and A = SᵀS + the priors of φ, its
+information is the Schur complement A_qq − A_qφ A_φφ⁻¹ A_φq. The information of several recordings
+adds up.
+
+For small motions, a few simulations predict the information of all motions to first order: a body
+hanging at rest responds to small motions of its hand as a linear time-invariant system, and so do
+the slopes of the measurements. One pulse of each coordinate gives the response to all: with a pulse
+p, a coordinate c_j at the samples and the response g to p,
+
+    c(t) ≈ Σ c_j p(t − t_j),   S(t) ≈ S_0(t) + Σ c_j g(t − t_j).
+
+This is not valid for large rotations and strains; it is used for the start of a search, not for its
+result.
+
+The size of the error bars is one number, the logarithm of a relative error bar.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal, get_args
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.spatial.transform import Rotation
+
+from ...common.array_types import Array
+from ...errors import InputError, require_among
+from ...fem.laws.constants import is_field_coefficient
+from ...model.parameters import Parameters, ThetaMap
+from ...problem import Problem
+from ...program.collocation import Collocation
+from ...program.forward.newton_solver import NewtonOptions
+from ...program.forward.scheme_simulation import continue_simulation
+from ...recording import Experiment, PoseSequence
+from ...recording.measured_wrench import Wrench
+from ...statistics.estimates import UNDETERMINED, relative_derivatives
+from ...statistics.linearised import (
+    DerivedModuli,
+    LinearisedFit,
+    least_squares_of_fit,
+    linearise_fit,
+)
+from .hand_limits import HandBounds, Limits
+from .hand_motion import HandMotion
+
+Kind = Literal["worst", "A", "D"]
+Over = Literal["mean", "worst"]
+
+
+@dataclass(frozen=True)
+class DesignCriterion:
+    """Criterion that a design minimises.
+
+    Attributes
+    ----------
+    kind : {"worst", "A", "D"}
+        The largest error bar, their root mean square, or the size of their joint ellipsoid: the
+        geometric mean of its half axes.
+    names : tuple of str
+        Parameters and derived moduli that count; every estimated parameter by default. For one
+        alone all kinds are the same.
+    over : {"mean", "worst"}
+        Over draws of θ: the geometric mean, or the largest.
+    """
+
+    kind: Kind = "worst"
+    names: tuple[str, ...] = ()
+    over: Over = "mean"
+
+    def __post_init__(self) -> None:
+        require_among(self.kind, get_args(Kind), where="--criterion")
+        require_among(self.over, get_args(Over), where="--over")
+
+    def log_size(self, errors: PredictedErrors) -> float:
+        """Return the logarithm of the error bar of the named parameters that is minimised: the
+        largest, for "A" the root mean square, for "D" the geometric mean over the axes of the
+        confidence ellipsoid.
+        """
+        slopes = errors.slopes_of(self.names)
+        covariance = slopes @ errors.covariance @ slopes.T
+        if self.kind == "D":
+            return float(np.linalg.slogdet(covariance)[1]) / (
+                2 * len(covariance)
+            )
+        variances = np.diag(covariance)
+        return 0.5 * float(
+            np.log(
+                variances.max() if self.kind == "worst" else variances.mean()
+            )
+        )
+
+    def combine_draws(self, sizes: Sequence[float]) -> float:
+        """Return the mean, or the largest value if `over` is "worst", of those at several draws of
+        θ.
+        """
+        return float(np.max(sizes) if self.over == "worst" else np.mean(sizes))
+
+    def require_known(self, errors: PredictedErrors) -> None:
+        """Raise `InputError` for names that are not estimated, and for "D" those that
+        depend on each other.
+        """
+        for name in self.names:
+            require_among(name, errors.slopes, where="--for", count="some")
+        slopes = errors.slopes_of(self.names)
+        if self.kind == "D" and np.linalg.matrix_rank(slopes) < len(slopes):
+            raise InputError(
+                f"of {', '.join(self.names)} one follows from the others, so that their "
+                "confidence ellipsoid has no volume; name fewer, or choose --criterion A or worst",
+                None,
+                where="--for",
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedErrors:
+    """Relative error bars at one θ, to first order.
+
+    Attributes
+    ----------
+    covariance : (nq, nq) array
+        Covariance of q.
+    values : dict of str to float
+        Estimated parameters, followed by derived moduli, by name.
+    slopes : dict of str to (nq,) array
+        Relative change of each with q.
+    estimated_count : int
+        Number of estimated parameters, the first of the names.
+    """
+
+    covariance: Array
+    values: dict[str, float]
+    slopes: dict[str, Array]
+    estimated_count: int
+
+    @classmethod
+    def from_information(
+        cls,
+        information: Array,
+        parameters: Parameters,
+        constants: ThetaMap,
+        q: Array,
+    ) -> PredictedErrors:
+        """Return the errors from the information (nq, nq) of all recordings and the priors of q.
+
+        No error bar exceeds `UNDETERMINED` times the parameter, so that motions without information
+        can be compared.
+
+        Parameters
+        ----------
+        information : (nq, nq) array
+            Information of all recordings.
+        parameters : Parameters
+            Parameters with their priors.
+        constants : ThetaMap
+            Map from q to the body's constants, for derived moduli.
+        q : (nq,) array
+            Parameters in the solver's coordinates.
+        """
+        sizes = relative_derivatives(parameters, q)
+        prior = (
+            parameters.prior_residuals(q)[1] ** 2 + (sizes / UNDETERMINED) ** 2
+        )
+        units = 1 / np.sqrt(np.diag(information) + prior)
+        scaled = units[:, None] * (information + np.diag(prior)) * units
+        covariance = units[:, None] * np.linalg.inv(scaled) * units
+        values = dict[str, float]()
+        slopes = dict[str, Array]()
+        for item, c, slope in zip(
+            parameters.free, q, np.diag(sizes), strict=True
+        ):
+            if not is_field_coefficient(item.name):
+                values[item.name] = item.from_coordinate(float(c))
+                slopes[item.name] = slope
+        estimated_count = len(values)
+        derived = DerivedModuli.from_bodies([constants], q)
+        varying = {
+            name: by_q
+            for name, by_q in derived.derivatives.items()
+            if by_q.any()
+        }
+        values |= {name: derived.values[name] for name in varying}
+        slopes |= {
+            name: by_q / derived.values[name] for name, by_q in varying.items()
+        }
+        return cls(covariance, values, slopes, estimated_count)
+
+    def slopes_of(self, names: Sequence[str]) -> Array:
+        """Return the relative change (k, nq) with q of the parameters with these names; of all
+        estimated parameters if `names` is empty.
+        """
+        chosen = names or list(self.slopes)[: self.estimated_count]
+        return np.array([self.slopes[name] for name in chosen])
+
+    @property
+    def relative(self) -> dict[str, float]:
+        """Standard errors relative to the values, by name."""
+        return {
+            name: float(np.sqrt(slope @ self.covariance @ slope))
+            for name, slope in self.slopes.items()
+        }
+
+
+def prior_draws(
+    parameters: Parameters, spread: float, pairs: int, seed: int
+) -> list[Array]:
+    """Return draws (nq,) of q: the middle, followed by pairs on either side of it.
+
+    A parameter with a prior is drawn from it. Others are drawn around their guess: logarithms with
+    a standard deviation of ln `spread`, linear ones with `spread` − 1 times their typical size.
+    """
+    middle = parameters.guess_q.copy()
+    deviation = np.array(
+        [
+            np.log(spread) if item.scale == "log" else spread - 1
+            for item in parameters.free
+        ]
+    )
+    for k, item in enumerate(parameters.free):
+        if item.prior is not None:
+            middle[k] = item.to_coordinate(item.prior[0])
+            deviation[k] = item.prior[1] / (
+                1.0 if item.scale == "log" else item.unit
+            )
+    return symmetric_draws(
+        parameters, middle, root=np.diag(deviation), pairs=pairs, seed=seed
+    )
+
+
+def symmetric_draws(
+    parameters: Parameters, middle: Array, root: Array, pairs: int, seed: int
+) -> list[Array]:
+    """Return the middle of a normal distribution of q and pairs of draws on either side, within
+    bounds.
+
+    Parameters
+    ----------
+    parameters : Parameters
+        Parameters with their bounds.
+    middle : (nq,) array
+        Mean.
+    root : (nq, nq) array
+        Square root of the covariance.
+    pairs : int
+        Number of pairs.
+    seed : int
+        Seed of the random numbers.
+    """
+    rng = np.random.default_rng(seed)
+    deviations = [root @ rng.normal(size=len(middle)) for _ in range(pairs)]
+    lower, upper = parameters.bounds_q
+    margin = 1e-3 * np.minimum(upper - lower, 1.0)
+    draws = [
+        middle,
+        *(middle + sign * way for way in deviations for sign in (1, -1)),
+    ]
+    return [np.clip(q, lower + margin, upper - margin) for q in draws]
+
+
+# Newton's last step over the body's size: what is left of it is ten thousand times less.
+TOLERANCE = 1e-5
+# Logged poses between two samples.
+POSES_PER_SAMPLE = 4
+# A motion of more is not meant: each candidate is simulated.
+MOST_SAMPLES = 100_000
+
+
+def shared_information(fit: LinearisedFit) -> Array:
+    """Return the information (nq, nq) of the measurements about the shared parameters.
+
+    Nuisance parameters are eliminated with their priors; priors of the shared parameters are not
+    included.
+    """
+    alone = least_squares_of_fit(fit).marginal(fit.shared_count)
+    return alone.information - np.diag(
+        fit.prior_jacobian[: fit.shared_count] ** 2
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedMotion:
+    """Result of a simulated motion at one q.
+
+    Attributes
+    ----------
+    information : (nq, nq) array
+        Information about the shared parameters.
+    markers_m : (T, M, 3) array
+        Marker positions [m].
+    """
+
+    information: Array
+    markers_m: Array
+
+
+@dataclass(frozen=True, eq=False)
+class FutureRecording:
+    """Recording to be designed: everything except the motion.
+
+    Attributes
+    ----------
+    problem : Problem
+        Problem with scheme and parameters.
+    template : Experiment
+        Experiment with the same body, grasp, markers, loads and nuisance parameters.
+    duration_s : float
+        Duration, rounded to whole samples [s].
+    """
+
+    problem: Problem
+    template: Experiment
+    duration_s: float
+    _starts: dict[bytes, Array] = field(
+        default_factory=dict, init=False, repr=False
+    )
+
+    def __post_init__(self) -> None:
+        try:
+            self._validate()
+        except InputError as error:
+            raise error.located(
+                self.problem.path, f"experiment '{self.template.name}'"
+            ) from error
+
+    def _validate(self) -> None:
+        """Raise `InputError` if a motion cannot be designed for the experiment."""
+        template = self.template
+        if template.is_static:
+            raise InputError(
+                "is static; expected one that moves, to design a motion for"
+            )
+        if len(template.grasps) != 1:
+            raise InputError(
+                f"has {len(template.grasps)} grasps; expected one, whose motion is designed"
+            )
+        (grasp,) = template.grasps
+        if grasp.axes != "xyz" or not (
+            np.isinf(grasp.from_s) and np.isinf(grasp.until_s)
+        ):
+            raise InputError(
+                "has a grasp that holds only some axes, or a part of the time; expected one that "
+                "holds throughout"
+            )
+        if not 3 <= self.samples <= MOST_SAMPLES:
+            raise InputError(
+                f"{self.duration_s:g} s are {self.samples - 1:.6g} steps of "
+                f"{template.timestep_s:g} s; expected 2 to {MOST_SAMPLES}",
+                where="--duration",
+            )
+
+    @property
+    def samples(self) -> int:
+        """Number of samples of the markers."""
+        return round(self.duration_s / self.template.timestep_s) + 1
+
+    @cached_property
+    def since_start_s(self) -> Array:
+        """Times (T,) of the samples since the start [s]."""
+        return np.asarray(
+            np.arange(self.samples) * self.template.timestep_s, dtype=np.float64
+        )
+
+    @cached_property
+    def start_pose(self) -> tuple[Array, Array]:
+        """Rotation (3, 3) and translation (3,) [m] of the first pose."""
+        rotations, translations = self.template.rigid_motion(
+            self.template.t_s[:1]
+        )
+        return rotations[0], translations[0]
+
+    @cached_property
+    def hand_m(self) -> Array:
+        """Centre (3,) of the grasped nodes in the undeformed body [m]."""
+        (grasp,) = self.template.grasps
+        return np.asarray(
+            self.template.body.nodes_m[grasp.nodes].mean(axis=0),
+            dtype=np.float64,
+        )
+
+    def bounds(self, limits: Limits) -> HandBounds:
+        """Return the limits of the hand relative to its initial position."""
+        rotation, translation = self.start_pose
+        return limits.bounds_from(rotation @ self.hand_m + translation)
+
+    def highest_hz(self, limits: Limits) -> float:
+        """Return the highest frequency of a wave [Hz]: the stated limit, or a tenth of the sampling
+        rate.
+
+        Raises
+        ------
+        InputError
+            If the stated limit exceeds half the sampling rate.
+        """
+        rate_hz = 1 / self.template.timestep_s
+        if (limits.frequency_hz or 0.0) > rate_hz / 2:
+            raise InputError(
+                f"found {limits.frequency_hz:g}; expected at most {rate_hz / 2:g}, half the rate "
+                "of the samples",
+                None,
+                where="frequency_hz",
+            )
+        return limits.frequency_hz or rate_hz / 10
+
+    @cached_property
+    def pose_times_s(self) -> Array:
+        """Times (P,) of the poses since the start [s], several per sample."""
+        count = POSES_PER_SAMPLE * (self.samples - 1) + 1
+        return np.linspace(0.0, self.since_start_s[-1], count)
+
+    def poses(self, motion: HandMotion) -> PoseSequence:
+        """Return the poses of a motion."""
+        return self.poses_from_coordinates(
+            motion.derivatives(self.pose_times_s)[0]
+        )
+
+    def poses_from_coordinates(self, coordinates: Array) -> PoseSequence:
+        """Return the poses at `pose_times_s` from translation and rotation vector (P, 6) of
+        the hand.
+        """
+        rotation, translation = self.start_pose
+        turned = Rotation.from_rotvec(
+            coordinates[:, 3:]
+        ) * Rotation.from_matrix(rotation)
+        hand = rotation @ self.hand_m + translation + coordinates[:, :3]
+        placed = hand - turned.apply(self.hand_m)
+        return PoseSequence(
+            self.pose_times_s + self.template.t_s[0], placed, turned.as_quat()
+        )
+
+    def experiment(self, poses: PoseSequence) -> Experiment:
+        """Return the future experiment with given poses; markers are placeholders at the origin."""
+        template = self.template
+        (grasp,) = self.template.grasps
+        t_s = self.since_start_s + template.t_s[0]
+        nowhere = np.zeros((len(t_s), len(template.markers.names), 3))
+        return replace(
+            template,
+            t_s=t_s,
+            grasps=(
+                replace(
+                    grasp, poses=poses, wrench=_resampled(grasp.wrench, t_s)
+                ),
+            ),
+            markers=replace(template.markers, t_s=t_s, positions_m=nowhere),
+        )
+
+    def simulate_motion(
+        self, experiment: Experiment, q: Array
+    ) -> SimulatedMotion:
+        """Return information and marker positions of an experiment simulated at the parameters q
+        (nq,), in the solver's coordinates.
+
+        Raises
+        ------
+        SimulationError
+            If the simulation does not reach the end.
+        """
+        fit, x = self.linearise(experiment, q)
+        positions = x[:: self.problem.first_substeps].reshape(
+            len(experiment.t_s), -1, 3
+        )
+        return SimulatedMotion(
+            shared_information(fit),
+            experiment.markers.predict_positions(positions),
+        )
+
+    def program(self, experiment: Experiment) -> Collocation:
+        """Return the nonlinear program of one experiment."""
+        problem = self.problem
+        fitted = (
+            replace(experiment, validation=False)
+            if experiment.validation
+            else experiment
+        )
+        return Collocation(
+            [fitted],
+            problem.parameters,
+            scheme=problem.scheme,
+            substeps=problem.first_substeps,
+        )
+
+    def linearise(
+        self, experiment: Experiment, q: Array
+    ) -> tuple[LinearisedFit, Array]:
+        """Return the linearised fit of an experiment simulated at the parameters q (nq,), and its
+        positions (N, 3n) [m] at the time steps.
+
+        Raises
+        ------
+        SimulationError
+            If the simulation does not reach the end.
+        """
+        alone = self.program(experiment)
+        (segment,) = alone.transcriptions
+        known = self._starts.get(
+            q.tobytes()
+        )  # every motion starts from the same rest
+        x, failure = continue_simulation(
+            experiment,
+            segment.dynamics.with_theta(segment.constants.theta(q)),
+            known=known,
+            options=NewtonOptions(tolerance=TOLERANCE),
+        )
+        if failure is not None:
+            raise failure
+        self._starts[q.tobytes()] = x[:1]
+        return linearise_fit(
+            alone, alone.pack(np.append(q, segment.guess_phi), [x])
+        ), x
+
+
+def _resampled(wrench: Wrench | None, t_s: Array) -> Wrench | None:
+    """Return the sensor with its own rate over the duration of t_s, with zeros as values, NaN for
+    components that it does not measure; None for None.
+    """
+    if wrench is None:
+        return None
+    rate_hz = (len(wrench.t_s) - 1) / max(np.ptp(wrench.t_s), 1e-300)
+    count = max(3, 1 + int(np.ptp(t_s) * rate_hz + 1e-6))
+    times = t_s[0] + np.arange(count) / rate_hz
+    values = np.tile(
+        np.where(wrench.measured_components, 0.0, np.nan), (count, 1)
+    )
+    return replace(wrench, t_s=times, values=values)
+
+
+# The pulses' heights, as small as the answers are linear, of shifts [m] and of turns [rad].
+HEIGHTS = np.repeat([1e-4, 1e-3], 3)
+# The cubic B-spline on even knots: of its shifted copies, values at the samples make a course.
+PULSE = BSpline.basis_element(np.arange(-2.0, 3.0), extrapolate=False)
+# The sample at which those that are simulated are highest.
+CENTRE = 2
+
+
+@dataclass(frozen=True, eq=False)
+class LinearRecording:
+    """Response of a recording to a pulse of each coordinate, at one q.
+
+    Attributes
+    ----------
+    recording : FutureRecording
+        Recording to be designed.
+    rest : LinearisedFit
+        Linearised fit without any motion.
+    responses : (6, frequencies, 3M, p) array
+        Fourier transforms of the change of the slopes, for a pulse of height one.
+    length : int
+        Length of the transforms.
+    """
+
+    recording: FutureRecording
+    rest: LinearisedFit
+    responses: Array
+    length: int
+
+    @staticmethod
+    def gigabytes(recording: FutureRecording) -> float:
+        """Return the memory of the responses [GB]."""
+        (segment,) = recording.program(recording.template).transcriptions
+        markers = 3 * len(recording.template.markers.names)
+        return (
+            6
+            * 16e-9
+            * recording.samples
+            * markers
+            * len(segment.parameter_indices)
+        )
+
+    @classmethod
+    def from_simulations(
+        cls, recording: FutureRecording, q: Array
+    ) -> LinearRecording:
+        """Return the response at q (nq,), from seven simulations.
+
+        Raises
+        ------
+        SimulationError
+            If a simulation does not reach the end.
+        """
+        still = recording.linearise(
+            recording.experiment(_pulse_poses(recording, np.zeros(6))), q
+        )[0]
+        (at_rest,) = still.blocks
+        count = recording.samples
+        length = 1 << (2 * count - 1).bit_length()
+        answers = []
+        for k, height in enumerate(HEIGHTS):
+            pulsed = recording.experiment(
+                _pulse_poses(recording, height * np.eye(6)[k])
+            )
+            (block,) = recording.linearise(pulsed, q)[0].blocks
+            change = (block.channels[1] - at_rest.channels[1]) / height
+            answers.append(np.fft.rfft(change, length, axis=0))
+        return cls(recording, still, np.array(answers), length)
+
+    def information(self, motion: HandMotion) -> Array:
+        """Return the information (nq, nq) of a motion about the shared parameters, see
+        `shared_information`.
+        """
+        recording = self.recording
+        course = motion.derivatives(recording.since_start_s)[0]
+        # What was simulated is highest at a sample before which a motion from rest is nothing yet.
+        of_course = np.fft.rfft(course[CENTRE:], self.length, axis=0)
+        transform = np.einsum("fk,kfcp->fcp", of_course, self.responses)
+        (rest,) = self.rest.blocks
+        change = np.fft.irfft(transform, self.length, axis=0)[
+            : recording.samples
+        ]
+        slope = rest.jacobian + change.reshape(rest.jacobian.shape)
+        return shared_information(
+            replace(self.rest, blocks=(replace(rest, jacobian=slope),))
+        )
+
+
+def _pulse_poses(recording: FutureRecording, heights: Array) -> PoseSequence:
+    """Return one sequence of poses at `pose_times_s`, with a pulse of all coordinates at once.
+
+    Parameters
+    ----------
+    recording : FutureRecording
+    heights : (6,)
+        Heights of the pulse in translation [m] and rotation vector [rad]; zero for coordinates
+        without one. The pulse is a cubic B-spline of four timesteps, highest at sample `CENTRE`.
+    """
+    t_s = recording.pose_times_s
+    since = t_s / recording.template.timestep_s - CENTRE
+    share = np.nan_to_num(np.asarray(PULSE(since), dtype=np.float64))
+    return recording.poses_from_coordinates(np.outer(share, heights))

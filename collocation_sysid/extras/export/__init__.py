@@ -1,0 +1,183 @@
+"""Export of the identified body to other simulators.
+
+`write_export` writes the files of a target in `TARGETS`, `verify_export` runs the target and
+compares its prediction with that of this package. One module per simulator: `mujoco`, `newton`,
+`usd`, `sofa`, `febio` and `calculix`. For all of them, `identified` reads the body from a run
+folder, `export_destination` finds format and place of the option --to, `export_target` describes
+what a simulator can express, and `obstacle_shapes` converts obstacles. `rerun_recording` writes the
+motion of a run for a viewer instead.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from ...common.display import Table
+from ...common.serialisation import as_json
+from ...errors import InputError, hint_at
+from ...recording import write_poses_csv
+from ...result.run_writers import replaced_folder
+from . import calculix, febio, mujoco, newton, rerun_recording, sofa, usd
+from .export_destination import ExportDestination, parse_destination
+from .export_target import ExportedFiles, ExportTarget, PredictionComparison
+from .identified import IdentifiedBody
+
+IDENTIFIED_FILE = "identified.json"
+
+
+TARGETS: dict[str, ExportTarget] = {
+    "mujoco": ExportTarget(
+        "MuJoCo", mujoco.MODEL, export=mujoco.export, verify=mujoco.verify
+    ),
+    "newton": ExportTarget("Newton", newton.MODULE_FILE, export=newton.export),
+    "usd": ExportTarget(
+        "OpenUSD", usd.STAGE_FILE, export=usd.export, verify=usd.verify
+    ),
+    "sofa": ExportTarget("SOFA", sofa.SCENE, export=sofa.export),
+    "febio": ExportTarget("FEBio", febio.MODEL, export=febio.export),
+    "calculix": ExportTarget(
+        "CalculiX",
+        calculix.DECK,
+        export=calculix.export,
+        verify=calculix.verify,
+    ),
+    "json": ExportTarget(
+        "JSON", IDENTIFIED_FILE, export=lambda body: ExportedFiles({}, ())
+    ),
+}
+# Main file of each format: the targets, and the recording for a viewer.
+MAIN_FILES = {
+    **{name: target.main_file for name, target in TARGETS.items()},
+    rerun_recording.TARGET: rerun_recording.RECORDING_FILE,
+}
+
+
+def write_export(
+    body: IdentifiedBody, target_name: str, folder: str | Path
+) -> ExportedFiles:
+    """Write a body for a target: its files, ``identified.json``, and the poses of its grasps and
+    obstacles.
+
+    Parameters
+    ----------
+    body : IdentifiedBody
+    target_name : str
+        Name of a target in `TARGETS`.
+    folder : str or Path
+        Written completely or not at all; an earlier export there is replaced.
+
+    Returns
+    -------
+    ExportedFiles
+        The files, and what the target cannot express.
+
+    Raises
+    ------
+    InputError
+        For an unknown target, a body that the target cannot express, or a folder with other files.
+    """
+    exported = target_named(target_name).export(body)
+    with replaced_folder(
+        folder, marker_file=IDENTIFIED_FILE, content_word="export"
+    ) as place:
+        for name, text in exported.files.items():
+            (place / name).write_text(text, encoding="utf-8")
+        content = {**body.as_dict(), "not_expressed": exported.limitations}
+        (place / IDENTIFIED_FILE).write_text(
+            as_json(content) + "\n", encoding="utf-8"
+        )
+        for k, grasp in enumerate(
+            (*body.experiment.grasps, *body.obstacles), start=1
+        ):
+            write_poses_csv(place / f"poses_{k}.csv", grasp.poses)
+    return exported
+
+
+def verify_export(
+    body: IdentifiedBody, target_name: str, folder: str | Path
+) -> Sequence[PredictionComparison]:
+    """Run an export in the target itself, and compare its predictions with those of this package.
+
+    Parameters
+    ----------
+    body : IdentifiedBody
+    target_name : str
+        Name of a target in `TARGETS`.
+    folder : str or Path
+        Folder of `write_export`; the target runs in a temporary copy.
+
+    Raises
+    ------
+    InputError
+        If the target cannot be run from here, or is not installed.
+    """
+    target = target_named(target_name)
+    if target.verify is None:
+        able = ", ".join(
+            name for name, each in TARGETS.items() if each.verify is not None
+        )
+        raise InputError(
+            f"{target.name} cannot be run by this program; --verify works with {able}"
+        )
+    # It may leave files of its own behind.
+    with tempfile.TemporaryDirectory() as scratch:
+        place = Path(shutil.copytree(folder, Path(scratch) / "export"))
+        return target.verify(body, place)
+
+
+def comparison_table(
+    name: str, comparisons: Sequence[PredictionComparison]
+) -> Table:
+    """Return the table of predictions of the simulator `name` and of this package."""
+    rows = []
+    for each in comparisons:
+        values = (
+            f"{value:.5g} {each.unit}" for value in (each.theirs, each.ours)
+        )
+        rows.append(
+            (
+                each.what,
+                *values,
+                f"{each.relative_difference:+.2%}",
+                each.remark,
+            )
+        )
+    return Table(
+        "", ("", name, "ours", "difference", ""), rows=tuple(rows), names=5
+    )
+
+
+def target_named(name: str) -> ExportTarget:
+    """Return the target in `TARGETS` called `name`.
+
+    Raises
+    ------
+    InputError
+        If there is no target of that name.
+    """
+    if name not in TARGETS:
+        known = (*TARGETS, rerun_recording.TARGET)
+        raise InputError(
+            f"no target {name!r}; available: {', '.join(known)}{hint_at(name, known)}"
+        )
+    return TARGETS[name]
+
+
+__all__ = [
+    "IDENTIFIED_FILE",
+    "MAIN_FILES",
+    "TARGETS",
+    "ExportDestination",
+    "ExportTarget",
+    "ExportedFiles",
+    "IdentifiedBody",
+    "PredictionComparison",
+    "comparison_table",
+    "parse_destination",
+    "target_named",
+    "verify_export",
+    "write_export",
+]

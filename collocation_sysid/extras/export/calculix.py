@@ -1,0 +1,431 @@
+"""CalculiX: an input deck of the body at rest under gravity, in its grasp and in contact with
+obstacles.
+
+For a static recording the deck has one step for each sample, else one for the first sample.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...errors import InputError
+from .export_target import (
+    ExportedFiles,
+    PredictionComparison,
+    TargetCapabilities,
+    comment_lines,
+    equilibria,
+    longest_displacement_m,
+)
+from .identified import IdentifiedBody, IdentifiedRegion
+from .obstacle_shapes import FacetedObstacle, faceted_obstacles
+
+DECK = "body.inp"
+# Time after which a run of CalculiX is stopped.
+TIME_LIMIT_S = 600.0
+# Corners of the sides of a tetrahedron in the order of CalculiX.
+TETRAHEDRON_SIDES = (0, 1, 2), (0, 1, 3), (1, 2, 3), (0, 2, 3)
+# Constant D_i that removes a term of U = Σ (J − 1)^2i / D_i: zero would mean a very stiff term.
+ABSENT_TERM = 1e20
+CAPABILITIES = TargetCapabilities(
+    {},
+    other_materials="",
+    mass_damping="",
+    node_forces="",
+    has_quadratic_elements=True,
+)
+# Coefficients C_i of the series of Arruda and Boyce.
+_ARRUDA_BOYCE_COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
+# Largest number of terms of Ogden's law and of the foam, and of values on a line.
+MOST_TERMS = 3
+# Largest number of values on a line of a card, by the manual of CalculiX.
+VALUES_PER_LINE = 8
+FOAM_LIMITATION = (
+    "CalculiX 2.20 finds no equilibrium of a HYPERFOAM of one term, or of two with a negative "
+    "exponent; the card is that of Abaqus, too"
+)
+
+
+def export(body: IdentifiedBody) -> ExportedFiles:
+    """Return the input deck, with what CalculiX cannot express."""
+    static = body.experiment.is_static
+    limits = replace(
+        CAPABILITIES, has_moving_grasps=static, has_moving_obstacles=static
+    ).limitations(body)
+    linear = all(region.material == "linear" for region in body.regions)
+    materials = ""
+    for k, region in enumerate(body.regions):
+        card, limitation = _material_card(region, linear)
+        limits += [f"{region.name}: {limitation}"] if limitation else []
+        materials += (
+            f"*MATERIAL,NAME=M{k}\n{card}*DENSITY\n{_format_values(region.density_kg_m3)}\n"
+            f"*SOLID SECTION,ELSET=E{k},MATERIAL=M{k}\n"
+        )
+    limits.append("damping is not exported: an equilibrium has none")
+    if body.is_quadratic:
+        limits.append(
+            "CalculiX distributes the weight of an element with its shape functions, "
+            "this program lumps it at the nodes"
+        )
+    nodes = (
+        f"{k},{_format_values(*point)}\n"
+        for k, point in enumerate(body.nodes_m, start=1)
+    )
+    mesh = f"*NODE,NSET=ALL\n{''.join(nodes)}"
+    kind = "C3D10" if body.is_quadratic else "C3D4"
+    for k, region in enumerate(body.regions):
+        cells = body.body.cells[region.cells] + 1
+        lines = (
+            ", ".join(map(str, (n + 1, *c)))
+            for n, c in zip(region.cells, cells, strict=True)
+        )
+        mesh += f"*ELEMENT,TYPE={kind},ELSET=E{k}\n" + "".join(
+            f"{line}\n" for line in lines
+        )
+    mesh += "".join(
+        f"*ELSET,ELSET=BODY\nE{k}\n" for k in range(len(body.regions))
+    )
+    head = comment_lines(body, limits, start="** ")
+    obstacles = faceted_obstacles(body)
+    steps = ""
+    for t_s in _step_times_s(body):
+        steps += _step_card(body, obstacles, t_s=t_s, is_linear=linear)
+    return ExportedFiles(
+        {
+            DECK: f"{head}{mesh}{materials}{_obstacle_cards(body, obstacles)}{steps}"
+        },
+        tuple(limits),
+    )
+
+
+def _step_times_s(body: IdentifiedBody) -> Array:
+    """Return the time of each step: all samples of a static recording, else the first one."""
+    return body.experiment.t_s[: None if body.experiment.is_static else 1]
+
+
+def _obstacle_cards(
+    body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]
+) -> str:
+    """Return the obstacles as cards: a tetrahedron under each facet, a common material, and a
+    contact pair for each obstacle; empty without obstacles.
+
+    The pressure is linear in the penetration, with friction if the obstacle has some. The step
+    prescribes all nodes of the tetrahedra.
+    """
+    deck = ""
+    tetrahedra = body.body.mesh.tetrahedra
+    cell_numbers = np.arange(len(body.body.cells)) + 1
+    faces = {
+        tuple(sorted(corners)): f"{number},S{side}"
+        for side, places in enumerate(TETRAHEDRON_SIDES, start=1)
+        for corners, number in zip(
+            tetrahedra[:, places].tolist(), cell_numbers, strict=True
+        )
+    }
+    for k, wall in enumerate(obstacles):
+        deck += f"*NODE,NSET=W{k}\n"
+        numbered = enumerate(wall.start_points_m, start=wall.first_node + 1)
+        deck += "".join(
+            f"{i},{_format_values(*point)}\n" for i, point in numbered
+        )
+        deck += f"*ELEMENT,TYPE=C3D4,ELSET=W{k}\n"
+        for i, nodes in enumerate(
+            wall.tetrahedra + 1, start=wall.first_cell + 1
+        ):
+            deck += f"{i},{','.join(map(str, nodes))}\n"
+        touching = body.body.mesh.surface[wall.faces].tolist()
+        sides = "".join(f"{faces[tuple(sorted(face))]}\n" for face in touching)
+        constants = _format_values(
+            float(wall.obstacle.friction), wall.stiffness_pa_m / 2
+        )
+        stick = f"*FRICTION\n{constants}\n"
+        deck += (
+            f"*SOLID SECTION,ELSET=W{k},MATERIAL=WALL\n*SURFACE,NAME=W{k}\nW{k},S1\n"
+            f"*SURFACE,NAME=B{k}\n{sides}"
+            f"*SURFACE INTERACTION,NAME=W{k}\n*SURFACE BEHAVIOR,PRESSURE-OVERCLOSURE=LINEAR\n"
+            f"{_format_values(wall.stiffness_pa_m)}\n{stick if wall.obstacle.has_friction else ''}"
+            f"*CONTACT PAIR,INTERACTION=W{k},TYPE=SURFACE TO SURFACE\nB{k},W{k}\n"
+        )
+    material = f"*MATERIAL,NAME=WALL\n*ELASTIC\n{_format_values(body.regions[0].young_pa, 0.3)}\n"
+    return f"{material}*DENSITY\n1.\n{deck}" if obstacles else ""
+
+
+def _step_card(
+    body: IdentifiedBody,
+    obstacles: Sequence[FacetedObstacle],
+    t_s: float,
+    is_linear: bool,
+) -> str:
+    """Return one step: prescribed nodes and obstacles at their places at `t_s`, gravity, and node
+    loads.
+
+    Parameters
+    ----------
+    body : IdentifiedBody
+    obstacles : sequence of FacetedObstacle
+        The obstacles.
+    t_s : float
+        Time of the sample.
+    is_linear : bool
+        Whether the analysis is geometrically linear.
+    """
+    displacements_m = [
+        body.experiment.prescribed_displacements([t_s])[1][0] - body.nodes_m
+    ]
+    displacements_m += [
+        wall.points_at_m(t_s) - wall.start_points_m for wall in obstacles
+    ]
+    rows = np.concatenate(displacements_m)
+    prescribed = np.argwhere(np.isfinite(rows))
+    boundary = "".join(
+        f"{n + 1},{a + 1},{a + 1},{_format_values(float(rows[n, a]))}\n"
+        for n, a in prescribed
+    )
+    prints = "".join(
+        f"*NODE PRINT,NSET=W{k},TOTALS=ONLY\nRF\n"
+        for k in range(len(obstacles))
+    )
+    loaded = np.argwhere(body.node_loads_n)
+    loads = "".join(
+        f"{n + 1},{a + 1},{_format_values(float(body.node_loads_n[n, a]))}\n"
+        for n, a in loaded
+    )
+    pull = float(np.linalg.norm(body.experiment.gravity_m_s2))
+    direction = body.experiment.gravity_m_s2 / pull if pull else np.zeros(3)
+    weight = (
+        f"*DLOAD\nBODY,GRAV,{_format_values(pull)},{_format_values(*direction)}\n"
+        if pull
+        else ""
+    )
+    return (
+        f"*STEP,INC=1000{'' if is_linear else ',NLGEOM'}\n"
+        f"*STATIC\n{'1.,1.' if is_linear else '0.1,1.'}\n"
+        + (f"*BOUNDARY\n{boundary}" if boundary else "")
+        + (f"*CLOAD\n{loads}" if loads else "")
+        + f"{weight}*NODE PRINT,NSET=ALL\nU\n{prints}*NODE FILE\nU\n*EL FILE\nS\n*END STEP\n"
+    )
+
+
+def _format_values(*values: float) -> str:
+    """Return numbers for a line of the deck, separated by commas.
+
+    CalculiX cuts off a number after 20 characters, even within its exponent.
+    """
+    return ",".join(f"{float(value):.12g}" for value in values)
+
+
+def _material_card(
+    region: IdentifiedRegion, is_linear: bool
+) -> tuple[str, str]:
+    """Return the card of a material, and a sentence on what the card does not express ("" if
+    nothing).
+
+    `is_linear` says whether the analysis is geometrically linear.
+    """
+    c: Mapping[str, float] = region.constants
+    volume = 2 / region.kappa_pa
+    if region.material in ("st-venant-kirchhoff", "linear"):
+        limitation = ""
+        if region.material == "linear" and not is_linear:
+            limitation = (
+                "in an analysis with large displacements the linear material becomes that of St. "
+                "Venant and Kirchhoff"
+            )
+        return (
+            f"*ELASTIC\n{_format_values(region.young_pa, region.poisson)}\n",
+            limitation,
+        )
+    if region.material == "mooney-rivlin":
+        constants = _format_values(c["c10_pa"], c["c01_pa"], volume)
+        return f"*HYPERELASTIC,MOONEY-RIVLIN\n{constants}\n", ""
+    if region.material in ("yeoh", "gent"):
+        if region.material == "yeoh":
+            factors = (c["c10_pa"], c["c20_pa"], c["c30_pa"])
+            limitation = ""
+        else:
+            mu = c["mu_pa"]
+            limit = c["gent_limit"]
+            factors = mu / 2, mu / (4 * limit), mu / (6 * limit**2)
+            limitation = (
+                "Gent's energy is exported as a series of three terms, accurate for Ī₁ − 3 well "
+                f"below {limit:.4g}"
+            )
+        constants = _format_values(
+            factors[0], factors[1], factors[2], volume, ABSENT_TERM, ABSENT_TERM
+        )
+        return f"*HYPERELASTIC,YEOH\n{constants}\n", limitation
+    if region.material == "arruda-boyce":
+        stretch = c["chain_stretch"]
+        slope = sum(
+            2 * a / stretch ** (2 * i - 2) * i * 3 ** (i - 1)
+            for i, a in enumerate(_ARRUDA_BOYCE_COEFFICIENTS, 1)
+        )
+        constants = _format_values(c["mu_pa"] / slope, stretch, volume)
+        return f"*HYPERELASTIC,ARRUDA-BOYCE\n{constants}\n", (
+            "its volumetric energy is ½ κ ((J² − 1)/2 − ln J) instead of ½ κ (J − 1)²: both "
+            "agree for small changes of volume"
+        )
+    if region.terms and len(region.terms) <= MOST_TERMS:
+        is_foam = region.material.startswith("hyperfoam")
+        return _power_law_card(
+            region, volume
+        ), FOAM_LIMITATION if is_foam else ""
+    constants = _format_values(region.mu_pa / 2, volume)
+    return f"*HYPERELASTIC,NEO HOOKE\n{constants}\n", (
+        f"{region.material} becomes the neo-Hookean law of Ī₁ with ½ κ (J − 1)²: the same λ and μ "
+        "at small strain, but stresses differ in second order of the strain"
+    )
+
+
+def _power_law_card(region: IdentifiedRegion, volume: float) -> str:
+    """Return the card of Ogden's law or of the foam.
+
+    The energy of a term in the card is 2μ/α² (Σ λ^α − 3): μ is ½ μ_p α_p of Ogden's law.
+
+    Parameters
+    ----------
+    region : IdentifiedRegion
+    volume : float
+        Constant D₁ = 2/κ of the volumetric energy of Ogden's law [1/Pa].
+    """
+    terms = region.terms
+    if region.material.startswith("ogden"):
+        keyword = "HYPERELASTIC,OGDEN"
+        values = [
+            value for t in terms for value in (t.mu_pa * t.alpha / 2, t.alpha)
+        ]
+        values += [volume] + [ABSENT_TERM] * (len(terms) - 1)
+    else:
+        keyword = "HYPERFOAM"
+        values = [value for t in terms for value in (t.mu_pa, t.alpha)]
+        values += [t.beta / (1 + 2 * t.beta) for t in terms]
+    lines = [
+        _format_values(*values[k : k + VALUES_PER_LINE])
+        for k in range(0, len(values), VALUES_PER_LINE)
+    ]
+    return f"*{keyword},N={len(terms)}\n" + "".join(
+        f"{line}\n" for line in lines
+    )
+
+
+def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
+    """Run CalculiX (the program ``ccx``), and compare the largest displacement at rest and the
+    forces of obstacles.
+
+    Parameters
+    ----------
+    body : IdentifiedBody
+    folder : Path
+        Folder with the deck, into which CalculiX writes its files.
+
+    Raises
+    ------
+    InputError
+        If it is not installed, fails, or takes longer than `TIME_LIMIT_S`.
+    """
+    program = shutil.which("ccx")
+    if program is None:
+        raise InputError(
+            "the program ccx was not found: install CalculiX to verify the export"
+        )
+    try:
+        job = [program, "-i", DECK.removesuffix(".inp")]
+        ended = subprocess.run(
+            job,
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=TIME_LIMIT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise InputError(
+            f"CalculiX took more than {TIME_LIMIT_S:g} s and was stopped; verify with a coarser "
+            "mesh or fewer samples",
+            folder / DECK,
+        ) from None
+    times = _step_times_s(body)
+    theirs, their_forces = _read_final_state(
+        folder / "body.dat", len(body.nodes_m), steps=len(times)
+    )
+    if theirs is None:
+        messages = [x for x in ended.stdout.splitlines() if "ERROR" in x] or [
+            "no displacements written"
+        ]
+        raise InputError(
+            f"CalculiX failed: {messages[0].strip()}", folder / DECK
+        )
+    (*_, ours), (*_, forces) = equilibria(body, len(times))
+    sag_m = longest_displacement_m(ours)
+    difference_m = longest_displacement_m(theirs - ours)
+    share = (
+        f" ({difference_m / sag_m:.2%} of the displacement)" if sag_m else ""
+    )
+    remark = f"node positions differ by at most {difference_m:.3g} m{share}"
+    what = "at rest" if len(times) == 1 else f"at {times[-1]:g} s"
+    comparisons = [
+        PredictionComparison(
+            f"largest displacement {what}",
+            longest_displacement_m(theirs),
+            ours=sag_m,
+            unit="m",
+            remark=remark,
+        )
+    ]
+    for each, push, force in zip(
+        body.obstacles, their_forces, forces, strict=True
+    ):
+        their_n = float(np.linalg.norm(push))
+        our_n = float(np.linalg.norm(force))
+        comparisons.append(
+            PredictionComparison(
+                f"force of {each.name} {what}", their_n, ours=our_n, unit="N"
+            )
+        )
+    return comparisons
+
+
+def _read_final_state(
+    file: Path, count: int, steps: int
+) -> tuple[Array | None, Array]:
+    """Return the displacements (n, 3) [m] and obstacle forces (o, 3) [N] at the end of the last
+    step.
+
+    Parameters
+    ----------
+    file : Path
+        The .dat file of CalculiX.
+    count : int
+        Number n of nodes of the body.
+    steps : int
+        Number of steps of the deck.
+
+    Returns
+    -------
+    displacements : (n, 3), or None if the last step was not completed
+    forces : (o, 3), with no rows if the file is missing
+    """
+    if not file.is_file():
+        return None, np.zeros((0, 3))
+    table = np.full((count, 3), np.nan)
+    forces = []
+    time = 0.0
+    for line in file.read_text().splitlines():
+        words = line.split()
+        if "time" in words:
+            if float(words[-1]) > time:
+                time = float(words[-1])
+                forces = []
+        elif len(words) == 3:
+            forces.append([float(word) for word in words])
+        elif len(words) == 4 and words[0].isdigit():
+            table[int(words[0]) - 1] = [float(word) for word in words[1:]]
+    done = time >= steps * (1.0 - 1e-6) and np.isfinite(table).all()
+    return table if done else None, np.array(forces).reshape(-1, 3)

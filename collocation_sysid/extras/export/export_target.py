@@ -1,0 +1,338 @@
+"""Description of export targets: their files, what they cannot express, and comparison of
+predictions.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from ...common.array_types import Array, Index
+from ...errors import printable
+from ...fem.meshes.refinement import split_in_eight
+from ...model.forces import Forces
+from ...program.forward.initial_equilibrium import equilibrium
+from ...program.simulation import simulate
+from .identified import IdentifiedBody
+from .obstacle_shapes import Primitive
+
+LINEAR_ONLY = (
+    "each quadratic tetrahedron is split into eight linear ones with the same nodes, which are "
+    "too stiff in bending and near ν = ½"
+)
+MEAN_DILATATION = (
+    "tet10-p0 becomes the standard quadratic tetrahedron, which is too stiff for ν near ½ (ν = "
+    "{worst:.4g} here)"
+)
+VISCOELASTICITY = (
+    "viscoelastic memory is not supported; the exported stiffness is the long-term one, and the "
+    "instantaneous one is {at_once:.4g} times that"
+)
+MOTION = (
+    "grasped nodes are fixed at their positions of the first sample; the motion is in the CSV "
+    "files of poses beside this file, and your simulation has to apply it"
+)
+UNTESTED = "untested: written according to the description of the format, but never read by the simulator"
+
+
+@dataclass(frozen=True)
+class ExportedFiles:
+    """Files of an export.
+
+    Attributes
+    ----------
+    files : mapping of file name to text
+    limitations : tuple of str
+        What the target cannot express, and what was done instead.
+    """
+
+    files: Mapping[str, str]
+    limitations: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PredictionComparison:
+    """One quantity as predicted by the target (`theirs`) and by this package (`ours`), in `unit`.
+
+    `what` names the quantity, `remark` adds a sentence.
+    """
+
+    what: str
+    theirs: float
+    ours: float
+    unit: str
+    remark: str = ""
+
+    @property
+    def relative_difference(self) -> float:
+        """Relative difference (theirs − ours) / ours; NaN if ours is zero."""
+        return (
+            (self.theirs - self.ours) / self.ours if self.ours else float("nan")
+        )
+
+
+@dataclass(frozen=True)
+class ExportTarget:
+    """Simulator to which a body can be exported.
+
+    Attributes
+    ----------
+    name : str
+        Name of the simulator as it writes it itself.
+    main_file : str
+        Name of the file that the simulator opens; its suffix is that of the format.
+    export : callable
+        Returns the files for a body.
+    verify : callable, optional
+        Runs the files of a folder in the simulator, and compares predictions; None if it cannot be
+        run from here.
+    """
+
+    name: str
+    main_file: str
+    export: Callable[[IdentifiedBody], ExportedFiles]
+    verify: (
+        Callable[[IdentifiedBody, Path], Sequence[PredictionComparison]] | None
+    ) = None
+
+
+@dataclass(frozen=True)
+class TargetCapabilities:
+    """Features of a body that a simulator can express; all others become limitations of an export.
+
+    Attributes
+    ----------
+    materials : mapping of str to str
+        Names in the simulator of the materials that it has; all others become what
+        `other_materials` states.
+    other_materials, stiffness_damping, mass_damping : str
+        Sentences on other materials, and on the two kinds of damping; they may contain `{material}`
+        and the names of constants of a region. Empty if the simulator expresses the damping.
+    damping_law : str
+        Name of the damping law that the simulator has, for which no sentence is needed.
+    has_viscoelasticity, has_moving_grasps, has_moving_obstacles, has_quadratic_elements : bool
+        Whether it has viscoelastic branches, moving grasps, moving obstacles, and elements with
+        nodes on their edges (which are split otherwise).
+    node_forces : str
+        Sentence for forces on nodes; empty if the simulator has them.
+    obstacle_shapes : tuple of str
+        Kinds of `Primitive` that obstacles may have.
+    has_rounded_edges, has_contact_faces, has_friction : bool
+        Whether obstacles may have rounded edges, be limited to some faces of the body, and have
+        friction.
+    is_tested : bool
+        Whether such files have been read by the simulator itself.
+    """
+
+    materials: Mapping[str, str]
+    other_materials: str = "{material} becomes the neo-Hookean material of the same λ and μ at small strain"
+    stiffness_damping: str = ""
+    mass_damping: str = "γ_m = {gamma_m_1_s:.4g} 1/s is not supported"
+    damping_law: str = ""
+    has_viscoelasticity: bool = False
+    has_moving_grasps: bool = False
+    has_moving_obstacles: bool = False
+    node_forces: str = "forces on nodes are not exported"
+    has_quadratic_elements: bool = False
+    obstacle_shapes: tuple[str, ...] = (
+        "plane",
+        "sphere",
+        "box",
+        "cylinder",
+        "capsule",
+    )
+    has_rounded_edges: bool = True
+    has_contact_faces: bool = True
+    has_friction: bool = True
+    is_tested: bool = True
+
+    def limitations(self, body: IdentifiedBody) -> list[str]:
+        """Return sentences on what the simulator cannot express of a body, and what was done
+        instead.
+        """
+        sentences = [*_common_limitations(body)]
+        sentences += self._obstacle_limitations(body)
+        for region in body.regions:
+            damped = bool(region.gamma_r_s)
+            templates = [
+                *[VISCOELASTICITY]
+                * (bool(region.branches) and not self.has_viscoelasticity),
+                *[self.other_materials]
+                * (region.material not in self.materials),
+                *[self.stiffness_damping]
+                * (damped and region.damping != self.damping_law),
+                *[self.mass_damping] * bool(region.gamma_m_1_s),
+            ]
+            at_once = 1 + sum(branch.share for branch in region.branches)
+            values = {**vars(region), "at_once": at_once}
+            sentences += [
+                f"{region.name}: {each.format(**values)}"
+                for each in filter(None, templates)
+            ]
+        if not self.has_moving_grasps:
+            sentences.append(MOTION)
+        if body.is_quadratic and not self.has_quadratic_elements:
+            sentences.append(LINEAR_ONLY)
+        elif body.body.element.mean_dilatation:
+            worst = max(region.poisson for region in body.regions)
+            sentences.append(MEAN_DILATATION.format(worst=worst))
+        if body.experiment.forces and self.node_forces:
+            sentences.append(self.node_forces)
+        return sentences if self.is_tested else [*sentences, UNTESTED]
+
+    def _obstacle_limitations(self, body: IdentifiedBody) -> Iterator[str]:
+        """Yield sentences on what the simulator cannot express of the obstacles."""
+        for each in body.obstacles:
+            if (
+                kind := Primitive.from_solid(each.shape).kind
+            ) not in self.obstacle_shapes:
+                yield f"{each.name}: an obstacle of the kind {kind} is not exported"
+                continue
+            if (
+                getattr(each.shape, "rounding_m", 0.0)
+                and not self.has_rounded_edges
+            ):
+                yield f"{each.name}: its edges are not rounded"
+            if each.faces is not None and not self.has_contact_faces:
+                yield f"{each.name}: the whole surface of the body may touch it"
+            if each.friction and not self.has_friction:
+                yield f"{each.name}: contact is without friction"
+            if len(each.poses.t_s) > 1 and not self.has_moving_obstacles:
+                yield (
+                    f"{each.name} is fixed at its position of the first sample; its motion is "
+                    "in its poses file"
+                )
+
+
+def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
+    """Yield sentences on what none of the targets can express."""
+    e = body.experiment
+    times = body.experiment.t_s
+    if e.actuators:
+        yield "tendons and pressures are not exported"
+    if e.air_density_kg_m3:
+        yield "buoyancy, added mass and drag of the air are not exported"
+    if e.body.forces:
+        yield f"custom forces are not exported: {', '.join(f.name for f in e.body.forces)}"
+    if (
+        np.ptp(e.declared_node_forces_n(times), axis=0).any()
+        or np.ptp(e.point_mass_at_nodes_kg(times), axis=0).any()
+    ):
+        yield "forces and point masses stay as they are at the first sample"
+    if any(not grasp.is_active(times).all() for grasp in e.grasps):
+        yield (
+            "grasps that begin or end within the recording stay as they are at the first sample"
+        )
+
+
+def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
+    """Return the equilibria of this package at the first samples, without the loads that exports
+    omit: tendons, pressures and air.
+
+    Parameters
+    ----------
+    body : IdentifiedBody
+    samples : int
+        Number of samples; more than one for static recordings only.
+
+    Returns
+    -------
+    moved_m : (T, n, 3)
+        Displacements of the nodes from `IdentifiedBody.nodes_m`.
+    forces_n : (T, o, 3)
+        Forces of each obstacle on the body.
+
+    Raises
+    ------
+    SimulationError
+        If an equilibrium cannot be found.
+    """
+    experiment = replace(
+        body.experiment_with_obstacles or body.experiment,
+        tendons=(),
+        pressures=(),
+        loaded_since_s=np.inf,
+        air_density_kg_m3="none",
+    )
+    if samples > 1:
+        states = (
+            simulate(experiment, body.theta)
+            .positions_m[:samples]
+            .reshape(samples, -1)
+        )
+    else:
+        states = equilibrium(experiment, body.theta)[None]
+    # In statics what slides is the way since the sample before.
+    ways = np.diff(states, axis=0, prepend=states[:1])
+    forces = Forces.from_experiment(
+        experiment, experiment.t_s[:samples], body.theta
+    ).total(states, ways)
+    on_nodes = forces.reshape(samples, -1, 3)
+    on_body = [-on_nodes[:, each.nodes].sum(axis=1) for each in body.obstacles]
+    moved_m = (
+        states.reshape(samples, -1, 3)[:, : len(body.nodes_m)] - body.nodes_m
+    )
+    return moved_m, np.stack(on_body, axis=1) if on_body else np.zeros(
+        (samples, 0, 3)
+    )
+
+
+def longest_displacement_m(displacements_m: Array) -> float:
+    """Return the largest length of displacements (n, 3)."""
+    return float(np.linalg.norm(displacements_m, axis=1).max())
+
+
+def linear_tetrahedra(body: IdentifiedBody) -> list[Index]:
+    """Return the linear tetrahedra (k, 4) of each region; quadratic ones are split on the same
+    nodes.
+    """
+    if not body.is_quadratic:
+        return [body.body.cells[region.cells] for region in body.regions]
+    eight = split_in_eight(body.body.mesh).tetrahedra.reshape(-1, 8, 4)
+    return [eight[region.cells].reshape(-1, 4) for region in body.regions]
+
+
+def values_as_text(
+    values: Iterable[float] | Array, separator: str = " "
+) -> str:
+    """Return numbers as text from which they are read back exactly."""
+    return separator.join(
+        repr(float(value)) for value in np.ravel(np.asarray(values))
+    )
+
+
+def comment_lines(
+    body: IdentifiedBody, limitations: Iterable[str], start: str, end: str = ""
+) -> str:
+    """Return comment lines on the body: title, warnings, limitations, and constants of each region.
+
+    Each line begins with `start` and ends with `end`, the marks of a comment in the format.
+    """
+    lines = [
+        f"{body.title}: identified body; SI units",
+        *(f"warning: {warning}" for warning in body.warnings),
+        *(f"not expressed: {limit}" for limit in limitations),
+    ]
+    for region in body.regions:
+        lines.append(
+            f"{region.name}: {region.material}, E = {region.young_pa:.6g} Pa, "
+            f"nu = {region.poisson:.6g}, density = {region.density_kg_m3:.6g} kg/m3, "
+            f"gamma_r = {region.gamma_r_s:.6g} s ({region.damping}), "
+            f"gamma_m = {region.gamma_m_1_s:.6g} 1/s"
+        )
+    # No line may end the comment itself.
+    texts = (
+        re.sub("-(?=-)", "- ", " ".join(printable(line).split()))
+        for line in lines
+    )
+    return "".join(f"{start}{text}{end}\n" for text in texts)
+
+
+def xml_attribute(text: str) -> str:
+    """Return a name as a quoted attribute of XML, with marks in place of control characters."""
+    return quoteattr(printable(text))

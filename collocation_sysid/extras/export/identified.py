@@ -1,0 +1,480 @@
+"""Identified body of a run folder, the input of every export.
+
+The body is undeformed and placed rigidly as its grasp holds it at the first sample. Simulators keep
+the grasped nodes there, or move them on from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.array_types import Array, Index
+from ...errors import InputError, listed, located
+from ...fem.body import Body
+from ...fem.laws.moduli import engineering_constants
+from ...fem.laws.ogden import is_power_law, term_numbers
+from ...problem import Problem
+from ...recording import Experiment, Markers, Obstacle
+from ...recording.obstacle_solids import solid_key
+from ...result.replay import MotionRecord, damaged_run_refused, read_arrays
+from ...runs.result_content import ReportedEstimate, Result
+from ...runs.warm_start import WarmStart
+
+
+@dataclass(frozen=True)
+class IdentifiedBranch:
+    """Viscoelastic branch: share of the long-term stiffness, and relaxation time [s]."""
+
+    name: str
+    share: float
+    tau_s: float
+
+
+@dataclass(frozen=True)
+class PowerTerm:
+    """Term of Ogden's law or of a compressible foam: μ_p [Pa], α_p, and β_p of a foam."""
+
+    mu_pa: float
+    alpha: float
+    beta: float
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedRegion:
+    """Part of the body with its constants.
+
+    Attributes
+    ----------
+    name : str
+        Name of the region; "body" for elements outside all regions.
+    cells : (k,)
+        Indices of its elements.
+    material : str
+        Name of the material.
+    constants : mapping of name to value
+        Constants of the material.
+    lambda_pa, mu_pa, young_pa, poisson : float
+        Elastic constants at rest and small strain, of the long-term energy.
+    density_kg_m3 : float
+    damping : str
+        Name of the damping law.
+    gamma_r_s, gamma_m_1_s : float
+        Stiffness-proportional and mass-proportional damping, see the glossary.
+    branches : tuple of BranchIndices
+    """
+
+    name: str
+    cells: Index
+    material: str
+    constants: Mapping[str, float]
+    lambda_pa: float
+    mu_pa: float
+    young_pa: float
+    poisson: float
+    density_kg_m3: float
+    damping: str
+    gamma_r_s: float
+    gamma_m_1_s: float
+    branches: tuple[IdentifiedBranch, ...]
+
+    @property
+    def kappa_pa(self) -> float:
+        """Bulk modulus κ = λ + ⅔ μ."""
+        return self.lambda_pa + 2 / 3 * self.mu_pa
+
+    @property
+    def terms(self) -> tuple[PowerTerm, ...]:
+        """Terms of Ogden's law or of a compressible foam; empty for other materials."""
+        if not is_power_law(self.material):
+            return ()
+        c = self.constants
+        return tuple(
+            PowerTerm(
+                c[f"mu_{p}_pa"], c[f"alpha_{p}"], beta=c.get(f"beta_{p}", 0.0)
+            )
+            for p in term_numbers(c)
+        )
+
+
+def without_obstacles(experiment: Experiment) -> Experiment:
+    """Return an experiment without its obstacles, which simulators have as separate objects.
+
+    Measurements are replaced by one placeholder marker, because there may be none on the body.
+
+    Raises
+    ------
+    InputError
+        If the body then has no initial equilibrium, because only obstacles support it.
+    """
+    body = experiment.body
+    t_s = experiment.t_s
+    own = len(body.nodes.points_m)
+    started = {
+        name: None
+        if (positions_m := getattr(experiment, name)) is None
+        else positions_m[:own]
+        for name in ("start_positions_m", "start_velocities_m_s")
+    }
+    # Exports need no measurements, and all of them may be of the obstacles.
+    some = Markers(
+        t_s,
+        np.zeros((len(t_s), 1, 3)),
+        sigma_m=1e-3,
+        names=["corner"],
+        places_m=body.nodes_m[:1],
+    )
+    unmeasured: dict[str, Any] = {"markers": some, "readings": (), "depths": ()}
+    try:
+        return replace(
+            experiment, grasps=experiment.body_grasps, **started, **unmeasured
+        )
+    except InputError as error:
+        raise InputError(
+            "exports leave obstacles out, and the body has no equilibrium without them; expected a "
+            f"recording in which it is grasped, or that starts undeformed: {error}"
+        ) from error
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedBody:
+    """Body as a run identified it, in the grasp of one of its recordings.
+
+    Attributes
+    ----------
+    title : str
+        Title of the problem.
+    verdict : str
+        Verdict of the run.
+    warnings : tuple of str
+        Reasons not to use the numbers without care.
+    parameters : mapping of name to ReportedEstimate
+    body : Body
+    theta : (k,)
+        Constants of the body.
+    experiment : Experiment
+        The recording with corrected gravity and grasps, and without obstacles.
+    simulated_m : (T, n, 3) or None
+        Forward simulation of this package at the samples.
+    experiment_with_obstacles : Experiment or None
+        The recording with its obstacles, whose friction coefficients are numbers; None without
+        obstacles.
+    """
+
+    title: str
+    verdict: str
+    warnings: tuple[str, ...]
+    parameters: Mapping[str, ReportedEstimate]
+    body: Body
+    theta: Array
+    experiment: Experiment
+    simulated_m: Array | None
+    experiment_with_obstacles: Experiment | None = None
+
+    @classmethod
+    def read(
+        cls,
+        run: str | Path,
+        experiment: str | None = None,
+        allow_code: bool = False,
+    ) -> IdentifiedBody:
+        """Read the body from a run folder.
+
+        Parameters
+        ----------
+        run : str or Path
+            A run folder.
+        experiment : str, optional
+            Name of a fitted experiment; the first by default.
+        allow_code : bool
+            Whether Python files that the problem names may run.
+
+        Raises
+        ------
+        InputError
+            If it is no run of a problem file, is damaged, or has no such recording.
+        """
+        folder = Path(run)
+        result = Result.read(folder)
+        answer = WarmStart.from_result(result, folder)
+        home = result.problem_folder(folder, "which export needs")
+        with damaged_run_refused(folder):
+            warnings = _warnings(result)
+        problem = Problem.read(
+            folder / "problem.toml", allow_code=allow_code, folder=home
+        )
+        problem = problem.with_lengths(
+            {n: each.shapes.length_m for n, each in result.fields.items()}
+        )
+        if problem.parameters.free:
+            problem = answer.apply_to_problem(
+                problem
+            )  # which may state no guess itself
+        if any(body.scan_conditions is not None for body in problem.bodies):
+            raise InputError(
+                "the mesh was made under gravity, but simulators assume a stress-free mesh; "
+                "expected a stress-free mesh: write body.stress_free_mesh(theta) to a file, and "
+                'solve with that and rest_shape = "stress_free"',
+                folder,
+                where="object.rest_shape",
+            )
+        collocation = problem.collocation()
+        names = [
+            segment.experiment.name for segment in collocation.transcriptions
+        ]
+        if experiment is not None and experiment not in names:
+            raise InputError(
+                f"no experiment {experiment!r} was fitted; expected {', '.join(names)}",
+                folder,
+            )
+        segment = collocation.transcriptions[
+            names.index(experiment) if experiment else 0
+        ]
+        with damaged_run_refused(folder):
+            values = {
+                item.name: result.parameters[item.name].value
+                for item in problem.parameters.items
+            }
+        phi = answer.apply_to_nuisance(collocation)[0][
+            segment.nuisance_indices.indices
+        ]
+        with damaged_run_refused(folder):
+            replay = MotionRecord.from_arrays(
+                segment.experiment.name, read_arrays(folder)
+            )
+            body = segment.body
+            if replay.undeformed_m.shape != body.nodes.points_m.shape:
+                raise ValueError("the mesh is not that of the problem file")
+        corrected = segment.corrected_experiment(phi)
+        rolled_out_m = replay.rolled_out_positions_m
+        obstacles = tuple(
+            replace(o, friction=values[o.friction])
+            if isinstance(o.friction, str)
+            else o
+            for o in corrected.obstacles
+        )
+        touching = corrected.with_obstacles(obstacles) if obstacles else None
+        if obstacles:
+            with located(folder):
+                corrected = without_obstacles(corrected)
+            body = corrected.body
+            rolled_out_m = (
+                None
+                if rolled_out_m is None
+                else rolled_out_m[:, : len(body.nodes_m)]
+            )
+        return cls(
+            problem.title,
+            result.trust.verdict,
+            warnings,
+            {
+                n: each
+                for n, each in result.parameters.items()
+                if n in result.values
+            },
+            body,
+            body.theta_from_values(values),
+            corrected,
+            rolled_out_m,
+            touching,
+        )
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """Obstacles with which the body may come into contact."""
+        return (
+            ()
+            if self.experiment_with_obstacles is None
+            else self.experiment_with_obstacles.obstacles
+        )
+
+    @property
+    def start_s(self) -> float:
+        """Time of the first sample."""
+        return float(self.experiment.t_s[0])
+
+    @cached_property
+    def nodes_m(self) -> Array:
+        """Undeformed nodes (n, 3), placed as the grasp holds the body at the first sample."""
+        return self.experiment.rigid_positions([self.start_s])[0]
+
+    @cached_property
+    def is_prescribed(self) -> NDArray[np.bool_]:
+        """Whether a node's coordinate has a prescribed displacement at the first sample (n, 3)."""
+        return self.experiment.is_prescribed([self.start_s])[0]
+
+    @cached_property
+    def prescribed_m(self) -> Array:
+        """Prescribed coordinates (n, 3) at the first sample, NaN where a coordinate is free."""
+        return self.experiment.prescribed_displacements([self.start_s])[1][0]
+
+    @property
+    def is_node_prescribed(self) -> NDArray[np.bool_]:
+        """Whether a node is prescribed along all axes at the first sample (n,)."""
+        return np.asarray(self.is_prescribed.all(axis=1))
+
+    @cached_property
+    def prescribed_displacements_m(self) -> Array:
+        """Prescribed coordinates minus `nodes_m` (n, 3), and 0 where a coordinate is free.
+
+        It is not zero where a second grasp holds nodes elsewhere than the rigidly placed body has
+        them.
+        """
+        return np.nan_to_num(self.prescribed_m - self.nodes_m)
+
+    @property
+    def is_quadratic(self) -> bool:
+        """Whether the elements have nodes on their edges."""
+        return self.body.element.nodes == 10
+
+    @cached_property
+    def point_masses_kg(self) -> Array:
+        """Point masses attached to the nodes (n,) at the first sample."""
+        return self.experiment.point_mass_at_nodes_kg([self.start_s])[0]
+
+    @cached_property
+    def node_mass_kg(self) -> Array:
+        """Lumped mass of the body at each node (n,), without point masses."""
+        return self.body.mass_of_dofs(self.theta)[::3]
+
+    @cached_property
+    def total_node_mass_kg(self) -> Array:
+        """Lumped mass at each node (n,), with point masses."""
+        return self.node_mass_kg + self.point_masses_kg
+
+    @cached_property
+    def node_loads_n(self) -> Array:
+        """Forces on the nodes (n, 3) at the first sample, with the weight of point masses but not
+        of the body.
+        """
+        weight = self.point_masses_kg[:, None] * self.experiment.gravity_m_s2
+        return (
+            self.experiment.declared_node_forces_n([self.start_s])[0] + weight
+        )
+
+    @cached_property
+    def regions(self) -> tuple[IdentifiedRegion, ...]:
+        """Parts of the body with their constants."""
+        body = self.body
+        regions = []
+        lame = body.lame(self.theta)
+        shares = body.split_theta(self.theta)
+        densities = body.densities(self.theta)
+        for part, share, density in zip(
+            body.parts, shares, densities, strict=True
+        ):
+            values = {
+                c.name: float(v)
+                for c, v in zip(part.constants, share, strict=True)
+            }
+            young, poisson = engineering_constants(*lame[part.name])
+            regions.append(
+                IdentifiedRegion(
+                    part.name or "body",
+                    part.cells,
+                    part.material.name,
+                    {c.name: values[c.name] for c in part.material.constants},
+                    *lame[part.name],
+                    young,
+                    poisson,
+                    density,
+                    part.damping.name,
+                    values.get("gamma_r_s", 0.0),
+                    values.get("gamma_m_1_s", 0.0),
+                    tuple(
+                        IdentifiedBranch(
+                            b.name,
+                            values[f"{b.name}.share"],
+                            tau_s=values[f"{b.name}.tau_s"],
+                        )
+                        for b in part.prony
+                    ),
+                )
+            )
+        return tuple(regions)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything as a dictionary for a JSON file."""
+        e = self.experiment
+        body = self.body
+        names = (
+            "value",
+            "combined_std_error",
+            "combined95",
+            "statistical_std_error",
+            "statistical95",
+            "at_bound",
+            "fixed",
+        )
+        return {
+            "title": self.title,
+            "verdict": self.verdict,
+            "warnings": self.warnings,
+            "parameters": {
+                name: {key: getattr(value, key) for key in names}
+                for name, value in self.parameters.items()
+            },
+            "element": body.element.name,
+            "nodes_m": self.nodes_m,
+            "cells": body.cells,
+            "node_mass_kg": self.node_mass_kg,
+            "tied_mass_kg": self.point_masses_kg,
+            "regions": self.regions,
+            "experiment": e.name,
+            "kind": e.kind,
+            "start": e.start,
+            "gravity_m_s2": e.gravity_m_s2,
+            "t_s": e.t_s,
+            "grasps": [
+                {
+                    "nodes": grasp.nodes,
+                    "axes": grasp.axes,
+                    "from_s": grasp.from_s,
+                    "until_s": grasp.until_s,
+                    "positions_m": self.prescribed_m[grasp.nodes],
+                    "pose_t_s": grasp.poses.t_s,
+                    "pose_positions_m": grasp.poses.positions_m,
+                    "pose_quaternions_xyzw": grasp.poses.quaternions_xyzw,
+                }
+                for grasp in e.grasps
+            ],
+            "obstacles": [
+                {
+                    "name": each.name,
+                    "shape": {solid_key(each.shape): each.shape},
+                    "friction": each.friction,
+                    "pose_t_s": each.poses.t_s,
+                    "pose_positions_m": each.poses.positions_m,
+                    "pose_quaternions_xyzw": each.poses.quaternions_xyzw,
+                }
+                for each in self.obstacles
+            ],
+            "node_loads_n": self.node_loads_n,
+        }
+
+
+def _warnings(result: Result) -> tuple[str, ...]:
+    """Return reasons not to use the numbers without care: verdict, bounds, averaged fields."""
+    warnings = []
+    if not result.converged:
+        warnings.append("the run did not converge")
+    if (verdict := result.trust.verdict) != "good":
+        warnings.append(
+            f"the verdict on the run is {verdict!r}: {'; '.join(result.trust.reasons)}"
+        )
+    if result.fields:
+        warnings.append(
+            f"{listed(result.fields)} varies in space: the mean is exported"
+        )
+    for name, each in result.parameters.items():
+        if each.at_bound and not each.fixed:
+            warnings.append(
+                f"{name} = {each.value:.4g} ended at a bound: the best value may lie beyond it"
+            )
+    return tuple(warnings)

@@ -1,0 +1,165 @@
+"""Newton: a Python module that builds the soft mesh from a JSON file beside it."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+from ...common.serialisation import content
+from ...recording import Obstacle
+from .export_target import (
+    ExportedFiles,
+    TargetCapabilities,
+    comment_lines,
+    linear_tetrahedra,
+)
+from .identified import IdentifiedBody
+from .obstacle_shapes import Primitive, SharedContact, faceted_obstacles
+
+MODULE_FILE = "body.py"
+DATA_FILE = "body.json"
+CAPABILITIES = TargetCapabilities(
+    {"stable-neo-hookean": "soft mesh"},
+    "{material} becomes the stable neo-Hookean energy of the same λ and μ at small strain",
+    stiffness_damping="damping γ_r becomes a viscosity k = γ_r μ / 2 [Pa s] with the stress 4 k Ė, the law "
+    '"material" without its part λ tr(Ė): changes of volume are damped less; the identified law '
+    "is {damping}",
+    has_rounded_edges=False,
+    has_contact_faces=False,
+)
+# Size arguments of each shape in Newton; zeros mean an infinite plane.
+SIZE_ARGUMENTS = {
+    "plane": ("width", "length"),
+    "sphere": ("radius",),
+    "box": ("hx", "hy", "hz"),
+    "cylinder": ("radius", "half_height"),
+    "capsule": ("radius", "half_height"),
+}
+_MODULE_SOURCE = '''
+import json
+from pathlib import Path
+
+import newton
+import numpy as np
+import warp as wp
+
+body = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
+
+
+def add_to(builder):
+    """Add the body to a newton.ModelBuilder; particles that are grasped have no mass."""
+    first = len(builder.particle_mass)
+    builder.add_soft_mesh(
+        pos=wp.vec3(),
+        rot=wp.quat_identity(),
+        scale=1.0,
+        vel=wp.vec3(),
+        vertices=body["nodes_m"],
+        indices=np.ravel(body["cells"]).tolist(),
+        density=1.0,
+        k_mu=np.array(body["k_mu"]),
+        k_lambda=np.array(body["k_lambda"]),
+        k_damp=np.array(body["k_damp"]),
+        particle_radius=body["contact_m"],
+    )
+    for k, (mass, held) in enumerate(zip(body["node_mass_kg"], body["held"])):
+        builder.particle_mass[first + k] = 0.0 if held else mass
+
+
+def add_obstacles_to(builder):
+    """Add what it may touch to a newton.ModelBuilder."""
+    for each in body["obstacles"]:
+        config = newton.ModelBuilder.ShapeConfig(
+            ke=body["contact_n_m"], kd=0.0, mu=each["friction"]
+        )
+        add = getattr(builder, "add_shape_" + each["kind"])
+        place = wp.transform(each["place_m"], each["quaternion_xyzw"])
+        still = {} if each["kind"] == "plane" else {"body": -1}
+        add(xform=place, cfg=config, label=each["name"], **each["size"], **still)
+
+
+def model(device=None):
+    """A model of the body and what it may touch, for newton.solvers.SolverVBD."""
+    builder = newton.ModelBuilder(gravity=tuple(body["gravity_m_s2"]))
+    add_to(builder)
+    add_obstacles_to(builder)
+    builder.color()
+    made = builder.finalize(device=device)
+    if body["obstacles"]:
+        # Newton averages the body's and the obstacle's: SolverVBD geometrically.
+        made.soft_contact_ke, made.soft_contact_kd = body["contact_n_m"], 0.0
+        made.soft_contact_mu = body["contact_mu"]
+    return made
+'''
+
+
+def export(body: IdentifiedBody) -> ExportedFiles:
+    """Return the module ``body.py`` and its numbers ``body.json``.
+
+    The module reads the JSON file with its own name, so that both can be renamed together.
+
+    The elastic constants are those of Newton's `SolverVBD`, whose energy is the stable neo-Hookean
+    one of λ and μ (Smith, de Goes & Kim 2018).
+    """
+    cells = []
+    constants = []
+    for region, own in zip(body.regions, linear_tetrahedra(body), strict=True):
+        cells.append(own)
+        # Its damping stress is 4 k Ė, ours γ_r (2 μ Ė + λ tr Ė): alike where the volume stays.
+        damping = region.gamma_r_s * region.mu_pa / 2
+        constants.append(
+            np.tile([region.mu_pa, region.lambda_pa, damping], (len(own), 1))
+        )
+    contact = SharedContact.from_obstacles(faceted_obstacles(body))
+    limits = [
+        *CAPABILITIES.limitations(body),
+        *contact.limitations,
+        "SolverSemiImplicit needs other constants for the same material, k_mu = 4/3 μ and "
+        "k_lambda = λ + 5/6 μ, and another damping",
+        "positions are single precision",
+    ]
+    k_mu, k_lambda, k_damp = np.concatenate(constants).T
+    data = {
+        "nodes_m": np.where(
+            body.is_prescribed, body.prescribed_m, body.nodes_m
+        ),
+        "cells": np.concatenate(cells),
+        "k_mu": k_mu,
+        "k_lambda": k_lambda,
+        "k_damp": k_damp,
+        "node_mass_kg": body.total_node_mass_kg,
+        "held": body.is_node_prescribed,
+        "gravity_m_s2": body.experiment.gravity_m_s2,
+        "contact_m": contact.particle_radius_m,
+        "contact_n_m": contact.node_stiffness_n_m,
+        "contact_mu": contact.friction,
+        "obstacles": [
+            _obstacle_data(each, body.start_s) for each in body.obstacles
+        ],
+    }
+    files = {
+        MODULE_FILE: comment_lines(body, limits, start="# ") + _MODULE_SOURCE,
+        DATA_FILE: json.dumps(content(data)) + "\n",
+    }
+    return ExportedFiles(files, tuple(limits))
+
+
+def _obstacle_data(obstacle: Obstacle, t_s: float) -> dict[str, Any]:
+    """Return shape, size, position and rotation of an obstacle at time `t_s`, and its friction, for
+    the JSON file.
+    """
+    shape = Primitive.from_solid(obstacle.shape)
+    place_m, turn = shape.pose_at(obstacle, t_s)
+    sizes = shape.size_m if len(shape.size_m) else np.zeros(2)
+    return {
+        "name": obstacle.name,
+        "kind": shape.kind,
+        "size": dict(
+            zip(SIZE_ARGUMENTS[shape.kind], sizes.tolist(), strict=True)
+        ),
+        "place_m": place_m,
+        "quaternion_xyzw": turn.as_quat(),
+        "friction": float(obstacle.friction),
+    }

@@ -1,0 +1,489 @@
+"""OpenUSD: a tetrahedral mesh with the schemas for deformable bodies that Newton and Isaac read.
+
+The schemas are those of the proposal for deformables in USD physics. They have Young's modulus,
+Poisson's ratio, density and masses, and no damping, which is stored in custom attributes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ...common.array_types import Array, Index
+from ...errors import InputError, printable
+from ...recording import Grasp, Obstacle
+from .export_target import (
+    ExportedFiles,
+    PredictionComparison,
+    TargetCapabilities,
+    comment_lines,
+    equilibria,
+    linear_tetrahedra,
+    longest_displacement_m,
+)
+from .identified import IdentifiedBody, IdentifiedRegion
+from .obstacle_shapes import Primitive, SharedContact, faceted_obstacles
+
+STAGE_FILE = "body.usda"
+ATTRIBUTE_NAMESPACE = "collocationSysid"
+# Factor on velocities after each step of Newton, so that the body comes to rest.
+VELOCITY_FACTOR = 0.95
+# Iterations of the solver in each step.
+SOLVER_ITERATIONS = 20
+# Steps until the body is at rest.
+REST_STEPS = 400
+# Timestep of Newton.
+REST_STEP_S = 2e-3
+CAPABILITIES = TargetCapabilities(
+    {},
+    "the simulator chooses the energy for E and ν instead of {material}: in Newton it is the "
+    "stable neo-Hookean law",
+    stiffness_damping="damping γ_r is not part of the USD schemas: it is exported as a custom attribute",
+    mass_damping="γ_m = {gamma_m_1_s:.4g} 1/s is not part of the USD schemas: it is exported as a custom "
+    "attribute",
+    has_moving_grasps=True,
+    has_moving_obstacles=True,
+    has_rounded_edges=False,
+    has_contact_faces=False,
+)
+SINGLE_PRECISION = "numbers are single precision"
+REGIONS = (
+    "regions are subsets of tetrahedra, each with its material; a simulator with one material "
+    "per body, such as Newton 1.8, uses that of the largest"
+)
+POINT_MASSES = "point masses on nodes are not exported"
+TILT = (
+    "gravity points {degrees:.3g}° away from −z of the stage, as estimated from the recording; a "
+    "simulator that uses its magnitude only, along −z, ignores this"
+)
+NO_SIMULATION = "the points of the body are those of the first sample: the run has no forward simulation"
+# Angle from which gravity counts as tilted: single precision of its direction rounds to less.
+LEAST_TILT_DEG = 1e-3
+# Frames per second of a single sample, which has no rate of its own.
+SINGLE_RATE_HZ = 24.0
+SINGLE_AXES = "nodes that are held along single axes only are free"
+
+
+def export(body: IdentifiedBody) -> ExportedFiles:
+    """Return the USD stage.
+
+    Raises
+    ------
+    InputError
+        If usd-core is not installed.
+    """
+    pxr = _import_usd()
+    limits = [*CAPABILITIES.limitations(body), SINGLE_PRECISION]
+    limits += [POINT_MASSES] * bool(body.point_masses_kg.any())
+    limits += [REGIONS] * (len(body.regions) > 1)
+    limits += [SINGLE_AXES] * bool(
+        (body.is_prescribed.any(axis=1) != body.is_node_prescribed).any()
+    )
+    limits += [NO_SIMULATION] * (body.simulated_m is None)
+    tilt_deg = _tilt_deg(body.experiment.gravity_m_s2)
+    limits += [TILT.format(degrees=tilt_deg)] * (tilt_deg > LEAST_TILT_DEG)
+    stage = pxr.Usd.Stage.CreateInMemory()
+    pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.z)
+    pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    pxr.UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
+    t_s = body.experiment.t_s
+    rate_hz = _rate_hz(t_s)
+    stage.SetTimeCodesPerSecond(rate_hz)
+    stage.SetFramesPerSecond(rate_hz)
+    stage.SetStartTimeCode(float(rate_hz * t_s[0]))
+    stage.SetEndTimeCode(float(rate_hz * t_s[-1]))
+    world = pxr.UsdGeom.Xform.Define(stage, "/World").GetPrim()
+    stage.SetDefaultPrim(world)
+    world.SetDocumentation(comment_lines(body, limits, start=""))
+    scene = pxr.UsdPhysics.Scene.Define(stage, "/World/Physics")
+    gravity = body.experiment.gravity_m_s2
+    size = float(np.linalg.norm(gravity))
+    scene.CreateGravityMagnitudeAttr(size)
+    scene.CreateGravityDirectionAttr(
+        pxr.Gf.Vec3f(*(gravity / (size or 1.0)).tolist())
+    )
+    placed_m = np.where(body.is_prescribed, body.prescribed_m, body.nodes_m)
+    _add_mesh(pxr, stage, body=body, start_positions_m=placed_m)
+    for k, grasp in enumerate(body.experiment.grasps, start=1):
+        _add_gripper(
+            pxr,
+            stage,
+            number=k,
+            grasp=grasp,
+            body=body,
+            start_positions_m=placed_m,
+        )
+    for k, obstacle in enumerate(body.obstacles, start=1):
+        _add_obstacle(
+            pxr,
+            stage,
+            path=f"/World/Obstacle_{k}",
+            obstacle=obstacle,
+            body=body,
+        )
+    return ExportedFiles(
+        {STAGE_FILE: stage.GetRootLayer().ExportToString()}, tuple(limits)
+    )
+
+
+def _rate_hz(t_s: Array) -> float:
+    """Return the time codes per second: one for each sample (T,), on average where samples are
+    uneven.
+    """
+    return (
+        (len(t_s) - 1) / float(np.ptp(t_s)) if len(t_s) > 1 else SINGLE_RATE_HZ
+    )
+
+
+def _tilt_deg(gravity_m_s2: Array) -> float:
+    """Return the angle between gravity (3,) and −z [°]; 0 without gravity."""
+    downwards = -gravity_m_s2[2]
+    across = np.linalg.norm(gravity_m_s2[:2])
+    return (
+        float(np.degrees(np.arctan2(across, downwards)))
+        if gravity_m_s2.any()
+        else 0.0
+    )
+
+
+def _import_usd() -> Any:
+    """Return the modules of usd-core as attributes of one object.
+
+    Raises
+    ------
+    InputError
+        If usd-core is not installed.
+    """
+    try:
+        from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
+    except ImportError as error:
+        raise InputError(
+            "USD needs usd-core: pip install 'collocation-sysid[usd]'"
+        ) from error
+    modules = (Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt)
+    return SimpleNamespace(
+        **{each.__name__.rpartition(".")[2]: each for each in modules}
+    )
+
+
+def _add_mesh(
+    pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Array
+) -> None:
+    """Add the tetrahedra, masses, materials and simulated motion of the body to the stage.
+
+    `pxr` are the modules of `_import_usd`; `start_positions_m` (n, 3) are the initial node
+    positions.
+    """
+    body_prim = pxr.UsdGeom.Xform.Define(stage, "/World/Body").GetPrim()
+    body_prim.AddAppliedSchema("PhysicsDeformableBodyAPI")
+    mesh = pxr.UsdGeom.TetMesh.Define(stage, "/World/Body/Mesh")
+    cells = linear_tetrahedra(body)
+    prim = mesh.GetPrim()
+    prim.AddAppliedSchema("PhysicsVolumeDeformableSimAPI")
+    pxr.UsdPhysics.CollisionAPI.Apply(prim)
+    # A simulator begins with the default; the samples are played back where nothing is simulated.
+    points = mesh.CreatePointsAttr(start_positions_m.astype(np.float32))
+    t_s = body.experiment.t_s
+    codes = (_rate_hz(t_s) * t_s).tolist()
+    if body.simulated_m is not None:
+        for code, shape_m in zip(codes, body.simulated_m, strict=True):
+            points.Set(shape_m.astype(np.float32), code)
+    mesh.CreateTetVertexIndicesAttr(np.concatenate(cells).astype(np.int32))
+    mesh.CreateSurfaceFaceVertexIndicesAttr(
+        pxr.UsdGeom.TetMesh.ComputeSurfaceFaces(mesh)
+    )
+    number = pxr.Sdf.ValueTypeNames
+    rest = prim.CreateAttribute(
+        "physics:restShapePoints", number.Point3fArray, False
+    )
+    rest.Set(body.nodes_m.astype(np.float32))
+    masses = prim.CreateAttribute("physics:masses", number.FloatArray, False)
+    masses.Set(_cell_masses_kg(body, cells).astype(np.float32))
+    _set_token(pxr, prim, name="physics:masses:elementType", text="tetrahedron")
+    grasped = prim.CreateAttribute(
+        f"{ATTRIBUTE_NAMESPACE}:graspedPoints", number.IntArray
+    )
+    grasped.Set(np.flatnonzero(body.is_node_prescribed).astype(np.int32))
+    names = _unique_prim_names([region.name for region in body.regions])
+    pairs = zip(body.regions, names, strict=True)
+    materials = [
+        _add_material(pxr, stage, region=region, name=name)
+        for region, name in pairs
+    ]
+    _bind_material(
+        pxr,
+        prim,
+        material=materials[int(np.argmax([len(each) for each in cells]))],
+    )
+    firsts = np.cumsum([0, *map(len, cells)])
+    for k, material in enumerate(materials if len(cells) > 1 else ()):
+        indices = pxr.Vt.IntArray(range(firsts[k], firsts[k + 1]))
+        subset = pxr.UsdGeom.Subset.CreateGeomSubset(
+            mesh,
+            names[k],
+            pxr.UsdGeom.Tokens.tetrahedron,
+            indices,
+            "materialBind",
+        )
+        _bind_material(pxr, subset.GetPrim(), material=material)
+
+
+def _cell_masses_kg(body: IdentifiedBody, cells: list[Index]) -> Array:
+    """Return the mass of each tetrahedron [kg], region after region.
+
+    `cells` are the corner nodes of the tetrahedra (k, 4) of each region.
+    """
+    edges = [np.diff(body.nodes_m[each], axis=1) for each in cells]
+    volumes = [np.abs(np.linalg.det(each)) / 6 for each in edges]
+    pairs = zip(body.regions, volumes, strict=True)
+    return np.concatenate(
+        [region.density_kg_m3 * volume for region, volume in pairs]
+    )
+
+
+def _add_material(
+    pxr: Any, stage: Any, region: IdentifiedRegion, name: str
+) -> Any:
+    """Add the material of a region to the stage under `name`, and return it."""
+    material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{name}")
+    prim = material.GetPrim()
+    prim.AddAppliedSchema("PhysicsVolumeDeformableMaterialAPI")
+    values = {
+        "physics:youngsModulus": region.young_pa,
+        "physics:poissonsRatio": region.poisson,
+        "physics:density": region.density_kg_m3,
+        f"{ATTRIBUTE_NAMESPACE}:gammaR_s": region.gamma_r_s,
+        f"{ATTRIBUTE_NAMESPACE}:gammaM_1_s": region.gamma_m_1_s,
+    }
+    values |= {
+        f"{ATTRIBUTE_NAMESPACE}:{name}": value
+        for name, value in region.constants.items()
+    }
+    number = pxr.Sdf.ValueTypeNames
+    for name, value in values.items():
+        prim.CreateAttribute(
+            name, number.Float, name.startswith(ATTRIBUTE_NAMESPACE)
+        ).Set(float(value))
+    for name, text in (
+        ("material", region.material),
+        ("damping", region.damping),
+    ):
+        prim.CreateAttribute(
+            f"{ATTRIBUTE_NAMESPACE}:{name}", number.String
+        ).Set(text)
+    return material
+
+
+def _bind_material(pxr: Any, prim: Any, material: Any) -> None:
+    """Bind a physics material to a prim."""
+    binding = pxr.UsdShade.MaterialBindingAPI.Apply(prim)
+    binding.Bind(material, pxr.UsdShade.Tokens.weakerThanDescendants, "physics")
+
+
+def _set_token(pxr: Any, prim: Any, name: str, text: str) -> None:
+    """Set a uniform token attribute of a prim."""
+    kind = pxr.Sdf.ValueTypeNames.Token
+    fixed = pxr.Sdf.VariabilityUniform
+    prim.CreateAttribute(name, kind, False, fixed).Set(text)
+
+
+def _add_gripper(
+    pxr: Any,
+    stage: Any,
+    number: int,
+    grasp: Grasp,
+    body: IdentifiedBody,
+    start_positions_m: Array,
+) -> None:
+    """Add a kinematic rigid body that follows the poses of a grasp, and attach the grasped nodes to
+    it.
+
+    `number` counts grasps from 1; `start_positions_m` (n, 3) are the initial node positions.
+    """
+    path = f"/World/Gripper_{number}"
+    gripper = pxr.UsdGeom.Xform.Define(stage, path)
+    pxr.UsdPhysics.RigidBodyAPI.Apply(
+        gripper.GetPrim()
+    ).CreateKinematicEnabledAttr(True)
+    matrices, positions_m = grasp.poses.at(body.experiment.t_s)
+    _set_poses(
+        pxr,
+        gripper,
+        positions_m=positions_m,
+        rotations=Rotation.from_matrix(matrices),
+        t_s=body.experiment.t_s,
+    )
+    nodes = np.intersect1d(grasp.nodes, np.flatnonzero(body.is_node_prescribed))
+    prim = stage.DefinePrim(f"{path}/Grasp", "PhysicsAttachment")
+    types = pxr.Sdf.ValueTypeNames
+    for name, target in (("src0", "/World/Body/Mesh"), ("src1", path)):
+        prim.CreateRelationship(f"physics:{name}", False).SetTargets(
+            [pxr.Sdf.Path(target)]
+        )
+    for name, text in (("type0", "point"), ("type1", "xform")):
+        _set_token(pxr, prim, name=f"physics:{name}", text=text)
+    local_m = (start_positions_m[nodes] - positions_m[0]) @ matrices[0]
+    for name, kind, values in (
+        ("indices0", types.IntArray, nodes.astype(np.int32)),
+        ("coords1", types.Vector3fArray, local_m.astype(np.float32)),
+    ):
+        prim.CreateAttribute(f"physics:{name}", kind, False).Set(values)
+
+
+def _set_poses(
+    pxr: Any, prim: Any, positions_m: Array, rotations: Rotation, t_s: Array
+) -> None:
+    """Place a prim at positions (T, 3) and rotations at times (T,), by default as in the first row.
+
+    With empty `t_s`, the only row holds for all time.
+    """
+    codes = (_rate_hz(t_s) * t_s).tolist()
+    wxyz = rotations.as_quat(scalar_first=True)
+    place = prim.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble)
+    turn = prim.AddOrientOp(pxr.UsdGeom.XformOp.PrecisionDouble)
+    for k, time in enumerate([pxr.Usd.TimeCode.Default(), *codes]):
+        row = max(k - 1, 0)
+        place.Set(pxr.Gf.Vec3d(*positions_m[row].tolist()), time)
+        turn.Set(pxr.Gf.Quatd(*wxyz[row].tolist()), time)
+
+
+def _add_obstacle(
+    pxr: Any, stage: Any, path: str, obstacle: Obstacle, body: IdentifiedBody
+) -> None:
+    """Add an obstacle with its friction to the stage under `path`; it is kinematic if it moves."""
+    shape = Primitive.from_solid(obstacle.shape)
+    t_s = body.experiment.t_s
+    frame = path
+    if len(obstacle.poses.t_s) > 1:
+        moving = pxr.UsdGeom.Xform.Define(stage, path)
+        pxr.UsdPhysics.RigidBodyAPI.Apply(
+            moving.GetPrim()
+        ).CreateKinematicEnabledAttr(True)
+        matrices, places_m = obstacle.poses.at(t_s)
+        _set_poses(
+            pxr,
+            moving,
+            positions_m=places_m,
+            rotations=Rotation.from_matrix(matrices),
+            t_s=t_s,
+        )
+        place_m = shape.centre_m
+        turn = shape.rotation
+        frame = f"{path}/Shape"
+    else:
+        place_m, turn = shape.pose_at(obstacle, body.start_s)
+    kinds = {"box": "Cube"}
+    solid = getattr(
+        pxr.UsdGeom, kinds.get(shape.kind, shape.kind.title())
+    ).Define(stage, frame)
+    _set_poses(
+        pxr,
+        solid,
+        positions_m=place_m[None],
+        rotations=Rotation.concatenate([turn]),
+        t_s=t_s[:0],
+    )
+    if shape.kind == "box":
+        solid.CreateSizeAttr(2.0)
+        solid.AddScaleOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(
+            pxr.Gf.Vec3d(*shape.size_m)
+        )
+    elif shape.kind != "plane":
+        solid.CreateRadiusAttr(float(shape.size_m[0]))
+    if shape.kind in ("plane", "cylinder", "capsule"):
+        solid.CreateAxisAttr("Z")
+    if shape.kind in ("cylinder", "capsule"):
+        solid.CreateHeightAttr(2 * float(shape.size_m[1]))
+    pxr.UsdPhysics.CollisionAPI.Apply(solid.GetPrim())
+    solid.GetPrim().SetDisplayName(printable(obstacle.name))
+    material = pxr.UsdShade.Material.Define(
+        stage, f"/World/Materials/{path.rpartition('/')[2]}"
+    )
+    rubbing = pxr.UsdPhysics.MaterialAPI.Apply(material.GetPrim())
+    for attribute in (
+        rubbing.CreateStaticFrictionAttr,
+        rubbing.CreateDynamicFrictionAttr,
+    ):
+        attribute(float(obstacle.friction))
+    _bind_material(pxr, solid.GetPrim(), material=material)
+
+
+def _unique_prim_names(names: Sequence[str]) -> list[str]:
+    """Return names that USD accepts, a different one for each of `names`."""
+    unique: list[str] = []
+    for name in names:
+        text = re.sub(r"[^A-Za-z0-9_]", "_", name)
+        text = text if re.match(r"[A-Za-z_]", text) else f"_{text}"
+        while text in unique:
+            text += "_"
+        unique.append(text)
+    return unique
+
+
+def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
+    """Run Newton on the exported stage, and compare the largest displacement at rest.
+
+    Raises
+    ------
+    InputError
+        If Newton is not installed.
+    """
+    try:
+        newton: Any = import_module("newton")
+    except ImportError as error:
+        raise InputError(
+            "install Newton to verify the export: pip install newton"
+        ) from error
+
+    builder = newton.ModelBuilder()
+    contact = SharedContact.from_obstacles(faceted_obstacles(body))
+    if body.obstacles:
+        builder.default_particle_radius = contact.particle_radius_m
+    # Its rigid bodies would be simulated too; what they hold stands still instead.
+    builder.add_usd(
+        str(folder / STAGE_FILE), ignore_paths=["/World/Gripper_.*"]
+    )
+    grasped = np.flatnonzero(body.is_node_prescribed)
+    for k in grasped:
+        builder.particle_mass[k] = 0.0
+    builder.color()
+    model = builder.finalize(device="cpu")
+    if body.obstacles:
+        model.soft_contact_ke = contact.node_stiffness_n_m
+        model.soft_contact_mu = contact.friction
+        model.shape_material_ke.fill_(contact.node_stiffness_n_m)
+    pipeline = newton.CollisionPipeline(model)
+    # What is touched stands still, and is nothing to solve for.
+    solver = newton.solvers.SolverVBD(
+        model,
+        iterations=SOLVER_ITERATIONS,
+        integrate_with_external_rigid_solver=True,
+    )
+    before: Any = model.state()
+    after = model.state()
+    control = model.control()
+    contacts = pipeline.contacts()
+    for _ in range(REST_STEPS):
+        pipeline.collide(before, contacts)
+        solver.step(before, after, control, contacts, REST_STEP_S)
+        before, after = after, before
+        before.particle_qd.assign(VELOCITY_FACTOR * before.particle_qd.numpy())
+    theirs = before.particle_q.numpy().astype(float) - body.nodes_m
+    sag_m = longest_displacement_m(equilibria(body)[0][0])
+    remark = "".join(contact.limitations)
+    return [
+        PredictionComparison(
+            "largest displacement at rest",
+            longest_displacement_m(theirs),
+            ours=sag_m,
+            unit="m",
+            remark=remark,
+        )
+    ]

@@ -1,0 +1,104 @@
+"""Batch solution of a live recording after its last frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ...methods.reduced_space import ReducedSpace
+from ...pipeline import Run, run
+from ...problem import Problem
+from ...program.streaming import LoggedRow, StreamingModel
+from ...recording.custom_sensor import Gauge
+from ...recording.experiment import Experiment
+from ...recording.poses import PoseSequence
+from ...recording.sample_times import STEP_TOLERANCE
+from .frame_buffer import FrameBuffer
+
+# Smallest number of samples of a motion.
+FEWEST = 3
+
+
+def recording_from_log(
+    model: StreamingModel, intake: FrameBuffer, log: Sequence[LoggedRow]
+) -> Experiment | None:
+    """Return the experiment with the poses, markers and samples of all rows, from the first frame
+    on.
+
+    Samples of a custom sensor or wrench replace its stated series; if fewer than three are within
+    the rows, or all are NaN, the sensor is left out. Missing markers are NaN.
+
+    None if there are fewer than three sample times or no measured marker, or if markers were
+    measured between samples.
+
+    Parameters
+    ----------
+    model : StreamingModel
+    intake : FrameBuffer
+        Buffer with the samples that still wait for rows, which are included.
+    log : sequence of LoggedRow
+        All rows, substeps included, with their samples.
+    """
+    experiment = model.experiment
+    at_samples = log[:: model.substeps]
+    t_s = experiment.t_s[0] + model.interval_s * np.arange(len(at_samples))
+    tracks_m = np.full((len(t_s), len(experiment.markers.names), 3), np.nan)
+    for when, tracks in intake.marker_samples(log):
+        if abs(when - round(when)) > STEP_TOLERANCE:
+            return None
+        if round(when) < len(t_s):
+            tracks_m[round(when)] = tracks
+    if len(t_s) < FEWEST or np.isnan(tracks_m).all():
+        return None
+    grasps = [replace(grasp, wrench=None) for grasp in experiment.grasps]
+    for k, number in enumerate(model.moving_grasps):
+        matrices = np.tile(np.eye(4), (len(t_s), 1, 1))
+        for matrix, row in zip(matrices, at_samples, strict=True):
+            matrix[:3, :3], matrix[:3, 3] = row.poses[k]
+        smooth = grasps[number].poses.interpolation
+        poses = PoseSequence.from_matrices(t_s, matrices, smooth)
+        grasps[number] = replace(grasps[number], poses=poses)
+    markers = replace(experiment.markers, t_s=t_s, positions_m=tracks_m)
+    readings = []
+    for number, gauge in enumerate((*experiment.readings, *model.wrenches), 1):
+        samples = {
+            when: values
+            for of, when, values in intake.all_samples(log)
+            if of == number
+        }
+        inside = [when for when in sorted(samples) if when <= len(t_s) - 1]
+        values = np.array([samples[when] for when in inside])
+        if len(inside) < FEWEST or not np.isfinite(values).any():
+            continue
+        series = {
+            "t_s": t_s[0] + model.interval_s * np.array(inside),
+            "values": values,
+        }
+        if isinstance(gauge, Gauge):
+            readings.append(replace(gauge, **series))
+        else:
+            wrench = replace(model.wrenches[gauge], **series)
+            grasps[gauge - 1] = replace(grasps[gauge - 1], wrench=wrench)
+    return replace(
+        experiment, t_s=t_s, grasps=grasps, markers=markers, readings=readings
+    )
+
+
+def solve_recording(problem: Problem, recording: Experiment) -> Run:
+    """Return the run of a recording, solved as a batch by reduced space, without profile
+    likelihoods and search for causes.
+
+    Raises
+    ------
+    InputError
+        If the recording is refused, see `run`.
+    """
+    options = replace(problem.uncertainty, profile=())
+    batch_problem = replace(
+        problem, experiments=[recording], uncertainty=options
+    )
+    return run(
+        batch_problem, problem.solver(ReducedSpace.name), seek_causes=False
+    )

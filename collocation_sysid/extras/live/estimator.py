@@ -1,0 +1,1187 @@
+"""Live estimation of parameters: one frame in, one estimate out.
+
+All frames are linearised at one point p; the estimate is the Gauss–Newton step from there, within
+bounds and a trust region. When the estimate has moved away from p, the rows in the window are
+computed again at the estimate, in what is left of each frame's time, until this second pass has
+caught up. It replaces the first pass if its sum of squares is acceptable; otherwise the trust
+region shrinks. Each pass is thus an iteration of the reduced-space method on all data so far, and
+the iterations converge to the result of the batch.
+
+In the meantime both passes change their linearisation point to the current estimate and continue
+from a state that is moved along its derivatives, as in an extended Kalman filter; another pass then
+follows.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...common.array_types import Array
+from ...common.validated_types import AtLeastOne, Options, Positive
+from ...errors import InputError, SimulationError
+from ...fem.laws.constants import is_field_coefficient
+from ...pipeline import Run
+from ...problem import Problem
+from ...program.streaming import (
+    LoggedRow,
+    Sample,
+    SquareRootInformation,
+    one_blas_thread,
+)
+from ...recording.poses import Poses
+from ...statistics.assessment import GROSS_MISFIT, Assessment
+from ...statistics.concerns import concern_if
+from ...statistics.estimates import Estimate, user_estimates
+from ...statistics.linearised import AT_BOUND
+from .batch_solution import recording_from_log, solve_recording
+from .frame_buffer import LARGEST_GAP, FrameBuffer
+from .frames import (
+    Frame,
+    Pose,
+    parse_custom_readings,
+    parse_markers,
+    parse_pose,
+    parse_time,
+    parse_wrenches,
+)
+from .live_model import model_from_problem
+from .live_trust import (
+    LARGEST_SETTLED_DISTANCE,
+    ResidualScatter,
+    data_concerns,
+    estimate_concerns,
+    variance_factor,
+)
+from .stiffness_search import TRIAL_SAMPLES, StiffnessSearch
+from .time_budget import TimeBudget
+from .window_pass import CombinedPasses, WindowPass
+
+# Standard deviation, in steps of the trust region, of a prior that keeps the next linearisation
+# point near the last one until many samples are available.
+POINT_PRIOR_DEVIATION = 0.5
+# Distance of the estimate from the linearisation point, in standard errors, that starts a new pass.
+REPEAT_DISTANCE = 0.1
+# Distance, in standard errors, at which a pass that is catching up changes its linearisation point.
+RELINEARISE_DISTANCE = 1.0
+# The same distance for the first pass, which receives the frames.
+RELINEARISE_DISTANCE_FIRST = 3.0
+# Initial radius of the trust region, see `methods.minimise`.
+INITIAL_RADIUS = 1.0
+# Largest radius of the trust region.
+LARGEST_RADIUS = 2.0
+# Factor of the radius after a rejected step.
+RADIUS_REDUCTION = 0.25
+# A pass is accepted if its sum of squares is at most TIMES · expected + SLACK: rows that arrived in
+# the meantime are fitted by the next pass.
+ACCEPTED_RATIO = 1.25
+# Slack of this sum of squares, for passes of few rows.
+ACCEPTED_EXCESS = 1.0
+# Default of the computing time of a frame, as a fraction of the time between samples.
+BUDGET_FRACTION = 0.8
+# Number of blocks of a window.
+WINDOW_BLOCKS = 12
+# Number of consecutively rejected passes after which other initial values are searched for.
+LARGEST_REJECTIONS = 3
+# Largest number of passes over the window after the last frame.
+FINAL_PASSES = 50
+# Number of timing measurements before the first frame.
+TIMING_REPETITIONS = 3
+# Ratio of a residual to the usual one above which a sample is an outlier.
+OUTLIER_RATIO = 6.0
+# Distance, in body sizes, from the grasp beyond which no marker can be, and beyond which no grasp
+# moves between two samples.
+REACH_BODY_SIZES = 5.0
+# Number of frames between two evaluations of all residuals.
+SCATTER_INTERVAL_FRAMES = 5
+
+
+@dataclass(frozen=True)
+class LiveOptions(Options):
+    """Options of live estimation.
+
+    Attributes
+    ----------
+    budget_s : float, optional
+        Computing time of a frame; 80 % of the time between samples by default. The rows of the
+        frame itself are computed even if they take longer.
+    window_s : float
+        Duration of the window of frames that are computed again when the estimate moves.
+    rows : int, optional
+        Number of rows of the grid that are computed again in each frame, in place of the time
+        limit: estimates are then the same on any machine.
+    """
+
+    name: ClassVar[str] = "live"
+
+    budget_s: Positive | None = None
+    window_s: Positive = 3.0
+    rows: AtLeastOne | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LiveUpdate:
+    """Result after a frame.
+
+    Attributes
+    ----------
+    t_s : float
+        Time of the frame.
+    estimates : mapping of name to Estimate
+        Value, standard error and 95 % interval of each parameter.
+    trust : Assessment
+        Verdict with its reasons.
+    marker_rms_m : float
+        Root mean square distance of this frame's markers from the estimate's; NaN without markers.
+    notes : tuple of str
+        Irregularities of the frame, and events.
+    latency_s : float
+        Computing time of the frame.
+    relinearised : int
+        Number of rows that were computed again.
+    marker_distances_m : (M,) array
+        Distance of each marker of the last sample from the estimate's; NaN where missing, empty if
+        there is no sample.
+    """
+
+    t_s: float
+    estimates: Mapping[str, Estimate]
+    trust: Assessment
+    marker_rms_m: float
+    notes: tuple[str, ...]
+    latency_s: float
+    relinearised: int
+    marker_distances_m: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __repr__(self) -> str:
+        values = ", ".join(
+            f"{name} = {each.value:.4g}"
+            for name, each in self.estimates.items()
+        )
+        return f"Update(t = {self.t_s:.4g} s: {values}; {self.trust.verdict})"
+
+
+def _require_phases(problem: Problem) -> None:
+    """Raise an `InputError` for a two-phase field without phases, which live estimation cannot
+    find.
+    """
+    for name, modes in problem.two_phase_fields.items():
+        if not modes.has_phases:
+            raise InputError(
+                f"the phases of {name} are unknown, and a live estimate does not search for them; "
+                "expected the problem of a result, `cs.run(problem).problem`, or prior = 'smooth'"
+            )
+
+
+class LiveEstimator:
+    """Estimator of a problem's parameters from frames, one after another.
+
+    Parameters
+    ----------
+    problem : Problem
+        One experiment; of its recording only the grasps, the markers and the sampling rate are
+        used.
+    options : LiveOptions
+    clock : callable
+        Time in seconds for the budget; `time.thread_time` excludes the time of other processes.
+
+    Attributes
+    ----------
+    p : (P,)
+        Current estimate of the parameters, in the solver's coordinates.
+    counts : Counter
+        Numbers of irregularities of frames, by kind.
+    last : LiveUpdate or None
+        Result after the last frame; None before the first one.
+
+    Raises
+    ------
+    InputError
+        If the problem has a feature that live estimation does not support.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        options: LiveOptions = LiveOptions(),
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self.problem = problem
+        self.options = options
+        self.clock = clock
+        _require_phases(problem)
+        self.model = model_from_problem(problem)
+        model = self.model
+        self.names = self.model.experiment.markers.names
+        most_motion_m = REACH_BODY_SIZES * model.body_size_m
+        neighbours = model.neighbouring_samples
+        self._reach_m = most_motion_m + float(
+            np.linalg.norm(model.segment.body.nodes_m.mean(axis=0))
+        )
+        stencils = [each.stencil for each in model.instruments]
+        self.intake = FrameBuffer(
+            model.interval_s,
+            model.substeps,
+            neighbouring_samples=neighbours,
+            largest_jump_m=most_motion_m,
+            instruments=stencils,
+        )
+        self.counts = self.intake.counts
+        self.samples = 0
+        self.budget_s = options.budget_s or BUDGET_FRACTION * model.interval_s
+        self.rows = options.rows
+        samples = max(
+            LARGEST_GAP,
+            round(options.window_s / model.interval_s / WINDOW_BLOCKS),
+        )
+        self._block_rows = samples * model.substeps
+        self._blocks = max(
+            2, round(options.window_s / model.interval_s / samples)
+        )
+        self._set_bounds()
+        self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
+        self.prior = SquareRootInformation.empty(model.parameter_count)
+        self.first_pass: WindowPass | None = None
+        self._combined = CombinedPasses(self.prior, [], [])
+        self._last_positions_m = np.full((1, 3), np.nan)
+        self.second_pass: WindowPass | None = None
+        self.log: list[LoggedRow] = []
+        self.search = (
+            self._new_search()
+            if problem.parameters.names_without_guess
+            else None
+        )
+        self.scatter = ResidualScatter()
+        self._trust = INITIAL_RADIUS
+        self._rejected = 0
+        self.budget = TimeBudget()
+        self.last: LiveUpdate | None = None
+        self._rest = self._warm_up()
+
+    # Frames -----------------------------------------------------------------------------------
+
+    def update(
+        self,
+        t_s: float,
+        pose: Pose | Mapping[str, Pose] | None,
+        markers: ArrayLike | Mapping[str, ArrayLike],
+        wrench: Any = None,
+        readings: Mapping[str, Any] | None = None,
+    ) -> LiveUpdate:
+        """Process a frame and return the result.
+
+        Parameters
+        ----------
+        t_s : float
+            Time of the frame.
+        pose : 4×4 matrix, (position, quaternion x y z w), or None
+            Pose of the moving grasp, None if it is missing; for several grasps a mapping by their
+            number from "1" on, or a list in the order of the problem.
+        markers : (M, 3) array, or mapping of name to (3,)
+            Marker positions; NaN, or omitted, where missing.
+        wrench : (6,) or (3,) array, optional
+            Wrench of the grasp on the body: fx, fy, fz [N], tx, ty, tz [N m], at the time of the
+            frame; or a mapping with ``t_s`` and ``values``, or a list of such mappings; for several
+            sensors a mapping by the number of their grasp. NaN, or None, where missing.
+        readings : mapping of name to numbers, optional
+            Values of custom sensors at the time of the frame; or mappings with ``t_s`` and
+            ``values``, or lists of such mappings. NaN, or None, where missing.
+
+        Raises
+        ------
+        InputError
+            If the values are not a valid frame; the estimator is then unchanged.
+        """
+        poses = parse_pose(pose, self.model.moving_grasps + 1)
+        tracks = parse_markers(markers, self.names)
+        gauges = self.model.experiment.readings
+        instrument_samples = parse_custom_readings(
+            readings, gauges, t_s=parse_time(t_s)
+        )
+        instrument_samples += parse_wrenches(
+            wrench,
+            self.model.wrenches,
+            instruments_before=len(gauges),
+            t_s=parse_time(t_s),
+        )
+        return self.process_frame(
+            Frame(
+                parse_time(t_s),
+                poses,
+                tracks_m=tracks,
+                has_wrench=wrench is not None,
+                instrument_samples=instrument_samples,
+            )
+        )
+
+    @one_blas_thread()
+    def process_frame(self, frame: Frame) -> LiveUpdate:
+        """Process a validated frame and return the result."""
+        began = self.clock()
+        frame, notes = self._checked_frame(frame)
+        if self.intake.is_motion_unknown(frame.t_s):
+            if frame.pose is None:
+                notes.append(
+                    "the pose of the grasp is missing: frames are ignored until it is back"
+                )
+            else:
+                self._restart()
+                notes.append(
+                    "restarted after a gap in the poses, assuming that the body is at rest"
+                )
+        rows, readings, new_notes = self.intake.add_frame(
+            frame.t_s, frame.pose, frame.tracks_m, frame.instrument_samples
+        )
+        notes += new_notes
+        self.budget.start_frame()
+        caught_up = self._catch_up(began, notes)
+        squares = []
+        before = self.clock()
+        while rows:
+            done, new_notes = self._compute_rows(rows, squares)
+            notes = notes + new_notes
+            rows = rows[done:]
+        notes += self._add_samples(readings, squares)
+        self._update_estimate()
+        if (
+            self.first_pass is not None
+            and not self.first_pass.has_failed
+            and self.search is None
+        ):
+            self._relinearise_if_moved(
+                self.first_pass,
+                self.first_pass,
+                began=began,
+                distance=RELINEARISE_DISTANCE_FIRST,
+            )
+        self.budget.frame_s = self.clock() - before
+        done = self._repeat_rows(began, notes, done=caught_up)
+        before = self.clock()
+        self._drop_old_rows()
+        squared_distances = np.concatenate([*squares, np.zeros(0)])
+        squared_distances = squared_distances[np.isfinite(squared_distances)]
+        rms_m = (
+            float(np.sqrt(squared_distances.mean()))
+            if len(squared_distances)
+            else float("nan")
+        )
+        estimates, trust = self._estimates_and_trust(frame.t_s)
+        self.budget.record_remainder(self.clock() - before)
+        latency_s = self.clock() - began
+        self.last = LiveUpdate(
+            frame.t_s,
+            estimates,
+            trust=trust,
+            marker_rms_m=rms_m,
+            notes=tuple(notes),
+            latency_s=latency_s,
+            relinearised=done,
+            marker_distances_m=np.sqrt(squares[-1]) if squares else np.zeros(0),
+        )
+        return self.last
+
+    @property
+    def node_positions_m(self) -> Array | None:
+        """Node positions (n, 3) of the latest row at the estimate [m], to first order around the
+        linearisation point; None before the first row.
+        """
+        if self.first_pass is None:
+            return None
+        x = self.first_pass.latest_positions_at(self.model.transformed(self.p))
+        if x is None:
+            return None
+        node_count = len(self.model.experiment.body.nodes.points_m)
+        return x.reshape(-1, 3)[:node_count]
+
+    @one_blas_thread()
+    def finish(self) -> LiveUpdate | None:
+        """Return the final result of all frames, however long that takes.
+
+        Call it after the last frame.
+
+        If the window holds the whole recording, this is the run of the batch. Otherwise, and if
+        markers were measured between samples, the rows in the window are computed again until the
+        estimate stays.
+
+        Returns
+        -------
+        Update or None
+            The update of the last frame with new estimates and, after a batch run, the root mean
+            square distance of all markers. None if there was no frame.
+        """
+        began = self.clock()
+        notes = ["final estimate after the last frame"]
+        if self.last is None or self.first_pass is None:
+            return self.last
+        last = self.last
+        batch_run = self._solve_batch(self.first_pass, notes)
+        if batch_run is None:
+            rows = self._repeat_until_settled(began, notes)
+            estimates, trust = self._estimates_and_trust(last.t_s)
+        else:
+            rows = len(batch_run.solution.history) * len(self.log)
+            estimates = {
+                name: batch_run.estimates[name] for name in last.estimates
+            }
+            unassessed = Assessment.from_concerns(
+                data_concerns(
+                    ResidualScatter(), self.counts, samples=self.samples
+                )
+            )
+            trust = batch_run.trust.combined_with(unassessed)
+            last = replace(last, marker_rms_m=batch_run.solution.rms_m)
+        return replace(
+            last,
+            estimates=estimates,
+            trust=trust,
+            notes=tuple(notes),
+            latency_s=self.clock() - began,
+            relinearised=rows,
+        )
+
+    def _solve_batch(self, track: WindowPass, notes: list[str]) -> Run | None:
+        """Return the run of the batch solve of the complete recording.
+
+        None if the window does not hold the whole recording, or if the solve is refused, which adds
+        to `notes`.
+        """
+        recording = (
+            None
+            if track.prior.row_count
+            else recording_from_log(self.model, self.intake, log=self.log)
+        )
+        try:
+            return (
+                None
+                if recording is None
+                else solve_recording(self.problem, recording)
+            )
+        except InputError as error:
+            notes.append(
+                f"the final estimate from the complete recording failed: {error.message}"
+            )
+            return None
+
+    def _repeat_until_settled(self, began: float, notes: list[str]) -> int:
+        """Compute the rows in the window again, without a time limit, until no further pass is
+        needed or `FINAL_PASSES` passes are done; return the number of rows. `notes` are extended in
+        place.
+        """
+        rows_per_frame, self.rows = self.rows, FINAL_PASSES * len(self.log)
+        try:
+            return self._repeat_rows(began, notes)
+        finally:
+            self.rows = rows_per_frame
+
+    def _checked_frame(self, frame: Frame) -> tuple[Frame, list[str]]:
+        """Return the frame with NaN for markers that are farther from every grasp than the body
+        reaches, and notes; counts are updated.
+        """
+        notes = []
+        if frame.has_wrench and not self.model.wrenches:
+            self.counts["with a wrench"] += 1
+            if self.counts["with a wrench"] == 1:
+                notes.append(
+                    "wrenches are ignored: no grasp of the problem has a sensor"
+                )
+        if frame.pose is not None:
+            self._last_positions_m = frame.pose[0]
+        distances_m = np.linalg.norm(
+            frame.tracks_m[:, None] - self._last_positions_m, axis=2
+        )
+        self.samples += int(np.isfinite(frame.tracks_m[:, 0]).sum())
+        is_implausible = (distances_m > self._reach_m).all(axis=1)
+        if is_implausible.any():
+            notes.append(self._note_outliers(is_implausible))
+            frame = replace(
+                frame,
+                tracks_m=np.where(
+                    is_implausible[:, None], np.nan, frame.tracks_m
+                ),
+            )
+        return frame, notes
+
+    def _note_outliers(self, wild: NDArray[np.bool_]) -> str:
+        """Add the outliers, given by a mask (M,) of the markers with at least one true value, to
+        the counts; return a note with their names.
+        """
+        self.counts["wild"] += int(wild.sum())
+        names = ", ".join(self.names[m] for m in np.flatnonzero(wild))
+        return f"markers ignored as outliers: {names}"
+
+    def _compute_rows(
+        self, rows: Sequence[LoggedRow], squares: list[Array]
+    ) -> tuple[int, list[str]]:
+        """Compute and log new rows with the first pass, as many as possible at once.
+
+        The first row starts the pass. If the initial state cannot be computed, the frames are
+        discarded; if a later row cannot be simulated, the pass is marked as failed, and rows are
+        only logged.
+
+        Parameters
+        ----------
+        rows : sequence of LoggedRow
+            At least one row.
+        squares : list
+            Squared marker residuals [m²] of the frame; extended in place.
+
+        Returns
+        -------
+        tuple of int and list of str
+            Number of rows that are done, at least one, and notes.
+        """
+        done = 1
+        notes = []
+        track = self.first_pass
+        try:
+            if track is None:
+                self._start_pass(rows[0])
+            elif not track.has_failed:
+                done = track.add_rows(
+                    [row.poses for row in rows[: track.remaining_rows_of_block]]
+                )
+        except SimulationError as error:
+            if track is None:
+                self.intake.reset()
+                return 1, [
+                    f"the initial state of the motion cannot be computed: {error}"
+                ]
+            track.has_failed = True
+            notes = [
+                f"the body cannot be simulated with these parameters: {error}"
+            ]
+        for k, row in enumerate(rows[:done], 1):
+            self.log.append(LoggedRow(row.poses, []))
+            notes += self._add_samples(row.samples, squares, rows=done - k)
+        return done, notes
+
+    def _add_samples(
+        self, readings: Sequence[Sample], squares: list[Array], rows: int = 0
+    ) -> list[str]:
+        """Add samples to the first pass and to the log, and return notes on outliers.
+
+        Outliers among the markers are counted and become NaN. Without a pass nothing is added; if
+        the pass has failed, all samples are added to the log alone, as they are.
+
+        Parameters
+        ----------
+        readings : sequence of Sample
+            Samples after the last row of the log.
+        squares : list of array
+            Squared residuals [m²] of the markers (M,), NaN where missing; an array is appended for
+            each marker sample, in place.
+        rows : int
+            Number of rows computed since the row after which the samples are evaluated.
+        """
+        track = self.first_pass
+        if track is None:
+            return []
+        notes = []
+        sigma_m = self.model.segment.experiment.markers.sigma_m[:, None]
+        if track.has_failed:
+            self.log[-1].samples.extend(readings)
+            return notes
+        all_linearised = track.sweep.linearise_samples(
+            [(reading, rows) for reading in readings]
+        )
+        for reading, linearised in zip(readings, all_linearised, strict=True):
+            if not reading.instrument:
+                residual = linearised.evaluate_at(
+                    self.model.transformed(self.p)
+                )
+                outliers = self._outliers(residual)
+                if outliers.any():
+                    notes.append(self._note_outliers(outliers))
+                    remaining = np.where(
+                        outliers[:, None], np.nan, reading.values
+                    )
+                    reading = reading._replace(values=remaining)
+                    linearised.at_zero[outliers] = residual[outliers] = np.nan
+                squared = np.sum((residual * sigma_m) ** 2, axis=1)
+                squares.append(squared)
+            self.log[-1].samples.append(reading)
+        track.add_residuals(all_linearised)
+        return notes
+
+    def _outliers(self, residual: Array) -> NDArray[np.bool_]:
+        """Return a mask (M,) of markers whose residuals (M, 3), in standard deviations, are far
+        larger than usual; all false while the estimate has not settled, or if most markers would be
+        outliers.
+        """
+        if (
+            self.linearisation_distance > LARGEST_SETTLED_DISTANCE
+            or not 0 < self.scatter.rms < GROSS_MISFIT
+        ):
+            return np.zeros(len(residual), dtype=bool)
+        length = np.sqrt(np.sum(residual**2, axis=1) / 3)
+        outliers = length > OUTLIER_RATIO * max(1.0, self.scatter.rms)
+        if outliers.sum() > np.isfinite(length).sum() / 2:
+            return np.zeros_like(outliers)
+        return outliers
+
+    # Beginnings -------------------------------------------------------------------------------
+
+    def _set_bounds(self) -> None:
+        """Set the bounds of p from the model."""
+        self.lower, self.upper = self.model.collocation.parameter_bounds
+
+    def _new_search(self) -> StiffnessSearch:
+        """Return a new search for initial values."""
+        return StiffnessSearch(self.model, self.p[self.model.collocation.nq :])
+
+    def _warm_up(self) -> tuple[Poses, Array] | None:
+        """Compile the kernels before the first frame, and measure computing times for the budget.
+
+        Return the poses and the positions (3n,) of the start of the problem's recording; None if it
+        cannot be computed.
+        """
+        poses = self.model.first_poses
+        moving_poses = tuple(poses[k] for k in self.model.moving_grasps)
+        no_markers = np.full((len(self.names), 3), np.nan)
+        no_markers[0] = 0.0
+        try:
+            trial = WindowPass(
+                self.model,
+                self.p,
+                prior=self.prior,
+                block_rows=self._block_rows,
+            )
+            row = LoggedRow(moving_poses, [Sample(0.0, no_markers)])
+            for _ in range(self.model.template_rows + 2):
+                trial.repeat_rows([row])
+        except SimulationError:
+            return None
+        self._estimates_at(trial.information, self.p)
+        self.budget = self._measure_times(trial, row)
+        return poses, trial.blocks[0].stored_rows[0].x
+
+    def _measure_times(self, trial: WindowPass, row: LoggedRow) -> TimeBudget:
+        """Return the measured computing times of one and of many repeated rows, each the shortest
+        of several measurements.
+        """
+        took_s: dict[int, float] = {}
+        most = min(
+            trial.rows - 1, self.model.rows_per_chunk, self._block_rows - 1
+        )
+        for count in (1, most) * TIMING_REPETITIONS:
+            again = WindowPass(
+                self.model,
+                self.p,
+                prior=self.prior,
+                block_rows=self._block_rows,
+                base=trial,
+            )
+            again.repeat_rows([row])
+            began = self.clock()
+            again.repeat_rows([row] * count)
+            took_s[count] = min(took_s.get(count, np.inf), self.clock() - began)
+        return TimeBudget.from_times(took_s[1], took_s[most], most)
+
+    def _start_pass(self, row: LoggedRow) -> None:
+        """Start the first pass with the first row, and set unknown marker places from its
+        markers.
+        """
+        model = self.model
+        guesses = []
+        poses = model.all_poses(row.poses)
+        if self._rest is not None and len(poses) == 1:
+            old_rotation, old_position = self._rest[0][0]
+            x = self._rest[1]
+            (rotation, position) = poses[0]
+            guesses = [
+                (
+                    (x.reshape(-1, 3) - old_position)
+                    @ old_rotation
+                    @ rotation.T
+                    + position
+                ).ravel()
+            ]
+        track = WindowPass(
+            model, self.p, prior=self.prior, block_rows=self._block_rows
+        )
+        track.add_rows([row.poses], guesses)
+        marker_samples = [
+            reading.values for reading in row.samples if not reading.instrument
+        ]
+        first = (
+            marker_samples[0]
+            if marker_samples
+            else np.full((len(self.names), 3), np.nan)
+        )
+        self.model = model.with_marker_places(
+            first, track.blocks[0].stored_rows[0].x
+        )
+        if self.model is not model:
+            self._set_bounds()
+            places = self.model.collocation.guess_p[model.collocation.nq :]
+            self.p = np.concatenate([self.p[: model.collocation.nq], places])
+            self.prior = SquareRootInformation.empty(self.model.parameter_count)
+            track = WindowPass(
+                self.model,
+                self.p,
+                prior=self.prior,
+                block_rows=self._block_rows,
+            )
+            track.add_rows([row.poses], guesses)
+        self.first_pass = track
+        self._combined = CombinedPasses.from_passes(track, None)
+
+    def _restart(self) -> None:
+        """Keep the information of all samples so far as a prior, discard passes, log and frames,
+        and wait for a new start.
+        """
+        if self.first_pass is not None:
+            self.prior = self.first_pass.measured_information
+        self.first_pass = self.second_pass = None
+        self.log.clear()
+        self.intake.reset()
+        self.counts["begun anew"] += 1
+
+    # Estimates --------------------------------------------------------------------------------
+
+    @property
+    def linearisation_distance(self) -> float:
+        """Largest distance of the estimate from the linearisation points, in standard errors.
+
+        Infinite if there is no pass, or if it failed.
+        """
+        if self.first_pass is None or self.first_pass.has_failed:
+            return np.inf
+        return self._largest_distance(
+            self.first_pass, self.p, points=self._combined.points
+        )
+
+    def _largest_distance(
+        self, track: WindowPass, p: Array, points: Sequence[Array]
+    ) -> float:
+        """Return the largest distance of p from some points, in the standard errors of a pass; 0
+        without points.
+
+        It is the largest absolute difference of a single material parameter over its standard
+        error; parameters of the recording do not count.
+
+        Parameters
+        ----------
+        track : WindowPass
+            Pass whose standard errors are used.
+        p : (P,)
+            Parameters, not transformed.
+        points : sequence of (P,)
+            Points in transformed parameters, see `StreamingModel.transformed`.
+        """
+        nq = self.model.collocation.nq
+        distances = np.abs(np.array(points) - self.model.transformed(p))[:, :nq]
+        return float(
+            np.max(
+                distances / track.information.standard_errors[:nq], initial=0.0
+            )
+        )
+
+    def _update_estimate(self) -> None:
+        """Set the estimate p, in place, to the minimum of the joint quadratic loss of the first and
+        the second pass; without effect before the first pass, or if it failed.
+        """
+        if self.first_pass is not None and not self.first_pass.has_failed:
+            self._combined = CombinedPasses.from_passes(
+                self.first_pass, self.second_pass
+            )
+            self.p = self._constrained_minimum(
+                self.first_pass, self._combined.information
+            )
+
+    def _constrained_minimum(
+        self, track: WindowPass, known: SquareRootInformation
+    ) -> Array:
+        """Return the p (P,) that minimises the quadratic loss of `known`, within the bounds and the
+        trust region about the linearisation point of a pass.
+        """
+        reach = self._trust * self.model.collocation.reach_p
+        low = np.maximum(self.lower, track.linearisation_point - reach)
+        high = np.minimum(self.upper, track.linearisation_point + reach)
+        best = known.minimiser(
+            self.model.transformed(low), self.model.transformed(high)
+        )
+        return np.clip(self.model.physical(best), low, high)
+
+    def _next_linearisation_point(self, track: WindowPass) -> Array:
+        """Return the next linearisation point p (P,) of a pass.
+
+        It minimises the joint quadratic loss of both passes, with a weak prior at the last
+        linearisation point, which keeps poorly determined parameters there, within bounds and trust
+        region.
+        """
+        size = self.model.parameter_count
+        samples = len(self.log) / self.model.substeps
+        deviation = POINT_PRIOR_DEVIATION * max(1.0, samples / TRIAL_SAMPLES)
+        slopes = np.diag(
+            1 / (deviation * self.model.collocation.reach_p * track.sweep.rates)
+        )
+        information = self._combined.information.with_rows(
+            np.zeros(size), slopes, track.sweep.transformed
+        )
+        return self._constrained_minimum(track, information)
+
+    def _estimates_and_trust(
+        self, t_s: float
+    ) -> tuple[Mapping[str, Estimate], Assessment]:
+        """Return estimates by name and the verdict at the time t_s [s].
+
+        Without a successful first pass the estimates are the values at the current p without
+        standard errors and intervals, and without coefficients of fields, and the only concern is
+        the reason. Otherwise the concerns are those of the data and of the estimates; a pose that
+        is missing too long and a search that goes on add one.
+
+        Calls with a successful pass are counted in `counts`, and every `SCATTER_INTERVAL_FRAMES`
+        such calls the scatter of the residuals, `scatter`, is computed again.
+        """
+        code = ""
+        if self.first_pass is None:
+            code = "solve/no-start"
+        elif self.first_pass.has_failed:
+            code = "solve/not-simulable"
+        elif self.intake.is_motion_unknown(t_s):
+            code = "solve/grasp-lost"
+        elif self.search is not None:
+            code = "solve/seeking"
+        grave = concern_if(bool(code), True, code=code)
+        if self.first_pass is None or self.first_pass.has_failed:
+            values = self.model.collocation.parameters.values(
+                self.p[: self.model.collocation.nq]
+            )
+            estimates_only = {
+                name: Estimate(v)
+                for name, v in values.items()
+                if not is_field_coefficient(name)
+            }
+            return estimates_only, Assessment.from_concerns(grave)
+        if self.counts["looked"] % SCATTER_INTERVAL_FRAMES == 0:
+            self.scatter = self._combined.scatter(
+                self.model.transformed(self.p)
+            )
+        self.counts["looked"] += 1
+        estimates = self._estimates_at(self._combined.information, self.p)
+        grave += data_concerns(self.scatter, self.counts, samples=self.samples)
+        grave += estimate_concerns(estimates, self.linearisation_distance)
+        return estimates, Assessment.from_concerns(grave)
+
+    def _estimates_at(
+        self, known: SquareRootInformation, p: Array
+    ) -> dict[str, Estimate]:
+        """Return estimates with intervals by name, without the coefficients of fields.
+
+        Their variances are scaled by `variance_factor` with the present scatter of the residuals.
+
+        Parameters
+        ----------
+        known : SquareRootInformation
+            Information in transformed parameters, including the priors.
+        p : (P,)
+            Parameters, not transformed; those within `AT_BOUND` of a bound count as at it.
+        """
+        collocation = self.model.collocation
+        nq = self.model.collocation.nq
+        transformed = self.model.transformed(p)
+        parameter_count = self.model.parameter_count
+        factor, quantile = variance_factor(
+            known,
+            transformed,
+            parameter_count=parameter_count,
+            scatter=self.scatter,
+        )
+        rates = self.model.transformation_derivatives(transformed)[:nq]
+        of_q = factor * known.covariance()[:nq, :nq] / np.outer(rates, rates)
+        bounded = ((p - self.lower < AT_BOUND) | (self.upper - p < AT_BOUND))[
+            :nq
+        ]
+        quantiles = np.full(nq, quantile)
+        return user_estimates(
+            collocation.parameters,
+            p[:nq],
+            covariance_q=of_q,
+            at_bound=bounded,
+            quantiles=quantiles,
+        )
+
+    # Passing again ----------------------------------------------------------------------------
+
+    def _repeat_rows(
+        self, began: float, notes: list[str], done: int = 0
+    ) -> int:
+        """Continue or start a second pass within the rest of the budget.
+
+        Parameters
+        ----------
+        began : float
+            Time at which the frame began.
+        notes : list of str
+            Extended in place.
+        done : int
+            Number of rows that were already computed again in this frame.
+
+        Returns
+        -------
+        int
+            Number of rows computed again in this frame.
+        """
+        while self.first_pass is not None:
+            pass_began = self.clock()
+            if self.second_pass is None and self._affordable_rows(
+                done, pass_began - began + self.budget.turn_s
+            ):
+                self.second_pass = self._start_second_pass(
+                    self.first_pass, notes
+                )
+                self.budget.record_relinearisation(self.clock() - pass_began)
+            again = self.second_pass
+            if again is None:
+                break
+            if not done and again.base is not None:
+                self._relinearise_if_moved(
+                    self.first_pass,
+                    again,
+                    began=began,
+                    distance=RELINEARISE_DISTANCE,
+                )
+            affordable = min(
+                self._affordable_rows(done, self.clock() - began),
+                again.repeatable_rows,
+            )
+            if not affordable:
+                break
+            done += self._advance_second_pass(again, affordable, notes=notes)
+        return done
+
+    def _catch_up(self, began: float, notes: list[str]) -> int:
+        """Complete a second pass that lags by few rows, if there is time, before new rows come.
+
+        Return the number of rows that were computed again.
+        """
+        again = self.second_pass
+        if again is None or again.base is None:
+            return 0
+        lag = len(self.log) - again.rows
+        elapsed_s = self.clock() - began
+        if lag > min(
+            again.repeatable_rows,
+            self._affordable_rows(0, elapsed_s + self.budget.frame_s),
+        ):
+            return 0
+        return self._advance_second_pass(again, lag, notes=notes)
+
+    def _advance_second_pass(
+        self, again: WindowPass, count: int, notes: list[str]
+    ) -> int:
+        """Compute up to `count` rows of the second pass; if it has caught up or failed, accept or
+        reject it, or record it as a trial of the search.
+
+        Return the number of rows that were computed. `notes` are extended in place.
+        """
+        before = self.clock()
+        first_row = again.rows
+        try:
+            again.repeat_rows(self.log[first_row : first_row + count])
+        except SimulationError:
+            again.has_failed = True
+        self.budget.record_steps(count, self.clock() - before)
+        if self.search is not None and not self.search.is_done:
+            if again.has_failed or again.rows >= min(
+                self.search.rows, len(self.log)
+            ):
+                self.search.record_trial(again)
+                self.second_pass = None
+        elif (
+            again.has_failed or again.rows == len(self.log)
+        ) and self.first_pass is not None:
+            self._accept_or_reject(self.first_pass, again, notes=notes)
+        return again.rows - first_row
+
+    def _affordable_rows(self, done: int, elapsed_s: float) -> int:
+        """Return how many rows may be computed again: as many as fit into the rest of the time
+        budget of the frame, or, if `rows` per frame is fixed, these minus `done`.
+
+        `elapsed_s` is the time since the frame began [s].
+        """
+        if self.rows is not None:
+            return self.rows - done
+        return self.budget.affordable_steps(self.budget_s - elapsed_s)
+
+    def _start_second_pass(
+        self, track: WindowPass, notes: list[str]
+    ) -> WindowPass | None:
+        """Return a new second pass if one is needed, otherwise None.
+
+        One is needed for the next trial of a search for initial values, which begins if the first
+        pass failed at its start, or if the estimate has moved away from the linearisation points of
+        the first pass `track`. `notes` are extended in place.
+        """
+        search = self.search
+        at_start = track.start[0] is None
+        if search is None and track.has_failed and at_start:
+            search = self.search = self._new_search()
+            notes.append(
+                "searching for initial values over a range of stiffnesses"
+            )
+        p = self.p
+        base = track
+        if search is not None:
+            if not search.is_done and (
+                len(self.log) < search.rows or not at_start
+            ):
+                return None
+            p = search.best if search.is_done else search.next_trial()
+            base = None
+            if p is None:
+                self.search = None
+                notes.append(
+                    "found no initial values over a range of stiffnesses"
+                )
+                return None
+        elif track.has_failed:
+            return None
+        else:
+            p = self._next_linearisation_point(track)
+            if (
+                self._largest_distance(
+                    track, p, points=track.linearisation_points
+                )
+                <= REPEAT_DISTANCE
+                and not track.sweep.needs_another_pass
+            ):
+                return None
+        return WindowPass(
+            self.model,
+            p,
+            prior=track.prior,
+            block_rows=self._block_rows,
+            base=base,
+        )
+
+    def _relinearise_if_moved(
+        self,
+        track: WindowPass,
+        pass_to_move: WindowPass,
+        began: float,
+        distance: float,
+    ) -> None:
+        """Move the linearisation point of a pass to the estimate if it is far and there is time.
+
+        Parameters
+        ----------
+        track : WindowPass
+            First pass, which gives the standard errors.
+        pass_to_move : WindowPass
+            Pass to change.
+        began : float
+            Time at which the frame began.
+        distance : float
+            Distance in standard errors.
+        """
+        current_point = [pass_to_move.sweep.transformed]
+        if (
+            pass_to_move.rows
+            < pass_to_move.last_relinearised_row + self.model.rows_per_chunk
+            or self._largest_distance(track, self.p, points=current_point)
+            <= distance
+        ):
+            return
+        before = self.clock()
+        if self.rows is None and not self._affordable_rows(
+            0, before - began + self.budget.turn_s
+        ):
+            return
+        p = self._next_linearisation_point(track)
+        if self._largest_distance(track, p, points=current_point) > distance:
+            pass_to_move.relinearise_at(p)
+            self.budget.record_relinearisation(self.clock() - before)
+
+    def _accept_or_reject(
+        self, track: WindowPass, again: WindowPass, notes: list[str]
+    ) -> None:
+        """Replace the first pass `track` by the second one, `again`, if that fits about as well as
+        expected, and enlarge the trust region; otherwise discard it and shrink the region. `notes`
+        are extended in place.
+        """
+        self.second_pass = None
+        was_search = self.search is not None
+        self.search = None
+        points = [*track.linearisation_points, again.linearisation_points[0]]
+        expected = max(track.information.loss(point) for point in points)
+        # Of a pass that turned the sum of squares is not that of a simulation.
+        is_within_trust_region = (
+            track.last_relinearised_row
+            and self._largest_distance(
+                track,
+                track.linearisation_point,
+                points=again.linearisation_points,
+            )
+            <= REPEAT_DISTANCE
+        )
+        fits = (
+            track.has_failed
+            or is_within_trust_region
+            or again.loss <= ACCEPTED_RATIO * expected + ACCEPTED_EXCESS
+        )
+        if not again.has_failed and fits:
+            again.base = None
+            self.first_pass = again
+            self._trust = (
+                INITIAL_RADIUS
+                if was_search
+                else min(2 * self._trust, LARGEST_RADIUS)
+            )
+            self._rejected = 0
+            if was_search:
+                notes.append("restarted with another stiffness")
+            self.scatter = CombinedPasses.from_passes(again, None).scatter(
+                again.sweep.transformed
+            )
+        else:
+            reach = self.model.collocation.reach_p
+            length = float(
+                np.abs(
+                    (again.linearisation_point - track.linearisation_point)
+                    / reach
+                ).max()
+            )
+            self._trust = max(RADIUS_REDUCTION * length, 1e-6)
+            self._rejected += 1
+            is_stuck = (
+                self._rejected >= LARGEST_REJECTIONS
+                and self.scatter.rms > GROSS_MISFIT
+            )
+            if (
+                is_stuck
+                and not was_search
+                and not self.counts["searched"]
+                and track.start[0] is None
+            ):
+                self.counts["searched"] += 1
+                self.search = self._new_search()
+                notes.append(
+                    "the estimation does not converge: searching for other initial values over a "
+                    "range of stiffnesses"
+                )
+        self._update_estimate()
+
+    def _drop_old_rows(self) -> None:
+        """Remove the oldest rows if the window is full."""
+        if self.first_pass is None:
+            return
+        most = self._blocks * self._block_rows
+        if self.second_pass is not None and len(self.log) > 2 * most:
+            self.second_pass = None
+        if self.first_pass.has_failed and len(self.log) > 2 * most:
+            self._restart()
+        while (
+            self.second_pass is None
+            and self.first_pass is not None
+            and not self.first_pass.has_failed
+        ):
+            if len(self.log) <= most:
+                break
+            del self.log[: self.first_pass.drop_oldest_block()]

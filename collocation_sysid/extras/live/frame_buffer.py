@@ -1,0 +1,350 @@
+"""Frame buffer: turns frames, as they arrive, into time steps with poses and samples.
+
+The time grid is that of the problem, starting at the first frame with a pose. Time steps without a
+frame (substeps, missing frames, frames between samples) get their poses from a cubic polynomial
+through the last four frames, or a straight line between two frames if more than a few are missing.
+There is no waiting: a time step is available as soon as a pose at its time or later has arrived.
+Markers are evaluated at their own times.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ...common.array_types import Array
+from ...program.streaming import (
+    LARGEST_SAMPLE_DELAY,
+    LoggedRow,
+    Sample,
+    StreamStencil,
+    lagrange_weights,
+)
+from ...recording.sample_times import TIME_TOLERANCE_S
+from .frames import InstrumentSample
+
+# Largest difference, in samples, of two times that count as equal.
+TIME_TOLERANCE_SAMPLES = 0.1
+# Largest gap between frames, in samples, over which poses are interpolated by a cubic polynomial;
+# over a larger gap they are interpolated linearly.
+LARGEST_CUBIC_GAP = 3
+# Largest gap between poses, in samples, after which the motion counts as unknown.
+LARGEST_GAP = 10
+
+
+@dataclass(eq=False)
+class FrameBuffer:
+    """Buffer of the frames that have arrived.
+
+    Attributes
+    ----------
+    interval_s : float
+        Time between samples.
+    substeps : int
+        Time steps between samples.
+    neighbouring_samples : int
+        Number of samples before and after one that its evaluation needs.
+    largest_jump_m : float
+        Largest distance that a grasp can move between two samples.
+    instruments : sequence of StreamStencil
+        Rows that a sample of each instrument needs.
+    counts : Counter
+        Numbers of irregularities of frames, by kind.
+    """
+
+    interval_s: float
+    substeps: int
+    neighbouring_samples: int
+    largest_jump_m: float = np.inf
+    instruments: Sequence[StreamStencil] = ()
+    counts: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard all frames and wait for a new start."""
+        self.start_s: float | None = None
+        self.rows = 0
+        self.last_s = -np.inf
+        self._times: deque[float] = deque(maxlen=8 * LARGEST_SAMPLE_DELAY)
+        self._poses: deque[tuple[float, Array, Array]] = deque(maxlen=4)
+        self._waiting: list[InstrumentSample] = []
+        self._too_late = 0
+
+    @property
+    def last_pose_s(self) -> float | None:
+        """Time of the last pose; None if there is none."""
+        return self._poses[-1][0] if self._poses else None
+
+    def marker_samples(
+        self, log: Sequence[LoggedRow]
+    ) -> Iterator[tuple[float, Array]]:
+        """Yield time and positions (M, 3) of all marker samples; times are in samples from the
+        first row on.
+        """
+        for of, when, tracks_m in self.all_samples(log):
+            if not of:
+                yield when, tracks_m
+
+    def all_samples(
+        self, log: Sequence[LoggedRow]
+    ) -> Iterator[InstrumentSample]:
+        """Yield instrument number, time and values of all samples; markers have the number 0.
+
+        Times are in samples from the first row on. Samples that still wait for rows come last.
+
+        Parameters
+        ----------
+        log : sequence of LoggedRow
+            Rows so far, with their samples.
+        """
+        for number, row in enumerate(log):
+            for back, values, of in row.samples:
+                yield of, (number - back) / self.substeps, values
+        for of, t_s, values in self._waiting:
+            yield of, (t_s - (self.start_s or 0.0)) / self.interval_s, values
+
+    def is_motion_unknown(self, t_s: float) -> bool:
+        """Return whether the time t_s is so long after the last pose that the motion is unknown.
+
+        This is also the case after many frames in turn that were too late, because the sender's
+        clock was set back.
+        """
+        if self._too_late >= LARGEST_GAP:
+            return True
+        gone_s = t_s - (t_s if self.last_pose_s is None else self.last_pose_s)
+        return gone_s > (LARGEST_GAP + TIME_TOLERANCE_SAMPLES) * self.interval_s
+
+    def add_frame(
+        self,
+        t_s: float,
+        pose: tuple[Array, Array] | None,
+        tracks_m: Array,
+        instrument_samples: Sequence[InstrumentSample] = (),
+    ) -> tuple[list[LoggedRow], list[Sample], list[str]]:
+        """Add a frame; return the completed rows, the samples after the last row, and notes.
+
+        The samples are returned separately only if no row is completed; otherwise the rows contain
+        them. A frame with a known time, or one that is too late, is ignored with a note; of a
+        slightly late frame the pose is ignored, and so is a pose that is implausibly far from the
+        last one. Missing poses are interpolated once the next pose arrives.
+
+        Parameters
+        ----------
+        t_s : float
+            Time of the frame.
+        pose : (positions, quaternions) or None
+            Positions (G, 3) [m] and quaternions (G, 4) of the G grasps that move; None if missing.
+        tracks_m : (M, 3)
+            Marker positions, NaN where missing.
+        instrument_samples : sequence of InstrumentSample
+            Samples of custom sensors and wrenches, each with its own time.
+        """
+        sample_s = self.interval_s
+        notes = []
+        if any(
+            abs(t_s - other) <= TIME_TOLERANCE_SAMPLES * sample_s
+            for other in self._times
+        ):
+            self.counts["doubled"] += 1
+            return (
+                [],
+                [],
+                [
+                    f"a frame at {t_s:.6g} s was received before: this one is ignored"
+                ],
+            )
+        late = t_s < self.last_s
+        if late:
+            if self.last_s - t_s > LARGEST_SAMPLE_DELAY * sample_s:
+                self.counts["late"] += 1
+                self._too_late += 1
+                return (
+                    [],
+                    [],
+                    [f"the frame at {t_s:.6g} s is too late: ignored"],
+                )
+            self.counts["unordered"] += 1
+            notes.append(
+                f"the frame at {t_s:.6g} s is late: its markers are used, its pose is not"
+            )
+        self._too_late = 0
+        self._times.append(t_s)
+        has_started = self.start_s is not None or pose is not None
+        if has_started and not self.is_motion_unknown(t_s):
+            if np.isfinite(tracks_m).any():
+                self._waiting.append((0, t_s, tracks_m))
+            on_time = [
+                each
+                for each in instrument_samples
+                if abs(each[1] - t_s) <= LARGEST_SAMPLE_DELAY * sample_s
+            ]
+            self.counts["late"] += len(instrument_samples) - len(on_time)
+            self._waiting += on_time
+        if not late:
+            if pose is not None and self._is_jump(t_s, pose[0]):
+                pose = None
+                notes.append(
+                    f"the pose at {t_s:.6g} s is implausibly far from the last one: ignored"
+                )
+            notes += self._note_gaps(t_s)
+            self.last_s = t_s
+            if pose is not None:
+                self._add_pose(t_s, *pose)
+            else:
+                self.counts["without a pose"] += 1
+        rows = self._completed_rows()
+        return rows, self._available_samples() if not rows else [], notes
+
+    def _is_jump(self, t_s: float, positions_m: Array) -> bool:
+        """Return whether a moving grasp is farther from its last position than it can have moved by
+        the time t_s.
+        """
+        if not self._poses:
+            return False
+        before_s, before_m, _ = self._poses[-1]
+        samples = max(1.0, (t_s - before_s) / self.interval_s)
+        return bool(
+            np.abs(positions_m - before_m).max() > samples * self.largest_jump_m
+        )
+
+    def _note_gaps(self, t_s: float) -> list[str]:
+        """Count missing frames and frames between samples, and return notes about them."""
+        if not np.isfinite(self.last_s):
+            return []
+        missing = round((t_s - self.last_s) / self.interval_s) - 1
+        offset = (
+            (t_s - self.start_s) / self.interval_s
+            if self.start_s is not None
+            else 0.0
+        )
+        notes = []
+        if missing > 0:
+            self.counts["dropped"] += missing
+            notes.append(
+                f"{missing} frames before {t_s:.6g} s are missing: bridged by interpolation"
+            )
+        if abs(offset - round(offset)) > TIME_TOLERANCE_SAMPLES:
+            if not self.counts["off the grid"]:
+                notes.append(
+                    f"the frame at {t_s:.6g} s lies between samples: markers are evaluated at the "
+                    "times of their frames, by interpolation"
+                )
+            self.counts["off the grid"] += 1
+        return notes
+
+    def _add_pose(
+        self, t_s: float, positions_m: Array, quaternions: Array
+    ) -> None:
+        """Store a pose, with the sign of each quaternion nearest to the previous one.
+
+        The time of the first pose becomes `start_s`.
+
+        Parameters
+        ----------
+        t_s : float
+            Time [s], later than that of the previous pose.
+        positions_m : (G, 3)
+        quaternions : (G, 4)
+            Unit quaternions x y z w of the moving grasps.
+        """
+        if self._poses:
+            before = self._poses[-1][2]
+            signs = np.where(
+                np.sum(quaternions * before, axis=1) < 0, -1.0, 1.0
+            )
+            quaternions = quaternions * signs[:, None]
+        elif self.start_s is None:
+            self.start_s = t_s
+        self._poses.append((t_s, positions_m, quaternions))
+
+    def _time_s(self, row: int) -> float:
+        """Return the time of a row, given by index."""
+        assert self.start_s is not None
+        return self.start_s + row * self.interval_s / self.substeps
+
+    def _completed_rows(self) -> list[LoggedRow]:
+        """Return the rows for which poses are available now, with the samples that are read after
+        them.
+        """
+        rows: list[tuple[Array, Array, list[Sample]]] = []
+        if self.start_s is None:
+            return []
+        until_s = self._poses[-1][0] + TIME_TOLERANCE_SAMPLES * self.interval_s
+        while self._time_s(self.rows) <= until_s:
+            pose = self._pose_at(self._time_s(self.rows))
+            self.rows += 1
+            rows.append((*pose, self._available_samples()))
+        if not rows:
+            return []
+        places, quaternions, readings = zip(*rows, strict=True)
+        matrices = Rotation.from_quat(np.concatenate(quaternions)).as_matrix()
+        rotations = matrices.reshape(len(rows), -1, 3, 3)
+        poses = (
+            tuple(zip(*each, strict=True))
+            for each in zip(rotations, places, strict=True)
+        )
+        return [LoggedRow(*each) for each in zip(poses, readings, strict=True)]
+
+    def _pose_at(self, t_s: float) -> tuple[Array, Array]:
+        """Return positions (G, 3) and quaternions (G, 4), not normalised, interpolated through the
+        last poses: cubic, or linear across a large gap.
+        """
+        for at_s, positions_m, quaternions in self._poses:
+            if abs(at_s - t_s) <= TIME_TOLERANCE_S:
+                return positions_m, quaternions
+        times, places, quaternions = (
+            list(each) for each in zip(*self._poses, strict=True)
+        )
+        has_large_gap = any(
+            b - a
+            > (LARGEST_CUBIC_GAP + TIME_TOLERANCE_SAMPLES) * self.interval_s
+            for a, b in pairwise(times)
+        )
+        used = slice(-2, None) if has_large_gap else slice(None)
+        weights = lagrange_weights(t_s, times[used])
+        position_m, quaternion = (
+            np.einsum("k,kgi->gi", weights, each[used])
+            for each in (places, quaternions)
+        )
+        return position_m, quaternion
+
+    def _available_samples(self) -> list[Sample]:
+        """Return the waiting samples that can be evaluated with the rows so far, and remove them
+        from the buffer; samples before the start are discarded.
+        """
+        if self.start_s is None or not self.rows:
+            return []
+        now_s = self._time_s(self.rows - 1)
+        step_s = self.interval_s / self.substeps
+        room_s = TIME_TOLERANCE_SAMPLES * self.interval_s
+        latest_s = now_s - self.neighbouring_samples * self.interval_s + room_s
+
+        def ready(of: int, t_s: float) -> bool:
+            """Return whether the rows that a sample needs are available."""
+            if not of:
+                return t_s <= latest_s
+            instrument = self.instruments[of - 1]
+            rows = instrument.rows_of_sample(
+                self.rows - 1 - (now_s - t_s) / step_s
+            )
+            return rows.stop + instrument.delay <= self.rows
+
+        available = [each for each in self._waiting if ready(*each[:2])]
+        self._waiting = [each for each in self._waiting if not ready(*each[:2])]
+        # Before the first row nothing is known.
+        available = [
+            each
+            for each in available
+            if each[1] >= self.start_s - (0 if each[0] else room_s)
+        ]
+        return [
+            Sample((now_s - t_s) / step_s, values, of)
+            for of, t_s, values in available
+        ]

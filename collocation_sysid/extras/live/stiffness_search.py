@@ -1,0 +1,90 @@
+"""Search for initial values over a range of stiffness, within the computing time of frames.
+
+It is used if there is no guess, or if the estimation does not converge from the guess.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...methods.stiffness_scan import (
+    STIFFEST_PA,
+    typical_parameters,
+    without_guesses,
+)
+from ...program.streaming import StreamingModel
+from .window_pass import WindowPass
+
+# Number of samples that decide which stiffness to start from.
+TRIAL_SAMPLES = 20
+# Ratio of a trial's sum of squares to the smallest one above which the trial has failed.
+FAILURE_RATIO = 9.0
+# Stiffnesses of the trials [Pa], two per decade.
+TRIED_PA = STIFFEST_PA * 10.0 ** (-0.5 * np.arange(11))
+
+
+class StiffnessSearch:
+    """Search for initial values, from stiff to soft.
+
+    Parameters
+    ----------
+    model : StreamingModel
+    phi : (k,)
+        Nuisance parameters of every trial.
+
+    Attributes
+    ----------
+    rows : int
+        Number of rows of every trial.
+    """
+
+    def __init__(self, model: StreamingModel, phi: Array) -> None:
+        self.rows = (TRIAL_SAMPLES - 1) * model.substeps + 1
+        forgotten = without_guesses(model.collocation).parameters
+        self._waiting = [
+            typical_parameters(forgotten, young).guess_q for young in TRIED_PA
+        ]
+        self._phi = phi
+        self._tried: list[tuple[float, Array]] = []
+
+    @property
+    def is_done(self) -> bool:
+        """Whether no trial is left."""
+        return not self._waiting
+
+    def next_trial(self) -> Array | None:
+        """Return the parameters p of the next trial; None if no trial is left. `record_trial`
+        advances to the one after it.
+        """
+        return (
+            np.concatenate([self._waiting[0], self._phi])
+            if self._waiting
+            else None
+        )
+
+    def record_trial(self, track: WindowPass) -> None:
+        """Record the loss of a pass as the result of the next trial.
+
+        After at least one success and at least three trials, two in a row that are far worse than
+        the best end the search.
+        """
+        self._waiting.pop(0)
+        self._tried.append(
+            (
+                np.inf if track.has_failed else track.loss,
+                track.linearisation_point,
+            )
+        )
+        least = min(loss for loss, _ in self._tried)
+        worse = [not loss <= FAILURE_RATIO * least for loss, _ in self._tried]
+        if np.isfinite(least) and all(worse[-2:]) and len(worse) > 2:
+            self._waiting.clear()
+
+    @property
+    def best(self) -> Array | None:
+        """Parameters p of the trial with the smallest loss; None if every trial failed. At least
+        one trial must be recorded.
+        """
+        loss, p = min(self._tried, key=lambda each: each[0])
+        return p if np.isfinite(loss) else None

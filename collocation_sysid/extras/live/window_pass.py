@@ -1,0 +1,391 @@
+"""Forward pass over a window of recent rows, with the information that later passes and the prior
+need.
+
+The window consists of blocks of rows. Each block begins with a state, and its residuals are one
+triangular factor at the linearisation point of the pass. When the window is full, the oldest block
+leaves: its information becomes part of the prior, and later passes begin at the state of the next
+block. That state is a function of p alone, since the motion has no noise. Therefore it is not
+estimated; its derivatives are those of the pass that computed it, and later passes move it along
+them (first-estimate Jacobians, as in filters, so that no direction gains information from being
+linearised twice).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...program.streaming import (
+    LinearisedResidual,
+    LoggedRow,
+    SquareRootInformation,
+    StoredRow,
+    StreamingModel,
+    StreamingSweep,
+    SweepState,
+)
+from ...recording.poses import Poses
+from .live_trust import ResidualScatter
+
+# Largest number of samples that a second pass may lag behind for its residuals to be used.
+LARGEST_LAG = 20
+
+
+@dataclass(eq=False)
+class WindowBlock:
+    """Some consecutive rows of a window.
+
+    Attributes
+    ----------
+    start : SweepState or None
+        State before the first row; None at the start of the recording.
+    linearisation_point : (P,)
+        Linearisation point of that state.
+    stored_rows : list of StoredRow
+        Rows for later passes.
+    residuals : list of LinearisedResidual
+        Linearised residuals of the samples.
+    """
+
+    start: SweepState | None
+    linearisation_point: Array
+    stored_rows: list[StoredRow] = field(default_factory=list)
+    residuals: list[LinearisedResidual] = field(default_factory=list)
+
+
+class WindowPass:
+    """Forward pass at parameters p over the window.
+
+    Parameters
+    ----------
+    model : StreamingModel
+    p : (P,)
+        Linearisation point, parameters that are not transformed.
+    prior : SquareRootInformation
+        Information of the samples before the window.
+    block_rows : int
+        Number of rows of a block.
+    base : WindowPass, optional
+        Pass that is repeated; it provides initial guesses of the positions.
+
+    Attributes
+    ----------
+    rows : int
+        Number of rows in the window so far.
+    has_failed : bool
+        Whether a row could not be solved.
+    """
+
+    def __init__(
+        self,
+        model: StreamingModel,
+        p: Array,
+        prior: SquareRootInformation,
+        block_rows: int,
+        base: WindowPass | None = None,
+    ) -> None:
+        first_block = (
+            base.blocks[0] if base is not None and base.blocks else None
+        )
+        self.prior = prior
+        self.base = base
+        self.block_rows = block_rows
+        self.start = (
+            (None, p)
+            if first_block is None
+            else (first_block.start, first_block.linearisation_point)
+        )
+        self.model = model
+        self.sweep = StreamingSweep(
+            model,
+            p,
+            prior.with_problem(model.prior_information(p)),
+            *self.start,
+        )
+        self.blocks: list[WindowBlock] = []
+        self._base_changes = [(0, self.sweep.transformed)]
+        self.has_failed = False
+        self.rows = 0
+        self._off: list[Array] = []
+
+    @property
+    def linearisation_point(self) -> Array:
+        """Parameters of the current linearisation point (P,), not transformed."""
+        return self.sweep.p
+
+    @property
+    def information(self) -> SquareRootInformation:
+        """Information at p in the transformed parameters, including the prior."""
+        return self.sweep.information
+
+    @property
+    def loss(self) -> float:
+        """Loss of measurements and prior at p."""
+        return self.information.loss(self.sweep.transformed)
+
+    def add_rows(
+        self, poses: Sequence[Poses], guesses: Sequence[Array] = ()
+    ) -> int:
+        """Compute further rows of one block and return how many; `add_residuals` adds their
+        samples.
+
+        Parameters
+        ----------
+        poses : sequence of Poses
+        guesses : sequence of (3n,), optional
+            Initial guesses of the positions; by default those of `base`, otherwise extrapolated.
+
+        Raises
+        ------
+        SimulationError
+            If a row cannot be solved.
+        """
+        if self.rows % self.block_rows == 0:
+            new = (
+                self.start
+                if not self.blocks
+                else (self.sweep.state, self.linearisation_point)
+            )
+            self.blocks.append(WindowBlock(*new))
+        rows_of_base = self._rows_of_base(len(poses))
+        computed = self.sweep.advance(
+            poses, guesses or self._initial_guesses(rows_of_base)
+        )
+        last_rows = list(zip(computed, rows_of_base, strict=False))[-2:]
+        errors = [
+            stored.x - self._predicted_positions(base)
+            for stored, base in last_rows
+        ]
+        self._off = [*self._off, *errors][-2:]
+        self.blocks[-1].stored_rows += computed
+        self.rows += len(computed)
+        return len(computed)
+
+    def relinearise_at(self, p: Array) -> None:
+        """Continue at another linearisation point p (P,), not transformed; previous rows keep
+        theirs.
+
+        The information so far is kept, and the state after the last row is moved to p along its
+        columns. Rows from here on are linearised at p.
+        """
+        self.sweep = StreamingSweep(
+            self.model,
+            p,
+            prior_information=self.information,
+            start=self.sweep.state,
+            at=self.linearisation_point,
+        )
+        self._base_changes.append((self.rows, self.sweep.transformed))
+
+    @property
+    def last_relinearised_row(self) -> int:
+        """Index of the row of the window at which the linearisation point was changed last.
+
+        0 if never.
+        """
+        return self._base_changes[-1][0]
+
+    @property
+    def linearisation_points(self) -> list[Array]:
+        """Transformed parameters at which the rows of the window are linearised."""
+        return self.linearisation_points_from(0)
+
+    def linearisation_points_from(self, row: int) -> list[Array]:
+        """Return the transformed parameters (P,) at which the rows from the index `row` of the
+        window on are linearised, in order of the rows; one for each change.
+        """
+        before = [
+            transformed
+            for first, transformed in self._base_changes
+            if first <= row
+        ]
+        return [
+            *before[-1:],
+            *[
+                transformed
+                for first, transformed in self._base_changes
+                if first > row
+            ],
+        ]
+
+    def add_residuals(self, residuals: Sequence[LinearisedResidual]) -> None:
+        """Add the linearised residuals of samples after the last rows."""
+        self.blocks[-1].residuals += residuals
+        self.sweep.add_residuals(residuals)
+
+    @property
+    def residuals(self) -> list[LinearisedResidual]:
+        """Linearised residuals of all samples in the window."""
+        return [
+            residual for block in self.blocks for residual in block.residuals
+        ]
+
+    def repeat_rows(self, rows: Sequence[LoggedRow]) -> None:
+        """Compute logged rows and add their samples, as many at once as the block allows; raise
+        `SimulationError` if one cannot be solved.
+        """
+        done = self.add_rows(
+            [row.poses for row in rows[: self.repeatable_rows]]
+        )
+        pairs = [
+            (each, done - k)
+            for k, row in enumerate(rows[:done], 1)
+            for each in row.samples
+        ]
+        self.add_residuals(self.sweep.linearise_samples(pairs))
+
+    @property
+    def remaining_rows_of_block(self) -> int:
+        """Largest number of rows that can be computed at once: those left in the block."""
+        return min(
+            self.model.rows_per_chunk,
+            self.block_rows - self.rows % self.block_rows,
+        )
+
+    @property
+    def repeatable_rows(self) -> int:
+        """Largest number of rows that can be repeated at once; 1 without an initial guess."""
+        rows_of_base = 0 if self.base is None else self.base.rows - self.rows
+        return max(1, min(rows_of_base, self.remaining_rows_of_block))
+
+    def _rows_of_base(self, count: int) -> list[StoredRow]:
+        """Return the next `count` rows of the pass that is repeated; none if it has fewer."""
+        if self.base is None or self.rows + count > self.base.rows:
+            return []
+        places = (divmod(self.rows + k, self.block_rows) for k in range(count))
+        return [
+            self.base.blocks[block].stored_rows[place]
+            for block, place in places
+        ]
+
+    def _initial_guesses(self, known: Sequence[StoredRow]) -> list[Array]:
+        """Return initial guesses of positions, (3n,) each, from rows of the pass that is repeated.
+
+        Each is extrapolated to p with the sensitivities of its row; the error of this prediction at
+        the last two rows is extrapolated and added.
+        """
+        if not known:
+            return []
+        # Straight on from the last two, where there are two.
+        previous_error, last_error = (
+            [np.zeros_like(known[0].x)] * 2 + self._off[:1] + self._off
+        )[-2:]
+        predicted = map(self._predicted_positions, known)
+        return [
+            x + last_error + k * (last_error - previous_error)
+            for k, x in enumerate(predicted, 1)
+        ]
+
+    def latest_positions_at(self, transformed: Array) -> Array | None:
+        """Return the positions (3n,) of the latest row at transformed parameters (P,), to first
+        order; None if there is no row in the window.
+        """
+        if not self.blocks or not self.blocks[-1].stored_rows:
+            return None
+        return self._positions_at(self.blocks[-1].stored_rows[-1], transformed)
+
+    def _predicted_positions(self, base: StoredRow) -> Array:
+        """Return the positions of a stored row, moved to p along its columns."""
+        return self._positions_at(base, self.sweep.transformed)
+
+    def _positions_at(self, base: StoredRow, transformed: Array) -> Array:
+        """Return the positions (3n,) of a stored row at transformed parameters (P,)."""
+        step = (transformed - base.transformed)[self.sweep.moving]
+        return base.x + base.columns @ step.astype(np.float32)
+
+    def drop_oldest_block(self) -> int:
+        """Add the oldest block to the prior and remove it from the window.
+
+        Return its number of rows.
+        """
+        block = self.blocks.pop(0)
+        self.rows -= len(block.stored_rows)
+        changes = [
+            (max(0, row - len(block.stored_rows)), transformed)
+            for row, transformed in self._base_changes
+        ]
+        self._base_changes = [
+            *[turn for turn in changes if not turn[0]][-1:],
+            *[t for t in changes if t[0]],
+        ]
+        self.prior = self.sweep.with_residuals(self.prior, block.residuals)
+        self.start = (self.blocks[0].start, self.blocks[0].linearisation_point)
+        return len(block.stored_rows)
+
+    @property
+    def measured_information(self) -> SquareRootInformation:
+        """Information of all samples within the window and before it, without stated priors."""
+        information = self.prior
+        for block in self.blocks:
+            information = self.sweep.with_residuals(
+                information, block.residuals
+            )
+        return information
+
+
+class CombinedPasses(NamedTuple):
+    """Joint information of two passes over the same frames.
+
+    Each sample counts as linearised last.
+
+    Attributes
+    ----------
+    information : SquareRootInformation
+    residuals : list of LinearisedResidual
+        Linearised residuals of all samples.
+    points : list of (P,)
+        Transformed parameters at which they are linearised.
+    """
+
+    information: SquareRootInformation
+    residuals: list[LinearisedResidual]
+    points: list[Array]
+
+    @classmethod
+    def from_passes(
+        cls, track: WindowPass, again: WindowPass | None
+    ) -> CombinedPasses:
+        """Return the joint information of a pass and of a repetition that has nearly caught up with
+        it.
+
+        If the repetition is None, has failed or lags behind too far, that of the pass alone.
+        """
+        residuals = track.residuals
+        repeated = (
+            again.residuals
+            if again is not None and again.base is not None
+            else []
+        )
+        remaining = residuals[len(repeated) :]
+        if (
+            again is None
+            or again.has_failed
+            or not repeated
+            or len(remaining) > min(LARGEST_LAG, len(repeated))
+        ):
+            return cls(track.information, residuals, track.linearisation_points)
+        points = [
+            *again.linearisation_points,
+            *track.linearisation_points_from(again.rows),
+        ]
+        return cls(
+            track.sweep.with_residuals(again.information, remaining),
+            [*repeated, *remaining],
+            points,
+        )
+
+    def scatter(self, transformed: Array) -> ResidualScatter:
+        """Return the scatter of the markers' residuals at transformed parameters, to first
+        order.
+        """
+        return ResidualScatter.from_residuals(
+            [
+                residual.evaluate_at(transformed)
+                for residual in self.residuals
+                if not residual.instrument
+            ]
+        )

@@ -1,0 +1,728 @@
+"""Choice of a model: prediction of held-out recordings, and Akaike's criterion.
+
+The prediction decides. All models are compared at the same samples, with the same noise, so their
+squared errors are compared block by block in time; the standard error follows from the scatter of
+the difference between blocks, and of the logarithmic ratio between recordings (Diebold & Mariano
+1995, with means of batches). Of the models that predict as well as the best, within one standard
+error, the one with the fewest parameters is chosen.
+
+Of a single recording the last third is held out: its samples are removed, and the simulation with
+the estimates from the rest continues into it. Otherwise each recording is left out in turn and
+simulated with the estimates from the others, with its own nuisance parameters fitted. Markers are
+compared, or forces if there are no markers.
+
+Akaike's criterion is −2 ln L + 2k. For n independent normal errors of unknown variance −2 ln L is n
+ln(RSS/n), up to a constant that all models of the same data share. Residuals of an imperfect model
+are not independent: ten samples with the same error count as one. n is therefore the equivalent
+number of independent samples: samples over 1 + 2 Σ_k (1 − k/T) ρ_k along time, and observables by
+(tr Σ)²/tr Σ² across, with the ρ and Σ of `statistics.residuals.autocorrelation`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from math import exp, log, sqrt
+from typing import Any
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...errors import InputError, SimulationError
+from ...methods.solution import Solution, pooled_wrench_rms
+from ...problem import Problem, RolloutOptions
+from ...program.simulation import with_markers
+from ...recording.custom_sensor import Gauge
+from ...recording.experiment import Experiment
+from ...recording.grasp import Grasp
+from ...recording.specimen import STRESS_UNIT
+from ...runs.forward_simulation import ForwardSimulation, simulate_experiment
+from ...runs.solving import solve
+from ...statistics.budget.consider_analysis import changes_of_assumptions
+from ...statistics.budget.uncertainty_budget import VarianceSources, budget
+from ...statistics.linearised import (
+    LinearisedFit,
+    ResidualBlock,
+    factorise_information,
+    linearise_fit,
+    parameter_values,
+)
+from ...statistics.residuals.autocorrelation import (
+    ErrorProcess,
+    error_processes,
+)
+from ...statistics.residuals.noise_level import ROUNDING
+from ...statistics.uncertainty import uncertainty_from_fit
+from .law_disagreements import Disagreement, find_disagreements
+from .run_execution import Record
+from .study_planning import PlannedRun, fitted_recordings
+from .study_rows import Row
+
+# Predictions closer than this, as a logarithm, are considered equal.
+EQUIVALENT_ERROR = 0.01
+# ΔAIC beyond which a model has hardly any support (Burnham & Anderson 2002, section 2.6).
+NO_SUPPORT = 10.0
+# ΔAIC below which it has substantial support.
+SUPPORT = 2.0
+# Standard errors by which predictions differ for certain.
+SURE = 2.0
+# Standard errors by which predictions probably differ.
+LIKELY = 1.0
+
+
+def model_rows(
+    planned: Sequence[PlannedRun], records: Mapping[str, Record]
+) -> list[Row]:
+    """Return one row for each model, in their order.
+
+    Parameters
+    ----------
+    planned : sequence of PlannedRun
+        Runs of a comparison of models.
+    records : mapping of str to Record
+        Finished runs by key.
+
+    Returns
+    -------
+    list of Row
+        Values are None if they are not known.
+    """
+    of_model: dict[str, dict[str, Any]] = {}
+    for run in planned:
+        fit = (records.get(run.key) or {}).get("model") or {}
+        of_model.setdefault(run.varied_values["model"], {})[
+            run.test_name or ""
+        ] = fit
+    rows = [_model_row(label, fits) for label, fits in of_model.items()]
+    _add_criterion(rows)
+    _add_ratios(rows)
+    chosen = chosen_row(rows)
+    for row in rows:
+        row["chosen"] = row is chosen
+    return rows
+
+
+def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
+    """Return the row of a model from its fits by name of the held-out recording; "" is the fit to
+    all. Unknown values are None.
+    """
+    complete_fit = fits.get("", {})
+    predictions = {
+        name: fit.get("prediction") or {} for name, fit in fits.items() if name
+    }
+    evidence = complete_fit.get("evidence")
+    free = complete_fit.get("free")
+    unit = next((each["unit"] for each in predictions.values() if each), "m")
+    return {
+        "model": label,
+        "status": complete_fit.get("status", "missing"),
+        "converged": bool(complete_fit.get("converged")),
+        "free": None if free is None else len(free),
+        "unit": unit,
+        "rms": (complete_fit.get("rms") or {}).get(unit),
+        "held_out_rms": _pooled_rms([*predictions.values()]),
+        "predictions": {
+            name: each.get("rms") for name, each in predictions.items()
+        },
+        "blocks": {
+            name: each.get("blocks") for name, each in predictions.items()
+        },
+        "failures": {
+            n: fits[n]["failure"] for n in predictions if fits[n].get("failure")
+        },
+        "evidence": evidence,
+        "parameters": complete_fit.get("parameters") or {},
+        "budget": complete_fit.get("budget") or {},
+        "total_s": sum(each.get("time_s") or 0.0 for each in fits.values()),
+    }
+
+
+def _pooled_rms(predictions: Sequence[Mapping[str, Any]]) -> float | None:
+    """Return the RMS over all predictions; None if one is missing or their units differ."""
+    if not predictions or any(each.get("rms") is None for each in predictions):
+        return None
+    if len({each["unit"] for each in predictions}) > 1:
+        return None  # metres and newtons have no common measure
+    samples = sum(each["samples"] for each in predictions)
+    return sqrt(
+        sum(each["samples"] * each["rms"] ** 2 for each in predictions)
+        / samples
+    )
+
+
+def _add_criterion(rows: Sequence[Row]) -> None:
+    """Add ΔAIC to the rows, in place, and the equivalent number of independent measurements of the
+    best fit; None where they are unknown.
+    """
+    known = [row for row in rows if row["converged"] and row["evidence"]]
+    evidences = [Evidence(**row["evidence"]) for row in known]
+    best = min(evidences, key=lambda e: e.misfit, default=None)
+    values = [e.criterion(best.independent) for e in evidences] if best else []
+    for row in rows:
+        row["independent"] = best.independent if best else None
+        row["delta_aic"] = None
+    for row, value in zip(known, values, strict=True):
+        row["delta_aic"] = value - min(values)
+
+
+def _add_ratios(rows: Sequence[Row]) -> None:
+    """Add to each row, in place, the logarithm of the ratio of its prediction error to the smallest
+    one, with its standard error; None without a prediction.
+    """
+    best = _best_prediction(rows)
+    for row in rows:
+        row["log_ratio"] = row["log_ratio_error"] = None
+        if best is None or row["held_out_rms"] is None:
+            continue
+        names = [name for name, rms in best["predictions"].items() if rms]
+        logs = [
+            log(row["predictions"][name] / best["predictions"][name])
+            for name in names
+        ]
+        row["log_ratio"] = log(row["held_out_rms"] / best["held_out_rms"])
+        row["log_ratio_error"] = _log_ratio_error(row, best, logs=logs)
+
+
+def _log_ratio_error(row: Row, best: Row, logs: Sequence[float]) -> float:
+    """Return the standard error of the logarithmic ratio of a row's prediction error to the best
+    one; 0 for the best.
+
+    It is the larger of the errors from the scatter between blocks in time and from the scatter
+    `logs` between recordings.
+    """
+    if row is best:
+        return 0.0
+    pairs = [
+        (row["blocks"][name], best["blocks"][name]) for name in best["blocks"]
+    ]
+    squares, best_squares = (
+        np.concatenate(each) for each in zip(*pairs, strict=True)
+    )
+    change = squares - best_squares
+    # d ln √(a/b) = (a − b) / (a + b) to first order
+    of_sum = float(np.std(change, ddof=1)) * sqrt(len(change))
+    between = (
+        float(np.std(logs, ddof=1)) / sqrt(len(logs)) if len(logs) > 1 else 0.0
+    )
+    return max(between, of_sum / float(np.sum(squares + best_squares)))
+
+
+def _best_prediction(rows: Sequence[Row]) -> Row | None:
+    """Return the converged model with the smallest prediction error for held-out data; None if
+    nothing was predicted.
+    """
+    predicted = [r for r in rows if r["converged"] and r["held_out_rms"]]
+    return min(predicted, key=lambda r: r["held_out_rms"], default=None)
+
+
+def chosen_row(rows: Sequence[Row]) -> Row | None:
+    """Return the model to use: the one with fewest parameters among those that predict equally
+    well; None if none could be fitted.
+
+    Without predictions it is the one with the least AIC.
+    """
+    best = _best_prediction(rows)
+    if best is None:
+        fitted = [row for row in rows if row["delta_aic"] is not None]
+        return min(fitted, key=lambda r: r["delta_aic"], default=None)
+    as_good = _equally_good(rows, LIKELY)
+    return min(as_good, key=lambda row: (row["free"], row["held_out_rms"]))
+
+
+def _equally_good(rows: Sequence[Row], errors: float) -> list[Row]:
+    """Return the converged models whose prediction error is equal to the best one within `errors`
+    standard errors, or practically equal.
+    """
+    return [
+        row
+        for row in rows
+        if row["converged"]
+        and row["log_ratio"] is not None
+        and row["log_ratio"]
+        <= max(EQUIVALENT_ERROR, errors * row["log_ratio_error"])
+    ]
+
+
+def advice(rows: Sequence[Row]) -> str:
+    """Return in words which model to use, why, and how certain that is.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `model_rows`, which contain "chosen".
+    """
+    chosen = next((row for row in rows if row["chosen"]), None)
+    if chosen is None:
+        return "No model could be fitted."
+    others = [row for row in rows if row is not chosen and row["converged"]]
+    use = f"Use {chosen['model']}"
+    if not others:
+        return f"{use}: no other could be fitted."
+    if chosen["held_out_rms"] is None:
+        rival = min(others, key=lambda row: row["delta_aic"])
+        return (
+            f"{use}, by AIC alone, because nothing could be predicted: its AIC is "
+            f"{rival['delta_aic']:.3g} lower than that of {rival['model']}."
+        )
+    predicted = [row for row in others if row["log_ratio"] is not None]
+    failures = [
+        _failed_prediction(row, chosen)
+        for row in others
+        if row["log_ratio"] is None
+    ]
+    if not predicted:
+        return " ".join(
+            [f"{use}: no other model predicts the held-out samples.", *failures]
+        )
+    rival = min(predicted, key=lambda row: row["log_ratio"])
+    sentences = [
+        f"{use}: {_comparison(chosen, rival)}.",
+        _certainty(chosen, rival),
+        *failures,
+    ]
+    return " ".join(
+        [*sentences, *(each.sentence for each in law_disagreements(rows))]
+    )
+
+
+def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
+    """Return the estimates in which the models that predict as well as the best disagree.
+
+    Models predict as well as the best within `SURE` standard errors. Empty if no row is chosen, or
+    if the chosen one has no prediction error ("log_ratio" is None).
+    """
+    chosen = next((row for row in rows if row["chosen"]), None)
+    if chosen is None or chosen["log_ratio"] is None:
+        return []
+    return find_disagreements(_equally_good(rows, SURE), chosen)
+
+
+def _failed_prediction(row: Row, chosen: Row) -> str:
+    """Return a sentence on a model with which some held-out samples cannot be predicted, and on its
+    AIC if that speaks for it.
+    """
+    without = " and ".join(
+        f"'{name}'" for name, rms in row["predictions"].items() if not rms
+    )
+    sentence = f"{row['model']} does not predict {without}"
+    if (more := chosen["delta_aic"] - row["delta_aic"]) <= NO_SUPPORT:
+        return f"{sentence}."
+    return (
+        f"{sentence}, but fits all recordings better (its AIC is {more:.3g} lower): only the "
+        "held-out samples determine its parameters, and more such recordings would decide."
+    )
+
+
+def _comparison(chosen: Row, rival: Row) -> str:
+    """Return the comparison of the chosen model with its closest rival, in words."""
+    prediction = f"its prediction error for held-out samples is {_prediction_text(chosen)}"
+    ratio, error = _log_ratio_between(chosen, rival)
+    more = chosen["free"] - rival["free"]
+    count = f"{abs(more)} parameter{'s' * (abs(more) > 1)}"
+    size = f" with {count} {'more' if more > 0 else 'fewer'}" if more else ""
+    support = rival["delta_aic"] - chosen["delta_aic"]
+    better, worse = (chosen, rival) if support > 0 else (rival, chosen)
+    return (
+        f"{prediction}{size}, that of {rival['model']} is {_prediction_text(rival)}, "
+        f"{exp(ratio):.3g} times as large (±{100 * error:.2g} %). The AIC of {better['model']} is "
+        f"{abs(support):.3g} lower than that of {worse['model']}"
+    )
+
+
+def _prediction_text(row: Row) -> str:
+    """Return the prediction error of a model, which must be known, as text with its unit."""
+    factor, unit = display_unit(row["unit"])
+    return f"{factor * row['held_out_rms']:.3g} {unit}"
+
+
+def display_unit(unit: str) -> tuple[float, str]:
+    """Return factor and unit for display: metres as millimetres, pascals as kilopascals, other
+    units unchanged.
+    """
+    return {"m": (1e3, "mm"), STRESS_UNIT: (1e-3, "kPa")}.get(unit, (1.0, unit))
+
+
+def _log_ratio_between(chosen: Row, rival: Row) -> tuple[float, float]:
+    """Return the logarithmic ratio of the rival's error to the chosen model's, and its
+    standard error.
+    """
+    ratio = rival["log_ratio"] - chosen["log_ratio"]
+    return ratio, max(rival["log_ratio_error"], chosen["log_ratio_error"])
+
+
+def _certainty(chosen: Row, rival: Row) -> str:
+    """Return a sentence on how certain the choice between the chosen model and its closest rival
+    is, by their predictions and AIC.
+    """
+    ratio, error = _log_ratio_between(chosen, rival)
+    support = rival["delta_aic"] - chosen["delta_aic"]
+    if ratio > SURE * error and support > NO_SUPPORT:
+        return "The difference is significant."
+    if ratio > LIKELY * error and support > SUPPORT:
+        return "The difference is likely, but not certain."
+    if support < -NO_SUPPORT:
+        return (
+            f"{rival['model']} fits better, but does not predict better: more recordings, or "
+            "larger motions, would decide."
+        )
+    return (
+        "These recordings hardly distinguish the models: of those that predict equally well, the "
+        "one with the fewest parameters is chosen."
+    )
+
+
+def model_notes(rows: Sequence[Row]) -> list[str]:
+    """Return notes that explain the table and list failures."""
+    names = rows[0]["predictions"]
+    test_data = (
+        "each recording in turn"
+        if len(names) > 1
+        else "the last third of the recording"
+    )
+    counted = rows[0]["independent"]
+    evidence = next((row["evidence"] for row in rows if row["evidence"]), None)
+    equivalent = ""
+    if counted is not None and evidence is not None:
+        equivalent = (
+            f" The {evidence['measurements']} measurements contain as much information "
+            f"as {counted:.0f} "
+        )
+        equivalent += "independent ones."
+    return [
+        f"Held out: {test_data}; ±: standard error of the ratio to the best.{equivalent}",
+        *(
+            f"{row['model']}: {row['status']}"
+            for row in rows
+            if not row["converged"]
+        ),
+        *(
+            f"{row['model']} without '{name}': {why}"
+            for row in rows
+            for name, why in row["failures"].items()
+        ),
+    ]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Data of a fit for Akaike's criterion.
+
+    Attributes
+    ----------
+    misfit : float
+        Sum of the squared measurement residuals, in units of σ²; not less than rounding.
+    prior : float
+        Sum of the squared residuals of the priors.
+    fitted : float
+        Number of parameters that the data determine, nuisance parameters included.
+    measurements : int
+        Number of measurements.
+    independent : float
+        Equivalent number of independent measurements.
+    """
+
+    misfit: float
+    prior: float
+    fitted: float
+    measurements: int
+    independent: float
+
+    def criterion(self, independent: float) -> float:
+        """Return Akaike's criterion N ln(misfit) + prior + 2 · fitted; smaller is better.
+
+        Parameters
+        ----------
+        independent : float
+            Equivalent number N of independent measurements, equal for all compared models; it
+            replaces this fit's own.
+        """
+        return (
+            independent * float(np.log(self.misfit))
+            + self.prior
+            + 2 * self.fitted
+        )
+
+
+def evidence_from_fit(fit: LinearisedFit) -> Evidence:
+    """Return the evidence of a model from its linearised fit at the solution.
+
+    The equivalent number of independent measurements follows from the correlation of the residuals
+    of each block; it is the number of measurements if the residuals are zero up to rounding.
+    """
+    factored = factorise_information(fit)
+    rounding = ROUNDING**2 * fit.measurement_count
+    independent = float(fit.measurement_count)
+    if fit.chi_squared > rounding:
+        processes = error_processes(fit, factored)
+        pairs = zip(fit.blocks, processes, strict=True)
+        independent = sum(
+            _independent_measurements(b, p)
+            for b, p in pairs
+            if b.measurement_count
+        )
+    return Evidence(
+        max(fit.chi_squared, rounding),
+        float(np.sum(fit.prior_residual**2)),
+        fitted=factored.determined_count,
+        measurements=fit.measurement_count,
+        independent=independent,
+    )
+
+
+def _independent_measurements(
+    block: ResidualBlock, process: ErrorProcess
+) -> float:
+    """Return the equivalent number of independent measurements in one block of residuals."""
+    lags = np.arange(1, len(process.autocorrelation))
+    in_time = 1 + 2 * float(
+        (1 - lags / len(block.t_s)) @ process.autocorrelation[1:]
+    )
+    is_observed = block.channels[2].any(axis=0)
+    among = process.channel_covariance[np.ix_(is_observed, is_observed)]
+    total = float(np.trace(among)) ** 2
+    # Few samples make channels look alike that are not: that much is taken off tr Σ².
+    sum_of_squares = float(np.sum(among**2)) - total / max(process.samples, 1.0)
+    channels = float(
+        np.clip(total / max(sum_of_squares, 1e-300), 1.0, len(among))
+    )
+    return block.measurement_count * channels / len(among) / max(1.0, in_time)
+
+
+# Share of a single recording that is fitted.
+FITTED = 2 / 3
+# Parts in time of what is held out: longer than most errors persist, and enough to see a scatter.
+BLOCKS = 8
+
+
+def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
+    """Fit a model to all recordings, or to all but the held-out one, and return its fit and
+    prediction.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem with the model.
+    method : str
+        Name of the method.
+    test_name : str
+        Recording that is predicted; "" to fit all.
+
+    Returns
+    -------
+    dict
+        Status, parameters and RMS; with converged fits also "evidence" and "budget" if all are
+        fitted, else "prediction", which is None with a "failure" if the simulation failed.
+    """
+    known, start_s = (
+        reserve_test_data(problem, test_name)
+        if test_name
+        else (problem, np.inf)
+    )
+    solution = solve(known, method)
+    record: dict[str, Any] = {
+        "status": solution.status.value,
+        "converged": solution.status.converged,
+        "rms": {
+            "m": solution.rms_m,
+            "N": pooled_wrench_rms(solution)[0],
+            STRESS_UNIT: _pooled_stress_rms_pa(solution),
+        },
+        "parameters": parameter_values(solution.collocation, solution.q),
+        "free": [item.name for item in problem.parameters.free],
+        "time_s": solution.timing.total,
+    }
+    if not solution.status.converged:
+        return record
+    if not test_name:
+        try:
+            fit = linearise_fit(solution.collocation, solution.z)
+        except SimulationError as error:
+            return record | {"converged": False, "status": str(error)}
+        return record | {
+            "evidence": asdict(evidence_from_fit(fit)),
+            "budget": _budget_record(problem, solution, fit=fit),
+        }
+    experiment = next(e for e in known.experiments if e.name == test_name)
+    # With the scheme that was fitted: what is compared are models, not integrators.
+    rollout = simulate_experiment(
+        replace(known, rollout=RolloutOptions("scheme")),
+        experiment,
+        solution=solution,
+    )
+    if not isinstance(rollout, ForwardSimulation):
+        return record | {"prediction": None, "failure": rollout}
+    complete_experiment = next(
+        e for e in problem.experiments if e.name == test_name
+    )
+    return record | {
+        "prediction": _prediction_error(
+            complete_experiment, rollout, start_s=start_s
+        )
+    }
+
+
+def _budget_record(
+    problem: Problem, solution: Solution, fit: LinearisedFit
+) -> dict[str, Any]:
+    """Return the uncertainty budget of each estimate, without noise of the poses, step and mesh.
+
+    Empty if the error bars cannot be computed.
+    """
+    options = problem.uncertainty
+    parameters = solution.collocation.parameters
+    try:
+        known = uncertainty_from_fit(
+            fit, parameters, q=solution.q, error_model=options
+        )
+        changes = changes_of_assumptions(
+            solution.collocation, solution.z, deviations=options.considered
+        )
+    except (InputError, SimulationError):
+        return {}  # without error bars there is none
+    means = options.assumptions.means
+    sources = VarianceSources.from_fit(
+        fit,
+        changes,
+        parameters=parameters,
+        q=solution.q,
+        uncertainty=known,
+        means=means,
+    )
+    return {
+        name: asdict(line)
+        for name, line in budget(sources, known, {}, parameters).items()
+    }
+
+
+def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
+    """Return the problem without a recording, or without its end, and the time of the first
+    held-out sample [s].
+
+    The end of a single recording is held out. The time is −∞ if the complete recording is held out.
+    """
+    chosen = next(e for e in problem.experiments if e.name == name)
+    if len(fitted_recordings(problem)) > 1:
+        remaining = replace(chosen, validation=True)
+        start_s = -np.inf
+    else:
+        start_s = float(chosen.t_s[0] + FITTED * chosen.duration_s)
+        tracks = np.where(
+            (chosen.t_s > start_s)[:, None, None],
+            np.nan,
+            chosen.markers.positions_m,
+        )
+        grasps = tuple(
+            _without_later_wrench(grasp, start_s) for grasp in chosen.grasps
+        )
+        depths = [
+            each
+            for d in chosen.depths
+            if (each := d.until_time(start_s)) is not None
+        ]
+        readings = [
+            _without_later_values(gauge, start_s) for gauge in chosen.readings
+        ]
+        remaining = replace(
+            with_markers(chosen, tracks),
+            grasps=grasps,
+            depths=depths,
+            readings=readings,
+        )
+    experiments = [remaining if e is chosen else e for e in problem.experiments]
+    return replace(problem, experiments=experiments), start_s
+
+
+def _without_later_wrench(grasp: Grasp, end_s: float) -> Grasp:
+    """Return the grasp with measurements of its sensor after `end_s` [s] replaced by NaN; unchanged
+    without a sensor.
+    """
+    wrench = grasp.wrench
+    if wrench is None:
+        return grasp
+    values = np.where((wrench.t_s > end_s)[:, None], np.nan, wrench.values)
+    return replace(grasp, wrench=replace(wrench, values=values))
+
+
+def _without_later_values(gauge: Gauge, end_s: float) -> Gauge:
+    """Return the custom sensor without measurements after a time [s]; itself if none would
+    remain.
+    """
+    values = np.where(
+        (gauge.sample_times_s > end_s)[:, None], np.nan, gauge.measured_values
+    )
+    return replace(gauge, values=values) if np.isfinite(values).any() else gauge
+
+
+def _stress_residuals_pa(
+    experiment: Experiment, predicted: Mapping[str, Array]
+) -> tuple[Array, Array]:
+    """Return times (S,) and differences (S,) of predicted and measured stresses [Pa] of a specimen,
+    in the order of time; NaN where not measured.
+    """
+    stresses = [
+        gauge for gauge in experiment.readings if gauge.unit == STRESS_UNIT
+    ]
+    t_s = np.concatenate([gauge.sample_times_s for gauge in stresses])
+    differences = [
+        predicted[gauge.name] - gauge.measured_values for gauge in stresses
+    ]
+    order = np.argsort(t_s, kind="stable")
+    return t_s[order], np.concatenate(differences)[order, 0]
+
+
+def _pooled_stress_rms_pa(solution: Solution) -> float | None:
+    """Return the RMS residual of the stresses of all fitted specimens [Pa]; None without any."""
+    residuals = [
+        _stress_residuals_pa(
+            segment.experiment, solution.readings[segment.experiment.name]
+        )[1]
+        for segment in solution.collocation.transcriptions
+        if segment.experiment.specimen is not None
+    ]
+    if not residuals:
+        return None
+    return float(np.sqrt(np.nanmean(np.concatenate(residuals) ** 2)))
+
+
+def _prediction_error(
+    experiment: Experiment, rollout: ForwardSimulation, start_s: float
+) -> dict[str, Any]:
+    """Return RMS, number of samples and sums of squares by block, of held-out measurements against
+    a simulation.
+
+    The measurements are markers [m] or, without any, forces [N] on the complete specimen, or
+    stresses [Pa] of a specimen without a mesh; `unit` says which. Samples up to `start_s` are
+    ignored; the RMS is None without samples.
+    """
+    markers = experiment.markers
+    unit = "m"
+    t_s = experiment.t_s
+    residuals = rollout.trajectory.markers_m - markers.positions_m
+    is_counted = markers.is_present
+    if experiment.specimen is not None:
+        t_s, stresses_pa = _stress_residuals_pa(experiment, rollout.readings)
+        unit = STRESS_UNIT
+        residuals = stresses_pa[:, None, None]
+        is_counted = np.isfinite(residuals[:, :, 0])
+    elif not markers.sample_count:
+        t_s = np.concatenate([sensor.t_s for sensor in experiment.wrenches])
+        pairs = zip(rollout.wrenches, experiment.wrenches, strict=True)
+        residuals = np.concatenate(
+            [
+                sensor.symmetry * (read - sensor.values)[:, :3]
+                for read, sensor in pairs
+            ]
+        )
+        order = np.argsort(t_s, kind="stable")
+        unit = "N"
+        t_s = t_s[order]
+        residuals = residuals[order, None]
+        is_counted = np.asarray(np.isfinite(residuals).any(axis=2))
+    is_test_sample = t_s > start_s
+    squares = np.where(is_counted, np.nansum(residuals**2, axis=2), 0.0)[
+        is_test_sample
+    ]
+    samples = int(is_counted[is_test_sample].sum())
+    blocks = [float(np.sum(each)) for each in np.array_split(squares, BLOCKS)]
+    rms = float(np.sqrt(squares.sum() / samples)) if samples else None
+    return {"rms": rms, "unit": unit, "samples": samples, "blocks": blocks}

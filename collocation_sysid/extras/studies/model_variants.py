@@ -1,0 +1,572 @@
+"""Variants of a problem's model as overrides of its file: other materials, damping laws, memory.
+
+The estimated parameters follow the model. Constants that a material does not have are removed;
+those that it needs in addition are estimated, starting from the stiffness of the file's guess or
+from a scan of the stiffness. Everything else stays as in the file.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import InputError, require_among
+from ...fem.laws.constants import MOST_TERMS, usual_value, without_region
+from ...fem.laws.materials import DAMPINGS, MATERIALS
+from ...fem.laws.moduli import ELASTIC, elastic_names
+from ...problem import Problem
+from ...problem.problem_reading import read_problem_file
+from .study_arguments import unique_items
+
+# Where a branch's share starts; time constants start evenly between a sample and the recording.
+SHARE = 0.1
+# Largest number of branches: no recording determines as many time constants.
+MOST_BRANCHES = 20
+# Constants of which a material needs one beside those of its shape.
+VOLUMETRIC = {"lambda_pa", "kappa_pa", "poisson"}
+# Budget entries that stand for other laws of damping, in place of which these are fitted.
+DAMPING_ASSUMPTIONS = ("damping_law", "rayleigh_damping")
+# Of a material of which nothing is said; and of the shear modulus, what a constant about zero has.
+USUAL_POISSON = 0.3
+# Typical change of a constant about zero, over the shear modulus.
+LESS = 0.1
+
+
+@dataclass(frozen=True)
+class ModelVariant:
+    """One model.
+
+    Attributes
+    ----------
+    label : str
+        Name of the model for the user.
+    overrides : tuple of str
+        Overrides "key=value" that derive it from the problem file.
+    path : Path
+        Problem file.
+    """
+
+    label: str
+    overrides: tuple[str, ...]
+    path: Path
+
+
+def parse_materials(text: str) -> tuple[str, ...]:
+    """Return names of materials from text separated by commas, each once.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, with the most similar known one.
+    """
+    return _parse_names(text, MATERIALS, option="--materials")
+
+
+def parse_dampings(text: str) -> tuple[str, ...]:
+    """Return names of damping laws from text separated by commas, each once.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, with the most similar known one.
+    """
+    return _parse_names(text, DAMPINGS, option="--damping")
+
+
+def _parse_names(
+    text: str, known_names: Iterable[str], option: str
+) -> tuple[str, ...]:
+    """Return names from text separated by commas, each once.
+
+    Raises
+    ------
+    InputError
+        For an unknown name or none; it refers to the command-line option.
+    """
+    names = unique_items(text)
+    for name in names or ("",):
+        require_among(name, known_names, where=option, count="some")
+    return names
+
+
+def parse_branches(text: str) -> tuple[int, ...]:
+    """Return numbers of Prony branches from text separated by commas, each once.
+
+    Raises
+    ------
+    InputError
+        For anything but whole numbers from 0 to `MOST_BRANCHES`.
+    """
+    items = [item.strip() for item in text.split(",") if item.strip()]
+    counts = [
+        int(item)
+        for item in items
+        if item.isascii() and item.isdecimal() and len(item) < 3
+    ]
+    if not items or len(counts) < len(items) or max(counts) > MOST_BRANCHES:
+        expected = f"whole numbers up to {MOST_BRANCHES}, such as 0,1,2"
+        raise InputError(
+            f"found {text!r}; expected {expected}", None, where="--prony"
+        )
+    return tuple(dict.fromkeys(counts))
+
+
+def models(
+    problems: Sequence[Problem],
+    overrides: Sequence[str],
+    materials: Sequence[str] = (),
+    branches: Sequence[int] = (),
+    region: str | None = None,
+    dampings: Sequence[str] = (),
+) -> list[ModelVariant]:
+    """Return a model for every problem file with every material, law of damping and number of
+    branches.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+        Of the same recordings, each with its file.
+    overrides, materials, branches, region, dampings
+        See `variants`.
+
+    Raises
+    ------
+    InputError
+        For less than two models, and what the files or variants refuse.
+    """
+    compared = file_variants(problems, overrides)
+    if materials or branches or dampings:
+        fitted = [e for e in problems[0].experiments if not e.validation]
+        times_s = (
+            min(e.timestep_s for e in fitted),
+            max(e.duration_s for e in fitted),
+        )
+        files, compared = compared, []
+        for file in files:
+            of_file = variants(
+                file.path,
+                overrides,
+                materials=materials,
+                branches=branches,
+                times_s=times_s,
+                region=region,
+                dampings=dampings,
+            )
+            front = f"{file.label}: " * (len(files) > 1)
+            compared += [
+                replace(v, label=front + v.label, path=file.path)
+                for v in of_file
+            ]
+    if len(compared) < 2:
+        options = {
+            "--materials": (materials, "neo-hookean,yeoh"),
+            "--damping": (dampings, "kelvin-voigt,material"),
+            "--prony": (branches or (0,), "0,1"),
+        }
+        option, example = next(
+            (o, e) for o, (is_declared, e) in options.items() if is_declared
+        )
+        raise InputError(
+            f"found the model {compared[0].label} alone; expected two or more to compare, such as "
+            f"{example}",
+            None,
+            where=option,
+        )
+    return compared
+
+
+def variants(
+    path: Path,
+    overrides: Sequence[str],
+    materials: Sequence[str],
+    branches: Sequence[int],
+    times_s: tuple[float, float],
+    region: str | None = None,
+    dampings: Sequence[str] = (),
+) -> list[ModelVariant]:
+    """Every material with every law of damping and every number of branches.
+
+    Parameters
+    ----------
+    path, overrides
+        The problem file.
+    materials : sequence of names; the file's own if there is none
+    branches : sequence of numbers of Prony branches; as in the file if there is none
+    times_s : (shortest, longest)
+        Time constants of branches start between them.
+    region : str, optional
+        Whose material, law and branches they are; by default every part of the body has them.
+    dampings : sequence of names of laws of damping; as in the file if there is none
+        Where some are compared, the first-order estimate of other laws is no budget entry.
+
+    Raises
+    ------
+    InputError
+        For an unknown region, and branches that belong to others.
+    """
+    file, _ = read_problem_file(path, overrides)
+    content = file.model_dump(mode="json", exclude_unset=True, by_alias=True)
+    body = content["object"]
+    _require_region(body, region, branches=bool(branches), path=path)
+    varied = []
+    for material, damping, count in product(
+        materials or (None,), dampings or (None,), branches or (None,)
+    ):
+        label = []
+        changes: dict[str, Any] = {}
+        parameters = content["parameters"]
+        if material is not None:
+            label.append(material)
+            changes |= _law_changes(body, {"material": material}, region=region)
+            parameters = _with_material(parameters, material, region=region)
+        if damping is not None:
+            label.append(damping)
+            laws = {"damping": damping} | (
+                {} if material is None else {"material": material}
+            )
+            changes |= _law_changes(body, laws, region=region)
+            for name in DAMPING_ASSUMPTIONS:
+                changes[f"uncertainty.assumptions.{name}"] = "none"
+        if count is not None:
+            label.append(
+                "no memory"
+                if count == 0
+                else f"{count} branch{'es' * (count > 1)}"
+            )
+            own = [
+                t for t in body.get("prony", []) if t.get("region") == region
+            ]
+            others = [
+                t for t in body.get("prony", []) if t.get("region") != region
+            ]
+            tables = _branch_tables(
+                own, count, others={t["name"] for t in others}, region=region
+            )
+            if tables or body.get("prony"):
+                changes["object.prony"] = [*others, *tables]
+            old = [each["name"] for each in own]
+            parameters = _with_memory(
+                parameters, old, tables=tables, times_s=times_s
+            )
+        changes["parameters"] = parameters
+        settings = tuple(
+            f"{key}={as_inline_toml(value)}" for key, value in changes.items()
+        )
+        label_text = f"{region}: " * (region is not None) + ", ".join(label)
+        varied.append(
+            ModelVariant(label_text, (*overrides, *settings), path=path)
+        )
+    return varied
+
+
+def file_variants(
+    problems: Sequence[Problem], overrides: Sequence[str]
+) -> list[ModelVariant]:
+    """Return problem files of the same recordings as models, named after the files.
+
+    Raises
+    ------
+    InputError
+        If the files do not fit the same recordings and samples, so that neither predictions nor AIC
+        could be compared, or a file is given twice.
+    """
+    first, *others = map(_measured_counts, problems)
+    for problem, measured in zip(problems[1:], others, strict=True):
+        if measured != first:
+            raise InputError(
+                f"it fits {_measured_text(measured)}, but {problems[0].path} fits "
+                f"{_measured_text(first)}; expected the same recordings and samples in all files",
+                problem.path,
+            )
+    paths = [Path(str(problem.path)) for problem in problems]
+    if len({path.resolve() for path in paths}) < len(paths):
+        raise InputError(
+            "this file is given twice; expected another",
+            paths[-1],
+            where="--with",
+        )
+    stems = [path.stem for path in paths]
+    distinct = len(set(stems)) == len(stems)
+    return [
+        ModelVariant(
+            path.stem if distinct else str(path), tuple(overrides), path=path
+        )
+        for path in paths
+    ]
+
+
+def _measured_counts(problem: Problem) -> dict[str, int]:
+    """Return how many numbers are measured in each fitted recording."""
+    return {
+        e.name: 3 * e.markers.sample_count
+        + sum(int(np.isfinite(wrench.values).sum()) for wrench in e.wrenches)
+        for e in problem.experiments
+        if not e.validation
+    }
+
+
+def _measured_text(measured: Mapping[str, int]) -> str:
+    """Return the recordings with their numbers in words."""
+    return " and ".join(
+        f"'{name}' ({count} numbers)" for name, count in measured.items()
+    )
+
+
+def _require_region(
+    body: Mapping[str, Any], region: str | None, branches: bool, path: Path
+) -> None:
+    """Raise `InputError` for an unknown region, or for branches that belong to other regions."""
+    names = [each["name"] for each in body.get("region", [])]
+    if region is not None and not names:
+        message = f"found {region!r}; expected none: it has no regions"
+        raise InputError(message, path, where="--region")
+    if region is not None:
+        require_among(region, names, source=path, where="--region")
+    owners = {each.get("region") for each in body.get("prony", [])}
+    if branches and owners - {region}:
+        other_region = next(iter(owners - {region}))
+        whose = (
+            "all parts without their own"
+            if other_region is None
+            else f"region '{other_region}'"
+        )
+        expected = (
+            "none with --region"
+            if other_region is None
+            else f"--region {other_region}"
+        )
+        raise InputError(
+            f"found branches of {whose}; expected {expected}",
+            path,
+            where="object.prony",
+        )
+
+
+def _law_changes(
+    body: Mapping[str, Any], laws: Mapping[str, str], region: str | None
+) -> dict[str, Any]:
+    """Return the object's keys with a material or damping for a region, or for all parts."""
+    regions = [dict(each) for each in body.get("region", [])]
+    for each in regions:
+        if region is None:
+            for key in laws:
+                each.pop(key, None)
+        elif each["name"] == region:
+            each |= laws
+    changes: dict[str, Any] = {"object.region": regions} if regions else {}
+    if region is not None:
+        return changes
+    return changes | {f"object.{key}": law for key, law in laws.items()}
+
+
+def _with_material(
+    parameters: Mapping[str, Any], material: str, region: str | None
+) -> dict[str, Any]:
+    """Return a copy of a problem's `[parameters]` for a body with another material.
+
+    A part with its own constants keeps constants of its own; the others share theirs. Constants
+    that the new material does not have are left out. Those that it needs are added with a guess of
+    the same shear modulus, or for a scan if that is unknown.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Table by parameter name, such as "mu_pa" or "tip.mu_pa"; not modified.
+    material : str
+        Name in `MATERIALS`.
+    region : str or None
+        Region that gets the material, or None for all parts. Without elastic constants of its own
+        it shares those of the body that the material has; other constants are its own.
+    """
+    of_any = {c.name for each in MATERIALS.values() for c in each.constants} | {
+        *ELASTIC
+    }
+    fronts = {
+        name[: -len(without_region(name))]
+        for name in parameters
+        if without_region(name) in of_any
+    }
+    if region is not None:
+        fronts = {f"{region}."}
+    for front in sorted(fronts):  # what is shared is first
+        parameters = _with_part_material(
+            parameters, front, material=material, of_any=of_any
+        )
+    return dict(parameters)
+
+
+def _with_part_material(
+    parameters: Mapping[str, Any], prefix: str, material: str, of_any: set[str]
+) -> dict[str, Any]:
+    """Return the parameters with another material in the part whose constants have this prefix.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Table by parameter name; not modified.
+    prefix : str
+        Region with a dot, such as "tip."; empty for the constants that parts share.
+    material : str
+        Name in `MATERIALS`.
+    of_any : set of str
+        Names of the constants of all materials, without regions.
+    """
+    own = [constant.name for constant in MATERIALS[material].constants]
+    possible = {*own, *elastic_names(MATERIALS[material])}
+    mine = {prefix + name for name in of_any}
+    unchanged = {
+        n: v
+        for n, v in parameters.items()
+        if n not in mine or without_region(n) in possible
+    }
+    alone = any(name in mine for name in parameters)
+    elastic = {
+        without_region(name)
+        for name in unchanged
+        if name in (mine if alone else of_any)
+    }
+    shear_pa = _shear_pa(parameters, prefix)
+    if "mu_pa" in own and not elastic & {"mu_pa", "young_pa"}:
+        unchanged[f"{prefix}mu_pa"] = _starting_guess("mu_pa", shear_pa)
+    own_or_shared = {
+        without_region(name) for name in unchanged if name in mine | of_any
+    }
+    if elastic_names(MATERIALS[material]) and not own_or_shared & VOLUMETRIC:
+        # A foam has no modulus that another material could take over.
+        unchanged[f"{prefix}poisson"] = _starting_guess("poisson", shear_pa)
+    needed = [
+        name
+        for name in own
+        if name not in ELASTIC and prefix + name not in unchanged
+    ]
+    return unchanged | {
+        prefix + name: _starting_guess(name, shear_pa) for name in needed
+    }
+
+
+def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
+    """Return the shear modulus at small strain [Pa] from the guesses or fixed values of the part
+    whose constants begin with `prefix`, or else those of the body; None if unknown.
+    """
+
+    def guess(name: str) -> float:
+        """Return the guess or fixed value of a constant; NaN if it has none."""
+        value = parameters.get(prefix + name, parameters.get(name))
+        if isinstance(value, Mapping):
+            value = value.get("fixed", value.get("guess"))
+        return float("nan") if value is None else float(value)
+
+    linear = 0.0 if math.isnan(guess("c01_pa")) else guess("c01_pa")
+    poisson = (
+        USUAL_POISSON if math.isnan(guess("poisson")) else guess("poisson")
+    )
+    terms = range(1, MOST_TERMS + 1)
+    if any(not math.isnan(guess(f"beta_{p}")) for p in terms):
+        factors = {p: 1.0 for p in terms}  # of a foam
+    else:
+        factors = {p: guess(f"alpha_{p}") / 2 for p in terms}
+    products = [factor * guess(f"mu_{p}_pa") for p, factor in factors.items()]
+    powers = sum(each for each in products if not math.isnan(each))
+    ways = (
+        guess("mu_pa"),
+        powers,
+        2 * (guess("c10_pa") + linear),
+        guess("young_pa") / (2 * (1 + poisson)),
+    )
+    return next((each for each in ways if each > 0), None)
+
+
+def _starting_guess(name: str, shear_pa: float | None) -> dict[str, Any]:
+    """Return the table of a constant: with a guess that gives the shear modulus `shear_pa` [Pa], or
+    empty, for a scan, if that is None or the constant has no usual value.
+
+    A constant whose usual value is zero also gets a typical size, `LESS` times the shear modulus.
+    """
+    if shear_pa is None:
+        return {}
+    usual = usual_value(
+        name, 2 * (1 + USUAL_POISSON) * shear_pa, poisson=USUAL_POISSON
+    )
+    if usual is None:
+        return {}
+    return (
+        {"guess": usual}
+        if usual
+        else {"guess": usual, "typical": LESS * shear_pa}
+    )
+
+
+def _branch_tables(
+    own: Sequence[Mapping[str, Any]],
+    count: int,
+    others: set[str],
+    region: str | None,
+) -> list[dict[str, Any]]:
+    """Return the first `count` branches of the file, followed by new ones if there are fewer."""
+    tables = [dict(each) for each in own[:count]]
+    used_names = {each["name"] for each in tables} | others
+    names = (f"prony_{k}" for k in range(1, count + len(used_names) + 1))
+    region_key = {} if region is None else {"region": region}
+    new = [
+        {"name": name, **region_key} for name in names if name not in used_names
+    ]
+    return [*tables, *new[: count - len(tables)]]
+
+
+def _with_memory(
+    parameters: Mapping[str, Any],
+    old: Sequence[str],
+    tables: Sequence[Mapping[str, Any]],
+    times_s: tuple[float, float],
+) -> dict[str, Any]:
+    """Return the parameters with a share and a time constant of each branch.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters of the file.
+    old : sequence of str
+        Names of the file's branches; parameters of those that are removed are removed.
+    tables : sequence of mapping
+        Tables of the new branches.
+    times_s : tuple of two floats
+        Interval in which time constants start [s].
+    """
+    names = [each["name"] for each in tables]
+    removed_names = {name for name in old if name not in names}
+    unchanged = {
+        n: v
+        for n, v in parameters.items()
+        if n.removesuffix(f".{without_region(n)}") not in removed_names
+    }
+    shortest, longest = times_s
+    for k, name in enumerate(names, start=1):
+        tau_s = shortest * (longest / shortest) ** (k / (len(names) + 1))
+        unchanged.setdefault(f"{name}.share", {"guess": SHARE})
+        unchanged.setdefault(f"{name}.tau_s", {"guess": float(f"{tau_s:.3g}")})
+    return unchanged
+
+
+def as_inline_toml(value: Any) -> str:
+    """Return a value in TOML's inline syntax."""
+    if isinstance(value, Mapping):
+        return (
+            "{"
+            + ", ".join(
+                f"{json.dumps(k)} = {as_inline_toml(v)}"
+                for k, v in value.items()
+            )
+            + "}"
+        )
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(as_inline_toml, value)) + "]"
+    if isinstance(value, (str, bool)):
+        return json.dumps(value)
+    return repr(value)

@@ -1,0 +1,120 @@
+"""Worker process for one run of a study: ``python -m collocation_sysid.extras.studies.worker OUT``.
+
+The run is read as one line of JSON from stdin, and its record is written to the file OUT. The
+process ends when its stdin is closed, so that it never outlives the study.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import traceback
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...common.files import write_text_file
+from ...common.serialisation import as_json
+from ...common.signal_handling import heed_interrupts, leave
+from ...errors import InputError, SimulationError
+from ...pipeline import Run, run
+from ...problem import Problem
+from ...recording.grasp import prescribed_nodes
+from ...runs.forward_simulation import ForwardSimulation
+from .model_choice import fit_record
+from .run_execution import ERROR, FINISHED
+
+
+def main() -> None:
+    """Entry point: read the run, execute it, and write its record."""
+    heed_interrupts()
+    planned = json.loads(sys.stdin.buffer.readline())
+    threading.Thread(target=_end_with_study, daemon=True).start()
+    write_text_file(Path(sys.argv[1]), as_json(record_of_run(planned)))
+    leave(0)
+
+
+def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
+    """Execute a planned run and return its record; errors become part of the record.
+
+    Parameters
+    ----------
+    planned : dict
+        A `PlannedRun` as a dictionary.
+    """
+    try:
+        problem = Problem.read(
+            planned["problem"], planned["overrides"], planned["allow_code"]
+        )
+        test_name = planned.get("test_name")
+        if test_name is not None:
+            fit = fit_record(problem, planned["method"], test_name=test_name)
+            return {"outcome": FINISHED, "message": fit["status"], "model": fit}
+        finished = run(problem, planned["method"])
+        return {
+            "outcome": FINISHED,
+            "message": finished.solution.message,
+            "result": finished.result,
+            "tip": _tip_record(finished),
+        }
+    except (InputError, SimulationError) as error:
+        return {"outcome": ERROR, "message": str(error)}
+    except Exception as error:
+        message = f"{type(error).__name__}: {error}"
+        return {
+            "outcome": ERROR,
+            "message": message,
+            "traceback": traceback.format_exc(),
+        }
+
+
+def _tip_record(finished: Run) -> dict[str, Any] | None:
+    """Return measured and simulated track of the marker farthest from the grasp in the first fitted
+    experiment, for JSON; None without markers. The simulated track is None if the simulation
+    failed.
+    """
+    experiment = finished.solution.collocation.transcriptions[0].experiment
+    markers = experiment.markers
+    nodes_m = experiment.body.nodes_m
+    grasped_nodes = prescribed_nodes(experiment.grasps)
+    if not markers.names:
+        return None
+    centre = nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(
+        axis=0
+    )
+    tip = int(
+        np.linalg.norm(
+            markers.predict_positions(nodes_m) - centre, axis=1
+        ).argmax()
+    )
+    measured = markers.positions_m[:, tip]
+    rollout = finished.rollouts[experiment.name]
+    rolled = (
+        rollout.trajectory.markers_m[:, tip]
+        if isinstance(rollout, ForwardSimulation)
+        else None
+    )
+    error = None
+    if rolled is not None and markers.is_present[:, tip].any():
+        error = float(np.nanmax(np.linalg.norm(rolled - measured, axis=1)))
+    return {
+        "experiment": experiment.name,
+        "marker": markers.names[tip],
+        "max_m": error,
+        "t_s": experiment.t_s.tolist(),
+        "measured_m": measured.tolist(),
+        "rolled_out_m": None if rolled is None else rolled.tolist(),
+    }
+
+
+def _end_with_study() -> None:
+    """Wait until stdin is closed, and end the process."""
+    os.read(0, 1)  # returns when the other end is closed
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,631 @@
+"""Presentation of a study: tables for the terminal and for Markdown, CSV, JSON, and plots."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import exp
+from pathlib import Path
+from typing import Any
+
+from ...common.display import (
+    Items,
+    Line,
+    Shown,
+    Table,
+    TitledParts,
+    as_markdown,
+)
+from ...common.files import SCHEMA, replaced_file, write_text_file
+from ...common.serialisation import as_json
+from ...fem.laws.constants import symbol_of, symbol_with_unit, unit_of
+from .law_disagreements import law_table
+from .model_choice import (
+    advice,
+    display_unit,
+    law_disagreements,
+    model_notes,
+    model_rows,
+)
+from .run_execution import Record, RunStore
+from .study_kinds import METHOD_STUDY, MODEL_STUDY
+from .study_planning import PlannedRun, shortened_keys
+from .study_plots import comparison_plots, sweep_plots
+from .study_rows import (
+    COLUMNS,
+    NumberColumn,
+    Row,
+    SuccessCriterion,
+    method_rows,
+    parameters_in,
+    run_row,
+)
+
+# Resolution of the plots [pixels per inch], for a page.
+RESOLUTION_DPI = 150
+# Largest number of failures on the terminal; summary.md lists all.
+SHOWN_FAILURES = 8
+# Heads of the tables where there is room, on pages.
+WORDS = {
+    **{column.head: column.words for column in COLUMNS.values()},
+    "": "chosen",
+    "success": "successes",
+    "95 %": "95 % interval of the rate",
+    "free": "parameters estimated",
+    "fit mm": "markers, RMS [mm]",
+    "fit N": "forces, RMS [N]",
+    "held out mm": "held out, RMS [mm]",
+    "held out N": "held out, RMS [N]",
+    "relative to best": "held out, relative to the best",
+}
+UNITS = ("Pa", "s", "1/s", "kg/m³")
+MEDIANS_NOTE = (
+    "Errors, misfits and costs are medians over the runs with a result."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class StudyReport:
+    """Results of a study, finished or not.
+
+    Attributes
+    ----------
+    title : str
+        Title.
+    kind : {METHOD_STUDY, MODEL_STUDY, SWEEP_STUDY}
+        Kind of study.
+    planned : tuple of PlannedRun
+        Runs of the study.
+    records : mapping of str to Record
+        Records of finished runs by key.
+    yardstick : SuccessCriterion
+        Criterion of success.
+    """
+
+    title: str
+    kind: str
+    planned: tuple[PlannedRun, ...]
+    records: Mapping[str, Record]
+    yardstick: SuccessCriterion
+
+    @property
+    def rows(self) -> list[Row]:
+        """One row for each planned run, or for each model."""
+        if self.kind == MODEL_STUDY:
+            return model_rows(self.planned, self.records)
+        return [
+            run_row(run, self.records.get(run.key), yardstick=self.yardstick)
+            for run in self.planned
+        ]
+
+    @property
+    def views(self) -> list[Table]:
+        """Tables for the terminal, each within 80 columns."""
+        if self.kind == METHOD_STUDY:
+            return comparison_views(method_rows(self.rows))
+        if self.kind == MODEL_STUDY:
+            disagreements = law_disagreements(self.rows)
+            return [
+                *model_views(self.rows),
+                *([law_table(disagreements)] if disagreements else []),
+            ]
+        return sweep_views(self.rows, list(self.planned[0].varied_values))
+
+    @property
+    def headline(self) -> list[str]:
+        """Result of the study in a few sentences."""
+        if self.kind == MODEL_STUDY:
+            return [advice(self.rows)]
+        if self.kind == METHOD_STUDY:
+            return [_method_sentence(row) for row in method_rows(self.rows)]
+        return sweep_sentences(self.rows)
+
+    @property
+    def tables(self) -> list[Table]:
+        """Tables for pages: headings in words, and the runs of a comparison."""
+        views = [
+            replace(view, heads=tuple(map(_in_words, view.heads)))
+            for view in self.views
+        ]
+        return (
+            [*views, run_view(self.rows)]
+            if self.kind == METHOD_STUDY
+            else views
+        )
+
+    @property
+    def failures(self) -> list[str]:
+        """One line for each run without a result."""
+        return [
+            f"{run.label}: {record['outcome']}: {record.get('message', '')}"
+            for run in self.planned
+            if (record := self.records.get(run.key)) is not None
+            and not {"result", "model"} & record.keys()
+        ]
+
+    @property
+    def notes(self) -> list[str]:
+        """Notes that explain the tables."""
+        missing = len(self.planned) - len(self.records)
+        notes = (
+            [f"{missing} of {len(self.planned)} runs remain to be done."]
+            if missing
+            else []
+        )
+        if self.kind == MODEL_STUDY:
+            return [*model_notes(self.rows), *notes]
+        return [
+            *(
+                (self.yardstick.sentence, MEDIANS_NOTE)
+                if self.kind == METHOD_STUDY
+                else ()
+            ),
+            *notes,
+        ]
+
+
+def load_report(
+    title: str,
+    kind: str,
+    planned: Sequence[PlannedRun],
+    store: RunStore,
+    yardstick: SuccessCriterion | None = None,
+) -> StudyReport:
+    """Return the report of planned runs from their stored records."""
+    loaded = {run.key: store.load(run.key) for run in planned}
+    records = {
+        key: record for key, record in loaded.items() if record is not None
+    }
+    return StudyReport(
+        title,
+        kind,
+        planned=tuple(planned),
+        records=records,
+        yardstick=yardstick or SuccessCriterion(),
+    )
+
+
+# In the terminal ---------------------------------------------------------------------------------
+
+
+def study_tables(report: StudyReport, folder: Path) -> list[Shown]:
+    """Return the tables of a study within 80 columns, and its failures."""
+    # What no line of the tables says.
+    parts: list[Shown] = (
+        [*report.headline, ""] if report.kind == MODEL_STUDY else []
+    )
+    for table in report.views:
+        parts += [table, ""]
+    failures = report.failures
+    parts += [
+        *report.notes,
+        *(Line(each, "doubtful") for each in failures[:SHOWN_FAILURES]),
+    ]
+    if len(failures) > SHOWN_FAILURES:
+        more = f"and {len(failures) - SHOWN_FAILURES} more in summary.md"
+        parts.append(Line(more, "doubtful"))
+    return [*parts, f"written to {folder}"]
+
+
+def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
+    """Return a table of the runs of a study, with those that are finished."""
+    rows = tuple(
+        (
+            str(number),
+            run.label,
+            " ".join(
+                "–" if g is None else f"{g:.4g}" for g in run.guess.values()
+            ),
+            "finished" if run.key in finished else "to do",
+        )
+        for number, run in enumerate(planned, start=1)
+    )
+    return Table("", ("", "run", "guess", ""), rows=rows, names=4)
+
+
+# Files --------------------------------------------------------------------------------------------
+
+
+def write_report(report: StudyReport, folder: Path) -> None:
+    """Write ``runs.csv``, ``summary.json``, ``summary.md`` and the plots of a study into a folder.
+
+    A comparison of methods has also ``summary.csv``; a comparison of models has no plots. Earlier
+    files are replaced.
+    """
+    rows = report.rows
+    write_text_file(folder / "runs.csv", as_csv(rows))
+    if report.kind == METHOD_STUDY:
+        write_text_file(folder / "summary.csv", as_csv(method_rows(rows)))
+    write_text_file(
+        folder / "summary.json", as_json(report_json(report)) + "\n"
+    )
+    write_text_file(
+        folder / "summary.md", as_markdown([report_section(report)])
+    )
+    if report.kind == MODEL_STUDY:
+        figures = {}
+    elif report.kind == METHOD_STUDY:
+        figures = comparison_plots(
+            rows, report.records, yardstick=report.yardstick
+        )
+    else:
+        figures = sweep_plots(rows, list(report.planned[0].varied_values))
+    for name, figure in figures.items():
+        with replaced_file(folder / f"{name}.png") as draft:
+            figure.savefig(draft, dpi=RESOLUTION_DPI)
+
+
+def report_json(report: StudyReport) -> dict[str, Any]:
+    """Return the content of summary.json."""
+    rows = report.rows
+    first = report.planned[0]
+    content: dict[str, Any] = {
+        "schema": SCHEMA,
+        "kind": report.kind,
+        "title": report.title,
+        "problem": first.problem,
+        "runs": rows,
+        "headline": report.headline,
+        "notes": report.notes,
+        "tables": report.tables,
+        "failures": report.failures,
+    }
+    if report.kind == METHOD_STUDY:
+        content |= {
+            "truth": dict(report.yardstick.truth) or None,
+            "within": report.yardstick.within,
+            "methods": method_rows(rows),
+        }
+    elif report.kind == MODEL_STUDY:
+        content |= {"advice": advice(rows), "laws": law_disagreements(rows)}
+    else:
+        content["varied_values"] = list(first.varied_values)
+    return content
+
+
+def as_csv(rows: Sequence[Row]) -> str:
+    """Return rows as CSV; the columns are those of all rows, in the order of their first
+    occurrence.
+    """
+    columns = dict.fromkeys(name for row in rows for name in row)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def report_section(report: StudyReport) -> TitledParts:
+    """Return tables and failures as a section for a paper's appendix or an issue."""
+    failures = (Items(tuple(report.failures)),) if report.failures else ()
+    without = tuple(
+        TitledParts("Runs without a result", (each,)) for each in failures
+    )
+    parts = (*report.headline, *report.notes, *report.views, *without)
+    return TitledParts(report.title, parts, level=1)
+
+
+def _in_words(head: str) -> str:
+    """Return the heading in words for a short heading `head` of the terminal."""
+    if head.startswith("Δ") and head.endswith(" %"):
+        return f"error of {head[1:-2]} [%]"
+    symbol, space, unit = head.partition(" ")
+    return WORDS.get(
+        head, f"{symbol} [{unit}]" if space and unit in UNITS else head
+    )
+
+
+# Views --------------------------------------------------------------------------------------------
+
+Cell = Callable[[Row], str]
+
+
+def comparison_views(summaries: Sequence[Row]) -> list[Table]:
+    """Return tables of success, quality and cost of every method."""
+    success: dict[str, Cell] = {
+        "runs": lambda row: str(row["runs"]),
+        "success": lambda row: f"{row['successes']}/{row['runs']}",
+        "95 %": lambda row: (
+            f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f} %"
+        ),
+    }
+    success |= _error_cells(summaries)
+    quality = [
+        "violation_n",
+        "violation_relative",
+        "rms_m",
+        "rollout_rms_m",
+        "tip_max_m",
+    ]
+    cost = [
+        "iterations",
+        "evaluations",
+        "build_s",
+        "evaluations_s",
+        "linear_algebra_s",
+        "total_s",
+    ]
+    if all(row["evaluations"] is None for row in summaries):
+        cost.remove("evaluations")
+    return [
+        _table_view(
+            "Success",
+            {"method": _text_cell("method")},
+            number_columns=success,
+            rows=summaries,
+        ),
+        _table_view(
+            "Quality",
+            {"method": _text_cell("method")},
+            number_columns=_number_cells(*quality),
+            rows=summaries,
+        ),
+        _table_view(
+            "Cost",
+            {"method": _text_cell("method")},
+            number_columns=_number_cells(*cost),
+            rows=summaries,
+        ),
+    ]
+
+
+def run_view(rows: Sequence[Row]) -> Table:
+    """Return a table of every run of a comparison."""
+    names = {"start": _text_cell("start"), "method": _text_cell("method")}
+    cells: dict[str, Cell] = {
+        "ended": _text_cell("status"),
+        "succeeded": lambda row: "yes" if row["success"] else "no",
+    }
+    cells |= _error_cells(rows) | _number_cells(
+        "rms_m", "rollout_rms_m", "iterations", "total_s"
+    )
+    ordered = sorted(rows, key=lambda row: row["start"])
+    view = _table_view("Runs", names, number_columns=cells, rows=ordered)
+    return replace(view, heads=tuple(map(_in_words, view.heads)))
+
+
+def _method_sentence(row: Row) -> str:
+    """Return how often, how accurately and how fast a method found the solution, in words."""
+    low = 100 * row["success_low"]
+    high = 100 * row["success_high"]
+    sentence = (
+        f"{row['method']} succeeded in {row['successes']} of {row['runs']} runs"
+    )
+    sentence += f" (95 % interval of the rate: {low:.0f} to {high:.0f} %)"
+    if row["total_s"] is None:
+        return f"{sentence}, and gave no result."
+    misfit = f"with a marker error of {1e3 * row['rms_m']:.2g} mm"
+    return (
+        f"{sentence}, {misfit} and a time of {row['total_s']:.2g} s (medians)."
+    )
+
+
+def sweep_sentences(rows: Sequence[Row]) -> list[str]:
+    """Return how many runs converged, and how much each estimate varies between them, in words."""
+    converged = [row for row in rows if row["converged"]]
+    sentences = [f"{len(converged)} of {len(rows)} runs converged."]
+    for name in parameters_in(rows):
+        values = [row[f"value_{name}"] for row in converged]
+        errors = [
+            e
+            for row in converged
+            if (e := row[f"std_error_{name}"]) is not None
+        ]
+        if len(values) > 1:
+            spread = (
+                f"; the largest standard error is {max(errors):.2g}"
+                if errors
+                else ""
+            )
+            low = f"{min(values):.4g}"
+            high = f"{max(values):.4g} {unit_of(name)}".strip()
+            sentences.append(
+                f"Their {symbol_of(name)} is from {low} to {high}{spread}."
+            )
+    return sentences
+
+
+def sweep_views(rows: Sequence[Row], varied_keys: Sequence[str]) -> list[Table]:
+    """Return tables of estimates and quality by swept values."""
+    places = {
+        short: _varied_cell(key) for key, short in shortened_keys(varied_keys)
+    }
+    estimates: dict[str, Cell] = {}
+    for name in parameters_in(rows):
+        estimates[symbol_with_unit(name)] = _estimate_cell(name)
+    number_columns = _number_cells(
+        "rms_m", "rollout_rms_m", "iterations", "total_s"
+    )
+    quality = {"status": _text_cell("status"), **number_columns}
+    return [
+        _table_view(
+            "Estimates ± standard error",
+            places,
+            number_columns=estimates,
+            rows=rows,
+        ),
+        _table_view(
+            "Quality and cost", places, number_columns=quality, rows=rows
+        ),
+    ]
+
+
+def model_views(rows: Sequence[Row]) -> list[Table]:
+    """Return tables of fit, prediction and small-strain moduli of every model."""
+    factor, unit = display_unit(rows[0]["unit"])
+    number_columns: dict[str, Cell] = {
+        "free": _number_cell("free", 1, form="d"),
+        f"fit {unit}": _number_cell("rms", factor, form=".3g"),
+        "ΔAIC": _number_cell("delta_aic", 1, form=".1f"),
+        f"held out {unit}": _number_cell("held_out_rms", factor, form=".3g"),
+        "relative to best": lambda row: _ratio_text(row),
+        "total s": _number_cell("total_s"),
+    }
+    moduli: dict[str, Cell] = {}
+    names = dict.fromkeys(name for row in rows for name in row["parameters"])
+    for name in names:
+        moduli[symbol_with_unit(name)] = _number_cell(
+            name, 1, form=".4g", among="parameters"
+        )
+    model = {
+        "": lambda row: "→" if row["chosen"] else "",
+        "model": _text_cell("model"),
+    }
+    views = [
+        _table_view("Models", model, number_columns=number_columns, rows=rows)
+    ]
+    test_columns = {
+        f"'{n}' {unit}": _number_cell(
+            n, factor, form=".3g", among="predictions"
+        )
+        for n in dict.fromkeys(n for r in rows for n in r["predictions"])
+    }
+    if len(test_columns) > 1:
+        views.append(
+            _table_view(
+                "Recordings held out",
+                {"model": _text_cell("model")},
+                number_columns=test_columns,
+                rows=rows,
+            )
+        )
+    return [
+        *views,
+        _transposed_view(
+            "Parameters",
+            {"model": _text_cell("model")},
+            cells=moduli,
+            rows=rows,
+        ),
+    ]
+
+
+def _transposed_view(
+    title: str,
+    names: Mapping[str, Cell],
+    cells: Mapping[str, Cell],
+    rows: Sequence[Row],
+) -> Table:
+    """Return a table with a line for each cell and a column for each row, for many cells and few
+    rows.
+
+    Parameters
+    ----------
+    title : str
+    names : mapping of heading to Cell
+        One cell, which gives the headings of the columns.
+    cells : mapping of heading to Cell
+        Cells of the lines.
+    rows : sequence of Row
+    """
+    (name,) = names.values()
+    lines = tuple(
+        (head, *(cell(row) for row in rows)) for head, cell in cells.items()
+    )
+    return Table(title, ("", *(name(row) for row in rows)), rows=lines)
+
+
+def _ratio_text(row: Row) -> str:
+    """Return the ratio of a model's prediction error to the best one as text, with its standard
+    error; "–" if nothing was predicted.
+    """
+    if row["log_ratio"] is None:
+        return "–"
+    times = exp(row["log_ratio"])
+    form = ".2f" if times < 100 else ".2g"
+    return f"{times:{form}} ± {times * row['log_ratio_error']:{form}}"
+
+
+def _table_view(
+    title: str,
+    names: Mapping[str, Cell],
+    number_columns: Mapping[str, Cell],
+    rows: Sequence[Row],
+) -> Table:
+    """Return a table with a line for each row and a column for each cell; the first columns are
+    `names`.
+    """
+    columns = {**names, **number_columns}
+    cells = tuple(tuple(cell(row) for cell in columns.values()) for row in rows)
+    return Table(title, tuple(columns), rows=cells, names=len(names))
+
+
+def _text_cell(name: str) -> Cell:
+    """Return the cell of the text that rows have under this name."""
+    return lambda row: str(row[name])
+
+
+def _varied_cell(key: str) -> Cell:
+    """Return the cell of the value of a swept key, a number with five digits, or else its text."""
+
+    def cell(row: Row) -> str:
+        """Return the text of the cell in a row."""
+        try:
+            return f"{float(row[key]):.5g}"
+        except ValueError:
+            return str(row[key])
+
+    return cell
+
+
+def _number_cell(
+    name: str, factor: float = 1.0, form: str = ".2g", among: str = ""
+) -> Cell:
+    """Return the cell of a number, "–" if unknown.
+
+    Parameters
+    ----------
+    name : str
+        Key of the number.
+    factor : float
+        Multiplies the number.
+    form : str
+        Format.
+    among : str
+        Key of the mapping in the row that contains the number; "" if it is in the row itself.
+    """
+    shown = NumberColumn(factor=factor, form=form)
+    return lambda row: shown.format(
+        row[among].get(name) if among else row[name]
+    )
+
+
+def _error_cells(rows: Sequence[Row]) -> dict[str, Cell]:
+    """Return a cell of the relative error [%] for each parameter whose true value is known, by
+    heading.
+    """
+    names = parameters_in(rows, "error_")
+    return {
+        f"Δ{symbol_of(name)} %": _number_cell(f"error_{name}", 100)
+        for name in names
+    }
+
+
+def _number_cells(*names: str) -> dict[str, Cell]:
+    """Return the cells of the columns with these names in `COLUMNS`, by heading."""
+    return {
+        COLUMNS[name].head: lambda row, name=name: COLUMNS[name].format(
+            row[name]
+        )
+        for name in names
+    }
+
+
+def _estimate_cell(name: str) -> Cell:
+    """Return the cell of an estimate, with its standard error if that is known."""
+
+    def cell(row: Row) -> str:
+        """Return the text of the cell in a row."""
+        value = row.get(f"value_{name}")
+        spread = row.get(f"std_error_{name}")
+        if value is None:
+            return "–"
+        return (
+            f"{value:.4g}"
+            if spread is None
+            else f"{value:.4g} ± {float(f'{spread:.1g}'):g}"
+        )
+
+    return cell

@@ -1,0 +1,160 @@
+"""Progress display in the terminal: of a study with the remaining time, and of a design."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from rich.console import Console
+from rich.text import Text
+
+from ...common.console import Watched
+from ...common.display import duration
+from ..design.motion_design import FORBIDDEN
+from .run_execution import Record
+from .study_planning import PlannedRun
+
+# Motions between lines of a search without a terminal.
+EVERY = 20
+
+
+class StudyProgress(Watched):
+    """Progress of a study: one updated line on a terminal, else a line per run.
+
+    Parameters
+    ----------
+    console : Console
+        Terminal.
+    remaining : sequence of PlannedRun
+        Runs that are not finished yet.
+    total : int
+        Number of all runs, finished ones included.
+    quiet : bool
+        Whether to show nothing.
+    """
+
+    def __init__(
+        self,
+        console: Console,
+        remaining: Sequence[PlannedRun],
+        total: int,
+        quiet: bool = False,
+    ) -> None:
+        super().__init__(console, quiet)
+        self.total = total
+        self._waiting = {run.key: run for run in remaining}
+        self._walls: dict[str, list[float]] = {}
+
+    def __enter__(self) -> StudyProgress:
+        skipped = self.total - len(self._waiting)
+        if skipped:
+            self.line(f"{skipped} of {self.total} runs are finished already")
+        super().__enter__()
+        self.update(Text(f"{skipped}/{self.total} runs", style="dim"))
+        if self._live is not None:
+            self._live.refresh()  # the first run may take less time than a frame
+        return self
+
+    def count_run(self, record: Record, worker_count: int) -> None:
+        """Count a finished run and update the display.
+
+        Parameters
+        ----------
+        record : Record
+            Record of the run.
+        worker_count : int
+            Number of runs that are executed at once.
+        """
+        run = self._waiting.pop(record["key"])
+        if record.get("wall_s") is not None:
+            self._walls.setdefault(run.method, []).append(record["wall_s"])
+        status = (record.get("result") or record).get(
+            "status", record["outcome"]
+        )
+        count = f"{self.total - len(self._waiting)}/{self.total} runs"
+        wall = record.get("wall_s") or 0.0
+        line = f"{count}: {run.label} {status} in {wall:.1f} s{self._remaining_text(worker_count)}"
+        self.update(Text(line, style="dim"), line)
+
+    def _remaining_text(self, worker_count: int) -> str:
+        """Return "; about … left", from the times of finished runs and the number of runs at once;
+        empty if the remaining time is unknown.
+        """
+        remaining_s = remaining_time_s(
+            [run.method for run in self._waiting.values()],
+            self._walls,
+            worker_count=worker_count,
+        )
+        return (
+            ""
+            if remaining_s is None
+            else f"; about {duration(remaining_s)} left"
+        )
+
+
+class DesignProgress(Watched):
+    """Progress of the search for a motion: one updated line on a terminal, else a line now
+    and then.
+    """
+
+    def __init__(
+        self, console: Console, evaluations: int, quiet: bool = False
+    ) -> None:
+        super().__init__(console, quiet)
+        self.evaluations = evaluations
+
+    def show_best(self, number: int, log_size: float) -> None:
+        """Show the smallest error bar so far.
+
+        Parameters
+        ----------
+        number : int
+            Number of motions so far.
+        log_size : float
+            Logarithm of the smallest relative error bar.
+        """
+        best = (
+            "none feasible yet"
+            if log_size >= FORBIDDEN
+            else f"{100 * np.exp(log_size):.3g} %"
+        )
+        line = f"{number} of {self.evaluations} motions evaluated, smallest error bar: {best}"
+        seldom = number % EVERY == 0 or number == self.evaluations
+        self.update(
+            Text(f"{line} (Ctrl-C stops and keeps the best)", style="dim"),
+            line if seldom else "",
+        )
+
+    def show_activity(self, what: str) -> None:
+        """Show `what` is being computed, such as a stage of the design."""
+        self.update(
+            Text(f"{what} (Ctrl-C stops and keeps the best)", style="dim"), what
+        )
+
+
+def remaining_time_s(
+    waiting: Sequence[str],
+    walls: Mapping[str, Sequence[float]],
+    worker_count: int,
+) -> float | None:
+    """Return the estimated time for the waiting runs [s]; None if it is unknown.
+
+    Parameters
+    ----------
+    waiting : sequence of str
+        Method of each waiting run.
+    walls : mapping of str to sequence of float
+        Durations of the finished runs by method [s].
+    worker_count : int
+        Number of runs that are executed at once.
+    """
+    every = [wall for of_method in walls.values() for wall in of_method]
+    if not waiting or not every:
+        return None
+    overall = sum(every) / len(every)
+    means = {
+        method: sum(of_method) / len(of_method)
+        for method, of_method in walls.items()
+    }
+    expected = [means.get(method, overall) for method in waiting]
+    return max(sum(expected) / worker_count, max(expected))

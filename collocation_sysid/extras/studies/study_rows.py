@@ -1,0 +1,365 @@
+"""Numbers of a study: one row per run, and a summary per method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import inf, nan, sqrt
+from typing import Any
+
+import numpy as np
+
+from ...common.serialisation import read
+from ...common.validated_types import Options, Positive
+from ...runs.result_content import Result
+from .run_execution import TIMEOUT, Record
+from .study_planning import PlannedRun
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class NumberColumn:
+    """Number of a run, with its heading and format.
+
+    Attributes
+    ----------
+    head : str
+        Short heading in the terminal; empty if the column is not shown.
+    words : str
+        Heading on pages.
+    factor : float
+        Factor before display, for example 1000 for millimetres.
+    form : str
+        Format specification.
+    from_result : callable, optional
+        Function that returns the number from a result; None if it comes from elsewhere.
+    has_median : bool
+        Whether the summary of a method contains the median over its runs.
+    """
+
+    head: str = ""
+    words: str = ""
+    factor: float = 1.0
+    form: str = ".2g"
+    from_result: Callable[[Result], float | None] | None = None
+    has_median: bool = True
+
+    def format(self, value: float | None) -> str:
+        """Return a number as text; a dash for None."""
+        if value is None:
+            return "–"
+        value *= self.factor
+        return format(
+            value,
+            ".0f" if self.form == ".2g" and abs(value) >= 100 else self.form,
+        )
+
+
+# Quality and cost of a run.
+COLUMNS = {
+    "loss": NumberColumn(
+        from_result=lambda r: r.history[-1].loss if r.history else None,
+        has_median=False,
+    ),
+    "rms_m": NumberColumn(
+        "markers mm",
+        "markers, RMS [mm]",
+        factor=1e3,
+        from_result=lambda r: r.fit.rms_m,
+    ),
+    "violation_n": NumberColumn(
+        "violation N",
+        "equations of motion violated by [N]",
+        factor=1,
+        form=".1e",
+        from_result=lambda r: r.dynamics.max_violation_n,
+    ),
+    "violation_relative": NumberColumn(
+        "relative",
+        "of the largest force",
+        factor=1,
+        form=".1e",
+        from_result=lambda r: r.dynamics.max_violation_relative,
+    ),
+    "rollout_rms_m": NumberColumn(
+        "forward mm",
+        "forward simulation, RMS [mm]",
+        factor=1e3,
+        from_result=lambda r: r.rollout.rms_m,
+    ),
+    "rollout_max_m": NumberColumn(
+        from_result=lambda r: r.rollout.max_m, has_median=False
+    ),
+    "tip_max_m": NumberColumn("tip mm", "tip, at most [mm]", factor=1e3),
+    "iterations": NumberColumn(
+        "iter.",
+        "iterations",
+        factor=1,
+        form=".4g",
+        from_result=lambda r: r.iterations,
+    ),
+    "evaluations": NumberColumn(
+        "evals",
+        "evaluations",
+        factor=1,
+        form=".4g",
+        from_result=lambda r: r.evaluations,
+    ),
+    "build_s": NumberColumn(
+        "build s", "set-up [s]", from_result=lambda r: r.timing_s.build
+    ),
+    "evaluations_s": NumberColumn(
+        "evaluate s",
+        "evaluations [s]",
+        from_result=lambda r: r.timing_s.evaluations,
+    ),
+    "linear_algebra_s": NumberColumn(
+        "solve s",
+        "linear algebra [s]",
+        from_result=lambda r: r.timing_s.linear_algebra,
+    ),
+    "total_s": NumberColumn(
+        "total s", "in all [s]", from_result=lambda r: r.timing_s.total
+    ),
+}
+# 97.5 % quantile of the standard normal distribution.
+NORMAL_975 = 1.959963984540054
+
+
+@dataclass(frozen=True)
+class SuccessCriterion(Options):
+    """Criterion of success.
+
+    Attributes
+    ----------
+    truth : mapping of name to value, empty where it is unknown
+        True values of the parameters.
+    within : float
+        Largest relative error of an estimated parameter.
+    """
+
+    truth: Mapping[str, float] = field(default_factory=dict)
+    within: Positive = 0.01
+
+    @property
+    def sentence(self) -> str:
+        """Explanation of the criterion for the user."""
+        if not self.truth:
+            return "A run succeeds when it converges."
+        return (
+            "A run succeeds when it converges with every estimated parameter within "
+            f"{100 * self.within:g} % of the truth."
+        )
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """95 % interval of a success rate (E. B. Wilson, J. Am. Stat. Assoc. 22, 1927).
+
+    Unlike the normal approximation it holds at rates of 0 and 1 and for few trials.
+    """
+    if trials == 0:
+        return 0.0, 1.0
+    rate = successes / trials
+    z2 = NORMAL_975**2
+    centre = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
+    spread = sqrt(z2 * (rate * (1 - rate) / trials + z2 / (4 * trials**2))) / (
+        1 + z2 / trials
+    )
+    low = 0.0 if successes == 0 else centre - spread
+    return low, 1.0 if successes == trials else centre + spread
+
+
+# Runs ---------------------------------------------------------------------------------------------
+
+
+def run_row(
+    run: PlannedRun, record: Record | None, yardstick: SuccessCriterion
+) -> Row:
+    """Return one run as a flat row; values are None if they are not known.
+
+    Columns ``guess_*``, ``value_*``, ``std_error_*``, ``low_*``, ``high_*`` and ``error_*``
+    (relative to the truth) contain the parameters; swept keys have columns of their own.
+
+    Parameters
+    ----------
+    run : PlannedRun
+        Run.
+    record : Record or None
+        Its record; None if it was not executed.
+    yardstick : SuccessCriterion
+        Criterion of success.
+    """
+    record = record or {"outcome": "missing", "message": "not run yet"}
+    result: Result | None = read(Result | None, record.get("result"))
+    is_timeout = record["outcome"] == TIMEOUT
+    converged = result is not None and result.converged and not is_timeout
+    parameters = _parameter_columns(run, result, truth=yardstick.truth)
+    errors = [
+        parameters[f"error_{name}"]
+        for name in run.guess
+        if name in yardstick.truth
+    ]
+    is_accurate = all(
+        error is not None and error <= yardstick.within for error in errors
+    )
+    values = {
+        name: None if result is None else column.from_result(result)
+        for name, column in COLUMNS.items()
+        if column.from_result is not None
+    }
+    row = {
+        "key": run.key,
+        "method": run.method,
+        "start": run.start,
+        **run.varied_values,
+        "status": record["outcome"]
+        if is_timeout or result is None
+        else result.status,
+        "converged": converged,
+        "success": converged and is_accurate,
+        **parameters,
+        **values,
+        "tip_max_m": (record.get("tip") or {}).get("max_m"),
+        "wall_s": record.get("wall_s"),
+        "attempts": record.get("attempts"),
+        "message": record.get("message", ""),
+    }
+    return {
+        key: None if each != each else each for key, each in row.items()
+    }  # NaN is no number
+
+
+def _parameter_columns(
+    run: PlannedRun, result: Result | None, truth: Mapping[str, float]
+) -> Row:
+    """Return the columns of the parameters."""
+    row: Row = {}
+    estimates = {} if result is None else result.parameters
+    for name, guess in run.guess.items():
+        known = estimates[name].guess if name in estimates else None
+        row[f"guess_{name}"] = known if guess is None else guess
+    for name in run.guess:
+        estimate = estimates.get(name)
+        value = None if estimate is None else estimate.value
+        row[f"value_{name}"] = value
+        row[f"std_error_{name}"] = (
+            None if estimate is None else estimate.combined_std_error
+        )
+        interval = None if estimate is None else estimate.combined95
+        row[f"low_{name}"], row[f"high_{name}"] = interval or (None, None)
+        if name in truth:
+            # Methods are compared by the optimum that they find, not by its correction.
+            optimum = (
+                value
+                if estimate is None or estimate.optimum is None
+                else estimate.optimum
+            )
+            row[f"error_{name}"] = (
+                None if optimum is None else abs(optimum / truth[name] - 1)
+            )
+    return row
+
+
+def parameters_in(rows: Sequence[Row], kind: str = "guess_") -> list[str]:
+    """Return the names of the parameters for which rows have a column of this kind."""
+    return [
+        name.removeprefix(kind) for name in rows[0] if name.startswith(kind)
+    ]
+
+
+# Methods ------------------------------------------------------------------------------------------
+
+
+def method_rows(rows: Sequence[Row]) -> list[Row]:
+    """Return a summary of each method, in the order of their first runs."""
+    methods = dict.fromkeys(row["method"] for row in rows)
+    return [
+        _method_summary(
+            method, [row for row in rows if row["method"] == method]
+        )
+        for method in methods
+    ]
+
+
+def _method_summary(method: str, rows: Sequence[Row]) -> Row:
+    """Return the summary of the runs of one method.
+
+    Runs with the status "missing" are not counted.
+
+    Parameters
+    ----------
+    method : str
+        Name for the summary.
+    rows : sequence of dict
+        Rows of this method's runs, at least one.
+
+    Returns
+    -------
+    dict
+        Numbers of "runs", "converged" and "successes"; "success_rate", None without runs, with its
+        95 % interval from "success_low" to "success_high"; and the medians of the relative errors
+        and of the columns that have a median, None if no run has a value.
+    """
+    done = [row for row in rows if row["status"] != "missing"]
+    successes = sum(row["success"] for row in done)
+    low, high = wilson_interval(successes, len(done))
+    errors = [f"error_{name}" for name in parameters_in(rows, "error_")]
+    medians = [name for name, column in COLUMNS.items() if column.has_median]
+    known = {
+        n: [row[n] for row in done if row[n] is not None]
+        for n in (*errors, *medians)
+    }
+    return {
+        "method": method,
+        "runs": len(done),
+        "converged": sum(row["converged"] for row in done),
+        "successes": successes,
+        "success_rate": successes / len(done) if done else None,
+        "success_low": low,
+        "success_high": high,
+        **{
+            name: float(np.median(each)) if each else None
+            for name, each in known.items()
+        },
+    }
+
+
+def best_run(rows: Sequence[Row]) -> Row | None:
+    """Return the run with the lowest loss, among successes if there are any, else converged runs.
+
+    None if no run has a result.
+    """
+    completed = [row for row in rows if row["rms_m"] is not None]
+
+    def rank(row: Row) -> tuple[bool, bool, float]:
+        """Return the sort key of a run."""
+        loss = row["loss"] if row["loss"] is not None else inf
+        return not row["success"], not row["converged"], loss
+
+    return min(completed, key=rank, default=None)
+
+
+def reference_parameters(
+    rows: Sequence[Row], yardstick: SuccessCriterion
+) -> dict[str, float]:
+    """Return the parameters from which guesses are measured: the truth, or those of the best run.
+
+    Empty if the best run did not converge.
+    """
+    names = parameters_in(rows)
+    if yardstick.truth:
+        return {name: yardstick.truth[name] for name in names}
+    best = best_run(rows)
+    if best is None or not best["converged"]:
+        return {}
+    return {name: best[f"value_{name}"] for name in names}
+
+
+def guess_distance(row: Row, centre: Mapping[str, float]) -> float:
+    """Return the largest ratio between a guess and the reference; NaN without a reference."""
+    logs = [
+        abs(np.log(row[f"guess_{name}"] / value))
+        for name, value in centre.items()
+    ]
+    return float(np.exp(max(logs))) if logs else nan

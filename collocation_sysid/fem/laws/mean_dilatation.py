@@ -1,0 +1,496 @@
+"""Kernels of elements that average the dilatation, which do not lock near incompressibility.
+
+The material of such an element is evaluated at F* = eᵐ F with m = ⅓ ln(J̄/J) and J̄ = v/V, the
+current volume of the element over its undeformed volume (Nagtegaal, Parks & Rice 1974; Simo, Taylor
+& Pister 1985). For ψ_iso(J^−⅓ F) + U(J) the energy is Σ_q V_q ψ_iso + V U(J̄); any other energy has
+the same limit under refinement.
+
+A scalar of the element is then Σ_q g(F_q, Ḟ_q, W_q, m_q; θ). The sums s = Σ_q σ(F_q, Ḟ_q, W_q) are
+v, its derivative along the velocities, and the derivatives of both along w; m are the same
+derivatives of ⅓ ln(J̄/J), and
+
+    m_q = n(s, V) − n(σ_q, V_q),   with n = ⅓ ln(v/V) and its derivatives.
+
+By the chain rule, with α and β any of x and v and with Γ = Σ_q ∂g/∂m, the derivatives of the scalar
+are Σ_q of those at fixed s, and
+
+    Γ ∂n/∂s ∂s/∂α                                                           for first derivatives,
+    (Σ_q ∂²g/∂α∂m) ∂n/∂s ∂s/∂β + its transpose with α and β exchanged
+        + ∂s/∂α [∂n/∂s (Σ_q ∂²g/∂m²) ∂n/∂s + Γ ∂²n/∂s²] ∂s/∂β + Γ ∂n/∂s ∂²s/∂α∂β   for second ones.
+
+So two phases precede the last one, for s and for Γ. The coupled node vectors are ∂s/∂x and
+Σ_q ∂²g/∂x∂m. They include the derivatives of s by v: an entry of s that is a rate depends on v as
+the entry of which it is the rate depends on x. For a g that is an energy, or its derivative along
+v, they include those of g by v, too; for a dissipated power Σ_q ∂²g/∂v∂m is a further vector.
+
+An element resists only the mean dilatation and the 4 · 5 distortions at its points: a single
+element does not resist the three conformal motions that preserve its volume. Four elements whose
+centroids are not in a plane resist them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+
+from ..kernel import (
+    By,
+    Derivative,
+    ElementKernel,
+    Outputs,
+    Pieces,
+    QuadraturePoint,
+    from_lower_triangle,
+)
+
+
+def averaging_kernel(
+    name: str, point: QuadraturePoint, outputs: Outputs
+) -> ElementKernel:
+    """Return the kernel of derivatives of scalars that depend on `QuadraturePoint.stretches`.
+
+    Parameters
+    ----------
+    name : str
+        Name of the kernel.
+    point : QuadraturePoint
+    outputs : dict
+        Derivatives that are summed in each output.
+    """
+    shape = _VolumeSums.from_point(point)
+    chains = _scalar_derivatives(shape, outputs)
+    order = max(len(term.by) for terms in outputs.values() for term in terms)
+    output_pieces: Pieces = {}
+    for key, terms in outputs.items():
+        summands = [
+            term.select_part(chains[id(term.scalar)].piece(term.by))
+            for term in terms
+        ]
+        output_pieces[key] = (
+            terms[0].contraction,
+            sum(summands[1:], summands[0]),
+        )
+    slopes: Pieces = {}
+    if order:
+        slopes = {
+            chain.sum_name("slopes"): ("none", chain.by_stretch)
+            for chain in chains.values()
+        }
+    sums = ca.vertcat(shape.volume, shape.volumes)
+    previous_phases = [point.make_phase("volumes", shape.volume_pieces(order))]
+    coupled = slopes
+    if order > 1:
+        previous_phases.append(
+            point.make_phase("slopes", shape.with_stretches(slopes), sums)
+        )
+        sums = ca.vertcat(sums, *(chain.slopes for chain in chains.values()))
+        coupled = {
+            key: p
+            for chain in chains.values()
+            for key, p in chain.second_derivative_pieces().items()
+        }
+    last = point.make_phase(
+        name, shape.with_stretches(output_pieces | coupled), sums
+    )
+    return ElementKernel(
+        last.pieces,
+        tuple(point.fields),
+        contractions={key: last.contractions[key] for key in output_pieces},
+        previous_phases=tuple(previous_phases),
+        coupled={key: last.contractions[key] for key in coupled},
+        coupling=_coupling(shape, chains, outputs=outputs, order=order)
+        if order
+        else None,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _VolumeSums:
+    """Volumes that determine the stretch of a point.
+
+    Attributes
+    ----------
+    point : QuadraturePoint
+    volume : SX
+        Symbol of the sum V.
+    volumes : SX
+        Symbols of the sums s.
+    own_volumes : SX
+        Contribution σ of the point to s.
+    """
+
+    point: QuadraturePoint
+    volume: ca.SX
+    volumes: ca.SX
+    own_volumes: ca.SX
+
+    @classmethod
+    def from_point(cls, point: QuadraturePoint) -> _VolumeSums:
+        """Return the volumes of a quadrature point and symbols of their sums."""
+        F, *rates = point.gradients.values()
+        volumes = point.mesh_volume * ca.det(ca.reshape(F, 3, 3))
+        for rate in rates:
+            volumes = ca.vertcat(volumes, ca.jtimes(volumes, F, rate))
+        return cls(
+            point,
+            ca.SX.sym("volume"),
+            ca.SX.sym("volumes", len(point.stretches)),
+            volumes,
+        )
+
+    @property
+    def stretches(self) -> ca.SX:
+        """Symbols m of the stretches, as one vector."""
+        return ca.vertcat(*self.point.stretches)
+
+    @property
+    def count(self) -> int:
+        """Number of the sums s."""
+        return self.volumes.numel()
+
+    def with_stretches(self, pieces: Pieces) -> Pieces:
+        """Return pieces with m replaced by its expression in the sums.
+
+        Symbols of energies are replaced first, because energies depend on m.
+        """
+        m = _volume_logarithms(self.volumes, self.volume)
+        m -= _volume_logarithms(self.own_volumes, self.point.mesh_volume)
+        expanded = self.point.rule.eliminate(
+            [piece for _, piece in pieces.values()]
+        )
+        return {
+            key: (how, ca.substitute(piece, self.stretches, m))
+            for (key, (how, _)), piece in zip(
+                pieces.items(), expanded, strict=True
+            )
+        }
+
+    def volume_pieces(self, order: int) -> Pieces:
+        """Return the pieces of the first phase: the volume of the mesh ("volume", summed to V), σ
+        ("volumes", summed to s) and, if `order` is at least 1, ∂σ/∂x ("volumes_by_x").
+
+        Parameters
+        ----------
+        order : int
+            Highest order of the derivatives.
+        """
+        sums: Pieces = {
+            "volume": ("none", self.point.mesh_volume),
+            "volumes": ("none", self.own_volumes),
+        }
+        if order:
+            sums["volumes_by_x"] = "nodes", self.volume_derivative("x").T
+        return sums
+
+    def volume_derivative(self, field: str) -> ca.SX:
+        """Return ∂σ by the gradient of a field."""
+        return ca.jacobian(self.own_volumes, self.point.gradients[field])
+
+    def relation_to_x(self, field: str) -> ca.SX:
+        """Return the matrix B with ∂s/∂field = B ∂s/∂x."""
+        if field == "x":
+            return ca.SX.eye(self.count)
+        # Every second one is the rate of the one before.
+        rates = [ca.SX(ca.sparsify(ca.DM([[0, 0], [1, 0]])))] * (
+            self.count // 2
+        )
+        return ca.diagcat(*rates)
+
+
+@dataclass(frozen=True, eq=False)
+class _ScalarDerivatives:
+    """Scalar g in the symbols of a point, with the chain rule through the stretches.
+
+    Attributes
+    ----------
+    shape : _VolumeSums
+    scalar : SX
+        Scalar g.
+    number : int
+        Index of the scalar, for names of sums.
+    slopes : SX
+        Symbols of the sum Γ.
+    fields : tuple of str
+        Fields whose Σ_q ∂²g/∂field∂m are coupled node vectors.
+    """
+
+    shape: _VolumeSums
+    scalar: ca.SX
+    number: int
+    slopes: ca.SX
+    fields: tuple[str, ...]
+
+    def sum_name(self, name: str) -> str:
+        """Return the name of a sum of this scalar."""
+        return f"{name}_{self.number}"
+
+    @cached_property
+    def by_stretch(self) -> ca.SX:
+        """Derivatives ∂g/∂m by the stretches."""
+        return self.shape.point.gradient(self.scalar, self.shape.stretches)
+
+    def second_derivative_pieces(self) -> Pieces:
+        """Return the pieces whose sums couple in second derivatives: ∂²g by (m, m), (m, θ), (field,
+        m).
+        """
+        point = self.shape.point
+        by_m = point.jacobian(self.by_stretch, self.shape.stretches)
+        pieces: Pieces = {
+            self.sum_name("second"): (
+                "none",
+                ca.vec(from_lower_triangle(by_m)),
+            ),
+            self.sum_name("slopes_by_theta"): (
+                "none",
+                ca.vec(
+                    point.jacobian(
+                        self.by_stretch, point.differentiated_constants
+                    )
+                ),
+            ),
+        }
+        for field in self.fields:
+            slopes = (self._with_stretch(field).T @ self._hessian(field, "x"))[
+                :, 9:
+            ]
+            pieces[self.sum_name(f"slopes_by_{field}")] = "nodes", slopes
+        return pieces
+
+    def piece(self, by: By) -> ca.SX:
+        """Return the piece of a derivative of g by one or two variables: the derivative at fixed
+        sums s and, for two fields α and β, the term Γ ∂n/∂s ∂²σ/∂α∂β of the point's own volumes σ.
+        """
+        shape = self.shape
+        point = self.shape.point
+        nodal = [field for field in by if field != "theta"]
+        if not nodal:
+            return point.derivative(self.scalar, by)
+        if len(nodal) == 1:
+            gradient = point.gradient(self.scalar, point.gradients[nodal[0]])
+            gradient += (
+                (self._with_stretch(nodal[0])[9:, :]).T @ self.by_stretch
+            )
+            return (
+                gradient
+                if len(by) == 1
+                else point.jacobian(gradient, point.differentiated_constants)
+            )
+        alpha, beta = nodal
+        weights = ca.SX.sym("weights", shape.count)
+        by_s, _ = _logarithm_derivatives(
+            shape.volumes, shape.volume, weights=self.slopes
+        )
+        by_own, second_by_own = _logarithm_derivatives(
+            shape.own_volumes, point.mesh_volume, weights=self.by_stretch
+        )
+        second_volumes = ca.jacobian(
+            ca.gradient(
+                ca.dot(weights, shape.own_volumes), point.gradients[alpha]
+            ),
+            point.gradients[beta],
+        )
+        weight_values = by_s.T @ self.slopes - by_own.T @ self.by_stretch
+        return (
+            self._with_stretch(alpha).T
+            @ self._hessian(alpha, beta)
+            @ self._with_stretch(beta)
+            - shape.volume_derivative(alpha).T
+            @ second_by_own
+            @ shape.volume_derivative(beta)
+            + ca.substitute(second_volumes, weights, weight_values)
+        )
+
+    def _with_stretch(self, field: str) -> ca.SX:
+        """Return ∂(F, m)/∂F at fixed s, or the same for the gradient of another field."""
+        by_own, _ = _logarithm_derivatives(
+            self.shape.own_volumes,
+            self.shape.point.mesh_volume,
+            weights=self.by_stretch,
+        )
+        return ca.vertcat(
+            ca.SX.eye(9), -by_own @ self.shape.volume_derivative(field)
+        )
+
+    def _hessian(self, alpha: str, beta: str) -> ca.SX:
+        """Return the second derivatives of g by (gradient, m) of two fields."""
+        point = self.shape.point
+        first, second = (
+            ca.vertcat(point.gradients[field], self.shape.stretches)
+            for field in (alpha, beta)
+        )
+        hessian = point.jacobian(point.gradient(self.scalar, first), second)
+        return from_lower_triangle(hessian) if alpha == beta else hessian
+
+
+def _scalar_derivatives(
+    shape: _VolumeSums, outputs: Outputs
+) -> dict[int, _ScalarDerivatives]:
+    """Return the chain rule of each scalar in the outputs, by the identity of the scalar."""
+    terms = [term for those in outputs.values() for term in those]
+    chains: dict[int, _ScalarDerivatives] = {}
+    for term in terms:
+        if id(term.scalar) not in chains:
+            number = len(chains)
+            parts = {
+                other.part for other in terms if other.scalar is term.scalar
+            }
+            # Where all is symmetric, what is by v is among what is by x.
+            fields = ("x",) if parts == {"whole"} else ("x", "v")
+            slopes = ca.SX.sym(f"slopes_{number}", shape.count)
+            chains[id(term.scalar)] = _ScalarDerivatives(
+                shape, term.scalar, number=number, slopes=slopes, fields=fields
+            )
+    return chains
+
+
+def _coupling(
+    shape: _VolumeSums,
+    chains: dict[int, _ScalarDerivatives],
+    outputs: Outputs,
+    order: int,
+) -> ca.Function:
+    """Return the coupling of each output as a function of all sums over the points: C of order 1 or
+    D of order 2, see `kernel`.
+    """
+    count = shape.count
+    constants = shape.point.differentiated_constants.numel()
+    sums = [
+        shape.volume,
+        shape.volumes,
+        *(chain.slopes for chain in chains.values()),
+    ]
+    blocks = {"volumes": slice(0, count)}
+    seconds = {}
+    by_thetas = {}
+    if order > 1:
+        for key, chain in chains.items():
+            seconds[key] = ca.SX.sym("second", count, count)
+            by_thetas[key] = ca.SX.sym("slopes_by_theta", count, constants)
+            sums += [ca.vec(seconds[key]), ca.vec(by_thetas[key])]
+            for field in chain.fields:
+                start = count * len(blocks)
+                blocks[chain.sum_name(field)] = slice(start, start + count)
+    size = count * len(blocks)
+    couplings = []
+    for terms in outputs.values():
+        total = ca.SX(0, 0)
+        if terms[0].contraction != "none":
+            width = constants if "theta" in terms[0].by else 1
+            total = ca.SX(
+                size, size if terms[0].contraction == "pairs" else width
+            )
+        for term in terms:
+            chain = chains[id(term.scalar)]
+            by_s, second_of_logarithm = _logarithm_derivatives(
+                shape.volumes, shape.volume, weights=chain.slopes
+            )
+            if term.contraction == "nodes":
+                relation = shape.relation_to_x(term.by[0])
+                slopes = (
+                    by_thetas[id(term.scalar)]
+                    if "theta" in term.by
+                    else chain.slopes
+                )
+                total[:count, :] += (by_s @ relation).T @ slopes
+            elif term.contraction == "pairs":
+                second = (
+                    by_s.T @ seconds[id(term.scalar)] @ by_s
+                    + second_of_logarithm
+                )
+                total += _pair_coupling(
+                    shape,
+                    chain,
+                    blocks=blocks,
+                    size=size,
+                    term=term,
+                    by_s=by_s,
+                    second=second,
+                )
+        couplings.append(total)
+    return ca.Function(
+        "coupling", [ca.vertcat(*sums)], couplings, ["sums"], list(outputs)
+    )
+
+
+def _pair_coupling(
+    shape: _VolumeSums,
+    chain: _ScalarDerivatives,
+    blocks: dict[str, slice],
+    size: int,
+    term: Derivative,
+    by_s: ca.SX,
+    second: ca.SX,
+) -> ca.SX:
+    """Return D of a second derivative by two fields, or of its symmetric or skew part.
+
+    Parameters
+    ----------
+    shape : _VolumeSums
+    chain : _ScalarDerivatives
+    blocks : dict
+        Slices of the coupled node vectors, by their names.
+    size : int
+        Number of coupled node vectors.
+    term : Derivative
+    by_s : SX
+        Derivative ∂n/∂s.
+    second : SX
+        Coupling of ∂s/∂α with ∂s/∂β.
+    """
+    alpha, beta = term.by
+    of_alpha = shape.relation_to_x(alpha)
+    of_beta = shape.relation_to_x(beta)
+    volume_block = blocks["volumes"]
+    coupling = ca.SX(size, size)
+    coupling[volume_block, volume_block] = of_alpha.T @ second @ of_beta
+    coupling[blocks[chain.sum_name(alpha)], volume_block] = by_s @ of_beta
+    if beta in chain.fields:
+        coupling[volume_block, blocks[chain.sum_name(beta)]] = (
+            of_alpha.T @ by_s.T
+        )
+    else:
+        coupling[volume_block, blocks[chain.sum_name(alpha)]] = (
+            of_beta.T @ by_s.T
+        )
+    if term.part == "whole":
+        return coupling
+    return (
+        coupling + coupling.T
+        if term.part == "symmetric"
+        else coupling - coupling.T
+    ) / 2
+
+
+def _volume_logarithms(volumes: ca.SX, volume: ca.SX) -> ca.SX:
+    """Return n: ⅓ ln(v/V), its derivative along the velocities, and the derivatives of both along
+    w.
+
+    Parameters
+    ----------
+    volumes : (1, 2 or 4,) SX
+        Deformed volume v [m³], and its derivatives in the same order; as many entries are returned.
+    volume : SX
+        Undeformed volume V [m³].
+    """
+    s = ca.SX.sym("s", volumes.numel())
+    n = ca.log(s[0] / volume) / 3
+    for known in (1, 2):
+        if s.numel() > known:
+            n = ca.vertcat(n, ca.jtimes(n, s[:known], s[known : 2 * known]))
+    return ca.substitute(n, s, volumes)
+
+
+def _logarithm_derivatives(
+    volumes: ca.SX, volume: ca.SX, weights: ca.SX
+) -> tuple[ca.SX, ca.SX]:
+    """Return ∂n/∂s and Σ_k weights_k ∂²n_k/∂s² of the function n of `_volume_logarithms`, with s =
+    `volumes`, at the undeformed `volume`.
+    """
+    s = ca.SX.sym("s", volumes.numel())
+    c = ca.SX.sym("c", volumes.numel())
+    n = _volume_logarithms(s, volume)
+    expressions = [ca.jacobian(n, s), ca.hessian(ca.dot(c, n), s)[0]]
+    first, second = ca.substitute(expressions, [s, c], [volumes, weights])
+    return first, second

@@ -1,0 +1,404 @@
+"""Tetrahedral mesh of a body: generated or read, cleaned and checked once, then immutable.
+
+`TetMesh` holds the mesh. `ElementNodes` are the nodes of a body's elements: those of the mesh,
+then, for quadratic elements, one in the middle of each edge.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...common.array_types import Array, Index
+from ...errors import InputError
+from ..elements import Element
+from .mesh_checks import (
+    MeshQuality,
+    checked_arrays,
+    checked_faces,
+    checked_points,
+    checked_tetrahedra,
+    clean_mesh,
+    mean_ratios,
+    signed_volumes,
+    unique_edges,
+)
+from .mesh_files import (
+    length_in_metres,
+    read_tetrahedra,
+    read_triangles,
+    write_tetrahedra,
+)
+from .surface import tetrahedralize_surface
+
+
+class NodeSelection(Protocol):
+    """Selection of nodes, see `selection_from_section`."""
+
+    def resolve(self, nodes: ElementNodes) -> np.ndarray:
+        """Return the indices of the selected nodes, sorted."""
+        ...
+
+
+_OUTWARD_FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+
+
+@dataclass(frozen=True, eq=False)
+class TetMesh:
+    """Mesh of linear tetrahedra in metres; its arrays are read-only.
+
+    The constructor drops nodes that are no element's corner and reverses negatively oriented
+    elements, and reports this in `notes`. The order of nodes and elements is kept.
+
+    Parameters
+    ----------
+    points_m : (n, 3) array
+        Node positions in metres.
+    tetrahedra : (E, 4) integer array
+        Nodes of each element, counted from 0.
+    point_arrays : mapping of name to (n, ...) array, optional
+        Values per node, such as the 0/1 masks of `Named` selections.
+    cell_arrays : mapping of name to (E, ...) array, optional
+        Values per element.
+    face_sets : mapping of name to (k, 3) integer array, optional
+        Corners of triangles, such as those of a cavity's wall.
+    is_generated : bool, default False
+        Whether the mesh was made of stated lengths, as those of `structured` are, not of a scan.
+
+    Attributes
+    ----------
+    file_index : (n,) int64
+        Index of each node before others were dropped; increasing.
+    file_node_count : int
+        Number of nodes before any were dropped.
+    notes : tuple of str
+        Sentences about what was cleaned and what looks suspicious.
+
+    Raises
+    ------
+    InputError
+        For wrong shapes, indices out of range, coordinates that are not finite, and elements that
+        are degenerate or given twice.
+    """
+
+    points_m: np.ndarray
+    tetrahedra: np.ndarray
+    point_arrays: dict[str, np.ndarray]
+    cell_arrays: dict[str, np.ndarray]
+    face_sets: dict[str, np.ndarray]
+    file_index: np.ndarray
+    file_node_count: int
+    notes: tuple[str, ...]
+    is_generated: bool
+
+    def __init__(
+        self,
+        points_m: ArrayLike,
+        tetrahedra: ArrayLike,
+        point_arrays: Mapping[str, ArrayLike] | None = None,
+        cell_arrays: Mapping[str, ArrayLike] | None = None,
+        face_sets: Mapping[str, ArrayLike] | None = None,
+        *,
+        is_generated: bool = False,
+    ) -> None:
+        raw_points = checked_points(points_m)
+        elements = checked_tetrahedra(tetrahedra, len(raw_points))
+        arrays = checked_arrays(
+            point_arrays or {}, len(raw_points), kind="point", of="nodes"
+        )
+        element_arrays = checked_arrays(
+            cell_arrays or {}, len(elements), kind="cell", of="elements"
+        )
+        points, elements, used, notes = clean_mesh(raw_points, elements)
+        new_index = np.full(len(raw_points), -1)
+        new_index[used] = np.arange(len(used))
+        faces = {
+            name: new_index[checked_faces(f, len(raw_points))]
+            for name, f in (face_sets or {}).items()
+        }
+        self._set(
+            points_m=_read_only(points),
+            tetrahedra=_read_only(elements),
+            point_arrays={
+                name: _read_only(values[used])
+                for name, values in arrays.items()
+            },
+            cell_arrays={
+                name: _read_only(values)
+                for name, values in element_arrays.items()
+            },
+            face_sets={
+                name: _read_only(corners) for name, corners in faces.items()
+            },
+            file_index=_read_only(used),
+            file_node_count=len(raw_points),
+            notes=notes,
+            is_generated=is_generated,
+        )
+
+    def _set(self, **values: Any) -> None:
+        """Set attributes of the frozen dataclass."""
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        return f"TetMesh({len(self.points_m)} nodes, {len(self.tetrahedra)} tetrahedra)"
+
+    @classmethod
+    def read(cls, path: str | Path, length_unit: str = "m") -> TetMesh:
+        """Read the tetrahedra of any file that meshio can read.
+
+        Other cells are omitted with a note.
+
+        Quadratic tetrahedra are reduced to their corners: the element of the body determines the
+        nodes on edges. Slightly curved sides are straightened, with a note.
+
+        Point arrays of the file, and its point sets as boolean arrays, become `point_arrays`; cell
+        arrays, cell sets and physical groups of the tetrahedra become `cell_arrays`. The nodes of
+        sets and groups, including those of triangles, lines or points, also become `point_arrays`,
+        and their triangles `face_sets`.
+
+        Parameters
+        ----------
+        path : str or Path
+        length_unit : {"m", "cm", "mm", "um", "in"}
+            Unit of the coordinates in the file.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read, contains no tetrahedra, has sides curved by more than 5 % of
+            their length, or its mesh is invalid.
+        """
+        points_m, tetrahedra, point_arrays, cell_arrays, faces, notes = (
+            read_tetrahedra(path, length_unit)
+        )
+        try:
+            mesh = cls(points_m, tetrahedra, point_arrays, cell_arrays, faces)
+        except InputError as error:
+            raise error.located(path) from None
+        mesh._set(notes=(*notes, *mesh.notes))
+        return mesh
+
+    @classmethod
+    def from_surface(
+        cls,
+        surface: str | Path | tuple[ArrayLike, ArrayLike],
+        edge_length_m: float,
+        length_unit: str = "m",
+        cache: str | Path | None = None,
+    ) -> TetMesh:
+        """Fill a closed surface with tetrahedra by `surface.tetrahedralize_surface`.
+
+        Parameters
+        ----------
+        surface : str, Path or pair of arrays
+            STL, OBJ or PLY file, or vertices (p, 3) and triangles (F, 3).
+        edge_length_m : float
+            Desired edge length in metres, whatever the unit of the surface.
+        length_unit : {"m", "cm", "mm", "um", "in"}
+            Unit of the surface's coordinates.
+        cache : str or Path, optional
+            Folder in which the mesh is kept, since meshing again would give a different mesh.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read, its surface is invalid, or pytetwild is not installed.
+        """
+        if isinstance(surface, (str, Path)):
+            path = surface
+            points, triangles = read_triangles(surface, length_unit)
+        else:
+            path = None
+            points = checked_points(surface[0]) * length_in_metres(length_unit)
+            triangles = surface[1]
+        try:
+            return cls(
+                *tetrahedralize_surface(
+                    points,
+                    triangles,
+                    edge_length_m=edge_length_m,
+                    cache_dir=cache,
+                )
+            )
+        except InputError as error:
+            raise error.located(path) from error.__cause__
+
+    def write(self, path: str | Path) -> None:
+        """Write the mesh, in metres, to any format that meshio knows by the file's extension."""
+        write_tetrahedra(
+            path,
+            self.points_m,
+            tetrahedra=self.tetrahedra,
+            point_arrays=self.point_arrays,
+            cell_arrays=self.cell_arrays,
+        )
+
+    def select(self, selection: NodeSelection) -> np.ndarray:
+        """Return the nodes of a `selection.Selection`, as sorted int64 indices.
+
+        For nodes on edges, which quadratic elements have, see `Body.select`.
+        """
+        return selection.resolve(ElementNodes.corners(self))
+
+    @cached_property
+    def volumes_m3(self) -> np.ndarray:
+        """Volume of each element (E,) [m³], all positive."""
+        return _read_only(signed_volumes(self.points_m, self.tetrahedra))
+
+    @cached_property
+    def centres_m(self) -> np.ndarray:
+        """Centre of each element (E, 3) [m]."""
+        return _read_only(self.points_m[self.tetrahedra].mean(axis=1))
+
+    @property
+    def volume_m3(self) -> float:
+        """Volume of the whole mesh [m³]."""
+        return float(self.volumes_m3.sum())
+
+    @property
+    def bounds_m(self) -> np.ndarray:
+        """Lowest and highest coordinates (2, 3) [m]."""
+        return np.array([self.points_m.min(axis=0), self.points_m.max(axis=0)])
+
+    @property
+    def surface(self) -> np.ndarray:
+        """Boundary triangles (F, 3) int64, counter-clockwise as seen from outside."""
+        return self._boundary[0]
+
+    @property
+    def surface_cells(self) -> np.ndarray:
+        """Index of the element to which each boundary triangle belongs (F,)."""
+        return self._boundary[1]
+
+    @cached_property
+    def _boundary(self) -> tuple[np.ndarray, np.ndarray]:
+        """Boundary triangles and the indices of their elements."""
+        faces, owners = boundary_of(self.tetrahedra)
+        return _read_only(faces), _read_only(owners)
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """Pairs of nodes that share an element, (m, 2) int64, each once, sorted."""
+        return _read_only(unique_edges(self.tetrahedra))
+
+    def mid_node_indices(self, pairs: np.ndarray) -> np.ndarray:
+        """Return the indices (…) of the mid nodes between pairs (…, 2) of corners.
+
+        Mid nodes follow the corners, in the order of `edges`.
+        """
+        count = len(self.points_m)
+        codes = np.sort(pairs, axis=-1) @ [count, 1]
+        return count + np.searchsorted(self.edges @ [count, 1], codes)
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hash of the points and tetrahedra, as 64 hexadecimal digits."""
+        digest = hashlib.sha256(
+            f"{self.points_m.shape} {self.tetrahedra.shape}".encode()
+        )
+        digest.update(self.points_m.astype("<f8").tobytes())
+        digest.update(self.tetrahedra.astype("<i8").tobytes())
+        return digest.hexdigest()
+
+    def quality(self) -> MeshQuality:
+        """Return edge lengths and mean ratios of the elements."""
+        lengths = np.linalg.norm(
+            np.diff(self.points_m[self.edges], axis=1), axis=2
+        )
+        ratios = mean_ratios(self.points_m, self.tetrahedra)
+        return MeshQuality(
+            edge_min_m=float(lengths.min()),
+            edge_mean_m=float(lengths.mean()),
+            edge_max_m=float(lengths.max()),
+            quality_min=float(ratios.min()),
+            quality_median=float(np.median(ratios)),
+        )
+
+
+def boundary_of(tetrahedra: Index) -> tuple[Index, Index]:
+    """Return the boundary faces (F, 3) of tetrahedra and the index (F,) of the element of each.
+
+    A boundary face belongs to one element only; it is counter-clockwise as seen from outside.
+    """
+    faces = tetrahedra[:, _OUTWARD_FACES].reshape(-1, 3)
+    _, first, count = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    boundary_faces = np.sort(first[count == 1])
+    return faces[boundary_faces], boundary_faces // 4
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    """Return a contiguous array that cannot be modified; the array itself if it is contiguous."""
+    array = np.ascontiguousarray(array)
+    array.flags.writeable = False
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class ElementNodes:
+    """Nodes of the elements of a body.
+
+    Attributes
+    ----------
+    mesh : TetMesh
+        Mesh whose nodes are the corners; they come first, with the same indices.
+    points_m : (n, 3)
+        Undeformed positions.
+    cells : (E, nodes per element)
+        Node indices of each element.
+    ends : (k, 2)
+        Corners at the ends of the edge of each mid node: the rows of `mesh.edges`, or none.
+    """
+
+    mesh: TetMesh
+    points_m: Array
+    cells: Index
+    ends: Index
+
+    @classmethod
+    def corners(cls, mesh: TetMesh) -> ElementNodes:
+        """Return the nodes of the mesh only."""
+        return cls(
+            mesh,
+            mesh.points_m,
+            mesh.tetrahedra,
+            np.empty((0, 2), dtype=np.int64),
+        )
+
+    @classmethod
+    def for_element(cls, mesh: TetMesh, element: Element) -> ElementNodes:
+        """Return the nodes of a kind of element: corners, and mid nodes if it has any."""
+        if not element.edges:
+            return cls.corners(mesh)
+        points = _read_only(
+            np.vstack([mesh.points_m, mesh.points_m[mesh.edges].mean(axis=1)])
+        )
+        middles = mesh.mid_node_indices(mesh.tetrahedra[:, element.edges])
+        return cls(
+            mesh, points, np.hstack([mesh.tetrahedra, middles]), mesh.edges
+        )
+
+    def with_mid_nodes(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Extend a mask of mesh nodes to mid nodes, which are selected if both ends of the edge
+        are.
+        """
+        return np.concatenate([chosen, chosen[self.ends].all(axis=1)])
+
+    def nodes_of_faces(self, triangles: Index) -> Index:
+        """Return the nodes (F, 3) or (F, 6) of triangles of corners, then those on the edges ab,
+        bc, ca.
+        """
+        if not len(self.ends):
+            return triangles
+        pairs = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2)
+        return np.hstack([triangles, self.mesh.mid_node_indices(pairs)])

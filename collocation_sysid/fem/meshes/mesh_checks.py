@@ -1,0 +1,351 @@
+"""Checks of tetrahedral meshes given as arrays: validation, cleaning and quality.
+
+`mesh.TetMesh` applies these functions to every mesh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ...errors import InputError
+from ..elements import EDGES
+
+# Volume over mean edge length cubed; 0.118 for the regular tetrahedron. Below this a
+# single-precision file cannot tell the element from a flat one.
+DEGENERATE_RATIO = 1e-6
+
+# Largest accepted coordinate [m]: larger than any body, while volumes do not overflow.
+LARGEST_M = 1e50
+
+# Largest offset of a mid node from the middle of its edge, in edge lengths, that is rounding of a
+# file in single precision.
+ROUND_OFF = 1e-5
+# Largest offset, in edge lengths, of sides that are straightened with a note.
+LARGEST_SIDE_CURVATURE = 0.05
+
+
+def checked_points(points_m: ArrayLike) -> np.ndarray:
+    """Return a float64 copy of (n, 3) coordinates; NaN is allowed.
+
+    Raises
+    ------
+    InputError
+        If the values are not numbers, of another shape, or beyond `LARGEST_M`.
+    """
+    try:
+        points = np.array(points_m, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(
+            "points_m must be an (n, 3) array of numbers"
+        ) from None
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"points_m must have shape (n, 3), not {points.shape}")
+    if (np.abs(points) > LARGEST_M).any():
+        raise InputError(
+            f"a node lies {np.nanmax(np.abs(points)):.3g} m away from the origin: check the "
+            "file and its unit of length"
+        )
+    return points
+
+
+def checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
+    """Return an int64 copy of (E, 4) node indices, or raise an `InputError`.
+
+    E must be positive and all indices below `node_count`.
+    """
+    try:
+        array = np.array(tetrahedra)
+    except ValueError:
+        raise InputError(
+            "tetrahedra must be an (E, 4) array of node numbers"
+        ) from None
+    if array.ndim != 2 or array.shape[1] != 4 or not len(array):
+        raise InputError(
+            f"tetrahedra must have shape (E, 4) with E > 0, not {array.shape}"
+        )
+    if array.dtype.kind not in "iu":
+        raise InputError(
+            f"tetrahedra must hold integer node numbers, not {array.dtype}"
+        )
+    require_known_nodes(array, node_count)
+    return array.astype(np.int64)
+
+
+def checked_faces(faces: ArrayLike, node_count: int) -> np.ndarray:
+    """Return an int64 copy of (k, 3) node indices below `node_count`, or raise an `InputError`."""
+    array = np.array(faces)
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "iu":
+        raise InputError(
+            f"a face set must be a (k, 3) array of node numbers, not {array.dtype} {array.shape}"
+        )
+    require_known_nodes(array, node_count)
+    return array.astype(np.int64)
+
+
+def require_known_nodes(cells: np.ndarray, node_count: int) -> None:
+    """Raise an `InputError` if cells (E, k) have node indices outside 0 … `node_count` − 1."""
+    bad = np.flatnonzero(((cells < 0) | (cells >= node_count)).any(axis=1))
+    if len(bad):
+        hint = (
+            "; they seem to count from 1"
+            if (cells.min(), cells.max()) == (1, node_count)
+            else ""
+        )
+        raise InputError(
+            f"element {bad[0]} has nodes {cells[bad[0]].tolist()}, but there are {node_count} "
+            f"nodes, counted from 0{hint} ({len(bad)} such in all)"
+        )
+
+
+def checked_arrays(
+    arrays: Mapping[str, ArrayLike], count: int, kind: str, of: str
+) -> dict[str, np.ndarray]:
+    """Return named arrays whose first length is `count`, or raise an `InputError`.
+
+    Parameters
+    ----------
+    arrays : mapping of name to array
+    count : int
+        Required first length.
+    kind : str
+        "point" or "cell", for the message.
+    of : str
+        What is counted, for the message.
+    """
+    checked = {name: np.asarray(values) for name, values in arrays.items()}
+    for name, values in checked.items():
+        if values.ndim == 0 or len(values) != count:
+            raise InputError(
+                f'{kind} array "{name}" has shape {values.shape}; '
+                f"its first length must be the number of {of}, {count}"
+            )
+    return checked
+
+
+def clean_mesh(
+    points_m: np.ndarray, tetrahedra: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Drop nodes that are no element's corner and reverse negatively oriented elements.
+
+    Orders are kept.
+
+    Returns
+    -------
+    points_m : (n', 3) array
+    tetrahedra : (E, 4) array
+    used : (n',) int64
+        Previous index of each node, increasing.
+    notes : tuple of str
+        Sentences about what was cleaned and what looks suspicious.
+
+    Raises
+    ------
+    InputError
+        For coordinates that are not finite, and elements that are degenerate or given twice.
+    """
+    used, renumbered = np.unique(tetrahedra, return_inverse=True)
+    _require_finite(points_m, used)
+    _require_no_duplicates(tetrahedra)
+    _require_not_degenerate(points_m, tetrahedra)
+    used_points = points_m[used]
+    oriented, reversed_elements = orient_elements(
+        used_points, renumbered.reshape(-1, 4)
+    )
+    notes = []
+    dropped = np.setdiff1d(np.arange(len(points_m)), used)
+    if len(dropped):
+        notes.append(
+            f"{len(dropped)} of {len(points_m)} nodes were dropped (node {dropped[0]} is the "
+            "first): they are not the corner of any element."
+        )
+    if len(reversed_elements):
+        notes.append(
+            f"{len(reversed_elements)} of {len(oriented)} elements had a negative volume and were "
+            "re-oriented."
+        )
+    return (
+        used_points,
+        oriented,
+        used,
+        (*notes, *_note_parts(used_points, oriented)),
+    )
+
+
+def orient_elements(
+    points_m: np.ndarray, tetrahedra: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a copy of the tetrahedra (E, 4) in which all volumes are positive, and the indices of
+    those whose last two nodes were exchanged for it.
+    """
+    reversed_elements = np.flatnonzero(signed_volumes(points_m, tetrahedra) < 0)
+    oriented = tetrahedra.copy()
+    oriented[reversed_elements, 2:] = tetrahedra[reversed_elements, :1:-1]
+    return oriented, reversed_elements
+
+
+def signed_volumes(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Return the volume of each tetrahedron (E,) [m³].
+
+    Positive if x₁−x₀, x₂−x₀, x₃−x₀ is right-handed.
+    """
+    corner = points_m[tetrahedra]
+    a, b, c = (corner[:, i] - corner[:, 0] for i in (1, 2, 3))
+    return np.einsum("ei,ei->e", np.cross(a, b), c) / 6
+
+
+def unique_edges(tetrahedra: np.ndarray) -> np.ndarray:
+    """Return the pairs of nodes that share an element, (m, 2), each once, sorted."""
+    return np.unique(
+        np.sort(tetrahedra[:, EDGES].reshape(-1, 2), axis=1), axis=0
+    )
+
+
+@dataclass(frozen=True)
+class MeshQuality:
+    """Edge lengths of a mesh and mean ratios of its elements.
+
+    Attributes
+    ----------
+    edge_min_m, edge_mean_m, edge_max_m : float
+        Shortest, mean and longest edge.
+    quality_min, quality_median : float
+        Smallest and median mean ratio, see `mean_ratios`.
+    """
+
+    edge_min_m: float
+    edge_mean_m: float
+    edge_max_m: float
+    quality_min: float
+    quality_median: float
+
+
+def mean_ratios(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Return 12 (3V)^(2/3) / Σ l² over the edges of each element (E,): 1 if regular, near 0 if
+    flat; NaN for a negative volume V.
+    """
+    volumes = signed_volumes(points_m, tetrahedra)
+    squares = edge_lengths(points_m, tetrahedra) ** 2
+    return 12 * (3 * volumes) ** (2 / 3) / squares.sum(axis=1)
+
+
+def edge_lengths(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Return the lengths (E, 6) [m] of the edges between the corners of elements (E, 4) or (E, 10),
+    in the order of `EDGES`.
+    """
+    ends = points[tetrahedra[:, EDGES]]
+    return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2)
+
+
+def _require_finite(points: np.ndarray, used: np.ndarray) -> None:
+    """Raise an `InputError` if a used node has coordinates that are not finite."""
+    bad = used[~np.isfinite(points[used]).all(axis=1)]
+    if len(bad):
+        raise InputError(
+            f"node {bad[0]} lies at {points[bad[0]].tolist()}: "
+            f"coordinates must be finite ({len(bad)} such in all)"
+        )
+
+
+def _require_no_duplicates(tetrahedra: np.ndarray) -> None:
+    """Raise an `InputError` if two elements have the same nodes."""
+    _, first, inverse = np.unique(
+        np.sort(tetrahedra, axis=1),
+        axis=0,
+        return_index=True,
+        return_inverse=True,
+    )
+    twin = first[inverse.ravel()]
+    again = np.flatnonzero(twin != np.arange(len(tetrahedra)))
+    if len(again):
+        raise InputError(
+            f"element {again[0]} has the same nodes {tetrahedra[again[0]].tolist()} as element "
+            f"{twin[again[0]]}; remove the duplicates ({len(again)} in all)"
+        )
+
+
+def _require_not_degenerate(points: np.ndarray, tetrahedra: np.ndarray) -> None:
+    """Raise an `InputError` if an element has almost no volume."""
+    volumes = np.abs(signed_volumes(points, tetrahedra))
+    cubes = edge_lengths(points, tetrahedra).mean(axis=1) ** 3
+    bad = np.flatnonzero(volumes <= DEGENERATE_RATIO * cubes)
+    if len(bad):
+        raise InputError(
+            f"element {bad[0]} with nodes {tetrahedra[bad[0]].tolist()} is degenerate: its volume "
+            f"is {volumes[bad[0]]:.3g} m³, which must exceed {DEGENERATE_RATIO:g} of its mean edge "
+            f"length cubed, {cubes[bad[0]]:.3g} m³ ({len(bad)} such in all); remove it or remesh"
+        )
+
+
+def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
+    """Return a note if the mesh consists of several unconnected parts; empty otherwise."""
+    edges = unique_edges(tetrahedra)
+    n = len(points)
+    graph = coo_array((np.ones(len(edges)), edges.T), shape=(n, n))
+    parts, label = connected_components(graph, directed=False)
+    if parts == 1:
+        return ()
+    sizes = ", ".join(str(size) for size in np.sort(np.bincount(label))[:-6:-1])
+    twins = n - len(np.unique(points, axis=0))
+    hint = (
+        f"; {twins} of {n} nodes coincide with others: merge them"
+        if twins
+        else ""
+    )
+    return (
+        f"The mesh is in {parts} unconnected parts (the largest have {sizes} nodes){hint}.",
+    )
+
+
+def straightening_notes(
+    points_m: np.ndarray, cells: np.ndarray
+) -> tuple[str, ...]:
+    """Return notes on curved sides that are lost when quadratic tetrahedra are reduced to corners.
+
+    Parameters
+    ----------
+    points_m : (n, 3)
+    cells : (E, 10)
+
+    Returns
+    -------
+    tuple of str
+        Empty if all sides are straight.
+
+    Raises
+    ------
+    InputError
+        If a node does not exist, or sides are curved by more than `LARGEST_SIDE_CURVATURE`.
+    """
+    require_known_nodes(cells, len(points_m))
+    start_of, end_of = np.array(EDGES).T
+    start = points_m[cells[:, start_of]]
+    stop = points_m[cells[:, end_of]]
+    length = np.linalg.norm(stop - start, axis=2)
+    offset = np.linalg.norm(points_m[cells[:, 4:]] - (start + stop) / 2, axis=2)
+    bad = np.argwhere(~(offset <= LARGEST_SIDE_CURVATURE * length))
+    if len(bad):
+        e, k = bad[0]
+        a = cells[e, start_of[k]]
+        b = cells[e, end_of[k]]
+        mid = cells[e, 4 + k]
+        raise InputError(
+            f"quadratic element {e}: mid node {mid} lies {offset[e, k]:.3g} m off the middle of "
+            f"the edge from node {a} to node {b}, which is {length[e, k]:.3g} m long; expected at "
+            f"most {LARGEST_SIDE_CURVATURE:.0%} of that ({len(bad)} such in all), because sides "
+            "are assumed to be straight: refine the mesh, or save it with linear tetrahedra"
+        )
+    is_curved = offset > ROUND_OFF * length
+    if not is_curved.any():
+        return ()
+    largest = (offset[is_curved] / length[is_curved]).max()
+    count = len(np.unique(cells[:, 4:][is_curved]))
+    return (
+        f"Curved sides were straightened: {count} mid nodes lie off the middle of their edges, "
+        f"by up to {largest:.2g} of the edge's length.",
+    )

@@ -1,0 +1,215 @@
+"""Refinement of a body: every tetrahedron is split into eight.
+
+Use `refine_body` for the body, and `refine_nodes` for nodes that are selected on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.array_types import Index
+from ..elements import ELEMENTS
+from ..node_force import LocatedForce, NodeForce
+from ..regions import Region
+from ..rest_shape import UnderGravity
+from .mesh import ElementNodes, TetMesh
+from .mesh_checks import orient_elements
+from .selection import Ball, Box, Indices, Selection
+
+if TYPE_CHECKING:
+    from ..body import Body
+
+# Tetrahedron at each corner: the corner and its mid nodes, in the order of `elements.EDGES`.
+_AT_CORNERS = ((0, 4, 6, 7), (1, 4, 5, 8), (2, 5, 6, 9), (3, 7, 8, 9))
+# Octahedron in the middle: each of its diagonals, and the ring of the other mid nodes.
+_DIAGONALS = np.array([(4, 9), (5, 7), (6, 8)])
+_RINGS = np.array([(5, 6, 7, 8), (4, 6, 9, 8), (4, 5, 9, 7)])
+
+
+def split_in_eight(mesh: TetMesh) -> TetMesh:
+    """Return the mesh with a node on each edge and eight tetrahedra in place of each one.
+
+    The octahedron in the middle is cut along its shortest diagonal, so that elements do not
+    deteriorate (Zhang 1995). The nodes of the mesh come first, then the middle of each of
+    `TetMesh.edges`; the eight parts of an element follow one another. Masks of nodes are true in
+    the middle of an edge if they are at both ends; other arrays of nodes are omitted.
+    """
+    finer = ElementNodes.for_element(mesh, ELEMENTS["tet10"])
+    ends = mesh.edges
+    points = finer.points_m
+    nodes = finer.cells
+    across = points[nodes[:, _DIAGONALS]]  # (E, 3, 2, 3)
+    shortest = (
+        np.linalg.norm(across[:, :, 1] - across[:, :, 0], axis=2)
+        .round(12)
+        .argmin(axis=1)
+    )
+    ring = _RINGS[shortest]
+    axis = _DIAGONALS[shortest]  # (E, 4), (E, 2)
+    middle = [
+        np.column_stack([axis, ring[:, k], ring[:, k - 1]]) for k in range(4)
+    ]
+    local = [
+        np.broadcast_to(corner, (len(nodes), 4)) for corner in _AT_CORNERS
+    ] + middle
+    children = np.take_along_axis(
+        nodes[:, None], np.stack(local, axis=1), axis=2
+    )
+    masks = {
+        n: a
+        for n, a in mesh.point_arrays.items()
+        if a.ndim == 1 and np.isin(a, (0, 1)).all()
+    }
+    return TetMesh(
+        points,
+        orient_elements(points, children.reshape(-1, 4))[0],
+        point_arrays={
+            name: np.concatenate([a, a[ends].min(axis=1)])
+            for name, a in masks.items()
+        },
+        cell_arrays={
+            name: np.repeat(a, 8, axis=0)
+            for name, a in mesh.cell_arrays.items()
+        },
+        face_sets={
+            name: split_faces_in_four(faces, mesh)
+            for name, faces in mesh.face_sets.items()
+        },
+        is_generated=mesh.is_generated,
+    )
+
+
+def split_faces_in_four(faces: Index, mesh: TetMesh) -> Index:
+    """Return faces (k, 3) of a mesh split into four each, with the nodes of `split_in_eight`."""
+    nodes = ElementNodes.for_element(mesh, ELEMENTS["tet10"]).nodes_of_faces(
+        faces
+    )
+    return nodes[:, [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)]].reshape(-1, 3)
+
+
+def refine_body(body: Body) -> Body:
+    """Return the body on a mesh with half the element size.
+
+    Its regions consist of the split cells.
+    """
+    cells = [8 * part.cells[:, None] + np.arange(8) for part in body.parts]
+    regions = [
+        Region(
+            part.name,
+            inside.ravel(),
+            material=part.material,
+            density_kg_m3=part.density_kg_m3 if part.has_own_density else None,
+            damping=part.damping,
+            prony=part.prony,
+        )
+        for part, inside in zip(body.parts, cells, strict=True)
+        if part.name
+    ]
+    # A region without a density has that of the body, even if regions claim all cells.
+    rest = next(
+        (part for part in body.parts if not part.has_own_density), body.parts[0]
+    )
+    mesh = split_in_eight(body.mesh)
+    finer = type(body)(
+        mesh,
+        rest.material,
+        rest.density_kg_m3,
+        body.element.name,
+        damping=rest.damping,
+        regions=regions,
+        prony=rest.prony,
+        forces=[
+            _refined_force(placed, mesh, body=body)
+            for placed in body.placed_forces
+        ],
+        rest_shape=_refined_rest_shape(body, mesh),
+        evaluator=body.evaluator,
+        threads=body.threads,
+    )
+    finer = finer.with_free_densities(
+        [part.name for part in body.parts if part.has_free_density]
+    )
+    if not body.field_lengths_m:
+        return finer
+    fields = [part.field and part.field.split_in_eight() for part in body.parts]
+    parts = zip(finer.parts, fields, strict=True)
+    return finer.with_parts(
+        tuple(replace(part, field=field) for part, field in parts)
+    )
+
+
+def _refined_rest_shape(
+    body: Body, mesh: TetMesh
+) -> UnderGravity | Literal["stress_free"] | None:
+    """Return the statement about the rest shape for the refined body: None if `body` has none,
+    "stress_free", or the scan conditions with the held nodes of the refined `mesh`.
+
+    A box or a ball selects nodes by position and stays as it is. Of the middle of an edge, both
+    ends must be held.
+    """
+    if body.scan_conditions is None:
+        return None if body.rest_shape is None else "stress_free"
+    if isinstance(body.scan_conditions.nodes, (Box, Ball)):
+        return body.scan_conditions
+    corners = len(body.mesh.points_m)
+    is_prescribed = np.isin(
+        np.arange(corners), body.scan_conditions.grasped_nodes(body.nodes)
+    )
+    chosen = np.concatenate(
+        [is_prescribed, is_prescribed[body.mesh.edges].all(axis=1)]
+    )
+    return replace(
+        body.scan_conditions, nodes=Indices(np.flatnonzero(chosen).tolist())
+    )
+
+
+def _refined_force(
+    placed: LocatedForce, mesh: TetMesh, body: Body
+) -> NodeForce:
+    """Return a custom force for the refined body, at the corresponding nodes.
+
+    The middle of an edge is among them if both ends are.
+
+    Parameters
+    ----------
+    placed : LocatedForce
+        Force on the nodes or faces of `body`.
+    mesh : TetMesh
+        Refined mesh.
+    body : Body
+        Body before the refinement.
+    """
+    chosen = np.isin(np.arange(len(body.nodes_m)), placed.points.nodes)
+    nodes = chosen[: len(body.mesh.points_m)]
+    chosen = np.concatenate([nodes, nodes[body.mesh.edges].all(axis=1)])
+    if body.element.edges:
+        chosen = np.concatenate([chosen, chosen[mesh.edges].all(axis=1)])
+    return placed.force.on_refined_body(np.flatnonzero(chosen))
+
+
+def refine_nodes(
+    nodes: Index, selection: Selection | None, body: Body, finer: Body
+) -> Index:
+    """Return the nodes of the refined body that correspond to nodes of the original one.
+
+    Boxes and balls select anew. Otherwise the middle of an edge is selected if both ends are.
+
+    Parameters
+    ----------
+    nodes : (k,) int
+        Nodes of the original body.
+    selection : Selection or None
+        Selection of these nodes, if there is one.
+    body, finer : Body
+        Original and refined body.
+    """
+    if isinstance(selection, (Box, Ball)):
+        return finer.select(selection)
+    chosen: NDArray[np.bool_] = np.isin(np.arange(len(body.nodes_m)), nodes)
+    if not body.element.edges:
+        chosen = np.concatenate([chosen, chosen[body.mesh.edges].all(axis=1)])
+    return np.flatnonzero(finer.nodes.with_mid_nodes(chosen)).astype(np.int64)

@@ -1,0 +1,236 @@
+"""Tetrahedral meshes of closed surfaces by fTetWild (package pytetwild)."""
+
+from __future__ import annotations
+
+import hashlib
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from ...common.files import replaced_file
+from ...common.isolated_process import Failed, run_isolated
+from ...errors import InputError
+from .mesh_checks import clean_mesh
+from .mesh_files import read_tetrahedra, write_tetrahedra
+
+# Edge length passed to fTetWild, as a fraction of the desired one. fTetWild stops as soon as its
+# elements are well shaped, however small; coarsening then merges edges up to about the length
+# passed, which gives a mean length about a quarter above it.
+ASKED_LENGTH = 0.8
+# Largest distance of the new surface from the old one, in edge lengths; it limits coarsening.
+TOLERANCE = 0.02
+_RECIPE = f"coarsen, length {ASKED_LENGTH}, tolerance {TOLERANCE}"
+
+# Largest accepted number of tetrahedra; more suggest a wrong edge length or length unit.
+MOST_ELEMENTS = 2_000_000
+
+# Program of a separate process: fTetWild writes a file to its working directory and cannot be
+# interrupted.
+_WORKER = """
+import pytetwild
+points, tetrahedra = pytetwild.tetrahedralize(
+    given["points_m"], given["triangles"], edge_length_abs=float(sys.argv[1]),
+    epsilon=float(sys.argv[2]), coarsen=True, vtk_ordering=True, quiet=True,
+)
+found = {"points_m": points, "tetrahedra": tetrahedra}
+"""
+
+
+def tetrahedralize_surface(
+    points_m: ArrayLike,
+    triangles: ArrayLike,
+    edge_length_m: float,
+    cache_dir: str | Path | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fill a closed surface with tetrahedra.
+
+    fTetWild keeps neither the vertices nor the triangles of the surface: the new surface stays
+    within 2 % of `edge_length_m` of the old one, for which it uses shorter edges where the surface
+    is curved. So give a selection by coordinates that margin. fTetWild is not deterministic either:
+    keep the mesh, by `cache_dir` or `TetMesh.write`, to reproduce a result.
+
+    Parameters
+    ----------
+    points_m : (p, 3) array
+        Vertices in metres; coincident ones are merged.
+    triangles : (F, 3) integer array
+        Vertices of each triangle, counted from 0, in any orientation.
+    edge_length_m : float
+        Desired edge length; the mean of the result is within some tens of percent of it.
+    cache_dir : str or Path, optional
+        Folder in which the mesh is kept as .vtu under a hash of the surface, the edge length and
+        the version of pytetwild. A mesh found there is returned instead of a new one.
+
+    Returns
+    -------
+    points_m : (n, 3) array
+    tetrahedra : (E, 4) array
+
+    Raises
+    ------
+    InputError
+        If the surface is not closed, the edge length does not suit it, or pytetwild is missing.
+    """
+    points, faces = merge_coincident(*_checked_surface(points_m, triangles))
+    _require_closed(faces)
+    _require_suitable_edge_length(points, faces, edge_length_m=edge_length_m)
+    mesher = _pytetwild_version()
+    if cache_dir is None:
+        return _run_ftetwild(points, faces, edge_length_m=edge_length_m)
+    digest = hashlib.sha256(
+        f"{mesher} {_RECIPE} {float(edge_length_m)!r} {points.shape}".encode()
+    )
+    digest.update(
+        points.astype("<f8").tobytes() + faces.astype("<i8").tobytes()
+    )
+    cached = Path(cache_dir) / f"mesh-{digest.hexdigest()[:16]}.vtu"
+    if not cached.exists():
+        with replaced_file(cached) as draft:
+            # A mesh that is refused must not be kept.
+            nodes, tetrahedra, *_ = clean_mesh(
+                *_run_ftetwild(points, faces, edge_length_m=edge_length_m)
+            )
+            write_tetrahedra(draft, nodes, tetrahedra=tetrahedra)
+    nodes, tetrahedra, *_ = read_tetrahedra(cached)
+    return nodes, tetrahedra
+
+
+def merge_coincident(
+    points: np.ndarray, triangles: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices and triangles with vertices merged that coincide in single precision (10⁻⁶ of
+    the diagonal), and without the triangles that become degenerate.
+    """
+    tolerance = 1e-6 * np.linalg.norm(np.ptp(points, axis=0))
+    pairs = KDTree(points).query_pairs(tolerance, output_type="ndarray")
+    links = coo_array(
+        (np.ones(len(pairs)), pairs.T), shape=(len(points), len(points))
+    )
+    label = connected_components(links, directed=False)[1]
+    _, first = np.unique(label, return_index=True)
+    merged = label[triangles].astype(np.int64)
+    is_degenerate = (merged == np.roll(merged, 1, axis=1)).any(axis=1)
+    return points[first], merged[~is_degenerate]
+
+
+def _checked_surface(
+    points_m: ArrayLike, triangles: ArrayLike
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices and triangles as arrays, or raise an `InputError` if they are invalid."""
+    points = np.asarray(points_m, dtype=float)
+    faces = np.asarray(triangles)
+    if (
+        points.ndim != 2
+        or points.shape[1] != 3
+        or not np.isfinite(points).all()
+    ):
+        raise InputError(
+            f"a surface needs (p, 3) finite vertex coordinates, not {points.shape}"
+        )
+    if (
+        faces.ndim != 2
+        or faces.shape[1] != 3
+        or not len(faces)
+        or faces.dtype.kind not in "iu"
+    ):
+        raise InputError(
+            f"a surface needs (F, 3) integer triangles, F > 0, not {faces.shape}"
+        )
+    if faces.min() < 0 or faces.max() >= len(points):
+        raise InputError(
+            f"the triangles name vertices {faces.min()} to {faces.max()}, "
+            f"but there are {len(points)}, counted from 0"
+        )
+    return points, faces
+
+
+def _require_closed(triangles: np.ndarray) -> None:
+    """Raise an `InputError` unless every edge belongs to exactly two triangles."""
+    edges = np.sort(
+        triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1
+    )
+    _, count = np.unique(edges, axis=0, return_counts=True)
+    open_edges = int((count == 1).sum())
+    crowded = int((count > 2).sum())
+    if not len(count) or open_edges or crowded:
+        raise InputError(
+            f"the surface is not closed: {open_edges} open edges belong to one triangle only and "
+            f"{crowded} to more than two, of {len(count)}; every edge must be shared by exactly "
+            "two. Fill its holes and remove inner or doubled faces in a mesh editor"
+        )
+
+
+def _require_suitable_edge_length(
+    points: np.ndarray, triangles: np.ndarray, edge_length_m: float
+) -> None:
+    """Raise an `InputError` if the edge length is not positive, too large or too small for the
+    body.
+    """
+    if not 0 < edge_length_m < np.inf:
+        raise InputError(
+            f"the edge length must be a positive number of metres: {edge_length_m!r}"
+        )
+    extent = " × ".join(f"{length:.4g}" for length in np.ptp(points, axis=0))
+    remedy = f"the surface measures {extent} m: check the edge length and the length unit"
+    # fTetWild takes minutes, or forever, over edges longer than the body.
+    if edge_length_m > np.linalg.norm(np.ptp(points, axis=0)) / 2:
+        raise InputError(
+            f"the edge length {edge_length_m:g} m is over half the surface's diagonal; {remedy}"
+        )
+    volume = (
+        abs(np.linalg.det(points[triangles] - points.mean(axis=0)).sum()) / 6
+    )
+    elements = 6 * np.sqrt(2) * volume / edge_length_m**3
+    if elements > MOST_ELEMENTS:
+        raise InputError(
+            f"the edge length {edge_length_m:g} m would take about {elements:.1g} tetrahedra, more "
+            f"than {MOST_ELEMENTS:.1g}; {remedy}"
+        )
+
+
+def _pytetwild_version() -> str:
+    """Return the version of pytetwild, or raise an `InputError` if it is not installed."""
+    try:
+        version("pyvista")  # pytetwild imports it without depending on it
+        return version("pytetwild")
+    except PackageNotFoundError as missing:
+        raise InputError(
+            f"filling a surface with tetrahedra needs the package {missing.name}, which is not "
+            "installed: pip install 'collocation-sysid[surface]', or give a tetrahedral mesh"
+        ) from missing
+
+
+def _run_ftetwild(
+    points: np.ndarray, triangles: np.ndarray, edge_length_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes (n, 3) [m] and tetrahedra (E, 4) of fTetWild, run in a separate process.
+
+    Raises
+    ------
+    InputError
+        If it fails or is not installed.
+    """
+    diagonal = np.linalg.norm(np.ptp(points, axis=0))
+    lengths = (
+        ASKED_LENGTH * edge_length_m,
+        TOLERANCE * edge_length_m / diagonal,
+    )
+    words = [repr(float(length)) for length in lengths]
+    try:
+        mesh = run_isolated(
+            _WORKER, *words, points_m=points, triangles=triangles.astype("i4")
+        )
+    except Failed as error:
+        raise InputError(
+            f"pytetwild could not fill the surface ({error})"
+        ) from error
+    if not len(mesh["tetrahedra"]):
+        raise InputError(
+            "pytetwild found no interior: the surface encloses no volume"
+        )
+    return mesh["points_m"], mesh["tetrahedra"].astype(np.int64)

@@ -1,0 +1,256 @@
+"""Contact within one time step, restricted to the points that may touch.
+
+Other points of the surface contribute nothing, and obstacles do not move while the step is solved.
+Candidate points are therefore searched once a step, with a margin, and only the forces on the nodes
+of their faces are evaluated, with exact derivatives for Newton's method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ...common.array_types import Array, Index
+from ...fem.contact_surface import VECTORS_PER_POINT
+from ...fem.pattern import SymmetricPattern, dofs_of
+from ...model.contact import Contact, ContactLaw
+
+# Distance within which points are candidates, in edges of the surface.
+MARGIN = 0.25
+# Share of this distance by which a coordinate may change before candidates are searched again.
+CHANGE = 1 / 3
+
+
+@dataclass(frozen=True, eq=False)
+class ContactCandidates:
+    """Contact points that an obstacle may touch in a time step.
+
+    Attributes
+    ----------
+    law : ContactLaw
+        Contact law of the obstacle.
+    point_indices : (i,) array
+        Indices of the points among all contact points.
+    nodes : (i, k) array
+        Nodes of the face of each point.
+    weights : (i, k) array
+        Shape functions of these nodes.
+    dofs : (i, 3k) array
+        Dofs of these nodes.
+    entries : (i, 3k, 3k) array
+        Positions of the pairs of dofs in the pattern.
+    symmetric_factors, skew_factors : (i, 3k, 3k) arrays
+        Factors of the entries in the symmetric and the skew part of a matrix.
+    """
+
+    law: ContactLaw
+    point_indices: Index
+    nodes: Index
+    weights: Array
+    dofs: Index
+    entries: Index
+    symmetric_factors: Array
+    skew_factors: Array
+
+    @staticmethod
+    @lru_cache(maxsize=64)
+    def from_indices(
+        law: ContactLaw, pattern: SymmetricPattern, chosen: bytes
+    ) -> ContactCandidates:
+        """Build the candidates of an obstacle; the last few are cached, because successive steps
+        are similar.
+
+        Parameters
+        ----------
+        law : ContactLaw
+            Contact law of the obstacle.
+        pattern : SymmetricPattern
+            Pattern of the matrices.
+        chosen : bytes
+            Indices of the points, an array of int64 as bytes.
+        """
+        some = np.frombuffer(chosen, dtype=np.int64)
+        points = law.surface.points
+        nodes = points.nodes[some, :-VECTORS_PER_POINT]
+        dofs = dofs_of(nodes)
+        row, column = np.broadcast_arrays(dofs[:, :, None], dofs[:, None])
+        return ContactCandidates(
+            law,
+            some,
+            nodes=nodes,
+            weights=points.node_weights[some, 0, :-VECTORS_PER_POINT],
+            dofs=dofs,
+            entries=pattern.positions_of(row, column),
+            symmetric_factors=(1 + (row == column)) / 2,
+            skew_factors=np.sign(row - column) / 2,
+        )
+
+    def inputs(
+        self, contact: Contact, xi: Array, nu: Array, theta: Array
+    ) -> tuple[Array, Array]:
+        """Return the inputs (k, i) and the data (d, i) of the law's `point_force_function` at the i
+        candidates.
+
+        Parameters
+        ----------
+        contact : Contact
+            Contact force with this law, which provides the data of the points.
+        xi, nu : (3n,) arrays
+            State [m] and velocity [m/s].
+        theta : (k,) array
+            Constants of the body.
+        """
+        frame = self.law.obstacle.nodes
+        moving = [
+            each.reshape(-1, 3)
+            for each in (xi, nu)[: 1 + self.law.depends_on_velocity]
+        ]
+        own = [
+            np.einsum("ik,ikj->ji", self.weights, x[self.nodes] - x[frame[0]])
+            for x in moving
+        ]
+        ends = [(x[frame[1:]] - x[frame[0]]).ravel() for x in moving]
+        same = np.concatenate([*ends, theta[self.law.constant_columns]])
+        data = np.broadcast_to(same[:, None], (len(same), len(self.nodes)))
+        return np.concatenate(own), np.concatenate(
+            [data, contact.data_of(self.point_indices)]
+        )
+
+    def assemble(self, push: Array, size: int) -> Array:
+        """Return forces (size,) [N] on the dofs of a body from forces `push` (3, i) [N] on the i
+        candidates.
+        """
+        on_nodes = self.weights[:, :, None] * push.T[:, None]
+        summed = np.bincount(
+            self.dofs.ravel(), weights=on_nodes.ravel(), minlength=size
+        )
+        return np.asarray(summed, dtype=float)
+
+
+class StepContact:
+    """Contact in one time step of a body with constants θ (k,).
+
+    Attributes
+    ----------
+    acts : bool
+        Whether there are contact forces at all.
+
+    Parameters
+    ----------
+    contacts : sequence of Contact
+        Contact forces; may be empty.
+    theta : (k,) array
+        Constants of the body.
+    pattern : SymmetricPattern
+        Pattern of the matrices.
+    """
+
+    def __init__(
+        self,
+        contacts: Sequence[Contact],
+        theta: Array,
+        pattern: SymmetricPattern,
+    ) -> None:
+        self._contacts = contacts
+        self._theta = theta
+        self._pattern = pattern
+        self._from = np.full((2, 1), np.nan)
+        self._candidates_of_contacts = list[tuple[Contact, ContactCandidates]]()
+        edges_m = [each.law_of_contact.surface.edge_m for each in contacts]
+        self.acts = bool(contacts)
+        self._margin_m = MARGIN * min(edges_m, default=0.0)
+        # A pressure that is averaged over a step depends on the states at both ends.
+        self._half_s = max((each.step_s for each in contacts), default=0.0) / 2
+
+    def force(self, xi: Array, nu: Array) -> Array:
+        """Return the contact forces (3n,) [N] at ξ and ν, each (1, 3n)."""
+        force = np.zeros(xi.size)
+        for candidates, u, data in self._candidates(xi[0], nu[0]):
+            force += candidates.assemble(
+                candidates.law.point_force_function.evaluate(u, data), xi.size
+            )
+        return force
+
+    def linearise(
+        self, xi: Array, nu: Array, rates: tuple[float, float]
+    ) -> tuple[Array, Array, Array]:
+        """Return the contact forces and their derivative.
+
+        Parameters
+        ----------
+        xi, nu : (1, 3n) arrays
+            State [m] and velocity [m/s].
+        rates : (float, float)
+            Derivatives of ξ and of ν by the unknown positions.
+
+        Returns
+        -------
+        (3n,) array
+            Forces [N].
+        (m,) array
+            Lower triangle of the symmetric part of the derivative by the unknown positions.
+        (m,) or (0,) array
+            Lower triangle of its skew part; empty without friction or other velocity dependence.
+        """
+        force = np.zeros(xi.size)
+        has_friction = any(
+            each.law_of_contact.depends_on_velocity for each in self._contacts
+        )
+        symmetric = np.zeros(self._pattern.entry_count)
+        skew = np.zeros(self._pattern.entry_count * has_friction)
+        for candidates, u, data in self._candidates(xi[0], nu[0]):
+            push, slopes = (
+                candidates.law.point_force_function.evaluate_with_jacobian(
+                    u, data
+                )
+            )
+            force += candidates.assemble(push, xi.size)
+            (touch,) = np.nonzero(push.any(axis=0))
+            by_way = rates[0] * slopes[:, :3, touch]
+            if candidates.law.depends_on_velocity:
+                by_way += rates[1] * slopes[:, 3:, touch]
+            weights = candidates.weights[touch]
+            here = candidates.entries[touch].ravel()
+            blocks = np.einsum("pa,ijp,pb->paibj", weights, by_way, weights)
+            blocks = blocks.reshape(candidates.entries[touch].shape)
+            counted = (candidates.symmetric_factors, candidates.skew_factors)[
+                : 1 + candidates.law.depends_on_velocity
+            ]
+            for part, counts in zip((symmetric, skew), counted, strict=False):
+                part += np.bincount(
+                    here,
+                    weights=(counts[touch] * blocks).ravel(),
+                    minlength=len(part),
+                )
+        return force, symmetric, skew
+
+    def _candidates(
+        self, xi: Array, nu: Array
+    ) -> Iterator[tuple[ContactCandidates, Array, Array]]:
+        """Yield for each contact its candidates, and the inputs and data of its law at ξ and ν,
+        (3n,) each.
+
+        The search for candidates is repeated if the state has changed by more than the margin
+        allows.
+        """
+        ends = np.array([xi - self._half_s * nu, xi + self._half_s * nu])
+        if not np.abs(ends - self._from).max() <= CHANGE * self._margin_m:
+            self._from = ends
+            self._candidates_of_contacts = []
+            for each in self._contacts:
+                gaps = each.law_of_contact.gaps(each.points.vectors(ends)).min(
+                    axis=0
+                )
+                (chosen,) = np.nonzero(
+                    gaps < each.law_of_contact.widths_m + self._margin_m
+                )
+                if len(chosen):
+                    candidates = ContactCandidates.from_indices(
+                        each.law_of_contact, self._pattern, chosen.tobytes()
+                    )
+                    self._candidates_of_contacts.append((each, candidates))
+        for contact, candidates in self._candidates_of_contacts:
+            yield candidates, *candidates.inputs(contact, xi, nu, self._theta)

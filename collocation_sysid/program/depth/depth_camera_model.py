@@ -1,0 +1,265 @@
+"""Model of a depth camera: pose, errors of pose and depth, and points in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ...common.array_types import Array, Index
+from ...model.generated_functions import GeneratedFunction
+from ...model.nuisance_map import NuisanceMap
+from ...recording.depth_camera import Depth
+from ...recording.experiment import Experiment
+from ...recording.nuisance import (
+    DEPTH_BIAS,
+    DEPTH_EDGE,
+    DEPTH_SCALE,
+    DEPTH_SHIFT,
+    DEPTH_TIME,
+    DEPTH_TURN,
+    NuisanceRow,
+    cayley_rotation,
+)
+
+OF_CAMERA = (
+    DEPTH_TURN,
+    DEPTH_SHIFT,
+    DEPTH_BIAS,
+    DEPTH_SCALE,
+    DEPTH_TIME,
+    DEPTH_EDGE,
+)
+# One over the deviation of what counts as exact.
+EXACT = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class DepthCameraModel:
+    """Depth camera with its estimated errors.
+
+    Attributes
+    ----------
+    depth : Depth
+        The camera and its measured points.
+    camera_index : int
+        Index of the camera in the experiment.
+    nuisance : NuisanceMap
+        Nuisance parameters of the experiment, which include the camera's errors.
+    pivot_m : (3,) array
+        Point about which the rotation error acts, the middle of the body, in the camera's frame
+        [m].
+    size_m : float
+        Diagonal of the undeformed body [m].
+    """
+
+    depth: Depth
+    camera_index: int
+    nuisance: NuisanceMap
+    pivot_m: Array
+    size_m: float
+
+    @classmethod
+    def from_experiment(
+        cls, experiment: Experiment, camera_index: int, nuisance: NuisanceMap
+    ) -> DepthCameraModel:
+        """Build the model of camera `camera_index` (index) of an experiment."""
+        depth = experiment.depths[camera_index]
+        rotations, translations = depth.camera.pose_at(depth.sample_times_s[:1])
+        pivot_m = (
+            experiment.body.nodes_m.mean(axis=0) - translations[0]
+        ) @ rotations[0]
+        size_m = float(np.linalg.norm(np.ptp(experiment.body.nodes_m, axis=0)))
+        return cls(depth, camera_index, nuisance, pivot_m, size_m)
+
+    @cached_property
+    def depth_expressions(self) -> dict[tuple[int, int], Any]:
+        """Generated functions of its depth residuals, shared by all copies of the
+        measurement model.
+        """
+        return {}
+
+    @cached_property
+    def outline_expressions(self) -> dict[tuple[int, int], Any]:
+        """Generated functions of its outline residuals, shared by all copies of the
+        measurement model.
+        """
+        return {}
+
+    @cached_property
+    def parameter_indices(self) -> Index:
+        """Indices in φ of the camera's nuisance parameters."""
+        return self.nuisance.indices_of_rows(
+            *OF_CAMERA, component=self.camera_index
+        )
+
+    @cached_property
+    def poses(self) -> tuple[Array, Array]:
+        """Rotations (S, 3, 3) and translations (S, 3) [m] from the camera's frame to the
+        world, at each image.
+        """
+        return self.depth.camera.pose_at(self.depth.sample_times_s)
+
+    @cached_property
+    def rays(self) -> list[Array]:
+        """For each image, directions (P, 3) in which points move as their depth grows;
+        zeros for point clouds.
+        """
+        clouds = self.depth.points_m
+        pinhole = self.depth.camera.matrix is not None
+        return [p / p[:, 2:] if pinhole else np.zeros_like(p) for p in clouds]
+
+    def corrected_expression(
+        self, point: ca.SX, ray: ca.SX, values: Mapping[NuisanceRow, ca.SX]
+    ) -> ca.SX:
+        """Return the expression of a point in the camera's stated frame, corrected by the estimated
+        errors.
+
+        Parameters
+        ----------
+        point : (3,) SX
+            Measured point [m].
+        ray : (3,) SX
+            Direction of its depth.
+        values : mapping of NuisanceRow to SX
+            Errors in physical units; missing ones are zero.
+        """
+        point = (1 + values.get(DEPTH_SCALE, 0)) * point + values.get(
+            DEPTH_BIAS, 0
+        ) * ray
+        if DEPTH_TURN in values:
+            pivot = ca.DM(self.pivot_m)
+            point = (
+                cayley_rotation(values[DEPTH_TURN]) @ (point - pivot) + pivot
+            )
+        return point + values.get(DEPTH_SHIFT, 0)
+
+    @cached_property
+    def _correction(self) -> GeneratedFunction:
+        """Generated function of `corrected_expression`."""
+
+        def expression(own: ca.SX, data: ca.SX) -> ca.SX:
+            values = self.nuisance.values_by_row(own, self.parameter_indices)
+            return self.corrected_expression(data[:3], data[3:], values=values)
+
+        return GeneratedFunction(
+            expression, len(self.parameter_indices), data_size=6
+        )
+
+    def world_points(self, phi: Array, image: int) -> Array:
+        """Return the points (P, 3) of an image in the world [m].
+
+        Parameters
+        ----------
+        phi : (k,) array
+            Nuisance parameters.
+        image : int
+            Index of the image.
+        """
+        return self.to_world(
+            phi, self.depth.points_m[image], self.rays[image], image
+        )
+
+    def to_world(
+        self, phi: Array, points: Array, rays: Array, image: int
+    ) -> Array:
+        """Return points (P, 3) of the camera's frame in the world [m], corrected at φ (k,).
+
+        Parameters
+        ----------
+        phi : (k,) array
+            Nuisance parameters.
+        points : (P, 3) array
+            Points in the camera's frame [m].
+        rays : (P, 3) array
+            Directions of their depths; zeros if no bias of the depth is to be applied.
+        image : int
+            Index of the image.
+        """
+        corrected = self._correction.evaluate(
+            phi[self.parameter_indices], np.vstack([points.T, rays.T])
+        ).T
+        rotations, translations = self.poses
+        return corrected @ rotations[image].T + translations[image]
+
+    def body_middle_m(self, sample: int) -> Array:
+        """Return the middle (3,) of the undeformed body, carried by the first pose, in the camera's
+        stated frame at the image with index `sample` [m].
+        """
+        rotations, translations = self.poses
+        middle_m = rotations[0] @ self.pivot_m + translations[0]
+        return (middle_m - translations[sample]) @ rotations[sample]
+
+    def to_camera_m(self, phi: Array, points_m: Array, sample: int) -> Array:
+        """Return points (P, 3) of the world in the camera's frame at φ and the image with index
+        `sample` [m]: the inverse of `to_world` without bias.
+        """
+        basis = np.vstack([np.zeros(3), np.eye(3)])
+        corner, *axes = self.to_world(phi, basis, np.zeros((4, 3)), sample)
+        return np.linalg.solve((axes - corner).T, (points_m - corner).T).T
+
+    def parameter_values(self, phi: Array) -> dict[str, float]:
+        """Return the camera's nuisance parameters in physical units by label, from φ (k,)."""
+        entries = self.nuisance.entries
+        values = phi * self.nuisance.scales
+        return {
+            entries[k].label: float(values[k]) for k in self.parameter_indices
+        }
+
+    def parameters_from(self, physical_values: Mapping[str, float]) -> Array:
+        """Return φ (k,) with the given values in physical units by label; others are zero."""
+        values = [
+            physical_values.get(entry.label, 0.0)
+            for entry in self.nuisance.entries
+        ]
+        return np.array(values) / self.nuisance.scales
+
+    def eye_m(self, phi: Array, sample: int) -> Array | None:
+        """Return the position (3,) of the camera in the world at φ (k,) and the image with index
+        `sample` [m]; None for a point cloud without camera.
+        """
+        if self.depth.camera.matrix is None:
+            return None
+        return self.to_world(phi, np.zeros((1, 3)), np.zeros((1, 3)), sample)[0]
+
+    def prior_weights(self, row: NuisanceRow) -> Array:
+        """Return one over the prior standard deviations (3,) of the camera's rotation [1/rad] or
+        translation [1/m], whichever `row` states; a large number if it is exact.
+        """
+        places = self.nuisance.indices_of_rows(row, component=self.camera_index)
+        return (
+            1 / self.nuisance.scales[places]
+            if len(places)
+            else np.full(3, EXACT)
+        )
+
+    def clock_shift_s(self, phi: Array) -> float:
+        """Return by how much images are taken later than their times state [s]."""
+        places = self.nuisance.indices_of_rows(
+            DEPTH_TIME, component=self.camera_index
+        )
+        return float((phi * self.nuisance.scales)[places].sum())
+
+    def with_pose(
+        self, phi: Array, rotation_vector: Array, shift_m: Array
+    ) -> Array:
+        """Return φ (k,) with another rotation error `rotation_vector` (3,) [rad] and translation
+        error `shift_m` (3,) of the camera; an error that is not estimated is ignored.
+        """
+        updated = phi.copy()
+        angle = np.linalg.norm(rotation_vector)
+        cayley = rotation_vector * (
+            2 * np.tan(angle / 2) / angle if angle else 1.0
+        )
+        for row, values in ((DEPTH_TURN, cayley), (DEPTH_SHIFT, shift_m)):
+            places = self.nuisance.indices_of_rows(
+                row, component=self.camera_index
+            )
+            updated[places] = (
+                values[: len(places)] / self.nuisance.scales[places]
+            )
+        return updated

@@ -1,0 +1,528 @@
+"""Outline of a body in a depth image, compared with the edge of what the image shows of the body.
+
+Distances along the normals of the surface do not tell how far the surface reaches: a body may
+extend beyond everything that was measured without any point being off its surface. Here points of
+the body's outline, as the camera sees it, are compared with the edge of what the image shows of it.
+
+A pixel is evidence that the body is not there where it shows something farther away than the body,
+or nothing at all in images whose background gives no depth (see `Depth.background`). It is no
+evidence where something nearer hides the body, or where a depth is missing for unknown reasons. The
+edge is looked for along the normal of the outline (Harris & Stennett 1990); where the body reaches
+farther into pixels that show nothing than that search, the nearest other pixel counts.
+
+Each pair of an outline point and an edge is a plane through the camera: its distance from the
+outline point, in pixels, is the residual (see `outline_residual`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import KDTree
+
+from ...common.array_types import Array, Index
+from ...fem.body import Body
+from ...recording.depth_camera import DepthCamera
+from .depth_camera_model import DepthCameraModel
+from .visible_surface import VisibleSurface
+
+# Distance to either side of the outline within which the edge is searched [pixels]; farther away it
+# may belong to another part of the body.
+SEARCH_PX = 6.0
+# Step of this search [pixels].
+STEP_PX = 0.25
+# Distance outside an outline at which the body itself must not cover the image [pixels].
+OUTSIDE_PX = 1.5
+# If at least this many pixels show background per pixel without depth, the sensor measures its
+# background, and missing depths are failures.
+LEAST_BACKGROUND_SHARE = 0.1
+# What pixels show, compared with a point of the outline.
+BODY = 0
+# The pixel does not tell whether the body is there.
+UNKNOWN = 1
+# The body is not there.
+EMPTY = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """Points of a body's outline and planes through the camera that they should lie in.
+
+    Arrays have S samples of E points at most; those beyond are not `is_compared`.
+
+    Attributes
+    ----------
+    nodes, weights : (S, E, v) of the surface's nodes in each outline point
+    normals : (S, E, 3) of the planes, in the world, outwards from the body
+    points, rays : (S, E, 3) a point of each plane in the camera's frame, and zeros
+    pixel_m : (S, E) width of a pixel at the outline point, along the plane's normal [m]
+    places_m : (S, E, 3) outline points on the undeformed body
+    is_compared : (S, E) outline points whose edge is known
+    """
+
+    nodes: Index
+    weights: Array
+    normals: Array
+    points: Array
+    rays: Array
+    pixel_m: Array
+    places_m: Array
+    is_compared: NDArray[np.bool_]
+
+    @classmethod
+    def from_shapes(
+        cls,
+        camera: DepthCameraModel,
+        surface: VisibleSurface,
+        body: Body,
+        *,
+        shapes_m: Array,
+        phi: Array,
+        gate_m: float,
+    ) -> Outline:
+        """Associate the outlines of shapes with the edges in the images of a camera.
+
+        Parameters
+        ----------
+        camera : DepthCameraModel
+        surface : VisibleSurface
+        body : Body
+        shapes_m : (S, n, 3) array
+            Positions of the surface's nodes at the times of the images [m].
+        phi : (k,) array
+            Nuisance parameters, with the pose of the camera.
+        gate_m : float
+            Pixels whose depth differs by less from that of the outline point may show the body [m].
+        """
+        corners = surface.faces.shape[1]
+        edges = []
+        for sample, shape_m in enumerate(shapes_m):
+            image_m = (
+                camera.depth.images_m[sample]
+                if len(camera.depth.images_m)
+                else None
+            )
+            points = None
+            if image_m is not None:
+                points = _outline_points(
+                    camera, surface, shape_m=shape_m, phi=phi, sample=sample
+                )
+            if image_m is None or points is None:
+                edges.append(_no_edges(corners))
+                continue
+            edges.append(
+                _edges(
+                    camera,
+                    points,
+                    image_m=image_m,
+                    phi=phi,
+                    gate_m=gate_m,
+                    sample=sample,
+                )
+            )
+        most = max(1, *(len(each["is_compared"]) for each in edges))
+
+        def together(name: str) -> NDArray:
+            return np.stack([_padded(each[name], most) for each in edges])
+
+        of_points = {
+            name: together(name) for name in edges[0] if name not in ("faces",)
+        }
+        faces = together("faces")
+        nodes = surface.faces[faces]
+        rest_m = body.nodes_m[surface.nodes][nodes]
+        return cls(
+            nodes=nodes,
+            places_m=np.einsum("sea,seai->sei", of_points["weights"], rest_m),
+            rays=np.zeros_like(of_points["points"]),
+            **of_points,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _OutlinePoints:
+    """Points (P) where the body ends in the view of a camera.
+
+    Attributes
+    ----------
+    faces : (P,) of the surface
+    weights : (P, v) of its nodes
+    depth_m : (P,) along the optical axis
+    pixels : (P, 2) u and v
+    outwards : (P, 2) unit normals of the outline in the image, away from the body
+    """
+
+    faces: Index
+    weights: Array
+    depth_m: Array
+    pixels: Array
+    outwards: Array
+
+
+def _padded(values: NDArray, count: int) -> NDArray:
+    """Return values (k, …) padded with zeros to a length of `count`."""
+    return np.pad(
+        values, [(0, count - len(values)), *[(0, 0)] * (values.ndim - 1)]
+    )
+
+
+def _no_edges(corners: int) -> dict[str, NDArray]:
+    """Return the result of `_edges` for no points, with `corners` nodes per face."""
+    return {
+        "faces": np.zeros(0, dtype=np.int64),
+        "weights": np.zeros((0, corners)),
+        "normals": np.zeros((0, 3)),
+        "points": np.zeros((0, 3)),
+        "pixel_m": np.zeros(0),
+        "is_compared": np.zeros(0, dtype=bool),
+    }
+
+
+def no_depth_is_empty(
+    camera: DepthCameraModel, image_m: Array, *, sample: int, size_m: float
+) -> bool:
+    """Return whether pixels without depth show that nothing is there.
+
+    Parameters
+    ----------
+    camera : DepthCameraModel
+    image_m : (rows, columns) array
+        Depths [m], NaN where missing.
+    sample : int
+        Index of the image.
+    size_m : float
+        Diagonal of the body [m]; what is farther behind its middle is background.
+    """
+    if camera.depth.background != "auto":
+        return camera.depth.background == "empty"
+    # The middle of the body as stated, which may move with the camera: a coarse measure suffices.
+    middle_m = float(camera.body_middle_m(sample)[2])
+    background = np.count_nonzero(image_m > middle_m + size_m)
+    return bool(
+        background
+        < LEAST_BACKGROUND_SHARE * np.count_nonzero(np.isnan(image_m))
+    )
+
+
+def _outline_points(
+    camera_in: DepthCameraModel,
+    surface: VisibleSurface,
+    shape_m: Array,
+    *,
+    phi: Array,
+    sample: int,
+) -> _OutlinePoints | None:
+    """Return the points where a shape (n, 3) [m] ends in the view of a camera, at φ and the image
+    with index `sample`; None if there are none, for a point cloud, or if the body is partly behind
+    the camera.
+
+    They lie `spacing_m` apart on edges between a flat triangle that faces the camera and one that
+    does not, and are not in front of or behind another part of the body.
+    """
+    eye_m = camera_in.eye_m(phi, sample)
+    camera = camera_in.depth.camera
+    own_m = camera_in.to_camera_m(phi, shape_m, sample)
+    if eye_m is None or (own_m[:, 2] <= 0).any():
+        return None
+    facing = surface.is_facing(shape_m, eye_m)
+    ends, faces_of_edges = surface.edges
+    is_front = facing[faces_of_edges]
+    first, second = faces_of_edges.T
+    front_triangle = np.where(is_front[:, 0], first, second)
+    parts = len(surface.plane_triangles) // len(surface.faces)
+    outline_edges = np.flatnonzero(
+        (is_front[:, 0] != is_front[:, 1])
+        & surface.is_selected[front_triangle // parts]
+    )
+    if not len(outline_edges):
+        return None
+    ends = ends[outline_edges]
+    front_triangle = front_triangle[outline_edges]
+    corners = surface.plane_triangles[front_triangle]
+    lengths_m = np.linalg.norm(np.diff(shape_m[ends], axis=1)[:, 0], axis=1)
+    counts = np.maximum(
+        1, np.ceil(lengths_m / camera_in.depth.spacing_m).astype(int)
+    )
+    edge = np.repeat(np.arange(len(outline_edges)), counts)
+    number = np.arange(len(edge)) - np.repeat(
+        np.cumsum(counts) - counts, counts
+    )
+    share = (number + 0.5) / counts[edge]
+    # Barycentric coordinates in the triangle that faces the camera.
+    at_first = corners[edge] == ends[edge, :1]
+    at_second = corners[edge] == ends[edge, 1:]
+    shares = at_first * (1 - share)[:, None] + at_second * share[:, None]
+    faces, places = surface.to_faces(front_triangle[edge], shares)
+    weights, points_m, _ = surface.evaluate(shape_m, faces, places)
+    pixels = camera.distorted_pixels(own_m)
+    tangents_px = pixels[ends[edge, 1]] - pixels[ends[edge, 0]]
+    length_px = np.linalg.norm(tangents_px, axis=1)
+    normals = (
+        np.column_stack([-tangents_px[:, 1], tangents_px[:, 0]])
+        / np.maximum(length_px, 1e-9)[:, None]
+    )
+    centres = pixels[corners[edge]].mean(axis=1)
+    at_m = camera_in.to_camera_m(phi, points_m, sample)
+    places_px = camera.distorted_pixels(at_m)
+    inwards = np.sum(normals * (places_px - centres), axis=1) < 0
+    outwards = np.where(inwards[:, None], -normals, normals)
+    separate = _first_of_each_cube(points_m, camera_in.depth.spacing_m)
+    alone = ~_covered(
+        places_px + OUTSIDE_PX * outwards,
+        pixels[surface.plane_triangles[facing]],
+    )
+    selected = separate[(alone & (length_px > 1e-6))[separate]]
+    if not len(selected):
+        return None
+    return _OutlinePoints(
+        faces=faces[selected],
+        weights=weights[selected],
+        depth_m=at_m[selected, 2],
+        pixels=places_px[selected],
+        outwards=outwards[selected],
+    )
+
+
+def _first_of_each_cube(points_m: Array, edge_m: float) -> Index:
+    """Indices of the first of the points (P, 3) in each cube of a grid with edges [m]."""
+    _, first = np.unique(
+        np.floor(points_m / edge_m).astype(np.int64), axis=0, return_index=True
+    )
+    return np.sort(first)
+
+
+def _covered(points: Array, triangles: Array) -> NDArray[np.bool_]:
+    """Return whether each of points (P, 2) of an image lies within, or on the border of, any of its
+    triangles (T, 3, 2), (P,).
+    """
+    covered = np.zeros(len(points), dtype=bool)
+    if not len(triangles):
+        return covered
+    middles = triangles.mean(axis=1)
+    reach = np.linalg.norm(triangles - middles[:, None], axis=2).max()
+    candidates = KDTree(middles).query_ball_point(points, reach)
+    point = np.repeat(
+        np.arange(len(points)), [len(each) for each in candidates]
+    )
+    a, b, c = triangles[
+        np.concatenate([*candidates, []]).astype(int)
+    ].transpose(1, 0, 2)
+
+    def side(start: Array, end: Array) -> Array:
+        way = end - start
+        to = points[point] - start
+        return way[:, 0] * to[:, 1] - way[:, 1] * to[:, 0]
+
+    sides = np.stack([side(a, b), side(b, c), side(c, a)])
+    covered[point[(sides >= 0).all(axis=0) | (sides <= 0).all(axis=0)]] = True
+    return covered
+
+
+def _edges(
+    camera_in: DepthCameraModel,
+    points: _OutlinePoints,
+    image_m: Array,
+    *,
+    phi: Array,
+    gate_m: float,
+    sample: int,
+) -> dict[str, NDArray]:
+    """Return the planes through the edges in an image that belong to points of an outline, by
+    attribute name of `Outline`.
+
+    Parameters
+    ----------
+    camera_in : DepthCameraModel
+    points : _OutlinePoints
+        The P points of the outline.
+    image_m : (rows, columns) array
+        Depths [m]; NaN where missing.
+    phi : (k,) array
+        Nuisance parameters.
+    gate_m : float
+        Largest difference of depth at which a pixel shows the body [m].
+    sample : int
+        Index of the image.
+    """
+    camera = camera_in.depth.camera
+    empty = no_depth_is_empty(
+        camera_in, image_m, sample=sample, size_m=camera_in.size_m
+    )
+    offsets = np.arange(-SEARCH_PX, SEARCH_PX + STEP_PX / 2, STEP_PX)
+    across = (
+        points.pixels[:, None] + offsets[:, None] * points.outwards[:, None]
+    )
+    shown = _classify_pixels(
+        image_m,
+        across,
+        depth_m=points.depth_m[:, None],
+        gate_m=gate_m,
+        is_missing_empty=empty,
+    )
+    ends = (shown[:, :-1] == BODY) & (shown[:, 1:] == EMPTY)
+    middles = (offsets[:-1] + offsets[1:]) / 2
+    nearest = np.where(ends, np.abs(middles), np.inf).argmin(axis=1)
+    has_edge = ends.any(axis=1)
+    outwards = points.outwards.copy()
+    edges = points.pixels + middles[nearest, None] * outwards
+    here = _classify_pixels(
+        image_m,
+        points.pixels,
+        depth_m=points.depth_m,
+        gate_m=gate_m,
+        is_missing_empty=empty,
+    )
+    is_beyond = ~has_edge & (here == EMPTY)
+    if is_beyond.any():
+        is_nothing = (image_m > points.depth_m.max() + gate_m) | (
+            np.isnan(image_m) & empty
+        )
+        edges[is_beyond], outwards[is_beyond], has_nearest = _nearest_edges(
+            is_nothing, points.pixels[is_beyond]
+        )
+        is_beyond[is_beyond] = has_nearest
+    return {
+        "faces": points.faces,
+        "weights": points.weights,
+        "is_compared": has_edge | is_beyond,
+        **_planes(
+            camera_in,
+            camera,
+            edges=edges,
+            outwards=outwards,
+            depth_m=points.depth_m,
+            phi=phi,
+            sample=sample,
+        ),
+    }
+
+
+def _classify_pixels(
+    image_m: Array,
+    pixels: Array,
+    depth_m: Array,
+    *,
+    gate_m: float,
+    is_missing_empty: bool,
+) -> NDArray[np.int64]:
+    """Classify pixels (…, 2) of an image beside a body at given depths as BODY, UNKNOWN or EMPTY.
+
+    Pixels outside the image are UNKNOWN. `is_missing_empty` states whether a missing depth (NaN)
+    means that nothing is there.
+    """
+    column, row = np.moveaxis(np.round(pixels).astype(np.int64), -1, 0)
+    inside = (
+        (column >= 0)
+        & (column < image_m.shape[1])
+        & (row >= 0)
+        & (row < image_m.shape[0])
+    )
+    depths_m = image_m[np.where(inside, row, 0), np.where(inside, column, 0)]
+    behind_m = depths_m - depth_m
+    shown = np.full(depths_m.shape, UNKNOWN)
+    shown[np.abs(behind_m) <= gate_m] = BODY
+    shown[(behind_m > gate_m) | (np.isnan(depths_m) & is_missing_empty)] = EMPTY
+    shown[~inside] = UNKNOWN
+    return shown
+
+
+def _nearest_edges(
+    nothing: NDArray[np.bool_], pixels: Array
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return the edges nearest to pixels (P, 2).
+
+    Parameters
+    ----------
+    nothing : (rows, columns) array of bool
+        Pixels of the image that show nothing, among them `pixels`.
+    pixels : (P, 2) array
+        Pixels u, v.
+
+    Returns
+    -------
+    ((P, 2) array, (P, 2) array, (P,) array of bool)
+        Edges, half a pixel from the middle of the nearest other pixel; unit vectors from the edge
+        to the pixel; and whether there is such an edge.
+    """
+    if nothing.all():
+        return pixels, np.ones_like(pixels), np.zeros(len(pixels), dtype=bool)
+    places: Array = np.asarray(
+        distance_transform_edt(
+            nothing, return_distances=False, return_indices=True
+        )
+    )
+    column, row = np.round(pixels).astype(np.int64).T
+    nearest = places[::-1, row, column].T.astype(float)
+    way = pixels - nearest
+    length = np.linalg.norm(way, axis=1)
+    has_edge = length > 0
+    way[has_edge] /= length[has_edge, None]
+    way[~has_edge] = [1.0, 0.0]
+    return nearest + 0.5 * way, way, has_edge
+
+
+def _planes(
+    camera_in: DepthCameraModel,
+    camera: DepthCamera,
+    edges: Array,
+    outwards: Array,
+    depth_m: Array,
+    *,
+    phi: Array,
+    sample: int,
+) -> dict[str, NDArray]:
+    """Return planes through the camera and edges in its image, by attribute name of `Outline`.
+
+    Parameters
+    ----------
+    camera_in, camera : DepthCameraModel, DepthCamera
+    edges : (P, 2) array
+        Pixels u, v of the edges.
+    outwards : (P, 2) array
+        Unit vectors in the image away from the body, which give the sign of the normals.
+    depth_m : (P,) array
+        Depths [m] that determine how wide a pixel is, and where the point of each plane is chosen.
+    phi : (k,) array
+        Nuisance parameters.
+    sample : int
+        Index of the image.
+
+    Returns
+    -------
+    dict
+        "normals" (P, 3), unit vectors in the world, away from the body; "points" (P, 3), points of
+        the planes in the camera's frame [m]; and "pixel_m" (P,), the width of a pixel along the
+        normal at the stated depth [m].
+    """
+    tangents_px = np.column_stack([-outwards[:, 1], outwards[:, 0]])
+    at, before, after, outside = _concatenated_rays(
+        camera,
+        [edges, edges - tangents_px, edges + tangents_px, edges + outwards],
+    )
+    normals = np.cross(before, after)
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    pixel = np.sum(normals * (outside - at), axis=1)
+    normals *= np.sign(pixel)[:, None]
+    corner = camera_in.to_world(phi, np.zeros((1, 3)), np.zeros((1, 3)), sample)
+    ways = (
+        camera_in.to_world(phi, normals, np.zeros_like(normals), sample)
+        - corner
+    )
+    return {
+        "normals": ways / np.linalg.norm(ways, axis=1)[:, None],
+        "points": depth_m[:, None] * at,
+        "pixel_m": np.abs(pixel) * depth_m,
+    }
+
+
+def _concatenated_rays(
+    camera: DepthCamera, pixels: Sequence[Array]
+) -> list[Array]:
+    """Return the rays (P, 3) of several sets of pixels (P, 2), computed in one call."""
+    return np.split(
+        camera.points_at_unit_depth(np.concatenate(pixels)), len(pixels)
+    )

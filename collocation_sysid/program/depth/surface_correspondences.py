@@ -1,0 +1,461 @@
+"""Correspondences between the points of a depth camera and the surface of the body.
+
+Points are not labelled: each belongs to the nearest point of the surface, for the current shape and
+camera pose (iterative closest points). A `SurfaceCorrespondences` states these correspondences for
+every image; it is renewed as estimates change, as associations of marker places are. In between,
+residuals along the surface normals are smooth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ...common.array_types import Array, Index
+from ...fem.body import Body
+from ...model.nuisance_map import NuisanceMap
+from ...recording.experiment import Experiment
+from .camera_alignment import align_camera, thinned
+from .depth_camera_model import DepthCameraModel
+from .depth_outline import Outline
+from .visible_surface import GRAZING, VisibleSurface
+
+# Share of the distance perpendicular to the normal beyond which a point lies beyond an edge.
+LARGEST_OFFSET_EDGES = 0.5
+# Gate before anything is fitted, relative to the diagonal of the body.
+WIDE = 0.25
+# Later gate, relative to the median distance of the points.
+SPREAD = 6.0
+# The gate is narrowed only if it decreases by this factor.
+NARROWER = 0.8
+# Shapes that change by less than this share of σ keep their correspondences.
+SAME = 0.2
+# Largest alignment in standard deviations of its prior; more belongs to something else.
+FARTHEST = 4.0
+# Reasons for leaving points out, in the order in which they are tested.
+EXCLUSION_REASONS = ("far", "grazing", "turned away", "not chosen", "hidden")
+# Share of the spacing of points by which a part must be in front to hide another; shapes that
+# change by less have converged.
+FRONT = 0.5
+
+
+def initial_gate_m(shape_m: Array) -> float:
+    """Return the largest distance of points from a surface with nodes (n, 3) before
+    anything is fitted [m].
+    """
+    return WIDE * float(np.linalg.norm(np.ptp(shape_m, axis=0)))
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceCorrespondences:
+    """Points of a camera and corresponding points of the surface, in S images of at most E points.
+
+    Attributes
+    ----------
+    camera : DepthCameraModel
+        Model of the camera.
+    body : Body
+        The body.
+    surface : VisibleSurface
+        Surface of the body.
+    nodes, weights : (S, E, v) arrays
+        Nodes of the surface, and shape functions of the corresponding points.
+    normals : (S, E, 3) array
+        Normals of the surface in the world.
+    points, rays : (S, E, 3) arrays
+        Measured points, and directions of their depths, in the camera's frame.
+    places_m : (S, E, 3) array
+        Corresponding points on the undeformed body [m].
+    is_compared : (S, E) array of bool
+        Points that are compared.
+    gate_m : float
+        Points farther from the surface are taken to belong to something else [m].
+    excluded_counts : mapping of str to int
+        Number of points that are not compared, by reason.
+    shapes_m : (S, n, 3) array
+        Surface nodes for which the correspondences were found [m].
+    start_values : mapping of str to float
+        The camera's nuisance parameters for which they were found, by label.
+    has_converged : bool
+        Whether shapes had hardly changed since the correspondences before. Only then are points
+        left out that the body hides from the camera: with wrong shapes, too many would seem hidden.
+    outline : Outline
+        Outline of the body in these shapes and the edges in the images; without points if there are
+        no images.
+    """
+
+    camera: DepthCameraModel
+    body: Body
+    surface: VisibleSurface
+    nodes: Index
+    weights: Array
+    normals: Array
+    points: Array
+    rays: Array
+    places_m: Array
+    is_compared: NDArray[np.bool_]
+    gate_m: float
+    excluded_counts: Mapping[str, int]
+    shapes_m: Array
+    start_values: Mapping[str, float]
+    has_converged: bool
+    outline: Outline
+
+    @classmethod
+    def from_shapes(
+        cls,
+        camera: DepthCameraModel,
+        body: Body,
+        shapes_m: Array,
+        phi: Array,
+        gate_m: float,
+        settled: bool = False,
+    ) -> SurfaceCorrespondences:
+        """Find the correspondences for given shapes.
+
+        Parameters
+        ----------
+        camera : DepthCameraModel
+            Model of the camera.
+        body : Body
+            The body.
+        shapes_m : (S, n, 3) array
+            Surface nodes at the images [m].
+        phi : (k,) array
+            Nuisance parameters, with the pose of the camera.
+        gate_m : float
+            Largest distance of points from the surface [m].
+        settled : bool
+            Whether to leave out points that the body hides.
+        """
+        skin = VisibleSurface.from_body(body, camera.depth)
+        images = [
+            _match_image(
+                camera,
+                skin,
+                body=body,
+                sample=k,
+                x=x,
+                phi=phi,
+                gate_m=gate_m,
+                settled=settled,
+            )
+            for k, x in enumerate(shapes_m)
+        ]
+        most = max(1, *(len(each["is_compared"]) for each in images))
+        arrays: dict[str, Any] = {
+            name: np.stack(
+                [
+                    np.pad(
+                        s[name],
+                        [
+                            (0, most - len(s[name])),
+                            *[(0, 0)] * (s[name].ndim - 1),
+                        ],
+                    )
+                    for s in images
+                ]
+            )
+            for name in images[0]
+            if name != "reasons"
+        }
+        total = np.sum([each["reasons"] for each in images], axis=0).tolist()
+        own: dict[str, Any] = {
+            "excluded_counts": dict(zip(EXCLUSION_REASONS, total, strict=True))
+        }
+        own |= {
+            "start_values": camera.parameter_values(phi),
+            "gate_m": gate_m,
+            "shapes_m": shapes_m,
+            "has_converged": settled,
+        }
+        own["outline"] = Outline.from_shapes(
+            camera, skin, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
+        )
+        return cls(camera, body, skin, **own, **arrays)
+
+    @classmethod
+    def from_alignment(
+        cls, camera: DepthCameraModel, body: Body, shapes_m: Array, phi: Array
+    ) -> SurfaceCorrespondences:
+        """Align the camera with the first shape, then find the correspondences.
+
+        The alignment is rejected if it differs from the stated pose by more than four prior
+        standard deviations.
+
+        Parameters
+        ----------
+        camera : DepthCameraModel
+            Model of the camera.
+        body : Body
+            The body.
+        shapes_m : (S, n, 3) array
+            Surface nodes at the images [m].
+        phi : (k,) array
+            Nuisance parameters, for those that the alignment does not estimate.
+        """
+        first = camera.depth.first_sample_with_points
+        skin = VisibleSurface.from_body(body, camera.depth)
+        turn, shift_m = align_camera(
+            camera, skin, x=shapes_m[first], image=first
+        )
+        moved = camera.with_pose(phi, turn, shift_m)
+        is_implausible = (
+            np.abs(moved[camera.parameter_indices]).max(initial=0.0) > FARTHEST
+        )
+        gate_m = max(initial_gate_m(body.nodes_m), camera.depth.gate_m)
+        phi = phi if is_implausible else moved
+        clouds = tuple(map(thinned, camera.depth.clouds))
+        thinned_view = replace(
+            camera, depth=replace(camera.depth, clouds=clouds, images_m=())
+        )
+        gate_m = cls.from_shapes(
+            thinned_view, body, shapes_m, phi, gate_m
+        ).next_gate_m(shapes_m, phi)
+        return cls.from_shapes(camera, body, shapes_m, phi, gate_m)
+
+    def updated(self, shapes_m: Array, phi: Array) -> SurfaceCorrespondences:
+        """Update the correspondences.
+
+        Parameters
+        ----------
+        shapes_m : (s, n, 3) array
+            Surface nodes at the first s images [m]; later images keep their shapes.
+        phi : (k,) array
+            Nuisance parameters.
+
+        Returns
+        -------
+        SurfaceCorrespondences
+            The new correspondences; self if neither shapes, camera nor gate have changed.
+        """
+        known = len(shapes_m)
+        all_shapes_m = np.concatenate([shapes_m, self.shapes_m[known:]])
+        depth = self.camera.depth
+        before = self.camera.parameters_from(self.start_values)
+        moved_m = np.abs(shapes_m - self.shapes_m[:known]).max(initial=0.0)
+        for k in range(known if moved_m < FRONT * depth.spacing_m else 0):
+            way = self.camera.world_points(phi, k) - self.camera.world_points(
+                before, k
+            )
+            moved_m = max(moved_m, np.abs(way).max(initial=0.0))
+        gate_m = self.next_gate_m(all_shapes_m, phi)
+        settled = moved_m < FRONT * depth.spacing_m
+        if (
+            moved_m < SAME * depth.sigma_m
+            and gate_m == self.gate_m
+            and self.has_converged
+        ):
+            return self
+        return SurfaceCorrespondences.from_shapes(
+            self.camera,
+            self.body,
+            shapes_m=all_shapes_m,
+            phi=phi,
+            gate_m=gate_m,
+            settled=settled,
+        )
+
+    def distance_to_cloud_m(self, x: Array, phi: Array) -> Array:
+        """Return the distances (P,) from visible parts of a shape x (n, 3) to the points of the
+        first image [m].
+
+        Distances are limited to `initial_gate_m` of the body.
+        """
+        view = self.camera
+        is_facing = self.surface.is_facing(
+            x, self.camera.eye_m(phi, 0), GRAZING
+        )
+        middles = x[self.surface.plane_triangles[is_facing]].mean(axis=1)
+        distances_m, _ = KDTree(view.world_points(phi, 0)).query(middles)
+        return np.minimum(distances_m, initial_gate_m(self.body.nodes_m))
+
+    def next_gate_m(self, shapes_m: Array, phi: Array) -> float:
+        """Return the gate for the next search [m]: narrower if the points are near enough to the
+        surfaces (S, n, 3), else the present one.
+        """
+        gate_m = max(
+            self._expected_distance_m(shapes_m, phi), self.camera.depth.gate_m
+        )
+        return gate_m if gate_m <= NARROWER * self.gate_m else self.gate_m
+
+    def _expected_distance_m(self, shapes_m: Array, phi: Array) -> float:
+        """Return six times the median distance of the compared points from the surface [m];
+        infinite without any.
+        """
+        distances_m = self.signed_distances_m(shapes_m, phi)
+        all_of_them = np.abs(distances_m[np.isfinite(distances_m)])
+        return (
+            SPREAD * float(np.median(all_of_them))
+            if len(all_of_them)
+            else np.inf
+        )
+
+    def signed_distances_m(self, shapes_m: Array, phi: Array) -> Array:
+        """Return how far points (S, E) are behind shapes (S, n, 3), along the normals [m].
+
+        NaN where a point is not compared.
+        """
+        distances_m = np.full(self.is_compared.shape, np.nan)
+        for k, x in enumerate(shapes_m):
+            surface = np.einsum("ea,eai->ei", self.weights[k], x[self.nodes[k]])
+            measured = self.camera.to_world(
+                phi, self.points[k], self.rays[k], k
+            )
+            behind_m = np.sum(self.normals[k] * (surface - measured), axis=1)
+            distances_m[k] = np.where(self.is_compared[k], behind_m, np.nan)
+        return distances_m
+
+
+def _match_image(
+    camera: DepthCameraModel,
+    surface: VisibleSurface,
+    body: Body,
+    sample: int,
+    x: Array,
+    phi: Array,
+    gate_m: float,
+    settled: bool,
+) -> dict[str, NDArray]:
+    """Find the correspondences of one image.
+
+    Parameters
+    ----------
+    camera : DepthCameraModel
+    surface : VisibleSurface
+    body : Body
+    sample : int
+        Index of the image.
+    x : (n, 3) array
+        Positions of the surface's nodes at the image [m].
+    phi : (k,) array
+        Nuisance parameters.
+    gate_m : float
+        Largest distance of a point from the surface [m].
+    settled : bool
+        Whether the search has nearly converged, so that points hidden behind other parts of the
+        body are left out.
+
+    Returns
+    -------
+    dict of arrays
+        Arrays of the points within the gate, by attribute name of `SurfaceCorrespondences`; and
+        "reasons", the numbers of points left out in the order of `EXCLUSION_REASONS`.
+    """
+    depth = camera.depth
+    cloud = camera.depth.clouds[sample]
+    world = camera.world_points(phi, sample)
+    eye_m = camera.eye_m(phi, sample)
+    indices, faces, places = _nearest_facing(
+        world, surface, x=x, eye_m=eye_m, gate_m=gate_m
+    )
+    weights, feet, normals = surface.evaluate(x, faces, places)
+    ways = normals if eye_m is None else eye_m - feet
+    is_frontal = np.sum(normals * ways, axis=1) >= GRAZING * np.linalg.norm(
+        ways, axis=1
+    )
+    offsets = world[indices] - feet
+    distance = np.linalg.norm(offsets, axis=1)
+    lateral = np.linalg.norm(
+        offsets - np.sum(offsets * normals, axis=1)[:, None] * normals, axis=1
+    )
+    # A point beyond an edge of what the camera sees pulls that along the way to it.
+    is_beyond_edge = lateral > LARGEST_OFFSET_EDGES * distance + depth.sigma_m
+    normals[is_beyond_edge] = (
+        offsets[is_beyond_edge] / distance[is_beyond_edge, None]
+    )
+    has_similar_normal = is_visible = is_any = np.ones(len(indices), dtype=bool)
+    if cloud.shape[1] == 6:
+        measured = cloud[indices, 3:] @ camera.poses[0][sample].T
+        has_similar_normal = np.sum(normals * measured, axis=1) >= GRAZING
+    if settled:
+        is_visible = ~surface.is_hidden(x, eye_m, feet, FRONT * depth.spacing_m)
+    is_within_gate = distance <= gate_m
+    remaining = np.cumprod(
+        [
+            is_any,
+            is_within_gate,
+            is_frontal,
+            has_similar_normal,
+            surface.is_selected[faces],
+            is_visible,
+        ],
+        axis=0,
+    )
+    reasons = -np.diff(remaining.sum(axis=1))
+    reasons[0] += len(cloud) - len(indices)
+    rest_m = np.einsum(
+        "pa,pai->pi", weights, body.nodes_m[surface.nodes][surface.faces[faces]]
+    )
+    of_points = {
+        "nodes": surface.faces[faces],
+        "weights": weights,
+        "normals": normals,
+        "points": cloud[indices, :3],
+        "rays": camera.rays[sample][indices],
+        "places_m": rest_m,
+        "is_compared": remaining[-1].astype(bool),
+    }
+    return {name: each[is_within_gate] for name, each in of_points.items()} | {
+        "reasons": reasons
+    }
+
+
+def _nearest_facing(
+    world: Array,
+    surface: VisibleSurface,
+    x: Array,
+    eye_m: Array | None,
+    gate_m: float,
+) -> tuple[Index, Index, Array]:
+    """Return indices of points near a shape, and the nearest points of faces towards the camera:
+    faces and barycentric coordinates.
+
+    Parameters
+    ----------
+    world : (P, 3) array
+        Points in the world [m].
+    surface : VisibleSurface
+        Surface of the body.
+    x : (n, 3) array
+        Surface nodes [m].
+    eye_m : (3,) array or None
+        Position of the camera; None for a point cloud.
+    gate_m : float
+        Points outside the bounding box of the shape by more are left out [m].
+    """
+    low = x.min(axis=0) - gate_m
+    high = x.max(axis=0) + gate_m
+    in_box = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
+    facing = np.flatnonzero(surface.is_facing(x, eye_m))
+    if not len(facing) or not len(in_box):
+        return in_box[:0], in_box[:0], np.zeros((0, 3))
+    return in_box, *surface.nearest_points(x, world[in_box], facing)
+
+
+def initial_correspondences(
+    experiment: Experiment,
+) -> tuple[SurfaceCorrespondences, ...]:
+    """Return the correspondences of an experiment's depth cameras with the undeformed body
+    in its grasps.
+    """
+    if not experiment.depths:
+        return ()
+    nuisance = NuisanceMap.from_experiment(experiment)
+    sightings = []
+    for number, depth in enumerate(experiment.depths):
+        view = DepthCameraModel.from_experiment(experiment, number, nuisance)
+        nodes = VisibleSurface.from_body(experiment.body, depth).nodes
+        shapes_m = experiment.rigid_positions(depth.sample_times_s)[:, nodes]
+        nothing = np.zeros(nuisance.size)
+        sightings.append(
+            SurfaceCorrespondences.from_alignment(
+                view, experiment.body, shapes_m, nothing
+            )
+        )
+    return tuple(sightings)

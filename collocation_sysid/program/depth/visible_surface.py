@@ -1,0 +1,347 @@
+"""Surface of a body as seen by a depth camera: facing and hidden parts, and nearest points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ...common.array_types import Array, Index
+from ...fem.body import Body
+from ...fem.contact_surface import face_shape_functions
+from ...recording.depth_camera import Depth
+from ...recording.experiment import Experiment
+from ...recording.placement import nearest_points_of_triangles
+
+# Number of triangles, nearest by their middles, among which the nearest point is searched.
+NEARBY = 10
+# Newton steps to the nearest point on a curved face.
+SETTLING = 3
+# Changes of barycentric coordinates that end these steps.
+STILL = 1e-6
+# Cosine between normal and view below which a point is seen at a grazing angle; measured normals
+# may be off by as much.
+GRAZING = 0.3
+
+# Flat triangles that stand for a face of three nodes, or of six with those on ab, bc, ca.
+CORNERS = np.vstack([np.eye(3), [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]]])
+TRIANGLES_OF_FACE = {
+    3: np.array([[0, 1, 2]]),
+    6: np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class VisibleSurface:
+    """Faces of a body's surface, each divided into flat triangles.
+
+    Attributes
+    ----------
+    nodes : (n,) array
+        Nodes of the body on the surface.
+    faces : (F, 3) or (F, 6) array
+        Indices into `nodes` of each face.
+    is_selected : (F,) array of bool
+        Faces that the camera may see according to the problem.
+    """
+
+    nodes: Index
+    faces: Index
+    is_selected: NDArray[np.bool_]
+
+    @classmethod
+    def from_body(cls, body: Body, depth: Depth) -> VisibleSurface:
+        """Build the surface of a body, with the faces that a depth camera may see according
+        to the problem.
+        """
+        triangles = body.mesh.surface
+        chosen = np.ones(len(triangles), dtype=bool)
+        if depth.faces is not None:
+            chosen[:] = False
+            chosen[depth.faces.resolve_faces(body.mesh)] = True
+        nodes, faces = np.unique(
+            body.nodes.nodes_of_faces(triangles), return_inverse=True
+        )
+        return cls(nodes, faces.reshape(len(triangles), -1), chosen)
+
+    def initial_positions_m(
+        self, experiment: Experiment, depth: Depth
+    ) -> Array:
+        """Return the node positions (n, 3) of the undeformed body in its grasps at the
+        camera's first image with points [m].
+        """
+        return experiment.rigid_positions(
+            depth.sample_times_s[[depth.first_sample_with_points]]
+        )[0, self.nodes]
+
+    @property
+    def plane_triangles(self) -> Index:
+        """Flat triangles (F·k, 3) as indices into `nodes`; those of a face are consecutive."""
+        return self.faces[:, TRIANGLES_OF_FACE[self.faces.shape[1]]].reshape(
+            -1, 3
+        )
+
+    @cached_property
+    def edges(self) -> tuple[Index, Index]:
+        """Edges (K, 2) between two flat triangles, as indices into `nodes`, and the indices (K, 2)
+        of these triangles; edges with another number of triangles are omitted.
+        """
+        triangles = self.plane_triangles
+        ends = np.sort(
+            triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1
+        )
+        unique, number, counts = np.unique(
+            ends, axis=0, return_inverse=True, return_counts=True
+        )
+        order = np.argsort(number.ravel(), kind="stable")
+        first = np.cumsum(counts) - counts
+        paired = counts == 2
+        faces_of_edges = (
+            np.stack([order[first[paired]], order[first[paired] + 1]], axis=1)
+            // 3
+        )
+        return unique[paired], faces_of_edges
+
+    def to_faces(
+        self, triangles: Index, barycentric: Array
+    ) -> tuple[Index, Array]:
+        """Return faces (P,), and barycentric coordinates (P, 3) on them, of points on flat
+        triangles.
+
+        Parameters
+        ----------
+        triangles : (P,) array
+            Indices of flat triangles.
+        barycentric : (P, 3) array
+            Barycentric coordinates in the triangles.
+        """
+        parts = TRIANGLES_OF_FACE[self.faces.shape[1]]
+        corners = CORNERS[parts[triangles % len(parts)]]
+        return triangles // len(parts), np.einsum(
+            "pc,pci->pi", barycentric, corners
+        )
+
+    def evaluate(
+        self, x: Array, faces: Index, barycentric: Array
+    ) -> tuple[Array, Array, Array]:
+        """Evaluate points on faces of a deformed surface.
+
+        Parameters
+        ----------
+        x : (n, 3) array
+            Node positions [m].
+        faces : (P,) array
+            Faces.
+        barycentric : (P, 3) array
+            Barycentric coordinates on them.
+
+        Returns
+        -------
+        ((P, v) array, (P, 3) array, (P, 3) array)
+            Shape functions of the nodes, points [m], and outward unit normals.
+        """
+        weights, points, tangents = self._evaluate_tangents(
+            x, faces, barycentric=barycentric
+        )
+        normals = np.cross(tangents[:, 0], tangents[:, 1])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+        return weights, points, normals
+
+    def _evaluate_tangents(
+        self, x: Array, faces: Index, barycentric: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return shape functions, points, and tangents (P, 2, 3) along the faces; arguments
+        as in `evaluate`.
+        """
+        weights, slopes = face_shape_functions(barycentric, self.faces.shape[1])
+        corners = x[self.faces[faces]]
+        tangents = np.einsum(
+            "pak,pai->pki", slopes[:, :, :2] - slopes[:, :, 2:], corners
+        )
+        return weights, np.einsum("pa,pai->pi", weights, corners), tangents
+
+    def subdivided_triangles(self, x: Array, divisions: int = 4) -> Array:
+        """Return the corners (F · divisions², 3, 3) [m] of triangles on a surface deformed to x (n,
+        3) [m], with each side of a face divided into `divisions`.
+        """
+        i, j = np.indices((divisions, divisions)).reshape(2, -1)
+        up = i + j < divisions
+        down = i + j < divisions - 1
+        upward = np.stack([[i, j], [i + 1, j], [i, j + 1]])[..., up]
+        downward = np.stack([[i + 1, j], [i + 1, j + 1], [i, j + 1]])[..., down]
+        of_b, of_c = (
+            np.concatenate([upward, downward], axis=2).transpose(1, 2, 0)
+            / divisions
+        )
+        places = np.stack([1 - of_b - of_c, of_b, of_c], axis=-1).reshape(-1, 3)
+        faces = np.repeat(np.arange(len(self.faces)), len(places))
+        points = self.evaluate(x, faces, np.tile(places, (len(self.faces), 1)))[
+            1
+        ]
+        return points.reshape(-1, 3, 3)
+
+    def is_facing(
+        self, x: Array, eye_m: Array | None, minimum_cosine: float = 0.0
+    ) -> NDArray[np.bool_]:
+        """Return the mask (F·k,) of flat triangles that face a camera.
+
+        Parameters
+        ----------
+        x : (n, 3) array
+            Node positions [m].
+        eye_m : (3,) array or None
+            Position of the camera [m]; None, for a point cloud without camera, gives all.
+        minimum_cosine : float
+            Smallest cosine between the normal and the direction to the camera.
+        """
+        if eye_m is None:
+            return np.ones(len(self.plane_triangles), dtype=bool)
+        a, b, c = x[self.plane_triangles].transpose(1, 0, 2)
+        normal = np.cross(b - a, c - a)
+        way = eye_m - (a + b + c) / 3
+        sizes = np.linalg.norm(normal, axis=1) * np.linalg.norm(way, axis=1)
+        return np.sum(normal * way, axis=1) > minimum_cosine * sizes
+
+    def is_hidden(
+        self, x: Array, eye_m: Array | None, points_m: Array, front_m: float
+    ) -> NDArray[np.bool_]:
+        """Return the mask (P,) of points that another part of the surface hides from a camera.
+
+        Parameters
+        ----------
+        x : (n, 3) array
+            Node positions [m].
+        eye_m : (3,) array or None
+            Position of the camera [m]; None gives none.
+        points_m : (P, 3) array
+            Points [m].
+        front_m : float
+            A part hides a point if it is at least so much nearer to the camera [m].
+        """
+        behind = np.zeros(len(points_m), dtype=bool)
+        if eye_m is None or not len(points_m):
+            return behind
+        # Seen from there in the plane at distance one.
+        optical_axis, *across = np.linalg.svd((x.mean(axis=0) - eye_m)[None])[2]
+        optical_axis *= np.sign(optical_axis @ (x.mean(axis=0) - eye_m))
+        depths = (x - eye_m) @ optical_axis
+        away = (points_m - eye_m) @ optical_axis
+        corners = self.plane_triangles[
+            self.is_facing(x, eye_m, minimum_cosine=0.0)
+        ]
+        corners = corners[(depths[corners] > 0).all(axis=1)]
+        places = ((x - eye_m) @ np.transpose(across) / depths[:, None])[corners]
+        projected = (points_m - eye_m) @ np.transpose(across) / away[:, None]
+        middles = places.mean(axis=1)
+        reach = np.linalg.norm(places - middles[:, None], axis=2).max(
+            initial=0.0
+        )
+        candidates = KDTree(middles).query_ball_point(projected, reach)
+        point = np.repeat(
+            np.arange(len(projected)), [len(each) for each in candidates]
+        )
+        triangle = np.concatenate([*candidates, []]).astype(int)
+        first = depths[corners[triangle]].min(axis=1) < away[point] - front_m
+        point = point[first]
+        triangle = triangle[first]
+        a, b, c = places[triangle].transpose(1, 0, 2)
+        way = projected[point] - a
+        double_area = _cross_2d(b - a, c - a)
+        of_b = _cross_2d(way, c - a) / double_area
+        of_c = _cross_2d(b - a, way) / double_area
+        shares = np.column_stack([1 - of_b - of_c, of_b, of_c])
+        # What is linear on a triangle is one over the depth in the plane.
+        hit = (
+            1 / np.sum(shares / depths[corners[triangle]], axis=1)
+            < away[point] - front_m
+        )
+        behind[point[(shares >= 0).all(axis=1) & hit]] = True
+        return behind
+
+    def nearest_points(
+        self, x: Array, points: Array, candidates: Index
+    ) -> tuple[Index, Array]:
+        """Return the nearest points of some flat triangles, and of the curved faces they belong to.
+
+        Parameters
+        ----------
+        x : (n, 3) array
+            Node positions [m].
+        points : (P, 3) array
+            Points [m].
+        candidates : array
+            Indices of the flat triangles, at least one.
+
+        Returns
+        -------
+        ((P,) array, (P, 3) array)
+            Faces, and barycentric coordinates on them.
+        """
+        corners = x[self.plane_triangles[candidates]]
+        middles = corners.mean(axis=1)
+        sizes = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
+        neighbours = KDTree(middles).query(points, min(NEARBY, len(corners)))
+        away, nearest_triangles = (
+            np.reshape(each, (len(points), -1)) for each in neighbours
+        )
+        # Triangles whose middles are farther than this by their own size cannot be nearer.
+        triangles = nearest_triangles[:, 0].copy()
+        least = np.full(len(points), np.inf)
+        feet = np.zeros_like(points)
+        for rank, own in enumerate(nearest_triangles.T):
+            here = np.flatnonzero(away[:, rank] - sizes[own] < least)
+            on = nearest_points_of_triangles(points[here], corners[own[here]])
+            distances = np.linalg.norm(on - points[here], axis=1)
+            is_closer = distances < least[here]
+            here = here[is_closer]
+            on = on[is_closer]
+            distances = distances[is_closer]
+            triangles[here] = own[here]
+            feet[here] = on
+            least[here] = distances
+        a, b, c = corners[triangles].transpose(1, 0, 2)
+        normal = np.cross(b - a, c - a)
+        squares = np.sum(normal**2, axis=1)
+        of_b = np.sum(np.cross(feet - a, c - a) * normal, axis=1) / squares
+        of_c = np.sum(np.cross(b - a, feet - a) * normal, axis=1) / squares
+        faces, places = self.to_faces(
+            candidates[triangles],
+            np.column_stack([1 - of_b - of_c, of_b, of_c]),
+        )
+        moving = np.arange(len(points) if self.faces.shape[1] > 3 else 0)
+        for _ in range(SETTLING):
+            # Faces are curved: what is nearest on the flat triangle is beside what is on them.
+            _, feet, tangents = self._evaluate_tangents(
+                x, faces[moving], barycentric=places[moving]
+            )
+            by_a, by_b = tangents.transpose(1, 0, 2)
+            aa, ab, bb = (
+                np.sum(u * v, axis=1)
+                for u, v in ((by_a, by_a), (by_a, by_b), (by_b, by_b))
+            )
+            to_a, to_b = (
+                np.sum(u * (points[moving] - feet), axis=1)
+                for u in (by_a, by_b)
+            )
+            step = np.column_stack(
+                [bb * to_a - ab * to_b, aa * to_b - ab * to_a]
+            )
+            step /= (aa * bb - ab**2)[:, None]
+            settled = np.clip(
+                places[moving] + np.column_stack([step, -step.sum(axis=1)]),
+                0.0,
+                1.0,
+            )
+            settled /= settled.sum(axis=1, keepdims=True)
+            has_moved = np.abs(settled - places[moving]).max(axis=1) > STILL
+            places[moving] = settled
+            moving = moving[has_moved]
+        return faces, places
+
+
+def _cross_2d(a: Array, b: Array) -> Array:
+    """Return the cross product of plane vectors (…, 2)."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -1,0 +1,8 @@
+"""Forward simulation of one experiment from its initial equilibrium.
+
+- `scheme_simulation`: simulation by a collocation scheme; `newmark`: by Newmark's method, as an
+  independent check.
+- `newton_solver`: Newton's method for one time step; `retraction`: updates of positions by rotation
+  and strain.
+- `initial_equilibrium`: static equilibrium; `loss_of_stability`: buckling and wrinkling on the way.
+"""

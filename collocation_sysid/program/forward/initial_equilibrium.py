@@ -1,0 +1,271 @@
+"""Initial state of an experiment: equilibrium under its loads, undeformed, or stated."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ...common.array_types import Array
+from ...common.step_counting import report_state
+from ...model.contact import Contact
+from ...model.forces import Forces
+from ...model.viscoelasticity import with_start_memory
+from ...recording.experiment import Experiment
+from ...recording.obstacle import Obstacle
+from ..linear_algebra.factorisation import NONE
+from ..linear_algebra.lapack import one_blas_thread
+from .newton_solver import (
+    NewtonFailure,
+    NewtonSolver,
+    follow_path,
+    simulation_error,
+)
+
+
+@one_blas_thread()
+def equilibrium(
+    experiment: Experiment,
+    theta: Array,
+    time_s: float | None = None,
+    start: Array | None = None,
+    solver: NewtonSolver | None = None,
+) -> Array:
+    """Return the static equilibrium (3n,) [m] under gravity and external forces, with grasped dofs
+    prescribed.
+
+    Newton's method starts from the undeformed body in its grasps, or from `start`. If it fails,
+    load and relative displacements of the grasps are applied in increments, and obstacles approach
+    from where they do not touch the body. A body with memory has relaxed, or has been loaded for as
+    long as the experiment states.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    theta : (k,) array
+        Constants of the body.
+    time_s : float, optional
+        Time of loads and poses [s]; the first time by default.
+    start : (3n,) array, optional
+        First guess [m].
+    solver : NewtonSolver, optional
+        Newton's method with the prescribed dofs of that time; a new one by default.
+
+    Raises
+    ------
+    SimulationError
+        If no stable equilibrium is found.
+    """
+    at_s = float(experiment.t_s[0] if time_s is None else time_s)
+    goals_m = experiment.prescribed_displacements([at_s])[1].ravel()
+    forces = Forces.from_experiment(experiment, at_s, theta)
+    return _solve_equilibrium(
+        experiment,
+        forces,
+        goals_m=goals_m,
+        at_s=at_s,
+        start=start,
+        solver=solver or NewtonSolver(experiment),
+    )
+
+
+def _solve_equilibrium(
+    experiment: Experiment,
+    forces: Forces,
+    goals_m: Array,
+    at_s: float,
+    start: Array | None,
+    solver: NewtonSolver,
+) -> Array:
+    """Return the equilibrium (3n,) [m] under given forces at the time `at_s`.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    forces : Forces
+        Forces at that time.
+    goals_m : (3n,) array
+        Prescribed positions [m]; NaN where a dof is free.
+    at_s : float
+        Time [s].
+    start : (3n,) array or None
+        Guess [m]; None to start from the body carried by its grasps.
+    solver : NewtonSolver
+
+    Raises
+    ------
+    NewtonFailure
+        If no equilibrium is found.
+    """
+    zero_velocity = np.zeros((1, len(goals_m)))
+    shape = experiment.rigid_positions([at_s])[0]
+    forces = with_start_memory(forces, experiment.loaded_since_s)
+    without_contact = _without_contact(forces, shape)
+
+    def solve(x: Array, share: float) -> Array:
+        loaded = forces.scaled(share)
+
+        def residual(state: Array) -> Array:
+            return loaded.total(state, zero_velocity)[0]
+
+        def linearise(state: Array) -> tuple[Array, Array, Array]:
+            # Nothing moves: there is no skew part.
+            at = loaded.linearise(state, zero_velocity)
+            report_state(
+                lambda: _describe_state(share, at.force[0][solver.free])
+            )
+            return at.force[0], -at.by_position[0], NONE
+
+        # Grasps that are off are there at the end: the way there may be any.
+        goal = (
+            goals_m
+            if share == 1
+            else _partial_displacement(
+                experiment, without_contact, time_s=at_s, share=share
+            ).ravel()
+        )
+        return solver.solve(
+            x,
+            residual,
+            linearise,
+            keep_definite=True,
+            prescribed_m=goal[solver.is_prescribed],
+        )
+
+    guess = shape.ravel() if start is None and experiment.obstacles else start
+    try:
+        return follow_path(
+            solve,
+            without_contact.ravel(),
+            halvings=solver.options.max_halvings,
+            guess=guess,
+        )
+    except NewtonFailure as failure:
+        raise simulation_error(
+            solver,
+            failure,
+            time_s=at_s,
+            what="finding the rest state",
+            static=True,
+        ) from failure
+
+
+def _describe_state(share: float, force_n: Array) -> str:
+    """Return the load step and the residual of the search for an equilibrium in words.
+
+    Parameters
+    ----------
+    share : float
+        Share of loads and displacements that are applied in the current load step.
+    force_n : (free,) array
+        Forces on the free dofs [N], which are zero in equilibrium.
+    """
+    residual_n = float(np.abs(force_n).max(initial=0.0))
+    return (
+        f"equilibrium at {share:.1%} of the load, residual {residual_n:.1e} N"
+    )
+
+
+def _without_contact(forces: Forces, shape: Array) -> Array:
+    """Return a shape (n, 3) with each obstacle retracted by its deepest penetration [m].
+
+    Deep inside a curved obstacle, contact forces are not stable; the obstacle must approach from
+    outside.
+    """
+    places = shape.copy()
+    for term in forces.external_terms:
+        if isinstance(term, Contact):
+            frame = term.law_of_contact.obstacle.nodes
+            depth_m, normal = term.deepest_point(shape.ravel())
+            places[frame] -= max(depth_m, 0.0) * normal
+    return places
+
+
+def _partial_displacement(
+    experiment: Experiment, displaced_m: Array, time_s: float, share: float
+) -> Array:
+    """Return positions (n, 3) with the grasps moved by a share of their displacement from the
+    carried body [m].
+
+    Each grasp rotates about the middle of its nodes, which moves along a line, so that no grasp is
+    squeezed or sheared at large rotations. Obstacles have their final rotation already. Other nodes
+    keep their positions.
+    """
+    positions = displaced_m.copy()
+    for grasp in experiment.grasps:
+        if not grasp.is_active(time_s):
+            continue
+        start = displaced_m[grasp.nodes]
+        nodes = grasp.nodes
+        place = np.ix_(nodes, grasp.axis_indices)
+        goal = grasp.positions_at(experiment.body.nodes_m, [time_s])[0]
+        if isinstance(grasp, Obstacle):
+            positions[nodes] = start + share * (goal - start)
+            continue
+        turn = (
+            grasp.poses.at(time_s)[0][0]
+            @ experiment.rigid_motion(time_s)[0][0].T
+        )
+        part = Rotation.from_rotvec(
+            share * Rotation.from_matrix(turn).as_rotvec()
+        )
+        middle = start.mean(axis=0)
+        way = (goal - start).mean(axis=0)
+        partial_m = middle + share * way + part.apply(start - middle)
+        positions[place] = partial_m[:, grasp.axis_indices]
+    return positions
+
+
+@one_blas_thread()
+def initial_state(
+    experiment: Experiment,
+    forces: Forces,
+    solver: NewtonSolver,
+    guess: Array | None = None,
+    prescribed_m: Array | None = None,
+) -> tuple[Array, Array]:
+    """Return initial positions x_0 [m] and velocities v_0 [m/s], each (3n,), by the experiment's
+    start rule.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    forces : Forces
+        Forces at the start.
+    solver : NewtonSolver
+        Newton's method with the prescribed dofs of the start.
+    guess : (3n,) array, optional
+        First guess of an equilibrium [m].
+    prescribed_m : (3n,) array, optional
+        Prescribed positions [m], NaN at free dofs; those of the experiment by default.
+
+    Raises
+    ------
+    SimulationError
+        If no stable equilibrium is found.
+    """
+    velocity = experiment.start_velocities_m_s
+    v0 = (
+        np.zeros(experiment.body.pattern.size)
+        if velocity is None
+        else np.ravel(velocity).copy()
+    )
+    if experiment.start == "equilibrium":
+        at_s = float(experiment.t_s[0])
+        prescribed_m = (
+            experiment.prescribed_displacements([at_s])[1].ravel()
+            if prescribed_m is None
+            else prescribed_m
+        )
+        return _solve_equilibrium(
+            experiment,
+            forces,
+            goals_m=prescribed_m,
+            at_s=at_s,
+            start=guess,
+            solver=solver,
+        ), v0
+    if experiment.start_positions_m is not None:
+        return experiment.start_positions_m.ravel().copy(), v0
+    return experiment.rigid_positions(experiment.t_s[:1]).ravel(), v0

@@ -1,0 +1,426 @@
+"""Implicit Newmark method (β = ¼, γ = ½, average acceleration): the reference integrator.
+
+All forces but contact are evaluated at both ends of a step. Contact acts by its mean over the step,
+C(ξ, ν) at ξ = (x_0 + x_1)/2 and ν = (x_1 − x_0)/h, whose work is the loss of its energy, see
+`model.contact`; forces at both ends would add energy at every impact:
+
+    M (v_1 − v_0) = h/2 (F_0 + F_1) + h C,    x_1 − x_0 = h/2 (v_0 + v_1).
+
+The accelerations a = M⁻¹ F of states are therefore those without contact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.array_types import Array, Index
+from ...model.contact import Contact
+from ...model.force_term import States
+from ...model.forces import Forces
+from ...model.internal_variables import (
+    PreviousState,
+    advance_states,
+    insert_previous_states,
+    start_states,
+)
+from ...model.weight import Weight
+from ...recording.experiment import Experiment
+from ..contact.step_contact import StepContact
+from ..linear_algebra.lapack import one_blas_thread
+from ..observables import ReactionForces
+from .initial_equilibrium import initial_state
+from .newton_solver import (
+    NewtonFailure,
+    NewtonOptions,
+    NewtonSolver,
+    NewtonSolvers,
+    simulation_error,
+)
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """State of the integrator at one time.
+
+    Attributes
+    ----------
+    t_s : float
+        Time [s].
+    x, v, a : (3n,) arrays
+        Positions [m], velocities [m/s] and accelerations without contact [m/s²].
+    previous_histories : tuple
+        History variables after the step; empty if there are none.
+    contact_n : (3n,) array or None
+        Mean contact force over the step that led here [N]; None if there is no contact.
+    """
+
+    t_s: float
+    x: Array
+    v: Array
+    a: Array
+    previous_histories: tuple[PreviousState, ...] = ()
+    contact_n: Array | None = (
+        None  # (3n,) mean over the step that led here, where there is contact
+    )
+
+
+@one_blas_thread()
+def simulate_newmark(
+    experiment: Experiment,
+    theta: Array,
+    steps_per_sample: int,
+    options: NewtonOptions | None,
+    progress: Progress | None,
+    sensed: Index,
+) -> tuple[Array, Array, ReactionForces]:
+    """Simulate an experiment by Newmark's method.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    theta : (k,) array
+        Constants of the body.
+    steps_per_sample : int
+        Time steps between samples.
+    options : NewtonOptions or None
+        Options of Newton's method; None means defaults.
+    progress : callable or None
+        Called with the share of the samples done.
+    sensed : (g,) array
+        Dofs whose reaction forces are wanted.
+
+    Returns
+    -------
+    (T, 3n) array
+        Positions at the samples [m].
+    (T, 3n) array
+        Velocities at the samples [m/s].
+    ReactionForces
+        Reaction forces on the sensed dofs at all steps.
+
+    Raises
+    ------
+    SimulationError
+        If a step fails even after halvings.
+    """
+    stepper = _Stepper(experiment, theta, options=options)
+    times = experiment.t_s
+    x, v = (
+        np.zeros((len(times), experiment.body.pattern.size)) for _ in range(2)
+    )
+    state = stepper.initial_state()
+    x[0] = state.x
+    v[0] = state.v
+    step = experiment.timestep_s / steps_per_sample
+    reactions_and_positions = np.zeros(
+        (2, (len(times) - 1) * steps_per_sample + 1, len(sensed))
+    )
+    reactions_and_positions[:, 0] = stepper.reactions_and_positions(
+        state, sensed
+    )
+    means_n = np.zeros_like(reactions_and_positions[0])
+    if state.contact_n is not None:
+        means_n[0] = state.contact_n[sensed]
+    for k in range(1, len(times)):
+        for j in range(1, steps_per_sample + 1):
+            state = stepper.advance(state, float(times[k - 1] + j * step))
+            row = (k - 1) * steps_per_sample + j
+            reactions_and_positions[:, row] = stepper.reactions_and_positions(
+                state, sensed
+            )
+            if state.contact_n is not None:
+                means_n[row] = state.contact_n[sensed]
+        x[k] = state.x
+        v[k] = state.v
+        if progress:
+            progress(k / (len(times) - 1))
+    # Contact at a time is the mean over the steps before and after it.
+    reactions_and_positions[0, 1:-1] -= (means_n[1:-1] + means_n[2:]) / 2
+    reactions_and_positions[0, [0, -1]] -= means_n[[0, -1]]
+    return x, v, ReactionForces(*reactions_and_positions)
+
+
+class _Stepper:
+    """Newmark steps of one experiment."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        theta: Array,
+        options: NewtonOptions | None,
+    ) -> None:
+        self.experiment = experiment
+        self.theta = theta
+        self.body = experiment.body
+        self.options = options or NewtonOptions()
+        self.solvers = NewtonSolvers(experiment, options)
+
+    def initial_state(self) -> _State:
+        """Return the initial state of the experiment."""
+        time_s = float(self.experiment.t_s[0])
+        solver = self._solver(time_s)
+        x, v = initial_state(self.experiment, self._forces(time_s), solver)
+        previous_histories = start_states(
+            self._forces(time_s),
+            x,
+            v=v,
+            loaded_s=self.experiment.loaded_since_s,
+        )
+        state = _State(
+            time_s,
+            x,
+            v=v,
+            a=np.zeros_like(x),
+            previous_histories=previous_histories,
+        )
+        if self.experiment.obstacles:
+            state = replace(
+                state, contact_n=self._contact_n(x, v, load_s=time_s)
+            )
+        return self._balanced(state, time_s, dofs=solver.free)
+
+    def advance(self, state: _State, target_s: float) -> _State:
+        """Return the state at `target_s`; where Newton's method fails, in shorter steps.
+
+        Raises
+        ------
+        SimulationError or NewtonFailure
+            If the shortest step fails.
+        """
+        step = target_s - state.t_s
+        smallest = step * 0.5**self.options.max_halvings
+        state = self._after_release(state, target_s)
+        while target_s - state.t_s > 0.5 * smallest:
+            solver = self._solver(target_s)
+            try:
+                end_s = (
+                    target_s
+                    if step >= target_s - state.t_s
+                    else state.t_s + step
+                )
+                state = self._step(solver, state, end_s, target_s)
+            except NewtonFailure as failure:
+                step /= 2
+                if step < smallest:
+                    raise simulation_error(
+                        solver, failure, time_s=state.t_s, what="a Newmark step"
+                    ) from failure
+        return state
+
+    def reactions_and_positions(
+        self, state: _State, dofs: Index
+    ) -> tuple[Array, Array]:
+        """Return the reaction forces without contact on dofs [N], and their positions [m]."""
+        if not len(dofs):
+            return np.zeros(0), np.zeros(0)
+        reaction = self._mass(state.t_s) * state.a - self._force(
+            state, state.t_s
+        )
+        return reaction[dofs], state.x[dofs]
+
+    def _force(self, state: _State, load_s: float) -> Array:
+        """Return all forces (3n,) [N] except contact in a state, under the loads at the time
+        `load_s`.
+        """
+        forces, _ = self._forces(load_s).without_contact()
+        for each in state.previous_histories:
+            forces = each.insert_at_same_time(forces)
+        return forces.total(state.x, state.v)[0]
+
+    def _forces(self, load_s: float, step_s: float = 0.0) -> Forces:
+        """Return the forces under the loads at a time; contact is averaged over a step of
+        `step_s` if it is not zero.
+        """
+        return Forces.from_experiment(
+            self.experiment, load_s, self.theta, step_s=step_s
+        )
+
+    def _contact_n(
+        self, x: Array, v: Array, load_s: float, step_s: float = 0.0
+    ) -> Array:
+        """Return the contact forces (3n,) [N] at positions x and velocities v, (3n,) each, and the
+        time `load_s`; averaged over a step of `step_s` about this state, unless that is zero.
+        """
+        forces = self._forces(load_s, step_s)
+        total_n = np.zeros_like(x)
+        for term in forces.external_terms:
+            if isinstance(term, Contact) and not term.is_complementarity:
+                total_n += term.force(
+                    States(x[None], v[None], theta=self.theta)
+                )[0]
+        return total_n
+
+    def _solver(self, time_s: float) -> NewtonSolver:
+        """Return the solver with the dofs that are prescribed at a time."""
+        return self.solvers.for_prescribed(
+            self.experiment.is_prescribed(time_s)[0]
+        )
+
+    def _mass(self, time_s: float) -> Array:
+        """Return the masses (3n,) at a time [kg]."""
+        return (
+            Weight.from_experiment(self.experiment, time_s)
+            .with_theta(self.theta)
+            .mass.inertia_kg[0]
+        )
+
+    def _after_release(self, state: _State, goal_s: float) -> _State:
+        """Return the state with new accelerations at dofs that a grasp has released between the
+        state's time and `goal_s`; the same state if there are none.
+        """
+        before = self._solver(state.t_s)
+        after = self._solver(goal_s)
+        if before is after:
+            return state
+        return self._balanced(
+            state, goal_s, dofs=np.setdiff1d(after.free, before.free)
+        )
+
+    def _balanced(
+        self, state: _State, load_s: float, dofs: NDArray[np.int64]
+    ) -> _State:
+        """Return the state with the accelerations of some dofs (indices) computed from the forces
+        on them, without contact, under the loads at the time `load_s`.
+        """
+        acceleration = state.a.copy()
+        acceleration[dofs] = (
+            self._force(state, load_s)[dofs] / self._mass(load_s)[dofs]
+        )
+        return replace(state, a=acceleration)
+
+    def _step(
+        self, solver: NewtonSolver, state: _State, end_s: float, load_s: float
+    ) -> _State:
+        """Return the state after one step to `end_s`, with loads and grasps of the time
+        `load_s`.
+        """
+        h = end_s - state.t_s
+        forces, touching = insert_previous_states(
+            self._forces(load_s, step_s=h),
+            state.previous_histories,
+            interval_s=h,
+        ).without_contact()
+        contact = StepContact(touching, self.theta, pattern=forces.pattern)
+        mass = forces.mass.inertia_kg[0]
+        x_prescribed, v_prescribed, a_prescribed = self._prescribed_motion(
+            solver, end_s, step_s=h, holding_s=load_s
+        )
+        slope = 2.0 / h
+        known_v = -slope * state.x - state.v
+        known_a = -(slope**2) * state.x - 2 * slope * state.v - state.a
+
+        def kinematics(x: Array) -> tuple[Array, Array]:
+            v = slope * x + known_v
+            a = slope**2 * x + known_a
+            # Finite differences of a grasp's motion ring under this rule; its own motion does not.
+            v[solver.is_prescribed] = v_prescribed
+            a[solver.is_prescribed] = a_prescribed
+            return v, a
+
+        def middle(x: Array) -> tuple[Array, Array]:
+            return (state.x + x)[None] / 2, (x - state.x)[None] / h
+
+        def residual(x: Array) -> Array:
+            v, a = kinematics(x)
+            balance = forces.total(x, v)[0] - mass * a
+            return (
+                balance + 2 * contact.force(*middle(x))
+                if contact.acts
+                else balance
+            )
+
+        def linearise(x: Array) -> tuple[Array, Array, Array]:
+            v, a = kinematics(x)
+            at = forces.linearise(x, v)
+            matrix = -(at.by_position[0] + slope * at.by_velocity[0])
+            matrix[forces.pattern.diagonal] += slope**2 * mass
+            skew = -at.by_position_skew[0]
+            if at.by_velocity_skew.size:
+                skew = skew - slope * at.by_velocity_skew[0]
+            balance = at.force[0] - mass * a
+            if contact.acts:
+                contact_force, symmetric, askew = contact.linearise(
+                    *middle(x), (0.5, 1 / h)
+                )
+                balance = balance + 2 * contact_force
+                matrix -= 2 * symmetric
+                skew = skew - 2 * askew
+            return balance, matrix, skew
+
+        guess = state.x + h * state.v + 0.5 * h * h * state.a
+        if state.contact_n is not None:
+            guess += (
+                0.5 * h * h * state.contact_n / np.where(mass > 0, mass, np.inf)
+            )
+        guess[solver.is_prescribed] = x_prescribed
+        if not solver.has_no_inverted_element(guess):
+            guess = state.x.copy()
+            guess[solver.is_prescribed] = x_prescribed
+        x = solver.solve(guess, residual, linearise)
+        v, a = kinematics(x)
+        contact_n = None
+        if contact.acts:
+            xi, nu = middle(x)
+            contact_n = self._contact_n(xi[0], nu[0], load_s=load_s, step_s=h)
+            # Held dofs have the acceleration of the grasp.
+            free = solver.free
+            a[free] -= (
+                2 * contact_n[free] / np.where(mass[free] > 0, mass[free], 1.0)
+            )
+        previous_histories = advance_states(
+            forces, state.previous_histories, x=x, v=v, interval_s=h
+        )
+        return _State(
+            end_s,
+            x,
+            v=v,
+            a=a,
+            previous_histories=previous_histories,
+            contact_n=contact_n,
+        )
+
+    def _prescribed_motion(
+        self,
+        solver: NewtonSolver,
+        time_s: float,
+        step_s: float,
+        holding_s: float,
+    ) -> tuple[Array, Array, Array]:
+        """Return position, velocity and acceleration of the solver's prescribed dofs at `time_s`,
+        by central differences over `step_s`; grasps are those that hold at `holding_s`.
+        """
+        experiment = self.experiment
+        nodes_m = self.experiment.body.nodes_m
+        motion = np.zeros((3, *nodes_m.shape))
+        for grasp in experiment.grasps:
+            if not grasp.is_active(holding_s):
+                continue
+            # What it does before it holds and after it has let go means nothing.
+            first = max(grasp.from_s, float(experiment.t_s[0]))
+            last = min(grasp.until_s, float(experiment.t_s[-1]))
+            times = np.clip(
+                [time_s - step_s, time_s, time_s + step_s], first, last
+            )
+            before, now, after = grasp.positions_at(nodes_m, times)[
+                ..., grasp.axis_indices
+            ]
+            velocity = (after - before) / (times[2] - times[0])
+            is_central = times[2] - times[1] > 0.5 * step_s
+            acceleration = (
+                (after - 2 * now + before) / step_s**2
+                if is_central
+                else np.zeros_like(now)
+            )
+            place = np.ix_(grasp.nodes, grasp.axis_indices)
+            motion[:, *place] = now, velocity, acceleration
+        now, velocity, acceleration = motion.reshape(3, -1)[
+            :, solver.is_prescribed
+        ]
+        return now, velocity, acceleration

@@ -1,0 +1,531 @@
+"""Newton's method for the static problem and for one implicit time step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.array_types import Array
+from ...errors import SimulationError
+from ...recording.experiment import Experiment
+from ..linear_algebra.factorisation import Factor, Factoriser
+from ..stopwatch import Stopwatch
+from .retraction import Retraction, add_increment
+
+Residual = Callable[[Array], Array]
+# Residual, and the lower triangles of the symmetric and the skew part of its slope's negative.
+Linearise = Callable[[Array], tuple[Array, Array, Array]]
+T = TypeVar("T")
+
+# With the factor of the previous iterate, a last step must be shorter by this factor.
+STALE = 0.01
+# Chord steps are continued while each is shorter than the last by this factor.
+FAST = 0.1
+# Largest number of chord steps with one factor.
+OFTEN = 8
+# Chord steps end when the expected remaining error is this share of the tolerance.
+LEAST_RESIDUAL_SHARE = 1e-5
+
+
+@dataclass(frozen=True)
+class NewtonOptions:
+    """Options of Newton's method for one implicit step or an equilibrium.
+
+    Attributes
+    ----------
+    tolerance : float
+        Length of the last Newton step over the body's size.
+    max_iterations : int
+        Largest number of iterations.
+    max_backtracks : int
+        Largest number of halvings of a Newton step.
+    max_halvings : int
+        Largest number of halvings of a time step (Newmark) or of the increment of the grasps in it
+        (schemes).
+    """
+
+    tolerance: float = 1e-10
+    max_iterations: int = 30
+    max_backtracks: int = 25
+    max_halvings: int = 8
+
+
+class NewtonFailure(Exception):
+    """Newton's method did not converge.
+
+    Parameters
+    ----------
+    x : (3n,) array
+        Last state [m], for the error message.
+    reason : str
+        Cause.
+    """
+
+    def __init__(self, x: Array, reason: str) -> None:
+        self.x = x
+        self.reason = reason
+        super().__init__(x, reason)
+
+    def __str__(self) -> str:
+        return self.reason
+
+
+class NewtonSolver:
+    """Newton's method with backtracking on the free dofs of a body, for one set of prescribed dofs.
+
+    Attributes
+    ----------
+    free, is_prescribed : arrays
+        Indices of free and of prescribed dofs.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Its body, obstacles and grasps.
+    options : NewtonOptions, optional
+        Options; defaults otherwise.
+    stopwatch : Stopwatch, optional
+        Accumulates the time spent.
+    is_prescribed : (n, 3) array of bool, optional
+        Prescribed coordinates; by default those at the experiment's first time.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        options: NewtonOptions | None = None,
+        stopwatch: Stopwatch | None = None,
+        prescribed: NDArray[np.bool_] | None = None,
+    ) -> None:
+        self.stopwatch = stopwatch or Stopwatch()
+        self.body = experiment.body
+        # A retraction moves surfaces off the obstacles that hold them.
+        self._is_free_of_contact = not experiment.obstacles
+        self.options = options or NewtonOptions()
+        at_start = experiment.is_prescribed(experiment.t_s[:1])[0]
+        holding = at_start if prescribed is None else prescribed
+        self.free = np.flatnonzero(~holding)
+        self.is_prescribed = np.flatnonzero(holding)
+        self.pattern = experiment.sparsity
+        self.factoriser = Factoriser.cached(self.pattern, self.free)
+        self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
+        self._last_factor: Factor | None = None
+
+    def solve(
+        self,
+        x: Array,
+        residual: Residual,
+        linearise: Linearise,
+        keep_definite: bool = False,
+        prescribed_m: Array | None = None,
+    ) -> Array:
+        """Solve residual(x) = 0 for the free dofs.
+
+        A step is accepted when the next one, computed with the same factor, is shorter (Deuflhard's
+        natural monotonicity test), and no element is inverted. Equilibria may be far from x:
+        without obstacles their steps are applied as rotations and strains, see `Retraction`. Time
+        steps first reuse the factor of the previous solution as long as steps shrink fast.
+
+        Parameters
+        ----------
+        x : (3n,) array
+            First guess [m]; not modified. Prescribed dofs keep their values unless `prescribed_m`
+            is given.
+        residual : callable
+            Residual (3n,) of x.
+        linearise : callable
+            Residual (3n,), and lower triangles of the symmetric part (m,) and of the skew part,
+            (m,) or (0,), of −∂residual/∂x.
+        keep_definite : bool
+            If true, solve for a stable equilibrium: accept states only while −∂residual/∂x is
+            positive definite.
+        prescribed_m : (held,) array, optional
+            Positions of the prescribed dofs [m]. The free dofs first follow to first order, because
+            moving prescribed dofs alone would crush adjacent elements.
+
+        Returns
+        -------
+        (3n,) array
+            Solution [m].
+
+        Raises
+        ------
+        NewtonFailure
+            If the method does not converge.
+        """
+        x = (
+            x.copy()
+            if prescribed_m is None
+            else self._with_prescribed(x, prescribed_m, linearise=linearise)
+        )
+        self._require_upright(x)
+        if not keep_definite:
+            # What these lead to without end may be far off: the search then begins where they did.
+            improved, done = self._simplified_newton(
+                x, residual, linearise=linearise
+            )
+            if done:
+                return improved
+        value, *matrix = self._timed(linearise, x)
+        factor = self._factorise(matrix, x, keep_definite)
+        step = self._step(factor, value)
+        for _ in range(self.options.max_iterations):
+            if self._is_last(step):
+                self._last_factor = factor
+                x[self.free] += step
+                return x
+            x, factor, step = self._backtrack(
+                x,
+                step,
+                factor=factor,
+                residual=residual,
+                linearise=linearise,
+                keep_definite=keep_definite,
+            )
+        raise NewtonFailure(
+            x,
+            f"Newton's method took more than {self.options.max_iterations} iterations",
+        )
+
+    def _simplified_newton(
+        self, x: Array, residual: Residual, linearise: Linearise
+    ) -> tuple[Array, bool]:
+        """Iterate with few factorisations (simplified Newton method); the last factor is stored.
+
+        Returns
+        -------
+        ((3n,) array, bool)
+            Last state, and whether it is the solution.
+        """
+        is_own = False
+        for _ in range(self.options.max_iterations):
+            if self._last_factor is not None:
+                improved, done = self._chord_steps(
+                    x, residual, factor=self._last_factor
+                )
+                if done:
+                    return improved, True
+                if improved is x and is_own:
+                    break
+                x = improved
+            _, *matrix = self._timed(linearise, x)
+            try:
+                self._last_factor = self._factorise(matrix, x, False)
+                is_own = True
+            except NewtonFailure:
+                break
+        return x, False
+
+    def _chord_steps(
+        self, x: Array, residual: Residual, factor: Factor
+    ) -> tuple[Array, bool]:
+        """Iterate with a given factor while steps shrink fast.
+
+        Returns
+        -------
+        ((3n,) array, bool)
+            Last state, which is x itself if steps grow or invert an element; and whether it is the
+            solution.
+        """
+        improved = x.copy()
+        before = None
+        done = False
+        for _ in range(OFTEN):
+            step = self._step(factor, self._timed(residual, improved))
+            length = float(np.linalg.norm(step))
+            rate = length / before if before else 1.0
+            if not rate <= 1.0:
+                return x, False
+            improved[self.free] += step
+            done = self._is_last(rate * step, LEAST_RESIDUAL_SHARE)
+            if done or (before and rate > FAST):
+                break
+            before = length
+        return (
+            (improved, done)
+            if self.has_no_inverted_element(improved)
+            else (x, False)
+        )
+
+    def _with_prescribed(
+        self, x: Array, goal: Array, linearise: Linearise
+    ) -> Array:
+        """Return the state x (3n,) [m] with the prescribed dofs at `goal` (prescribed,), and the
+        free dofs in equilibrium to first order.
+
+        Raises
+        ------
+        NewtonFailure
+            If the matrix at x is singular or not positive definite, or an element of x is inverted.
+        """
+        state = x.copy()
+        way = np.zeros_like(x)
+        way[self.is_prescribed] = goal - x[self.is_prescribed]
+        state[self.is_prescribed] = goal
+        if not self._is_last(way):
+            self._require_upright(x)
+            value, *matrix = self._timed(linearise, x)
+            coupling = self.pattern.products(matrix[0][None], way[None])[0]
+            factor = self._factorise(matrix, x, keep_definite=False)
+            state[self.free] += self._step(factor, value - coupling)
+        return state
+
+    def _backtrack(
+        self,
+        x: Array,
+        step: Array,
+        factor: Factor,
+        residual: Residual,
+        linearise: Linearise,
+        keep_definite: bool,
+    ) -> tuple[Array, Factor, Array]:
+        """Return the next iterate (3n,), its factor and the Newton step (free,) there, with the
+        first of the halved steps that is acceptable.
+
+        Parameters
+        ----------
+        x : (3n,) array
+            Present iterate [m].
+        step : (free,) array
+            Newton step at x [m].
+        factor : Factor
+            Factor at x.
+        residual, linearise : callable
+            Functions of the state.
+        keep_definite : bool
+            Whether the matrix must be positive definite.
+
+        Raises
+        ------
+        NewtonFailure
+            If no step is acceptable.
+        """
+        length = np.linalg.norm(step)
+        share = 1.0
+        update = (
+            self._retraction
+            if keep_definite and self._is_free_of_contact
+            else add_increment
+        )
+        for _ in range(self.options.max_backtracks):
+            increment = np.zeros_like(x)
+            increment[self.free] = share * step
+            trial = update(x, increment)
+            if self.has_no_inverted_element(trial):
+                # A whole step is mostly taken: it is evaluated with its derivatives at once.
+                if share == 1:
+                    value, *matrix = self._timed(linearise, trial)
+                else:
+                    value = self._timed(residual, trial)
+                    matrix = None
+                next_step = self._step(factor, value)
+                if np.linalg.norm(next_step) <= (1 - share / 4) * length:
+                    if self._is_last(next_step, STALE) and not keep_definite:
+                        return trial, factor, next_step
+                    if matrix is None:
+                        value, *matrix = self._timed(linearise, trial)
+                    try:
+                        own = self._factorise(matrix, trial, keep_definite)
+                        return trial, own, self._step(own, value)
+                    except NewtonFailure:
+                        pass
+            share /= 2
+        raise NewtonFailure(
+            x, "no step along the Newton direction decreases the residual"
+        )
+
+    @cached_property
+    def _retraction(self) -> Retraction:
+        """Retraction that applies increments towards an equilibrium."""
+        prescribed = np.zeros(self.pattern.size, dtype=bool)
+        prescribed[self.is_prescribed] = True
+        return Retraction(self.body, prescribed.reshape(-1, 3))
+
+    def _is_last(self, step: Array, share: float = 1.0) -> bool:
+        """Whether the largest entry of a step (free or 3n,) [m] is at most `share` times the
+        tolerance.
+        """
+        tolerance = share * self.options.tolerance * self._size_m
+        return bool(np.abs(step).max(initial=0.0) <= tolerance)
+
+    def _factorise(
+        self, matrix: Sequence[Array], x: Array, keep_definite: bool
+    ) -> Factor:
+        """Return the factor of a matrix on the free dofs.
+
+        Parameters
+        ----------
+        matrix : (symmetric, skew)
+            Lower triangles of both parts, the second empty for a symmetric matrix.
+        x : (3n,) array
+            State, for the failure.
+        keep_definite : bool
+            Whether a matrix that is not positive definite is a failure.
+
+        Raises
+        ------
+        NewtonFailure
+            If the matrix is singular or, with `keep_definite`, not positive definite.
+        """
+        try:
+            with self.stopwatch.solving():
+                factor = self.factoriser.factorise(matrix[0], matrix[1])
+        except np.linalg.LinAlgError as error:
+            raise NewtonFailure(
+                x, f"the equations are singular: {error}"
+            ) from error
+        if keep_definite and not factor.positive_definite:
+            raise NewtonFailure(x, "the stiffness is not positive definite")
+        return factor
+
+    def _step(self, factor: Factor, residual: Array) -> Array:
+        """Return the Newton step of the free dofs."""
+        with self.stopwatch.solving():
+            return factor.solve(residual[self.free])
+
+    def _timed(self, function: Callable[[Array], T], x: Array) -> T:
+        """Evaluate a function at x, and measure the time."""
+        with self.stopwatch.evaluating():
+            return function(x)
+
+    def has_no_inverted_element(self, x: Array) -> bool:
+        """Whether no element is inverted at x (3n,)."""
+        return bool(self.body.volume_ratios(x).min() > 0)
+
+    def _require_upright(self, x: Array) -> None:
+        """Raise NewtonFailure if an element is inverted at x (3n,)."""
+        if not self.has_no_inverted_element(x):
+            raise NewtonFailure(
+                x, "an element is inverted before the first iteration"
+            )
+
+    def worst_element(self, x: Array) -> int:
+        """Return the index of the element with the smallest det F at x (3n,)."""
+        return int(self.body.volume_ratios(x)[0].min(axis=1).argmin())
+
+
+def follow_path(
+    solve: Callable[[Array, float], Array],
+    x: Array,
+    halvings: int,
+    guess: Array | None = None,
+) -> Array:
+    """Follow the solution x(s) from x(0) to x(1) in increments that shrink on failure, and grow
+    after two successes.
+
+    Parameters
+    ----------
+    solve : callable
+        Returns x(s) from a first guess and s; raises NewtonFailure.
+    x : (3n,) array
+        x(0).
+    halvings : int
+        The smallest increment is 0.5 to this power.
+    guess : (3n,) array, optional
+        Guess of x(1), which is tried first; if it fails and `halvings` is 0, the failure is raised.
+
+    Raises
+    ------
+    NewtonFailure
+        If an increment of the smallest size fails.
+    """
+    if guess is not None:
+        try:
+            return solve(guess, 1.0)
+        except NewtonFailure:
+            if not halvings:
+                raise
+    rate = np.zeros_like(x)
+    reached = 0.0
+    increment = 1.0
+    easy = False
+    while reached < 1.0:
+        step = min(increment, 1.0 - reached)
+        try:
+            solution = solve(x + step * rate, reached + step)
+        except NewtonFailure:
+            # What fails costs many times what succeeds: better short steps that grow.
+            increment = step / 4
+            easy = False
+            if increment < 0.5**halvings:
+                raise
+        else:
+            rate = (solution - x) / step
+            x = solution
+            reached = reached + step
+            # One step as long as that which failed would fail again.
+            increment = 2 * step if easy else step
+            easy = True
+    return x
+
+
+class NewtonSolvers:
+    """Solvers of an experiment, one for each set of prescribed dofs; created on demand.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    options : NewtonOptions, optional
+        Options of Newton's method.
+    stopwatch : Stopwatch, optional
+        Accumulates the time spent.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        options: NewtonOptions | None = None,
+        stopwatch: Stopwatch | None = None,
+    ) -> None:
+        self._arguments = (experiment, options, stopwatch)
+        self._known: dict[bytes, NewtonSolver] = {}
+
+    def for_prescribed(self, is_prescribed: NDArray[np.bool_]) -> NewtonSolver:
+        """Return the solver for a set of prescribed coordinates (n, 3) bool; it is created on the
+        first call and stored.
+        """
+        key = is_prescribed.tobytes()
+        if key not in self._known:
+            self._known[key] = NewtonSolver(*self._arguments, is_prescribed)
+        return self._known[key]
+
+
+def simulation_error(
+    solver: NewtonSolver,
+    failure: NewtonFailure,
+    time_s: float,
+    what: str,
+    *,
+    static: bool = False,
+) -> SimulationError:
+    """Return the error for the user: what failed, when, at which element, and what to change.
+
+    Parameters
+    ----------
+    solver : NewtonSolver
+        The solver that failed.
+    failure : NewtonFailure
+        The failure.
+    time_s : float
+        Time of the step [s].
+    what : str
+        Description of the step, as the subject of a sentence.
+    static : bool
+        If true, the error contains the state where the path of equilibria ended, see
+        `stability_loss.explain_failure`.
+    """
+    element = solver.worst_element(failure.x)
+    ratio = float(solver.body.volume_ratios(failure.x)[0, element].min())
+    return SimulationError(
+        f"{what} failed: {failure.reason}; the worst element has det F = {ratio:.3g}. "
+        "Stiffer parameters, a smaller timestep or a finer mesh may help",
+        time_s,
+        element=element,
+        state_m=failure.x if static else None,
+    )

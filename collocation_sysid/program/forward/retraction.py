@@ -1,0 +1,136 @@
+"""Displacement increments with large rotations, applied without spurious strain.
+
+A Newton step δ is a solution of linearised equations. Added to the positions of a slender body, its
+rotations stretch the body in second order: a rotation by 0.5 rad adds 12 % of strain, whose stress
+exceeds that of bending by orders of magnitude, makes the stiffness indefinite, and shortens the
+next steps. The retraction applies the same increment as rotation and strain (rotation–strain
+coordinates: Huang, Tong, Zhou, Bao and Desbrun, IEEE TVCG 17, 2011): with the deformation
+gradient F and the gradient of the increment H = ∇δ F⁻¹ = ε + ω, its symmetric and skew part,
+
+    F_new = exp(ω) (I + ε) F
+
+at each quadrature point, and the new positions y minimise Σ V ‖∇y − F_new‖². To first order in δ
+they are x + δ, so that Newton's method keeps its order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.linalg import SuperLU, splu
+from scipy.spatial.transform import Rotation
+
+from ...common.array_types import Array, Index
+from ...fem.body import Body
+
+# Weight of the distance to x + δ beside that of the gradients, relative to the square of the body's
+# size: it determines a translation where nothing holds the body along an axis, and nothing else.
+ANCHOR = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class _Axis:
+    """Least-squares problem of one coordinate of the positions.
+
+    Attributes
+    ----------
+    free, prescribed : (f,), (p,) arrays
+        Nodes whose coordinate is free or prescribed.
+    factor : SuperLU
+        Factor of the normal equations of the free nodes.
+    coupling : (f, p) sparse array
+        Normal equations of the free nodes by the prescribed ones.
+    """
+
+    free: Index
+    prescribed: Index
+    factor: SuperLU
+    coupling: sp.csc_array
+
+
+class Retraction:
+    """Retraction of displacement increments for one set of prescribed degrees of freedom.
+
+    Parameters
+    ----------
+    body : Body
+    prescribed : (n, 3) bool
+        Coordinates that are prescribed, and are displaced exactly by the increment.
+    """
+
+    def __init__(self, body: Body, prescribed: NDArray[np.bool_]) -> None:
+        self._gradient = body.shape_gradients
+        self._weights = np.tile(body.geometry[..., -1].ravel(), 3)
+        laplacian = (
+            self._gradient.T @ sp.diags_array(self._weights) @ self._gradient
+        )
+        size_m = float(np.linalg.norm(np.ptp(body.nodes_m, axis=0)))
+        # Nodes of obstacle frames belong to no element: the anchor alone determines them.
+        anchor = np.full(
+            len(body.nodes_m), ANCHOR * float(self._weights.sum()) / size_m**2
+        )
+        self._anchor = anchor
+        normal = sp.csc_array(laplacian + sp.diags_array(anchor))
+        known: dict[bytes, _Axis] = {}
+        for column in prescribed.T:
+            key = column.tobytes()
+            if key not in known:
+                known[key] = _axis(normal, column)
+        self._axes = [known[column.tobytes()] for column in prescribed.T]
+
+    def __call__(self, x: Array, increment: Array) -> Array:
+        """Return the positions (3n,) after an increment (3n,) of the positions x (3n,) [m]."""
+        moved = (x + increment).reshape(-1, 3)
+        right = self._gradient.T @ (
+            self._weights[:, None] * self._target(x, increment)
+        )
+        right += self._anchor[:, None] * moved
+        for k, axis in enumerate(self._axes):
+            known = axis.coupling @ moved[axis.prescribed, k]
+            moved[axis.free, k] = axis.factor.solve(right[axis.free, k] - known)
+        return moved.ravel()
+
+    def _target(self, x: Array, increment: Array) -> Array:
+        """Return the new deformation gradients at all quadrature points after an increment (3n,) of
+        positions x (3n,) [m], (3 · points, 3), derivatives along X first.
+
+        The spin of the increment is applied as a finite rotation.
+        """
+        deformation = self._deformation(x)
+        relative = self._deformation(increment) @ np.linalg.inv(deformation)
+        strain = (relative + relative.transpose(0, 2, 1)) / 2
+        spin = (relative - relative.transpose(0, 2, 1)) / 2
+        vectors = np.stack(
+            [spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1
+        )
+        rotation = Rotation.from_rotvec(vectors).as_matrix()
+        target = rotation @ (np.eye(3) + strain) @ deformation
+        return target.transpose(2, 0, 1).reshape(-1, 3)
+
+    def _deformation(self, field: Array) -> Array:
+        """Return the gradient (points, 3, 3) of a nodal field (3n,) by the undeformed positions."""
+        by_axis = (self._gradient @ field.reshape(-1, 3)).reshape(3, -1, 3)
+        return by_axis.transpose(1, 2, 0)
+
+
+def _axis(normal: sp.csc_array, prescribed: NDArray[np.bool_]) -> _Axis:
+    """Return the least-squares problem of one coordinate, from the normal equations (n, n) of all
+    nodes and the mask (n,) of prescribed nodes.
+    """
+    free = np.flatnonzero(~prescribed)
+    fixed = np.flatnonzero(prescribed)
+    rows = normal[free]
+    return _Axis(
+        free,
+        fixed,
+        factor=splu(sp.csc_matrix(rows[:, free])),
+        coupling=sp.csc_array(rows[:, fixed]),
+    )
+
+
+def add_increment(x: Array, increment: Array) -> Array:
+    """Return x + δ: the update of a time step, in which a body rotates little."""
+    return x + increment

@@ -1,0 +1,390 @@
+"""Simulation with a collocation scheme, row by row: trajectories that satisfy its
+constraints to solver tolerance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import copy
+
+import numpy as np
+
+from ...common.array_types import Array, Index
+from ...errors import SimulationError
+from ...fem.rest_shape import RestShapeError
+from ...model.dynamics import Dynamics, StencilRow, weighted_sum_of_past
+from ...model.internal_variables import (
+    PreviousState,
+    advance_states,
+    insert_previous_states,
+)
+from ...recording.experiment import Experiment
+from ..contact.step_contact import StepContact
+from ..linear_algebra.lapack import one_blas_thread
+from ..stopwatch import Stopwatch
+from .initial_equilibrium import initial_state
+from .newton_solver import (
+    NewtonFailure,
+    NewtonOptions,
+    NewtonSolver,
+    NewtonSolvers,
+    follow_path,
+    simulation_error,
+)
+
+Progress = Callable[[float], None]
+
+
+def simulate_scheme(
+    experiment: Experiment,
+    dynamics: Dynamics,
+    options: NewtonOptions | None = None,
+    progress: Progress | None = None,
+) -> Array:
+    """Simulate all rows of a scheme.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment, which states the start.
+    dynamics : Dynamics
+        Discrete equations of motion at the parameters.
+    options : NewtonOptions, optional
+        Options of Newton's method.
+    progress : callable, optional
+        Called with the share of the rows done.
+
+    Returns
+    -------
+    (N, 3n) array
+        Positions [m].
+
+    Raises
+    ------
+    SimulationError
+        If a step fails; names its time and element.
+    """
+    x, failure = continue_simulation(
+        experiment, dynamics, known=None, options=options, progress=progress
+    )
+    if failure is not None:
+        raise failure
+    return x
+
+
+@one_blas_thread()
+def continue_simulation(
+    experiment: Experiment,
+    dynamics: Dynamics,
+    known: Array | None = None,
+    options: NewtonOptions | None = None,
+    progress: Progress | None = None,
+    stopwatch: Stopwatch | None = None,
+    approximate_solution: Array | None = None,
+) -> tuple[Array, SimulationError | None]:
+    """Continue a trajectory until its end or until a step fails.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment, which states the start.
+    dynamics : Dynamics
+        Discrete equations of motion at the parameters.
+    known : (k, 3n) array, optional
+        First rows [m]; by default the start of the experiment is computed.
+    options : NewtonOptions, optional
+        Options of Newton's method.
+    progress : callable, optional
+        Called with the share of the rows done.
+    stopwatch : Stopwatch, optional
+        Accumulates the time spent.
+    approximate_solution : (N, 3n) array, optional
+        Trajectory at other parameters, as the first guess of equilibria.
+
+    Returns
+    -------
+    (r, 3n) array
+        The rows computed, including `known`; all N if nothing failed.
+    SimulationError or None
+        Why the simulation stopped early.
+    """
+    if (massless := dynamics.body.mass_problem(dynamics.theta)) is not None:
+        failure = SimulationError(massless, float(dynamics.t_s[0]))
+        return np.zeros(
+            (0, dynamics.body.pattern.size)
+        ) if known is None else known, failure
+    if (
+        unreachable := dynamics.body.rest_shape_failure(dynamics.theta)
+    ) is not None:
+        failure = RestShapeError(unreachable)
+        return np.zeros(
+            (0, dynamics.body.pattern.size)
+        ) if known is None else known, failure
+    solvers = NewtonSolvers(experiment, options, stopwatch=stopwatch)
+    is_prescribed = ~np.isnan(dynamics.prescribed_m)
+    x = np.zeros((dynamics.row_count, dynamics.body.pattern.size))
+    v0 = np.zeros(x.shape[1])
+    if known is None:
+        try:
+            at_start = dynamics.forces.at_times(slice(1))
+            start_guess = (
+                None
+                if approximate_solution is None
+                else approximate_solution[0]
+            )
+            solver = solvers.for_prescribed(is_prescribed[0])
+            goals_m = dynamics.prescribed_m[0]
+            x[0], v0 = initial_state(
+                experiment,
+                at_start,
+                solver=solver,
+                guess=start_guess,
+                prescribed_m=goals_m,
+            )
+        except SimulationError as failure:
+            return x[:0], failure
+        known = x[:1]
+    done = len(known)
+    x[:done] = known
+    forces = np.zeros_like(x)  # total force at every evaluation so far
+    xi, nu = dynamics.evaluation_states(x)
+    first = dynamics.first_row
+    known_evaluations = done - dynamics.first_row
+    histories = dynamics.histories(x[:done])
+    intervals = dynamics.interval_to_next_s
+    if known_evaluations > 0:
+        known_rows = slice(first, done)
+        forces[known_rows] = dynamics.forces_with_histories(
+            histories, known_rows
+        ).total(xi[:known_evaluations], nu[:known_evaluations])
+    dynamics.zero_prescribed_forces(forces)
+    previous_histories = tuple(history.final_state for history in histories)
+    for t in range(done, dynamics.row_count):
+        row = RowEquations(
+            dynamics, x, forces=forces, t=t, previous=previous_histories
+        )
+        solver = solvers.for_prescribed(is_prescribed[t])
+        goal = dynamics.prescribed_m[t, solver.is_prescribed]
+        if not dynamics.is_static:
+            guess = extrapolate(x[:t], dynamics.step_s * v0)
+        elif approximate_solution is None:
+            guess = _extrapolate_static(x[:t], solver.is_prescribed, goal=goal)
+        else:
+            guess = approximate_solution[t]
+        try:
+            x[t] = solve_row(
+                solver, row, guess=guess, previous=x[t - 1], prescribed_m=goal
+            )
+        except NewtonFailure as failure:
+            time_s = float(dynamics.t_s[t])
+            static = dynamics.is_static
+            return x[:t], simulation_error(
+                solver,
+                failure,
+                time_s=time_s,
+                what=f"the step at row {t}",
+                static=static,
+            )
+        forces[t] = row.force(x[t])
+        forces[t, dynamics.is_temporarily_prescribed[t]] = 0
+        if previous_histories:
+            (xi_t,), (nu_t,) = row.states(x[t])
+            previous_histories = advance_states(
+                row.forces,
+                previous_histories,
+                x=xi_t,
+                v=nu_t,
+                interval_s=intervals[t - 1],
+            )
+        if progress:
+            progress(t / (dynamics.row_count - 1))
+    return x, None
+
+
+def extrapolate(x: Array, first_step: Array) -> Array:
+    """Return an extrapolation of the next row from rows x (k, 3n); with one row, by
+    `first_step` (3n,).
+    """
+    if len(x) > 2:
+        return 3 * (x[-1] - x[-2]) + x[-3]
+    return x[-1] + (x[-1] - x[-2] if len(x) > 1 else first_step)
+
+
+def _extrapolate_static(x: Array, prescribed: Index, goal: Array) -> Array:
+    """Return an extrapolation (3n,) of the next equilibrium from equilibria x (k, 3n): the last
+    increment, scaled by that of the prescribed dofs towards `goal` (prescribed,).
+    """
+    if len(x) < 2:
+        return x[-1]
+    before = x[-1, prescribed] - x[-2, prescribed]
+    way = goal - x[-1, prescribed]
+    share = float(before @ way) / max(
+        float(before @ before), np.finfo(float).tiny
+    )
+    return x[-1] + share * (x[-1] - x[-2])
+
+
+class RowEquations:
+    """Row t of the discrete equations of motion as a function of x_t alone.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Equations of motion.
+    x : (N, 3n) array
+        Positions [m]; rows before t are used.
+    forces : (N, 3n) array
+        Total forces at the evaluations before t [N].
+    t : int
+        Index of the row.
+    left : sequence
+        History variables after row t − 1; empty if there are none.
+    """
+
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        x: Array,
+        forces: Array,
+        t: int,
+        previous: Sequence[PreviousState] = (),
+    ) -> None:
+        self.dynamics = dynamics
+        self.row = StencilRow.from_dynamics(dynamics, t)
+        self.forces = dynamics.forces.at_times(slice(t, t + 1))
+        if previous:
+            self.forces = insert_previous_states(
+                self.forces,
+                previous,
+                interval_s=float(dynamics.interval_to_next_s[t - 1]),
+            )
+        self.forces_before = (
+            dynamics.forces.at_times(slice(t - 1, t))
+            if dynamics.is_static
+            else None
+        )
+        self.rest = self.forces
+        contacts = []
+        if not dynamics.is_static:
+            self.rest, contacts = self.forces.without_contact()
+        self.contact = StepContact(
+            contacts, self.rest.theta, pattern=self.rest.pattern
+        )
+        row = self.row
+        first = max(0, t - dynamics.largest_lag)
+        shape = x.shape[1:]
+        past = x[first:t][::-1]
+        past_forces = forces[first:t][::-1]
+        self.xi = weighted_sum_of_past(row.p, past, shape=shape)
+        self.nu = weighted_sum_of_past(row.q, past, shape=shape)
+        self.known = weighted_sum_of_past(row.w, past_forces, shape=shape)
+        self.known -= row.mass_kg * weighted_sum_of_past(
+            row.s, past, shape=shape
+        )
+        self.known -= row.mass_kg * row.r * dynamics.start_velocity_m_s
+
+    def with_load_step(self, share: float) -> RowEquations:
+        """Return the row with loads between those of the previous sample (share 0) and its own
+        (share 1); rows of a motion have their complete loads.
+        """
+        scaled = copy(self)
+        if self.forces_before is not None:
+            scaled.rest = self.forces_before.interpolate(self.forces, share)
+        return scaled
+
+    def force(self, x: Array) -> Array:
+        """Return the force F_t (3n,) [N] at the evaluation state that follows from x_t = `x` (3n,)
+        [m], with contact.
+        """
+        states = self.states(x)
+        rest = self.rest.total(*states)[0]
+        return rest + self.contact.force(*states) if self.contact.acts else rest
+
+    def states(self, x: Array) -> tuple[Array, Array]:
+        """Return ξ_t [m] and ν_t [m/s], each (1, 3n), from x_t (3n,)."""
+        return (self.xi + self.row.p[0] * x)[None], (
+            self.nu + self.row.q[0] * x
+        )[None]
+
+    def residual_from(self, force: Array, x: Array) -> Array:
+        """Return c_t (3n,) [N] from the force F_t (3n,) [N] and x_t (3n,) [m]."""
+        row = self.row
+        return row.w[0] * force + self.known - row.s[0] * row.mass_kg * x
+
+    def residual(self, x: Array) -> Array:
+        """Return the constraints c_t (3n,) [N] at positions x_t (3n,) [m]."""
+        return self.residual_from(self.force(x), x)
+
+    def linearise(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return c_t (3n,) [N] at x_t = `x` (3n,) [m], and the lower triangles of the symmetric and
+        the skew part of −∂c_t/∂x_t.
+        """
+        states = self.states(x)
+        row = self.row
+        at = self.rest.linearise(*states)
+        matrix = row.block(
+            at.by_position[0], at.by_velocity[0], self.rest.pattern
+        )
+        skew = row.skew_block(at.by_position_skew[0], at.by_velocity_skew[0])
+        if not self.contact.acts:
+            return self.residual_from(at.force[0], x), matrix, skew
+        force, symmetric, askew = self.contact.linearise(
+            *states, (row.p[0], row.q[0])
+        )
+        matrix -= row.w[0] * symmetric
+        if askew.size:
+            skew -= row.w[0] * askew
+        return self.residual_from(at.force[0] + force, x), matrix, skew
+
+
+def solve_row(
+    solver: NewtonSolver,
+    row: RowEquations,
+    guess: Array,
+    previous: Array,
+    prescribed_m: Array,
+) -> Array:
+    """Solve one row; where Newton's method fails, apply the grasps' displacement (and a static
+    load) in smaller increments.
+
+    Static rows stay on the branch of stable equilibria.
+
+    Parameters
+    ----------
+    solver : NewtonSolver
+        Newton's method for the dofs prescribed at this time.
+    row : RowEquations
+        The row.
+    guess : (3n,) array
+        First guess [m].
+    previous : (3n,) array
+        Positions of the row before [m].
+    prescribed_m : (h,) array
+        Prescribed positions of the prescribed dofs [m].
+
+    Raises
+    ------
+    NewtonFailure
+        If an increment fails after all halvings.
+    """
+    origin = previous[solver.is_prescribed]
+
+    def solve(guess: Array, share: float) -> Array:
+        start = guess.copy()
+        step = row.with_load_step(share)
+        # To the last digit at the end: bounds hold it there.
+        goal = (
+            prescribed_m
+            if share == 1
+            else origin + share * (prescribed_m - origin)
+        )
+        if row.dynamics.is_static:
+            return solver.solve(
+                start, step.residual, step.linearise, True, goal
+            )
+        start[solver.is_prescribed] = goal
+        return solver.solve(start, step.residual, step.linearise)
+
+    return follow_path(
+        solve, previous, halvings=solver.options.max_halvings, guess=guess
+    )

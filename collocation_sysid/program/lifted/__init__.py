@@ -1,0 +1,12 @@
+"""Variables that are eliminated by default and can be kept, with equations of their own.
+
+Interior-point methods and the methods for comparison keep them, because the sparse program then
+has simpler equations; reduced space eliminates them.
+
+- `lifted_variables`: base class; `lifting`: adds the variables to a collocation.
+- `lifted_memory`: internal variables of viscoelastic materials; `lifted_force_histories`: those of
+  forces with a history.
+- `lifted_contact_pressures`: contact pressures with complementarity conditions.
+- `lifted_reactions`, `lifted_wrenches`: reactions of grasps and measured wrenches.
+- `expression_patterns`: constraints that repeat one small expression.
+"""

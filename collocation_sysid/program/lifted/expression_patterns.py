@@ -1,0 +1,228 @@
+"""Constraints that repeat one small expression at many instances, with generated derivatives.
+
+The values y(u, data) of all instances are added to constraints; index arrays state which variables
+are the inputs u and which constraints the values belong to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, TypeVar
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.array_types import Array, Index
+from ...model.generated_functions import GeneratedFunction
+from ...model.recursion import Recursion
+
+T = TypeVar("T", bound=np.generic)
+ONE = np.ones(1)
+
+
+class PatternIndices(NamedTuple):
+    """Variables or constraints of instances.
+
+    Attributes
+    ----------
+    indices : (k, …) array
+        Their indices in z or g.
+    unit : array
+        Physical value of one unit of each; of the same shape as `indices` or one that broadcasts to
+        it.
+    """
+
+    indices: Index
+    unit: Array = ONE
+
+
+@dataclass(frozen=True, eq=False)
+class ExpressionPattern:
+    """An expression at I instances.
+
+    Attributes
+    ----------
+    expression : GeneratedFunction
+        Function y(u, data) with derivatives.
+    data : (d, I) array
+        Data of the instances.
+    inputs : PatternIndices, (k, I)
+        Variables that are the inputs u.
+    rows : PatternIndices, (m, I)
+        Constraints that the values y are added to.
+    """
+
+    expression: GeneratedFunction
+    data: Array
+    inputs: PatternIndices
+    rows: PatternIndices
+
+    @classmethod
+    def from_arrays(
+        cls,
+        expression: GeneratedFunction,
+        data: Array,
+        inputs: Sequence[PatternIndices],
+        rows: PatternIndices,
+    ) -> ExpressionPattern:
+        """Build a pattern of instances of any shape.
+
+        Parameters
+        ----------
+        expression : GeneratedFunction
+            Function y(u, data).
+        data : (d, …) array
+            Data; broadcast to the shape of the instances.
+        inputs : sequence of PatternIndices, each (k, …)
+            Inputs, concatenated along the first axis after broadcasting.
+        rows : PatternIndices, (m, …)
+            Constraints.
+        """
+        shapes = (
+            data.shape,
+            rows.indices.shape,
+            *(each.indices.shape for each in inputs),
+        )
+        shape = np.broadcast_shapes(*(shape[1:] for shape in shapes))
+
+        def one_dimensional(values: NDArray[T], length: int) -> NDArray[T]:
+            broadcast = np.broadcast_to(values, (length, *shape))
+            return broadcast.reshape(length, int(np.prod(shape)))
+
+        def concatenated(parts: Sequence[PatternIndices]) -> PatternIndices:
+            places = [
+                one_dimensional(part.indices, len(part.indices))
+                for part in parts
+            ]
+            units = [
+                one_dimensional(np.asarray(part.unit), len(part.indices))
+                for part in parts
+            ]
+            return PatternIndices(np.concatenate(places), np.concatenate(units))
+
+        return cls(
+            expression,
+            one_dimensional(data, len(data)),
+            concatenated(inputs),
+            concatenated([rows]),
+        )
+
+    @classmethod
+    def from_recursion(
+        cls,
+        recursion: Recursion,
+        data: Array,
+        states: PatternIndices,
+        input_indices: PatternIndices,
+        constants: PatternIndices,
+        rows: PatternIndices,
+    ) -> ExpressionPattern:
+        """Build the pattern h_k − R(h_{k−1}, s_k, s_{k−1}; c) of a recursion R.
+
+        At the first evaluation, the first states and inputs stand for those before; the recursion
+        must ignore them.
+
+        Parameters
+        ----------
+        recursion : Recursion
+            The recursion R.
+        data : array
+            Data of the recursion.
+        states : PatternIndices, (n, N, I)
+            States h.
+        input_indices : PatternIndices, (i, N, I)
+            Inputs s.
+        constants : PatternIndices
+            Constants c.
+        rows : PatternIndices
+            Constraints.
+        """
+
+        def gap(u: ca.SX, data: ca.SX) -> ca.SX:
+            own, inputs = ca.vertsplit(u, [0, recursion.state_size, u.numel()])
+            return own - recursion.step_function.expression(inputs, data)
+
+        before = np.maximum(np.arange(states.indices.shape[1]) - 1, 0)
+        parts = [
+            states,
+            _at_evaluations(states, before),
+            input_indices,
+            _at_evaluations(input_indices, before),
+            constants,
+        ]
+        size = recursion.state_size + recursion.input_offsets[-1]
+        return cls.from_arrays(
+            GeneratedFunction(gap, size, data_size=recursion.data_size),
+            data,
+            parts,
+            rows,
+        )
+
+    def _input_values(self, z: Array) -> Array:
+        """Return the inputs (k, I) in physical units."""
+        return self.inputs.unit * z[self.inputs.indices]
+
+    def residuals(self, z: Array, count: int) -> Array:
+        """Return the contributions to the constraints (count,)."""
+        return self._assemble(
+            self.expression.evaluate(self._input_values(z), self.data), count
+        )
+
+    def _assemble(self, y: Array, count: int) -> Array:
+        """Return the sums (count,) of values y (m, I) over the constraints to which they belong,
+        each value divided by the unit of its row.
+        """
+        assembled = np.zeros(count)
+        np.add.at(assembled, self.rows.indices, y / self.rows.unit)
+        return assembled
+
+    def jacobian_entries(self) -> tuple[Index, Index]:
+        """Return constraint, and index in z, of each derivative that may be non-zero."""
+        y, u = np.nonzero(self.expression.jacobian_pattern)
+        return self.rows.indices[y].ravel(), self.inputs.indices[u].ravel()
+
+    def jacobian_values(self, z: Array, count: int) -> tuple[Array, Array]:
+        """Return the contributions to the scaled constraints (count,) at z, and the values of
+        `jacobian_entries`, derivatives by scaled variables.
+        """
+        value, slopes = self.expression.evaluate_with_jacobian(
+            self._input_values(z), self.data
+        )
+        y, u = np.nonzero(self.expression.jacobian_pattern)
+        slopes = slopes[y, u] * self.inputs.unit[u] / self.rows.unit[y]
+        return self._assemble(value, count), slopes.ravel()
+
+    @cached_property
+    def _hessian_pairs(self) -> tuple[Index, Index, NDArray[np.bool_]]:
+        """Pairs (i, j) of inputs with second derivatives, and a mask of the instances where
+        they are in the upper triangle.
+        """
+        i, j = np.nonzero(self.expression.hessian_pattern)
+        return i, j, self.inputs.indices[i] <= self.inputs.indices[j]
+
+    def hessian_entries(self) -> tuple[Index, Index]:
+        """Return rows and columns in z of the second derivatives, upper triangle."""
+        i, j, above = self._hessian_pairs
+        return self.inputs.indices[i][above], self.inputs.indices[j][above]
+
+    def hessian_values(self, z: Array, multipliers: Array) -> Array:
+        """Return the second derivatives of multipliers (count,) · constraints, in the order
+        of `hessian_entries`.
+        """
+        i, j, above = self._hessian_pairs
+        unit = self.inputs.unit
+        weights = multipliers[self.rows.indices] / self.rows.unit
+        curvature = self.expression.weighted_hessian(
+            self._input_values(z), self.data, weights
+        )
+        return (curvature[i, j] * unit[i] * unit[j])[above]
+
+
+def _at_evaluations(
+    indices: PatternIndices, evaluations: Index
+) -> PatternIndices:
+    """Return the indices of other evaluations; units must be the same at all evaluations."""
+    return PatternIndices(indices.indices[:, evaluations], indices.unit)

@@ -1,0 +1,232 @@
+"""Lifted variables: variables of the program that follow from the others, each with an equation.
+
+By default they are eliminated; `Collocation.has_lifted_variables` adds them so that exact matrices
+stay sparse. Their equations come after all other constraints, and the variables after all other
+variables. Subclass `LiftedVariables` to lift another quantity; most subclasses only declare
+`patterns` of small expressions, see `expression_patterns`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from ...common.array_types import Array, Index
+from ..experiment_iterate import ExperimentIterate
+from ..transcription import RowWeights, Transcription, WeightedHistory
+from .expression_patterns import ExpressionPattern
+
+
+@dataclass(frozen=True)
+class LiftedOffsets:
+    """Offsets of a group of lifted variables in the program.
+
+    Attributes
+    ----------
+    variable : int
+        Index in z of its first variable.
+    row : int
+        Index in g of its first equation.
+    """
+
+    variable: int
+    row: int
+
+
+@dataclass(frozen=True, eq=False)
+class LiftedVariables(ABC):
+    """A group of lifted variables of one experiment, and as many equations.
+
+    Attributes
+    ----------
+    segment : Transcription
+        Transcription of the experiment.
+    segment_index : int
+        Index of the segment.
+    first_phi : int
+        Index in z where the nuisance parameters of all experiments begin.
+    offsets : LiftedOffsets
+        Offsets of the variables and equations.
+    kind : {"memory", "force", "pressure", "wrench"}
+        Kind of quantity.
+    """
+
+    segment: Transcription
+    segment_index: int
+    first_phi: int
+    offsets: LiftedOffsets
+    kind: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the array of variables, and of that of the equations."""
+
+    @property
+    def count(self) -> int:
+        """Number of variables, which is that of the equations."""
+        return int(np.prod(self.shape))
+
+    @property
+    def columns(self) -> slice:
+        """Slice of the variables in z."""
+        return slice(self.offsets.variable, self.offsets.variable + self.count)
+
+    @property
+    def rows(self) -> slice:
+        """Slice of the equations in g."""
+        return slice(self.offsets.row, self.offsets.row + self.count)
+
+    @property
+    def next_offsets(self) -> LiftedOffsets:
+        """Offsets of the group that follows."""
+        return LiftedOffsets(self.columns.stop, self.rows.stop)
+
+    @property
+    def phi_columns(self) -> Index:
+        """Indices (k,) in z of the experiment's nuisance parameters."""
+        return (
+            self.first_phi
+            + self.segment.nuisance_indices.indices
+            - self.segment.nq
+        )
+
+    @property
+    def lower_bound(self) -> float:
+        """Lower bound of the variables."""
+        return -np.inf
+
+    def with_lifted(
+        self, iterate: ExperimentIterate, z: Array
+    ) -> ExperimentIterate:
+        """Return the iterate with those quantities replaced that these variables of z determine;
+        the iterate itself if there are none.
+        """
+        return iterate
+
+    @abstractmethod
+    def consistent_values(self, iterate: ExperimentIterate) -> Array:
+        """Return the scaled variables (count,) that satisfy the equations at the iterate's
+        positions and parameters.
+        """
+
+    @cached_property
+    def patterns(self) -> tuple[ExpressionPattern, ...]:
+        """Expressions whose sum is the equations; row indices count from the group's first
+        equation.
+        """
+        return ()
+
+    def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
+        """Return the scaled equations (count,) at the iterate and z."""
+        return np.sum(
+            [pattern.residuals(z, self.count) for pattern in self.patterns],
+            axis=0,
+        )
+
+    def jacobian_entries(self) -> tuple[Index, Index]:
+        """Return rows in g and columns in z of the additional entries of ∂g/∂z, in the order of
+        their values.
+        """
+        rows, columns = concatenated_entries(
+            pattern.jacobian_entries() for pattern in self.patterns
+        )
+        return self.offsets.row + rows, columns
+
+    def jacobian_values(
+        self, iterate: ExperimentIterate, z: Array
+    ) -> tuple[Array, Array]:
+        """Return the scaled equations (count,) at an iterate and z, and the values of
+        `jacobian_entries`.
+        """
+        evaluated = [
+            pattern.jacobian_values(z, self.count) for pattern in self.patterns
+        ]
+        values, slopes = zip(*evaluated, strict=True)
+        return np.sum(values, axis=0), np.concatenate(slopes)
+
+    def hessian_entries(self) -> tuple[Index, Index]:
+        """Return rows and columns of the additional entries of the Lagrangian's Hessian,
+        upper triangle.
+        """
+        return concatenated_entries(
+            pattern.hessian_entries() for pattern in self.patterns
+        )
+
+    def hessian_values(
+        self,
+        iterate: ExperimentIterate,
+        z: Array,
+        loss_weight: float,
+        multipliers: Array,
+        weights: RowWeights,
+    ) -> Array:
+        """Return the values of `hessian_entries`: second derivatives of loss_weight · loss +
+        multipliers · g.
+
+        Parameters
+        ----------
+        iterate : ExperimentIterate
+            The experiment at z.
+        z : array
+            All variables of the program.
+        loss_weight : float
+            Factor of the loss; used by groups on which the loss depends.
+        multipliers : array
+            Multipliers of all constraints g.
+        weights : RowWeights
+            Weights of the experiment's constraints and forces.
+        """
+        own = multipliers[self.rows]
+        blocks = [pattern.hessian_values(z, own) for pattern in self.patterns]
+        return np.concatenate([np.zeros(0), *blocks])
+
+    # What the loss has of the variables ---------------------------------------------------------
+
+    def loss_gradient(self, iterate: ExperimentIterate) -> Array:
+        """Return the gradient of the loss by these variables (count,)."""
+        return np.zeros(self.count)
+
+    # What multipliers weigh ---------------------------------------------------------------------
+
+    def residual_weights(self, multipliers: Array) -> Array | float:
+        """Return the derivative (N, 3n) of multipliers · equations by the residual c in
+        newtons [1/N]; 0 if there is none.
+        """
+        return 0.0
+
+    @property
+    def history_index(self) -> int | None:
+        """Index of the history among those of the motion, or None if the group is no history."""
+        return None
+
+    def weighted_history(
+        self, iterate: ExperimentIterate, multipliers: Array
+    ) -> WeightedHistory:
+        """Return the history, and the weights of each h_k in multipliers · equations.
+
+        Raises
+        ------
+        NotImplementedError
+            If the group is no history.
+        """
+        raise NotImplementedError
+
+    @property
+    def entry_counts(self) -> tuple[int, int]:
+        """Numbers of additional entries of the Jacobian and of the Hessian."""
+        return len(self.jacobian_entries()[0]), len(self.hessian_entries()[0])
+
+
+def concatenated_entries(
+    groups: Iterable[tuple[Index, Index]],
+) -> tuple[Index, Index]:
+    """Concatenate rows, and columns, of several groups of entries; no group gives empty arrays."""
+    none = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    rows, columns = zip(none, *groups, strict=True)
+    return np.concatenate(rows), np.concatenate(columns)

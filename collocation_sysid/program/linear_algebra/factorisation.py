@@ -1,0 +1,583 @@
+"""Factorisation of matrices on the mesh graph, repeated with one sparsity pattern.
+
+Reverse Cuthill–McKee ordering makes the mesh graph a narrow band. A factorisation without row
+exchanges, within the skyline or, for wide bands, Cholesky's, then also decides whether the matrix
+is positive definite. Wide bands use LAPACK, or a supernodal method where it is installed.
+Indefinite matrices use SuperLU, and so do all where its fill-in is estimated to cost less than the
+band. A matrix with a skew part (see `block_band`) needs no row exchanges either where the symmetric
+part is positive definite and the skew part is small compared with it: within a skyline it is
+factorised directly, otherwise by its symmetric part and iterative refinement. SuperLU takes the
+rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cache, cached_property, lru_cache
+from typing import TYPE_CHECKING, Literal, Protocol
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.linalg import get_lapack_funcs
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse.linalg import SuperLU, splu
+
+from ...common.array_types import Array, Index
+from ...fem.kernels import make_skyline, run_in_slices
+from ...fem.pattern import SymmetricPattern
+from .lapack import cholesky_in_place
+from .supernodal import Pardiso, SupernodalFactor, load_mkl
+
+if TYPE_CHECKING:
+    from ...fem.kernels.skyline import FactorMemory, SkylineFactorisation
+
+Choice = Literal["auto", "band", "sparse", "supernodal"]
+
+# Speed of LAPACK on a band over that of SuperLU on its columns (measured: 40 against 4 GFlop/s on
+# one core).
+BAND_SPEED = 10.0
+# Work of a band below which it is always used.
+LITTLE_WORK = 1e8
+# Work of a band from which on supernodal sweeps are faster: some 3,000 nodes of a stout body.
+MUCH_WORK = 2e9
+
+# Half bandwidth up to which the skyline is faster than LAPACK (measured: 17 GFlop/s at 200,
+# LAPACK's Cholesky 21 at 300).
+NARROW = 250
+# Largest growth of a diagonal entry without row exchanges; definite matrices have none.
+GROWTH = 10.0
+# Relative size of the last correction by the skew part, far below the accuracy of a Newton or
+# Gauss–Newton step.
+ACCURACY = 1e-10
+# Factor by which each correction must be smaller; otherwise another factorisation is cheaper.
+CONTRACTION = 0.2
+# Smallest size of a correction, against division by zero.
+TINY = 1e-300
+
+(_pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=np.float64)
+# Skew part of a symmetric matrix.
+NONE = np.zeros(0)
+
+
+class Factor(Protocol):
+    """Factorised matrix on the free degrees of freedom."""
+
+    @property
+    def positive_definite(self) -> bool:
+        """Whether the matrix, or its symmetric part, is positive definite."""
+        ...
+
+    def solve(self, right: Array, transposed: bool = False) -> Array:
+        """Solve for right-hand sides (k,) or (k, m) in the order of the free dofs.
+
+        If `transposed`, solve with the transposed matrix.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class _BandFactor:
+    """Cholesky factor of a symmetric band.
+
+    Attributes
+    ----------
+    band : (half-bandwidth + 1, k) array
+        Lower band of the factor.
+    order : (k,) array
+        Free dof of each row of the band.
+    positive_definite : bool
+        Always true.
+    """
+
+    band: Array
+    order: Index
+    positive_definite: bool = True
+
+    def solve(self, right: Array, transposed: bool = False) -> Array:
+        """Return the solution for right-hand sides (k,) or (k, m) on the free dofs; the matrix is
+        symmetric.
+        """
+        permuted = right[self.order]
+        solved, _ = _pbtrs(self.band, permuted, lower=1)
+        result = np.empty_like(right)
+        result[self.order] = solved.reshape(right.shape)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class _SkylineFactor:
+    """Factors L, D and U within a skyline, see `fem.kernels.skyline`.
+
+    Attributes
+    ----------
+    skyline : SkylineFactorisation
+        Structure and kernels.
+    sides : array
+        L and U; one of them for a symmetric matrix.
+    pivots : array
+        D.
+    order, rank : (k,) arrays
+        Permutation to the skyline and its inverse.
+    positive_definite : bool
+        Always true.
+    """
+
+    skyline: SkylineFactorisation
+    sides: Array
+    pivots: Array
+    order: Index
+    rank: Index
+    positive_definite: bool = True
+
+    def solve(self, right: Array, transposed: bool = False) -> Array:
+        """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, of the
+        transposed matrix if `transposed`.
+        """
+        first = self.sides[-transposed]
+        second = self.sides[transposed - 1]
+        rows = np.atleast_2d(right.take(self.order, axis=0).T)
+        solved = self.skyline.solve(first, self.pivots, second, rows)
+        return solved.T.take(self.rank, axis=0).reshape(right.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class _RefinedFactor:
+    """Inverse of S + K with symmetric S and skew K as the series Σ_k (−S⁻¹K)^k S⁻¹.
+
+    Attributes
+    ----------
+    symmetric : Factor
+        Factor of S.
+    skew : sparse array
+        K.
+    factorise_complete : callable
+        Returns the factor of S + K, which is used if the series does not converge.
+    positive_definite : bool
+        Always true.
+    divergence_flags : list of bool
+        Not empty after the series has failed once.
+    """
+
+    symmetric: Factor
+    skew: sp.csc_array
+    factorise_complete: Callable[[], Factor]
+    positive_definite: bool = True
+    divergence_flags: list[bool] = field(default_factory=list)
+
+    def solve(self, right: Array, transposed: bool = False) -> Array:
+        """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, of the
+        transposed matrix if `transposed`. If the series diverges, the complete matrix is
+        factorised, also for later calls.
+        """
+        if self.divergence_flags:
+            return self.factorise_complete().solve(right, transposed)
+        solution = correction = self.symmetric.solve(right)
+        size = last = np.abs(solution).max(axis=0, initial=TINY)
+        shrinks = 1.0
+        # What the next correction would be is not worth another solution.
+        while (shrinks * last > ACCURACY * size).any():
+            product = self.skew @ correction
+            correction = self.symmetric.solve(
+                product if transposed else -product
+            )
+            length = np.abs(correction).max(axis=0, initial=TINY)
+            shrinks = float((length / last).max(initial=0.0))
+            if not shrinks <= CONTRACTION:
+                self.divergence_flags.append(True)
+                return self.factorise_complete().solve(right, transposed)
+            solution = solution + correction
+            last = length
+        return solution
+
+
+@dataclass(frozen=True, eq=False)
+class _SparseFactor:
+    """Complete LU factorisation of a sparse matrix by SuperLU."""
+
+    lu: SuperLU
+    positive_definite: bool
+
+    def solve(self, right: Array, transposed: bool = False) -> Array:
+        """Solve for right-hand sides (k,) or (k, m)."""
+        return self.lu.solve(right, "T" if transposed else "N")
+
+
+class Factoriser:
+    """Symbolic analysis of a symmetric pattern restricted to free degrees of freedom.
+
+    Attributes
+    ----------
+    half_bandwidth : int
+        Number of subdiagonals of the reordered band.
+
+    Parameters
+    ----------
+    pattern : SymmetricPattern
+        Pattern of the complete matrix.
+    free : (k,) array
+        Sorted free degrees of freedom.
+    choice : {"auto", "band", "sparse", "supernodal"}
+        Banded Cholesky ("band"), SuperLU ("sparse"), supernodal Cholesky, or the one with the least
+        estimated cost.
+
+    Raises
+    ------
+    InputError
+        If a supernodal method is asked for and not installed.
+    """
+
+    def __init__(
+        self, pattern: SymmetricPattern, free: Index, choice: Choice = "auto"
+    ) -> None:
+        self.choice: Choice = choice
+        position = np.full(pattern.size, -1)
+        position[free] = np.arange(len(free))
+        rows = position[pattern.rows]
+        columns = position[pattern.columns]
+        self._free_entries = np.flatnonzero((rows >= 0) & (columns >= 0))
+        rows = rows[self._free_entries]
+        columns = columns[self._free_entries]
+        self._size = len(free)
+        ones = np.ones(len(rows))
+        graph = sp.csr_array(
+            (ones, (rows, columns)), shape=(self._size, self._size)
+        )
+        self._order = reverse_cuthill_mckee(
+            graph + graph.T, symmetric_mode=True
+        ).astype(np.int64)
+        self._rank = rank = np.empty(self._size, dtype=np.int64)
+        rank[self._order] = np.arange(self._size)
+        low = np.minimum(rank[rows], rank[columns])
+        high = np.maximum(rank[rows], rank[columns])
+        self.half_bandwidth = int((high - low).max(initial=0))
+        self._band_places = low * (self.half_bandwidth + 1) + high - low
+        self._ranks = rank[rows], rank[columns]
+        strict = rows != columns
+        self._full_rows = np.concatenate([rows, columns[strict]])
+        self._full_columns = np.concatenate([columns, rows[strict]])
+        self._full_source = np.concatenate(
+            [self._free_entries, self._free_entries[strict]]
+        )
+        # Whether an entry has the skew part's own sign; none on the diagonal.
+        self._signs = np.concatenate(
+            [strict.astype(float), -np.ones(strict.sum())]
+        )
+        self._entries = pattern.entry_count
+        self._pool: list[Pardiso] = []
+        if choice == "supernodal":
+            self._pool.append(self._pardiso())
+
+    @classmethod
+    def cached(
+        cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto"
+    ) -> Factoriser:
+        """Return the analysis of a pattern; the last few are cached."""
+        return _cached_analysis(pattern, free.tobytes(), choice=choice)
+
+    @cached_property
+    def is_banded(self) -> bool:
+        """Whether banded Cholesky is chosen; "auto" does so if it is estimated to be faster than a
+        sparse factorisation.
+        """
+        if self.choice != "auto":
+            return self.choice == "band"
+        if self.is_supernodal:
+            return False
+        return self._band_work <= max(
+            LITTLE_WORK, BAND_SPEED * self._sparse_work
+        )
+
+    @cached_property
+    def is_supernodal(self) -> bool:
+        """Whether supernodal Cholesky is chosen; "auto" does so for a wide band with much work if
+        MKL is installed.
+        """
+        if self.choice != "auto":
+            return self.choice == "supernodal"
+        wide = self.half_bandwidth > NARROW and self._band_work > MUCH_WORK
+        return wide and load_mkl() is not None
+
+    @property
+    def _band_work(self) -> int:
+        """Operations of a banded factorisation, up to a factor."""
+        return self._size * self.half_bandwidth**2
+
+    @property
+    def factor_size(self) -> int:
+        """Number of floating-point numbers in the factor of a symmetric matrix."""
+        if self.is_banded:
+            width = (
+                self.skyline.shape[1]
+                if self.skyline
+                else self.half_bandwidth + 1
+            )
+            return self._size * width
+        if self.is_supernodal:
+            return self._supernodal_size
+        return 3 * int(
+            self._column_counts.sum()
+        )  # L, U, and their row numbers at half the size
+
+    @property
+    def unsymmetric_factor_size(self) -> int:
+        """Number of floating-point numbers in the factor of an unsymmetric matrix."""
+        return (2 if self.skyline else 1) * self.factor_size
+
+    @cached_property
+    def skyline(self) -> SkylineFactorisation | None:
+        """Skyline factorisation for narrow bands; None for others."""
+        if not self.is_banded or self.half_bandwidth > NARROW:
+            return None
+        return make_skyline(self._size, *self._ranks, self._free_entries)
+
+    @property
+    def _sparse_work(self) -> float:
+        """Operations of a factorisation by SuperLU, up to a factor."""
+        return float(np.sum(self._column_counts.astype(float) ** 2))
+
+    @cached_property
+    def _column_counts(self) -> Index:
+        """Number of entries of each column of SuperLU's L, from a matrix that needs no pivoting."""
+        values = np.full(self._entries, -1.0)
+        degree = np.bincount(self._full_rows, minlength=self._size)
+        values[self._full_source[self._full_rows == self._full_columns]] = (
+            degree
+        )
+        return np.diff(self._superlu(values, pivot_below=0.0).L.indptr)
+
+    def factorise(
+        self,
+        values: Array,
+        skew: Array = NONE,
+        buffer: FactorMemory | None = None,
+    ) -> Factor:
+        """Factorise a matrix.
+
+        Parameters
+        ----------
+        values : (m,) array
+            Lower triangle of the symmetric part.
+        skew : (m,) or (0,) array
+            Lower triangle of the skew part; empty if the matrix is symmetric.
+        buffer : FactorMemory, optional
+            Memory for the factor; the factor is valid until it is used again.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the matrix is singular or not finite.
+        """
+        skew = skew if skew.any() else NONE
+        skyline_factor = self._factorise_in_skyline(values, skew, buffer=buffer)
+        if skyline_factor:
+            return skyline_factor
+        if not (np.isfinite(values).all() and np.isfinite(skew).all()):
+            raise np.linalg.LinAlgError(
+                "the matrix has entries that are not finite"
+            )
+        definite = (
+            self._factorise_in_skyline(values, NONE, buffer=buffer)
+            if skew.size
+            else None
+        ) or self._factorise_definite(values)
+        if not skew.size:
+            # Without pivoting the factor of an indefinite matrix can be arbitrarily wrong.
+            return definite or _SparseFactor(
+                self._superlu(values, pivot_below=0.1), False
+            )
+        if not definite:
+            # Where a body slides under friction it never is: the pivots of the whole tell then.
+            lu = self._superlu(values, pivot_below=0.1, skew=skew)
+            return _SparseFactor(lu, _has_positive_pivots(lu))
+
+        @cache
+        def complete_factor() -> Factor:
+            return _SparseFactor(
+                self._superlu(values, pivot_below=1.0, skew=skew), True
+            )
+
+        entries = self._signs * skew[self._full_source]
+        return _RefinedFactor(
+            definite,
+            self._sparse_matrix(entries),
+            factorise_complete=complete_factor,
+        )
+
+    def _factorise_definite(self, values: Array) -> Factor | None:
+        """Return the factor of a symmetric matrix (entries of the lower triangle), or None if it is
+        not positive definite.
+        """
+        if self.is_supernodal:
+            try:
+                pardiso = self._pool.pop()
+            except (
+                IndexError
+            ):  # not asked for beforehand: other threads take from it too
+                pardiso = self._pardiso()
+            factor = SupernodalFactor(pardiso, self._pool)
+            return factor if pardiso.factorise(values[self._upper[2]]) else None
+        if not self.is_banded:
+            lu = self._superlu(values, pivot_below=0.0)
+            return (
+                _SparseFactor(lu, positive_definite=True)
+                if _has_positive_pivots(lu)
+                else None
+            )
+        if self.skyline:
+            return None
+        band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
+        band.T.reshape(-1)[self._band_places] = values[self._free_entries]
+        return (
+            _BandFactor(band, self._order) if cholesky_in_place(band) else None
+        )
+
+    def _pardiso(self) -> Pardiso:
+        """Return a new PARDISO solver for the pattern."""
+        return Pardiso(*self._upper[:2])
+
+    @cached_property
+    def _supernodal_size(self) -> int:
+        """Number of floating-point numbers in a supernodal factor.
+
+        If the pool is empty, the matrix is analysed, and the solver is added to the pool.
+        """
+        if not self._pool:
+            self._pool.append(self._pardiso())
+        return self._pool[-1].factor_size
+
+    @cached_property
+    def _upper(self) -> tuple[Index, Index, Index]:
+        """Starts of the rows of the upper triangle, their columns, and the positions of
+        their values in the lower triangle.
+        """
+        here = self._full_rows <= self._full_columns
+        rows = self._full_rows[here]
+        columns = self._full_columns[here]
+        order = np.lexsort((columns, rows))
+        starts = np.searchsorted(rows[order], np.arange(self._size + 1))
+        return starts, columns[order], self._full_source[here][order]
+
+    def allocate(self, sides: int) -> FactorMemory | None:
+        """Return memory for a factor within the skyline, or None if other methods are used.
+
+        Parameters
+        ----------
+        sides : int
+            2 for unsymmetric matrices, else 1.
+        """
+        return self.skyline.allocate(sides) if self.skyline else None
+
+    def _factorise_in_skyline(
+        self, values: Array, skew: Array, buffer: FactorMemory | None
+    ) -> Factor | None:
+        """Return the factor within the skyline of a matrix with lower triangles `values` and
+        `skew`, or None if there is no skyline or the matrix needs row exchanges. The factor is
+        written to `buffer` if that is given.
+        """
+        skyline = self.skyline
+        if skyline is None:
+            return None
+        count = 2 if skew.size else 1
+        buffer = buffer or skyline.allocate(count)
+        pivots, growth = skyline.factorise(buffer, values, skew)
+        # What is not finite in the matrix is not in its pivots.
+        if not (
+            pivots.min() > 0 and pivots.max() < np.inf and growth.max() < GROWTH
+        ):
+            return None
+        return _SkylineFactor(
+            skyline,
+            buffer.sides[:count],
+            pivots=pivots,
+            order=self._order,
+            rank=self._rank,
+        )
+
+    def factorise_each(
+        self,
+        matrix: Callable[[int], tuple[Array, Array]],
+        count: int,
+        threads: int,
+        buffers: Sequence[FactorMemory | None] = (),
+    ) -> list[Factor]:
+        """Factorise several matrices in parallel.
+
+        Parameters
+        ----------
+        matrix : callable
+            Returns lower triangles of both parts of matrix k, see `factorise`.
+        count : int
+            Number of matrices.
+        threads : int
+            Number of threads.
+        buffers : sequence of FactorMemory or None
+            Memory for each factor; empty to allocate.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If a matrix is singular or not finite.
+        """
+        factors: dict[int, Factor] = {}
+
+        def run(start: int, stop: int) -> None:
+            for k in range(start, stop):
+                factors[k] = self.factorise(
+                    *matrix(k), buffers[k] if buffers else None
+                )
+
+        run_in_slices(run, count, threads=threads)
+        return [factors[k] for k in range(count)]
+
+    def _sparse_matrix(self, entries: Array) -> sp.csc_array:
+        """Return the sparse matrix (k, k) of entries in the order of both triangles."""
+        places = self._full_rows, self._full_columns
+        return sp.csc_array((entries, places), shape=(self._size, self._size))
+
+    def _superlu(
+        self, values: Array, pivot_below: float, skew: Array = NONE
+    ) -> SuperLU:
+        """Factorise by SuperLU.
+
+        Parameters
+        ----------
+        values : array
+            Lower triangle of the symmetric part.
+        pivot_below : float
+            Threshold for row exchanges, from 0 (none) to 1 (partial pivoting).
+        skew : array
+            Lower triangle of the skew part; empty for none.
+
+        Raises
+        ------
+        LinAlgError
+            If the matrix is singular.
+        """
+        entries = values[self._full_source]
+        if skew.size:
+            entries += self._signs * skew[self._full_source]
+        try:
+            return splu(
+                self._sparse_matrix(entries),
+                permc_spec="MMD_AT_PLUS_A",
+                options={"SymmetricMode": True},
+                diag_pivot_thresh=pivot_below,
+            )
+        except RuntimeError as error:
+            raise np.linalg.LinAlgError(str(error)) from error
+
+
+def _has_positive_pivots(lu: SuperLU) -> bool:
+    """Whether SuperLU took the pivots in their order, and all are positive."""
+    return bool((lu.perm_r == lu.perm_c).all() and (lu.U.diagonal() > 0).all())
+
+
+@lru_cache(maxsize=8)
+def _cached_analysis(
+    pattern: SymmetricPattern, free: bytes, choice: Choice
+) -> Factoriser:
+    """Return the analysis of a pattern; `free` are the bytes of an array of int64."""
+    return Factoriser(
+        pattern, np.frombuffer(free, dtype=np.int64), choice=choice
+    )

@@ -1,0 +1,210 @@
+"""Assembly of additional entries into a sparse matrix in compressed columns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.array_types import Array, Index
+
+
+class EntryBlock(NamedTuple):
+    """Entries whose rows and columns are sums of arrays that broadcast.
+
+    Attributes
+    ----------
+    rows : sequence of arrays or int
+        Summands of the row indices.
+    columns : sequence of arrays or int
+        Summands of the column indices.
+    """
+
+    rows: Sequence[Index | int]
+    columns: Sequence[Index | int]
+
+    @property
+    def count(self) -> int:
+        """Number of entries."""
+        return int(
+            np.prod(
+                np.broadcast_shapes(*map(np.shape, (*self.rows, *self.columns)))
+            )
+        )
+
+    def indices(self) -> tuple[Index, Index]:
+        """Return row and column index of each entry, flat."""
+        rows, columns = np.broadcast_arrays(sum(self.rows), sum(self.columns))
+        return rows.ravel(), columns.ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class SparseAssembly:
+    """Structure of a sparse matrix, and positions of the values of its contributions.
+
+    Attributes
+    ----------
+    indptr : array
+        Column pointers.
+    indices : array
+        Row indices.
+    initial_positions : array or None
+        Position of each value of the initial structure; None if they all come first, in their
+        order.
+    group_positions : tuple of arrays
+        Positions of the entries of each group.
+    has_duplicates : tuple of bool
+        Whether several entries of a group have the same position.
+    """
+
+    indptr: Index
+    indices: Index
+    initial_positions: Index | None
+    group_positions: tuple[Index, ...]
+    has_duplicates: tuple[bool, ...]
+
+    @classmethod
+    def from_groups(
+        cls,
+        structure: tuple[Index, Index],
+        shape: tuple[int, int],
+        groups: Iterable[tuple[Index, Index]],
+    ) -> SparseAssembly:
+        """Add groups of entries to a structure; entries may exist already, or belong to several
+        groups.
+
+        Parameters
+        ----------
+        structure : (array, array)
+            Column pointers and ascending row indices of the first columns.
+        shape : (int, int)
+            Rows and columns of the complete matrix.
+        groups : iterable of (array, array)
+            Rows and columns of each group's entries.
+        """
+        indptr, indices = structure
+        height, width = shape
+        group_codes = [columns * height + rows for rows, columns in groups]
+        codes = np.unique(
+            np.concatenate([np.zeros(0, dtype=np.int64), *group_codes])
+        )
+        before, absent = _locate(structure, height, codes=codes)
+        own = before + np.cumsum(absent) - absent
+        added = own[absent]
+        columns = codes[absent] // height
+        is_initial = np.ones(len(indices) + len(added), dtype=bool)
+        is_initial[added] = False
+        all_indices = np.empty(len(is_initial), dtype=np.int64)
+        all_indices[is_initial] = indices
+        all_indices[added] = codes[absent] - columns * height
+        counts = np.bincount(columns, minlength=width)
+        counts[: len(indptr) - 1] += np.diff(indptr)
+        group_indices = [np.searchsorted(codes, each) for each in group_codes]
+        return cls(
+            np.concatenate([[0], np.cumsum(counts)]),
+            all_indices,
+            None
+            if is_initial[: len(indices)].all()
+            else np.flatnonzero(is_initial),
+            tuple(own[each] for each in group_indices),
+            tuple(
+                bool(np.bincount(each, minlength=1).max() > 1)
+                for each in group_indices
+            ),
+        )
+
+    @property
+    def structure(self) -> tuple[Index, Index]:
+        """Column pointers and row indices."""
+        return self.indptr, self.indices
+
+    def positions_of(self, positions: Index) -> Index:
+        """Return the positions of values of the initial structure, given by their positions
+        there.
+        """
+        return (
+            positions
+            if self.initial_positions is None
+            else self.initial_positions[positions]
+        )
+
+    def allocate(self, out: Array | None, count: int) -> tuple[Array, Array]:
+        """Return arrays for all values, and for the `count` values of the initial structure.
+
+        The second array is a view of the first where possible. Neither is initialised.
+
+        Parameters
+        ----------
+        out : array or None
+            Used for all values if given.
+        count : int
+            Number of values of the initial structure.
+        """
+        values = np.empty(len(self.indices)) if out is None else out
+        return values, values[
+            :count
+        ] if self.initial_positions is None else np.empty(count)
+
+    def assemble(
+        self, values: Array, initial: Array, groups: Sequence[Array]
+    ) -> None:
+        """Compute all values in place.
+
+        Parameters
+        ----------
+        values : array
+            All values, overwritten. If `initial_positions` is None, the first of them must contain
+            the initial values already and are kept, see `allocate`; the others are set to zero.
+        initial : array
+            Values of the initial structure; only their number is used if `initial_positions` is
+            None.
+        groups : sequence of arrays
+            Values of each group; duplicates are added up.
+        """
+        if self.initial_positions is None:
+            values[len(initial) :] = 0.0
+        else:
+            values[:] = 0.0
+            values[self.initial_positions] = initial
+        for places, repeats, more in zip(
+            self.group_positions, self.has_duplicates, groups, strict=True
+        ):
+            if repeats:
+                np.add.at(values, places, more)
+            else:
+                values[places] += more
+
+
+def _locate(
+    structure: tuple[Index, Index], height: int, codes: Index
+) -> tuple[Index, NDArray[np.bool_]]:
+    """Find entries in a structure.
+
+    Parameters
+    ----------
+    structure : (array, array)
+        Column pointers and row indices.
+    height : int
+        Number of rows of the complete matrix.
+    codes : array
+        Column · height + row of the entries, ascending.
+
+    Returns
+    -------
+    (array, array of bool)
+        Number of entries of the structure before each, and whether it is absent.
+    """
+    indptr, indices = structure
+    if not len(codes) or codes[0] >= (len(indptr) - 1) * height:
+        return np.full(len(codes), len(indices)), np.ones(
+            len(codes), dtype=bool
+        )
+    own = (
+        np.repeat(np.arange(len(indptr) - 1) * height, np.diff(indptr))
+        + indices
+    )
+    before = np.searchsorted(own, codes)
+    return before, np.append(own, -1)[before] != codes

@@ -1,0 +1,377 @@
+"""Marker–element association: the element of each marker's place, and the whole samples of the
+clock.
+
+The place X of a marker on the undeformed body and the shift τ of its clock are estimated.
+Predictions are smooth functions of them within one element and around one sample; a
+`MarkerAssociation` states which. When estimates leave it, `MarkerAssociation.follow_estimates`
+returns another association, and the problem stays the same up to the tolerances below. An
+association also contains the surface correspondences of depth cameras, see
+`surface_correspondences`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.array_types import Array, Index
+from ...fem.body import Body
+from ...recording.experiment import Experiment
+from ...recording.placement import LocatedBody, Placement
+from ..depth.surface_correspondences import (
+    SurfaceCorrespondences,
+    initial_correspondences,
+)
+
+# A place leaves its element when another contains it better by this barycentric coordinate, so that
+# it cannot alternate between two.
+BETTER = 0.01
+# The clock leaves its sample when its shift differs by more than this [samples].
+SAMPLES_OFF = 1.0
+# A place that has left the surface across the same edge so often stays in its plane.
+AGAIN = 2
+# Edges nearer than this are the same, relative to the mean edge length.
+SAME = 1e-6
+
+
+class ShapeFunctions(NamedTuple):
+    """Weights of the nodes in the place of each marker, and their derivatives by its φ.
+
+    Attributes
+    ----------
+    weights : (M, npe) array
+        Shape functions, npe being the nodes per element.
+    gradients : (M, npe, k) array
+        First derivatives.
+    hessians : (M, npe, k, k) array
+        Second derivatives.
+    """
+
+    weights: Array
+    gradients: Array
+    hessians: Array
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerAssociation:
+    """Element of each marker, directions in which its place may move, and the clock's sample.
+
+    Attributes
+    ----------
+    body : Body
+        The body.
+    sigma_m : (M,) array
+        Prior standard deviation of each place [m], zero where it is exact.
+    prior_places_m : (M, 3) array
+        Places at the centres of the priors [m].
+    on_surface : bool
+        Whether places move in the plane of the nearest face (k = 2) or freely (k = 3).
+    nodes, weights : (M, npe) arrays
+        Nodes and shape functions of exact places.
+    cells : (M,) array
+        Elements of estimated places.
+    centre_places_m : (M, 3) array
+        Places at the centre of the association [m].
+    axes : (M, 3, k) array
+        Orthonormal directions in which places may move.
+    crossed_edges : (M, 2, 3) array
+        Point and direction of the edge across which each place last left the surface; NaN if it did
+        not.
+    crossing_counts : (M,) array
+        How often in succession it left the surface across this edge before.
+    clock_samples : int
+        Whole samples of the clock's shift.
+    correspondences : tuple of SurfaceCorrespondences
+        Surface correspondences of depth cameras.
+    """
+
+    body: Body
+    sigma_m: Array
+    prior_places_m: Array
+    on_surface: bool
+    nodes: Index
+    weights: Array
+    cells: Index
+    centre_places_m: Array
+    axes: Array
+    crossed_edges: Array
+    crossing_counts: Index
+    clock_samples: int = 0
+    correspondences: tuple[SurfaceCorrespondences, ...] = ()
+
+    @classmethod
+    def from_experiment(cls, experiment: Experiment) -> MarkerAssociation:
+        """Return the association for the stated places of an experiment's markers and depth
+        cameras.
+
+        Markers without a stated place get the place where their first sample lies on the undeformed
+        body in its grasp; `Transcription.place_unknown_markers` replaces it before a solve.
+        """
+        body = experiment.body
+        markers = experiment.markers
+        placement = markers.placement
+        sigma_m = experiment.place_sigma_m
+        points = markers.predict_positions(body.nodes_m)
+        k = 2 if markers.on_surface else 3
+        chart = cls(
+            body,
+            sigma_m,
+            points,
+            markers.on_surface,
+            placement.nodes,
+            placement.weights,
+            np.zeros(len(points), dtype=np.int64),
+            points,
+            np.zeros((len(points), 3, k)),
+            np.full((len(points), 2, 3), np.nan),
+            np.zeros(len(points), dtype=np.int64),
+            correspondences=initial_correspondences(experiment),
+        )
+        return chart.centred_at(points)
+
+    @classmethod
+    def from_exact_places(
+        cls, body: Body, placement: Placement, points_m: Array
+    ) -> MarkerAssociation:
+        """Return the association for places (M, 3) [m] that are not estimated."""
+        count = len(points_m)
+        none = np.zeros(count, dtype=np.int64)
+        return cls(
+            body=body,
+            sigma_m=np.zeros(count),
+            prior_places_m=points_m,
+            on_surface=False,
+            nodes=placement.nodes,
+            weights=placement.weights,
+            cells=none,
+            centre_places_m=points_m,
+            axes=np.zeros((count, 3, 3)),
+            crossed_edges=np.full((count, 2, 3), np.nan),
+            crossing_counts=none,
+        )
+
+    def matches(self, experiment: Experiment) -> bool:
+        """Whether the association belongs to the experiment's body, and has the same priors and
+        cameras.
+        """
+        return (
+            self.body is experiment.body
+            and self.on_surface == experiment.markers.on_surface
+            and np.array_equal(self.sigma_m, experiment.place_sigma_m)
+            and [s.camera.depth for s in self.correspondences]
+            == [*experiment.depths]
+        )
+
+    @cached_property
+    def estimated(self) -> Index:
+        """Indices of the markers whose places are estimated."""
+        return np.flatnonzero(self.sigma_m > 0)
+
+    @cached_property
+    def centre_coordinates(self) -> Array:
+        """Coordinates φ (M, k) of the places at the centre of the association."""
+        return self._coordinates(self.centre_places_m)
+
+    def _coordinates(self, points_m: Array) -> Array:
+        """Return the coordinates (M, k) of places (M, 3) [m], in prior standard deviations along
+        `axes`; zero for exact places.
+        """
+        sigma = np.where(self.sigma_m > 0, self.sigma_m, np.inf)[:, None]
+        return (
+            np.einsum("mik,mi->mk", self.axes, points_m - self.prior_places_m)
+            / sigma
+        )
+
+    def places_m(self, phi: Array) -> Array:
+        """Return the places (M, 3) on the undeformed body [m] for coordinates `phi` (M, k) in prior
+        standard deviations along `axes`.
+        """
+        moved = np.einsum(
+            "mik,mk->mi", self.axes, phi - self.centre_coordinates
+        )
+        return self.centre_places_m + self.sigma_m[:, None] * moved
+
+    def shape_functions(self, phi: Array) -> tuple[Index, ShapeFunctions]:
+        """Return the nodes (M, npe) of each marker's element, and their shape functions at its
+        place with derivatives by the k coordinates of the place.
+
+        Parameters
+        ----------
+        phi : (M, k) array
+            Coordinates of the places, in prior standard deviations along `axes`.
+        """
+        element = self.body.element
+        k = self.axes.shape[2]
+        nodes = self.nodes.copy()
+        weights = self.weights.copy()
+        slopes = np.zeros((*nodes.shape, k))
+        curvatures = np.zeros((*nodes.shape, k, k))
+        estimated = self.estimated
+        if len(estimated):
+            cells = self.cells[estimated]
+            local = self._shape.barycentric(
+                self.places_m(phi)[estimated], cells
+            )
+            gradients = self._shape.barycentric_gradients(cells) @ (
+                self.sigma_m[estimated, None, None] * self.axes[estimated]
+            )
+            nodes[estimated] = self.body.cells[cells]
+            weights[estimated] = element.shape_functions(local)
+            slopes[estimated] = element.shape_gradients(local) @ gradients
+            curvatures[estimated] = np.einsum(
+                "mail,mik,mln->makn",
+                _second_derivatives(element, local),
+                gradients,
+                gradients,
+            )
+        return nodes, ShapeFunctions(weights, slopes, curvatures)
+
+    @cached_property
+    def _shape(self) -> LocatedBody:
+        """Geometry of the undeformed body."""
+        return LocatedBody(self.body.nodes_m, self.body)
+
+    # Following the estimates ------------------------------------------------------------------
+
+    def centred_at(self, points_m: Array) -> MarkerAssociation:
+        """Return the association with its centre at places (M, 3) [m] of the estimated markers:
+        their elements, and the axes along which the places may move. With `on_surface` the centres
+        are the nearest points of the surface.
+        """
+        points = points_m.copy()
+        cells = self.cells.copy()
+        axes = self.axes.copy()
+        for m in self.estimated:
+            if self.on_surface:
+                points[m], axes[m] = self._shape.nearest_surface_point(
+                    points[m]
+                )
+            else:
+                axes[m] = np.eye(3)
+            cells[m], _ = self._shape.nearest_cell(points[m])
+        return replace(self, centre_places_m=points, cells=cells, axes=axes)
+
+    def follow_estimates(
+        self, phi: Array, shift_samples: float
+    ) -> tuple[MarkerAssociation, Array]:
+        """Return an association for estimates that have left this one, and φ in it.
+
+        Parameters
+        ----------
+        phi : (M, k) array
+            Coordinates of the places.
+        shift_samples : float
+            Shift of the clock over the sample interval.
+
+        Returns
+        -------
+        (MarkerAssociation, (M, k) array)
+            The new association, which is self if nothing has left it, and φ in it.
+        """
+        points = self.places_m(phi)
+        changed_cell = False
+        for m in self.estimated:
+            changed_cell = changed_cell or self._is_outside(
+                points[m], int(self.cells[m])
+            )
+        samples = self.clock_samples
+        if abs(shift_samples - samples) > SAMPLES_OFF:
+            samples = round(shift_samples)
+        if not changed_cell:
+            return (
+                self
+                if samples == self.clock_samples
+                else replace(self, clock_samples=samples)
+            ), phi
+        chart = replace(
+            self._without_alternation(points), clock_samples=samples
+        )
+        return chart, chart.centre_coordinates
+
+    def _without_alternation(self, points_m: Array) -> MarkerAssociation:
+        """Return the association about places (M, 3) [m] such that none alternates between two
+        faces for ever.
+
+        Where a marker stands off an edge, the plane of each face may lead back to the other. Such a
+        place stays in one of the planes, even outside the surface.
+        """
+        centred = self.centred_at(points_m)
+        if not self.on_surface:
+            return centred
+        points = centred.centre_places_m.copy()
+        axes = centred.axes.copy()
+        cells = centred.cells.copy()
+        crossed = self.crossed_edges.copy()
+        again = self.crossing_counts.copy()
+        same_m = SAME * self._shape.mean_edge_m
+        for m in self.estimated:
+            beyond = points_m[m] - points[m]
+            if again[m] < AGAIN and np.linalg.norm(beyond) > same_m:
+                edge = np.cross(np.cross(*self.axes[m].T), beyond)
+                off_m = np.linalg.norm(
+                    np.cross(points[m] - crossed[m, 0], crossed[m, 1])
+                )
+                again[m] = again[m] + 1 if off_m < same_m else 0
+                crossed[m] = points[m], edge / np.linalg.norm(edge)
+            if again[m] == AGAIN:
+                points[m] = points_m[m]
+                axes[m] = self.axes[m]
+                cells[m], _ = self._shape.nearest_cell(points_m[m])
+        return replace(
+            centred,
+            centre_places_m=points,
+            axes=axes,
+            cells=cells,
+            crossed_edges=crossed,
+            crossing_counts=again,
+        )
+
+    def _is_outside(self, point: Array, cell: int) -> bool:
+        """Whether another element contains a point (3,) of the undeformed body better than the
+        element with index `cell`, by more than `BETTER`; false for NaN.
+        """
+        if not np.isfinite(point).all():
+            return False
+        if self._shape.barycentric(point, np.array([cell])).min() >= 0:
+            return False  # none holds it better
+        best, _ = self._shape.nearest_cell(point)
+        depth = self._shape.barycentric(
+            np.stack([point, point]), np.array([cell, best])
+        ).min(axis=1)
+        return bool(depth[1] > depth[0] + BETTER)
+
+    def places_of_points(self, nodes_m: Array, points_m: Array) -> Array:
+        """Return the places (M, 3) on the undeformed body of points (M, 3) measured in another
+        configuration.
+
+        A point outside the body is projected onto its surface.
+
+        Parameters
+        ----------
+        nodes_m : (n, 3) array
+            Node positions of the configuration [m].
+        points_m : (M, 3) array
+            Points [m].
+
+        Returns
+        -------
+        (M, 3) array
+            Places [m]; NaN where a point is not finite.
+        """
+        shape = LocatedBody(nodes_m, self.body)
+        places_m = np.full(points_m.shape, np.nan)
+        for m, point in enumerate(points_m):
+            if np.isfinite(point).all():
+                nodes, weights = shape.weights_at_nearest_point(point)
+                places_m[m] = weights @ self.body.nodes_m[nodes]
+        return places_m
+
+
+def _second_derivatives(element, local: Array) -> Array:
+    """Return ∂²N/∂L² (m, npe, 4, 4) of shape functions whose gradients are linear in L."""
+    at = element.shape_gradients(local)
+    steps = [element.shape_gradients(local + unit) - at for unit in np.eye(4)]
+    return np.stack(steps, axis=3)

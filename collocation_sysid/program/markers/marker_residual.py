@@ -1,0 +1,264 @@
+"""Marker positions measured by motion capture, from node positions x and nuisance parameters φ:
+
+    y = R(a) (Σ_i ℓ_i(τ) h(x_i) − c) + c + d + b,
+
+with the place h(x_i) of the marker on the body at neighbouring samples, Lagrange weights ℓ of up to
+five samples at the time shifted by τ, a rotation R(a) about the pivot c, a translation d and an
+offset b; without φ it is h(x_t). See `observables` for h and `model.nuisance_map` for φ.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.array_types import Array, Index
+from ...model.nuisance_map import NuisanceMap
+from ...recording.markers import Markers
+from ...recording.nuisance import PLACE
+from ..measurement_residual import (
+    MeasurementResidual,
+    RowStencil,
+    lagrange_weights,
+)
+from ..observables import PointPositions
+from .marker_association import MarkerAssociation
+
+# Samples that a time-shifted marker is interpolated from: an error of (ωΔt)⁵ / 3500 of a swing.
+NEIGHBOURS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerResidual(MeasurementResidual):
+    """Measurement model of the tracks of all markers of an experiment.
+
+    Attributes
+    ----------
+    observable : PointPositions
+        Places of the markers on the body at the samples.
+    markers : Markers
+        Measured tracks.
+    is_initially_at_rest : bool
+        Whether the body rests in its first state before the first time; then a shifted marker is
+        predicted there, otherwise such samples are not compared.
+    preceding_times : int
+        Number of the channel's times before the first sample.
+    """
+
+    observable: PointPositions
+    markers: Markers
+    is_initially_at_rest: bool
+    preceding_times: int
+
+    @classmethod
+    def from_markers(
+        cls,
+        markers: Markers,
+        rows: Index,
+        nuisance: NuisanceMap,
+        association: MarkerAssociation,
+        huber: float | None = None,
+        is_initially_at_rest: bool = True,
+        preceding_times: int = 0,
+    ) -> MarkerResidual:
+        """Build the measurement model of the markers of an experiment.
+
+        Parameters
+        ----------
+        markers : Markers
+            Measured tracks.
+        rows : (T,) array
+            Grid times of the observable, one for each sample and `preceding_times` ones before.
+        nuisance : NuisanceMap
+            Nuisance parameters of the experiment.
+        association : MarkerAssociation
+            Elements of the markers.
+        huber : float or None
+            Threshold of Huber's loss in standard deviations; None means a quadratic loss.
+        is_initially_at_rest : bool
+            Whether the body is at rest before the first time.
+        preceding_times : int
+            Number of `rows` before the first sample.
+        """
+        places = np.full((len(markers.names), association.axes.shape[2]), -1)
+        places[association.estimated] = nuisance.indices_of_rows(PLACE).reshape(
+            -1, places.shape[1]
+        )
+        shifted = (
+            preceding_times
+            + np.arange(len(markers.t_s))
+            + association.clock_samples
+        )
+        covered = (shifted < len(rows)) & (
+            (shifted >= 0) | is_initially_at_rest
+        )
+        is_compared = markers.is_present & covered[:, None]
+        return cls(
+            observable=PointPositions(
+                rows, association, coordinate_parameters=places
+            ),
+            nuisance=nuisance,
+            huber=huber,
+            names=markers.names,
+            t_s=markers.t_s,
+            sigmas=markers.sigma_m,
+            measured=markers.positions_m,
+            is_compared=np.repeat(is_compared[..., None], 3, axis=2),
+            own_parameters=nuisance.marker_indices(len(markers.names)),
+            markers=markers,
+            is_initially_at_rest=is_initially_at_rest,
+            preceding_times=preceding_times,
+        )
+
+    @property
+    def sample_rows(self) -> Index:
+        """Grid time (T,) of each sample."""
+        return self.observable.rows
+
+    @property
+    def coordinate_parameters(self) -> Index:
+        """Indices (M, k) in φ of the markers' places; −1 for exact ones."""
+        return self.observable.coordinate_parameters
+
+    @property
+    def is_present(self) -> NDArray[np.bool_]:
+        """Mask (T, M) of the samples that are compared."""
+        return self.is_compared[..., 0]
+
+    # One sample -------------------------------------------------------------------------------
+
+    @property
+    def _sample_indices(self) -> Index:
+        """Index (T,) of each sample among the channel's times."""
+        return self.preceding_times + np.arange(len(self.t_s))
+
+    @cached_property
+    def _neighbour_count(self) -> int:
+        """Number of samples that a marker is interpolated from; 1 if no clock is estimated."""
+        return (
+            min(NEIGHBOURS, self.observable.count)
+            if len(self.nuisance.clock_indices)
+            else 1
+        )
+
+    @cached_property
+    def _first_neighbour(self) -> Index:
+        """Index (T,) of the first sample that each one is interpolated from; negative
+        before the start.
+        """
+        first = (
+            self._sample_indices
+            + self.observable.association.clock_samples
+            - self._neighbour_count // 2
+        )
+        first = np.minimum(first, self.observable.count - self._neighbour_count)
+        return first if self.is_initially_at_rest else np.maximum(first, 0)
+
+    @cached_property
+    def _neighbour_indices(self) -> Index:
+        """Indices (T, neighbours) of the samples that each one is interpolated from."""
+        return np.maximum(
+            self._first_neighbour[:, None] + np.arange(self._neighbour_count), 0
+        )
+
+    @cached_property
+    def _stencil(self) -> RowStencil:
+        """Stencil of all samples: indices of the neighbouring places, and the data of the
+        expression.
+        """
+        count = len(self.markers.names)
+        place = np.array(
+            [self._sample_indices - self._first_neighbour, self.t_s],
+            dtype=np.float64,
+        )
+        places = (
+            self._neighbour_indices[:, None] * count + np.arange(count)[:, None]
+        )
+        return RowStencil(places, np.repeat(place[..., None], count, axis=2))
+
+    def stencil(self, phi: Array, known: int) -> RowStencil:
+        """Return the stencil of the first samples that depend only on the first `known` times of
+        the observable; φ is not used.
+        """
+        samples = int(np.count_nonzero(self._neighbour_indices[:, -1] < known))
+        return RowStencil(
+            self._stencil.indices[:samples], self._stencil.data[:, :samples]
+        )
+
+    def shifted(self, by_s: float) -> MarkerResidual:
+        """Return the model of samples taken `by_s` seconds later, at the same stencil; self if the
+        expression does not depend on time.
+        """
+        if not self._full_expression.residual.depends_on_datum(1):
+            return self
+        other = copy(self)
+        data = self._stencil.data.copy()
+        instruments = self._expressions
+        data[1] += by_s
+        shifted = self._stencil._replace(data=data)
+        vars(other).update(_stencil=shifted, _expressions=instruments)
+        return other
+
+    def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
+        """Return the prediction y (3,) of one marker.
+
+        Parameters
+        ----------
+        values : (3, neighbours) SX
+            Places of the marker at neighbouring grid times [m].
+        phi : SX
+            Nuisance parameters of the marker, in prior standard deviations.
+        data : (2,) SX
+            Position of the sample among the neighbours, in samples, and its time [s].
+        """
+        place, t_s = ca.vertsplit(data)
+        own = (
+            self.own_parameters[0]
+            if len(self.own_parameters)
+            else np.zeros(0, dtype=np.int64)
+        )
+        reading = values[:, 0]
+        if len(self.nuisance.clock_indices):
+            late = (
+                self.nuisance.marker_delay_s(phi, own, t_s)
+                / self.nuisance.interval_s
+            )
+            places = [ca.SX(k) for k in range(self._neighbour_count)]
+            reading = values @ ca.vertcat(
+                *lagrange_weights(place + late, places)
+            )
+        return self.nuisance.marker_measurement(reading, phi, own, t_s)
+
+    # Of positions -----------------------------------------------------------------------------
+
+    def predict_samples(self, positions_m: Array, phi: Array) -> Array:
+        """Return predictions (T, M, 3) [m] from the body's positions (T, n, 3) at the samples."""
+        plain = replace(
+            self,
+            observable=replace(
+                self.observable, rows=np.arange(len(positions_m))
+            ),
+        )
+        return plain.predict_positions(
+            positions_m.reshape(len(positions_m), -1), phi
+        )
+
+    def predict_positions(self, x: Array, phi: Array) -> Array:
+        """Return predictions (t, M, 3) [m] from the first grid positions x (rows, 3n), for
+        samples that they suffice for.
+        """
+        return self.predict(self.observable.evaluate_positions(x, phi), phi)
+
+    def squared_distances_m2(self, x: Array, phi: Array) -> Array:
+        """Return the squared distances [m²] of predictions from all samples that are present (P,),
+        at positions x (rows, 3n) and φ; samples after the last row are omitted.
+        """
+        predicted = self.predict_positions(x, phi)
+        tracks = self.markers.positions_m[: len(predicted)]
+        present = self.is_present[: len(predicted)]
+        return np.sum((predicted - tracks) ** 2, axis=2)[present]

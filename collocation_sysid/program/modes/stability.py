@@ -1,0 +1,261 @@
+"""Stability of small disturbances of a state: eigenvalues s of M s² + D s + K with Re(s) > 0.
+
+K and D are −∂F/∂x and −∂F/∂v of the free dofs at a state, constant and without velocity. Where both
+are positive definite, no disturbance grows; that is checked by a factorisation of each. K is not
+positive definite beyond buckling, nor D where a damping law feeds energy in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.linalg import (
+    ArpackNoConvergence,
+    LinearOperator,
+    eigs,
+    eigsh,
+    splu,
+)
+
+from ...common.array_types import Array, Index
+from ...fem.pattern import SymmetricPattern
+from ...model.forces import Forces
+from ..collocation import Collocation, ExperimentIterate
+from ..linear_algebra.factorisation import Factoriser
+
+# Number of states of a motion that are examined.
+STATES = 8
+# Largest number of dofs that are solved densely.
+DENSE = 150
+# Number of most negative directions that are tried otherwise.
+DIRECTIONS = 8
+# Share of the largest diagonal entry per mass by which matrices are shifted, because those with
+# rigid motions are singular, not indefinite.
+SHIFT = 1e-9
+# Accuracy of Lanczos iterations, enough to determine a sign.
+TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Instability:
+    """Experiment with states in which disturbances grow.
+
+    Attributes
+    ----------
+    experiment : str
+        Name of the experiment.
+    time_s : float
+        Time of the state in which they grow fastest [s].
+    growth_1_s : float
+        Largest Re(s) there [1/s].
+    e_foldings : float
+        Integral of Re(s) > 0 over the recording: a disturbance may grow by e to this power.
+        Infinite for equilibria, to which a disturbed state does not return.
+    """
+
+    experiment: str
+    time_s: float
+    growth_1_s: float
+    e_foldings: float
+
+
+def find_instabilities(
+    collocation: Collocation, z: Array
+) -> tuple[Instability, ...]:
+    """Return the instabilities of the motions at z, at most one for each experiment."""
+    unstable = (_instability(part) for part in collocation.iterates(z))
+    return tuple(each for each in unstable if each is not None)
+
+
+def _instability(iterate: ExperimentIterate) -> Instability | None:
+    """Return the instability of one experiment's motion, or None if all examined states are
+    stable.
+    """
+    experiment = iterate.segment.experiment
+    last = len(experiment.t_s) - 1
+    samples = np.unique(np.linspace(0, last, STATES).round().astype(int))
+    t_s = experiment.t_s[samples]
+    rows = iterate.segment.markers.sample_rows[samples]
+    is_prescribed = experiment.is_prescribed(t_s).reshape(len(t_s), -1)
+    theta = iterate.equations.theta
+    growths = np.array(
+        [
+            growth_rate_1_s(
+                Forces.from_experiment(experiment, time, theta),
+                x,
+                free_dofs=np.flatnonzero(~there),
+            )
+            for time, x, there in zip(
+                t_s, iterate.x[rows], is_prescribed, strict=True
+            )
+        ]
+    )
+    worst = int(np.argmax(growths))
+    if growths[worst] <= 0:
+        return None
+    e_foldings = (
+        np.inf if experiment.is_static else float(np.trapezoid(growths, t_s))
+    )
+    return Instability(
+        experiment.name,
+        float(t_s[worst]),
+        growth_1_s=float(growths[worst]),
+        e_foldings=e_foldings,
+    )
+
+
+def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
+    """Return the largest Re(s) of M s² + D s + K at a state [1/s]; 0 where none exceeds the
+    rounding errors, or no dof is free.
+
+    Parameters
+    ----------
+    forces : Forces
+        Forces at one time.
+    x : (3n,) array
+        State [m].
+    free_dofs : (k,) array
+        Sorted dofs that are not prescribed; their masses must be positive.
+    """
+    if not len(free_dofs):
+        return 0.0
+    state = x.reshape(1, -1)
+    at = forces.linearise(state, np.zeros_like(state))
+    mass = forces.mass.inertia_kg[0, free_dofs]
+    pattern = forces.pattern
+    lowers = -at.by_position[0], -at.by_velocity[0]
+    if all(
+        _is_definite(lower, pattern, free_dofs=free_dofs, mass=mass)
+        for lower in lowers
+    ):
+        return 0.0
+    root = sp.diags_array(1 / np.sqrt(mass))
+    stiffness, damping = (
+        sp.csc_array(
+            root @ pattern.matrix(lower)[:, free_dofs][free_dofs] @ root
+        )
+        for lower in lowers
+    )
+    noise = SHIFT * np.sqrt(stiffness.diagonal().max())
+    growth = _fastest_growth(stiffness, damping)
+    return growth if growth > noise else 0.0
+
+
+def _is_definite(
+    lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array
+) -> bool:
+    """Whether a matrix on the free dofs, given by its lower triangle, is positive semidefinite up
+    to rounding relative to `mass` (free,); true for zero.
+    """
+    own = pattern.diagonal[free_dofs]
+    largest = float((lower[own] / mass).max())
+    if largest <= 0:
+        return not lower[own].any()
+    shifted = lower.copy()
+    shifted[own] += SHIFT * largest * mass
+    return (
+        Factoriser.cached(pattern, free_dofs)
+        .factorise(shifted)
+        .positive_definite
+    )
+
+
+def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
+    """Return the largest Re(s) [1/s] of the exponents s of s² + D s + K, for mass-normalised
+    matrices (n, n).
+    """
+    size = len(stiffness.diagonal())
+    if size <= DENSE:
+        return float(
+            _exponents(stiffness.toarray(), damping.toarray()).real.max()
+        )
+    lowest = [
+        _lowest_eigenvectors(each) for each in (stiffness, damping) if each.nnz
+    ]
+    basis, _ = np.linalg.qr(np.hstack(lowest))
+    in_basis = [basis.T @ (each @ basis) for each in (stiffness, damping)]
+    exponents = _exponents(*in_basis)
+    guess = exponents[np.argmax(exponents.real)]
+    return max(_growth_about(stiffness, damping, sigma=float(abs(guess))), 0.0)
+
+
+def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
+    """Return directions (n, k) with the smallest eigenvalues of a matrix; if the iteration stops
+    early, those that have converged and the start vector.
+    """
+    start = np.random.default_rng(0).normal(size=len(matrix.diagonal()))
+    options = {
+        "which": "SA",
+        "tol": TOLERANCE,
+        "v0": start,
+        "ncv": 12 * DIRECTIONS,
+    }
+    try:
+        return np.asarray(eigsh(matrix, DIRECTIONS, **options)[1])
+    except ArpackNoConvergence as stopped:
+        return np.column_stack([stopped.eigenvectors, start])
+
+
+def _exponents(stiffness: Array, damping: Array) -> NDArray[np.complex128]:
+    """Return all s of s² + D s + K for dense matrices."""
+    size = len(stiffness)
+    chain = np.block(
+        [[np.zeros((size, size)), np.eye(size)], [-stiffness, -damping]]
+    )
+    return np.linalg.eigvals(chain).astype(np.complex128)
+
+
+class _CayleyTransform(LinearOperator):
+    """Operator (A + σ)/(A − σ) of A = [[0, 1], [−K, −D]] and σ > 0.
+
+    Its eigenvalues (s + σ)/(s − σ) lie outside the unit circle where Re(s) > 0, so that Arnoldi's
+    method finds them first.
+    """
+
+    def __init__(
+        self, stiffness: sp.csc_array, damping: sp.csc_array, sigma: float
+    ) -> None:
+        size = len(stiffness.diagonal())
+        super().__init__(np.dtype(float), (2 * size, 2 * size))
+        self.damping = damping
+        self.sigma = sigma
+        self.solver = splu(
+            sp.csc_array(
+                sigma**2 * sp.eye_array(size) + sigma * damping + stiffness
+            )
+        )
+
+    def _matvec(self, x: Array) -> Array:
+        first, second = np.split(np.ravel(x), 2)
+        # (A − σ)(y, w) = (first, second), by way of (σ² + σ D + K) y.
+        y = self.solver.solve(
+            -second - self.damping @ first - self.sigma * first
+        )
+        w = first + self.sigma * y
+        return np.concatenate(
+            [first + 2 * self.sigma * y, second + 2 * self.sigma * w]
+        )
+
+
+def _growth_about(
+    stiffness: sp.csc_array, damping: sp.csc_array, sigma: float
+) -> float:
+    """Return the largest Re(s) of the exponents s with |s| of about `sigma` [1/s] that solve det(s²
+    + D s + K) = 0, for sparse matrices; at least 0.
+    """
+    turning = _CayleyTransform(stiffness, damping, sigma=sigma)
+    try:
+        eigenpairs = eigs(
+            turning,
+            4,
+            v0=np.random.default_rng(0).normal(size=turning.shape[0]),
+            ncv=60,
+        )
+        turned = np.asarray(eigenpairs[0])
+    except ArpackNoConvergence as stopped:
+        turned = np.asarray(stopped.eigenvalues)
+    exponents = sigma * (turned + 1) / (turned - 1)
+    return float(exponents.real.max(initial=0.0))

@@ -1,0 +1,262 @@
+"""Force–torque sensors in the grasps: a sample at time s is compared with
+
+    ŷ(s) = Σ_k ℓ_k(s + τ) Y_k + tare,
+
+where Y is the wrench on the grid (`wrench_observable`), τ the shift of the sensor's clock, and ℓ
+are the cubic weights of the four grid times around the sample. Each sample is compared at its own
+time, however many there are in a step, so that no averaging hides a motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.array_types import Array, Index
+from ...model.nuisance_map import NuisanceMap
+from ...recording.experiment import Experiment
+from ...recording.measured_wrench import Wrench
+from ...recording.nuisance import SENSOR_TIME, TARE
+from ...recording.sample_times import TIME_TOLERANCE_S
+from ..measurement_residual import (
+    MeasurementResidual,
+    RowStencil,
+    lagrange_weights,
+    neighbouring_times,
+)
+from ..observables import ObservedMotion, ReactionForces
+from .wrench_observable import GraspWrench, ReactionGrid
+
+# Grid times that a sample is interpolated from: an error of (ωΔt)⁴ / 40 of a swing.
+NEIGHBOURS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class WrenchResidual(MeasurementResidual):
+    """Measurement model of the force–torque sensor of one grasp.
+
+    Attributes
+    ----------
+    observable : GraspWrench
+        Wrench on the grid as an observable.
+    wrench : Wrench
+        Measured samples.
+    """
+
+    observable: GraspWrench
+    wrench: Wrench
+
+    sigma_key = "sigma_n"
+    has_offsets = True
+    has_fixed_stencils = False
+
+    @classmethod
+    def from_sensor(
+        cls,
+        observable: GraspWrench,
+        wrench: Wrench,
+        label: str = "",
+        huber: float | None = None,
+    ) -> WrenchResidual:
+        """Build the measurement model of a sensor.
+
+        Parameters
+        ----------
+        observable : GraspWrench
+            Wrench on the grid as an observable.
+        wrench : Wrench
+            Measured samples.
+        label : str
+            Suffix of the names of force and torque, such as " 2", if there are several sensors.
+        huber : float or None
+            Threshold of Huber's loss; None means a quadratic loss.
+        """
+        rows = (SENSOR_TIME, TARE)
+        is_compared = (
+            wrench.is_measured
+            & _is_covered(observable, wrench.t_s, known=observable.count)[
+                :, None
+            ]
+        )
+        return cls(
+            observable=observable,
+            nuisance=observable.nuisance,
+            huber=huber,
+            names=(f"force{label}", f"torque{label}"),
+            t_s=wrench.t_s,
+            sigmas=wrench.sigmas[[0, 3]],
+            measured=wrench.values[:, None],
+            is_compared=is_compared.reshape(-1, 2, 3),
+            own_parameters=np.concatenate(
+                [observable.parameter_indices(row) for row in rows]
+            )[None],
+            wrench=wrench,
+        )
+
+    @property
+    def is_compared_by_component(self) -> NDArray[np.bool_]:
+        """Mask (S, 6) of the numbers that are compared."""
+        return self.is_compared.reshape(-1, 6)
+
+    @property
+    def first_needed_s(self) -> float:
+        """Time [s] of the first sample with the largest possible shift of the clock."""
+        return super().first_needed_s + self.observable.clock_limit_s
+
+    def is_covered(self, known: int) -> NDArray[np.bool_]:
+        """Return the mask (S,) of the samples for which the first `known` times suffice,
+        for any shift of the clock.
+        """
+        return _is_covered(self.observable, self.t_s, known=known)
+
+    def _neighbour_count(self, known: int) -> int:
+        """Return the number of grid times that a sample is interpolated from."""
+        return min(
+            2 if self.observable.reaction_grid.is_static else NEIGHBOURS, known
+        )
+
+    def stencil(self, phi: Array, known: int) -> RowStencil:
+        """Return the stencil of all samples: the grid times around each, among the first `known`,
+        shifted by the clock of φ, and their distances from it.
+        """
+        clock = self.observable.parameter_indices(SENSOR_TIME)
+        used = self._neighbour_count(known)
+        t_s = self.observable.t_s[:known]
+        shift_s = (phi[clock] * self.nuisance.scales[clock]).sum()
+        times = neighbouring_times(t_s, self.t_s + shift_s, count=used)
+        data = self.observable.t_s[times] - self.t_s[:, None]
+        return RowStencil(_vector_indices(times), data.T[..., None])
+
+    def all_stencils(self) -> Index:
+        """Return the indices (…, 1, v) of neighbouring times, for any shift of the clock."""
+        used = self._neighbour_count(self.observable.count)
+        return _vector_indices(
+            np.arange(self.observable.count - used + 1)[:, None]
+            + np.arange(used)
+        )
+
+    def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
+        """Return the prediction (6,).
+
+        Parameters
+        ----------
+        values : (3, 2 · times) SX
+            Wrenches at neighbouring grid times [N, N m].
+        phi : SX
+            Shift of the clock, if estimated, and tare, in prior standard deviations.
+        data : (times,) SX
+            Distances of these times from the sample [s].
+        """
+        times = data.numel()
+        tared = np.flatnonzero(self.wrench.measured_components)
+        own = phi * self.nuisance.scales[self.own_parameters[0]][:, None]
+        has_clock = len(self.observable.parameter_indices(SENSOR_TIME))
+        at = own[0] if has_clock else ca.SX(0)
+        predicted = ca.reshape(values, 6, times) @ ca.vertcat(
+            *lagrange_weights(at, ca.vertsplit(data))
+        )
+        tare = own[has_clock:]
+        if tare.numel():
+            predicted[tared[: tare.numel()]] += tare
+        return predicted
+
+    # Of reactions -----------------------------------------------------------------------------
+
+    def predict_reactions(
+        self, known_reactions: ReactionForces, phi: Array
+    ) -> Array:
+        """Return the prediction (S, 6) from reaction forces [N, N m]; NaN for samples
+        outside the known times.
+        """
+
+        def reactions() -> ReactionForces:
+            return known_reactions
+
+        motion = ObservedMotion(np.zeros((0, 0)), reactions)
+        values = self.observable.evaluate(motion, phi)
+        if not len(values):
+            return np.full(self.wrench.values.shape, np.nan)
+        predicted = self.predict(values, phi).reshape(-1, 6)
+        return np.where(
+            self.is_covered(len(values))[:, None], predicted, np.nan
+        )
+
+    def on_grid(self, grid: ReactionGrid) -> WrenchResidual:
+        """Return the model with reaction forces at the times of another grid."""
+        return WrenchResidual.from_sensor(
+            replace(self.observable, reaction_grid=grid), self.wrench
+        )
+
+    def with_wrench(self, wrench: Wrench) -> WrenchResidual:
+        """Return the model of other samples, in their own frame."""
+        observable = replace(
+            self.observable, frame=wrench.frame, point_m=wrench.point_m
+        )
+        return WrenchResidual.from_sensor(observable, wrench)
+
+
+def _is_covered(
+    observable: GraspWrench, t_s: Array, known: int
+) -> NDArray[np.bool_]:
+    """Return the mask (S,) of the samples at times (S,) that lie within the first `known` grid
+    times for any admissible shift of the clock; all false if none are known.
+    """
+    if not known:
+        return np.zeros(len(t_s), dtype=bool)
+    first, last = observable.t_s[[0, known - 1]]
+    rounding = 1e-6 * observable.reaction_grid.step_s + TIME_TOLERANCE_S
+    limit_s = observable.clock_limit_s
+    return (t_s >= first + limit_s - rounding) & (
+        t_s <= last - limit_s + rounding
+    )
+
+
+def _vector_indices(times: Index) -> Index:
+    """Return the indices (S, 1, 2 used) of force and torque vectors at times (S, used)."""
+    return (2 * times[..., None] + np.arange(2)).reshape(len(times), 1, -1)
+
+
+def wrench_residuals(
+    experiment: Experiment,
+    grid: ReactionGrid,
+    nuisance: NuisanceMap,
+    huber: float | None = None,
+) -> tuple[WrenchResidual, ...]:
+    """Build the measurement models of all grasps of an experiment that have a force–torque sensor.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    grid : ReactionGrid
+        Times at which reaction forces are known.
+    nuisance : NuisanceMap
+        Nuisance parameters of the experiment.
+    huber : float or None
+        Threshold of Huber's loss; None means a quadratic loss.
+    """
+    models = []
+    sensors = [(g, g.wrench) for g in experiment.grasps if g.wrench is not None]
+    for number, (grasp, wrench) in enumerate(sensors):
+        label = "" if len(sensors) == 1 else f" {number + 1}"
+        channel = GraspWrench.from_experiment(
+            experiment,
+            grasp,
+            frame=wrench.frame,
+            point_m=wrench.point_m,
+            grid=grid,
+            nuisance=nuisance,
+            number=number,
+        )
+        models.append(WrenchResidual.from_sensor(channel, wrench, label, huber))
+    return tuple(models)
+
+
+def without_grasp_sensors(experiment: Experiment) -> Experiment:
+    """Return the experiment without force–torque sensors and custom sensors of grasps."""
+    grasps = [replace(grasp, wrench=None) for grasp in experiment.grasps]
+    readings = [gauge for gauge in experiment.readings if gauge.grasp is None]
+    return replace(experiment, grasps=grasps, readings=readings)

@@ -1,0 +1,357 @@
+"""Consider analysis (Schmidt): changes of the residuals if assumptions are wrong.
+
+Effects on forces, masses and prescribed displacements are propagated to trajectories by one forward
+sweep with a column for each assumption, and from these to residuals, at about the cost of one
+linearisation of the fit. Nuisance parameters that are not estimated are linearised like estimated
+ones, in the same program with them among its parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.array_types import Array, Index
+from ...fem.body import Linearisation
+from ...program.collocation import Collocation, ExperimentIterate
+from ...program.linear_algebra.lapack import one_blas_thread
+from ...program.measurement_residual import MeasurementResidual
+from ...program.observables import ObservedMotion, ReactionForces
+from ...program.sweep import (
+    ForwardSubstitution,
+    PrescribedColumns,
+    Sweep,
+    SweepColumns,
+)
+from ...program.wrench.reaction_forces import GraspForces
+from ...recording.experiment import Experiment
+from ...recording.nuisance import KINDS
+from ..linearised import linearise_fit
+from .shape_error import CORRELATION
+from .systematic_effects import (
+    ASSUMPTIONS,
+    CORRELATION_KEY,
+    Assumption,
+    Effect,
+    ExperimentAtAnswer,
+)
+
+# A threshold of Huber's loss that no residual reaches.
+UNWEIGHTED = 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class _EffectColumns(SweepColumns):
+    """Right-hand sides of a forward substitution by changes of forces and of equations.
+
+    Attributes
+    ----------
+    forces_n : (N, 3n, c) array
+        Changes of the forces at the evaluations [N].
+    rows_n : (N, 3n, c) array
+        Changes of the equations of motion [N].
+    """
+
+    forces_n: Array = field(default_factory=lambda: np.zeros(0))  # (N, 3n, c)
+    rows_n: Array = field(default_factory=lambda: np.zeros(0))  # (N, 3n, c)
+
+    def right_hand_sides(
+        self,
+        rows: slice,
+        at: Linearisation,
+        acceleration: Array,
+        residual: Array | None,
+        free: Index,
+    ) -> tuple[Array, Array]:
+        """Return R (k, free, c) and F_R (k, 3n, c) [N], copies of the stored changes of these rows.
+
+        The arguments are those of `SweepColumns.right_hand_sides`; `at`, `acceleration` and
+        `residual` are not used.
+        """
+        return self.rows_n[rows][:, free].copy(), self.forces_n[rows].copy()
+
+
+class ResidualChanges(NamedTuple):
+    """Changes of the residuals of a fit if assumptions are off by their standard deviations.
+
+    Attributes
+    ----------
+    names : (a,) tuple of str
+        Names of the assumptions with their components.
+    blocks : list of (T, M, 3, a) arrays
+        Changes for each block of `LinearisedFit`, in units of σ.
+    """
+
+    names: tuple[str, ...]
+    blocks: list[Array]
+
+    def without(self, assumptions: Iterable[str]) -> ResidualChanges:
+        """Return the changes without the assumptions of these names, each with all its
+        components.
+        """
+        excluded = set(assumptions)
+        remaining = [
+            k
+            for k, name in enumerate(self.names)
+            if name.partition(" ")[0] not in excluded
+        ]
+        names = tuple(self.names[k] for k in remaining)
+        return ResidualChanges(
+            names, [block[..., remaining] for block in self.blocks]
+        )
+
+
+def changes_of_assumptions(
+    collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
+) -> ResidualChanges:
+    """Return the changes of the residuals by all assumptions of a fit and by nuisance parameters
+    that are not estimated, each off by its standard deviation.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        The program.
+    z : (variables,) array
+        Variables that satisfy the equations of motion.
+    deviations : mapping of str to float or None
+        Standard deviations of assumptions and nuisance parameters by name, in place of those of the
+        tables; None for what is exact.
+    """
+    rows = [(row, deviations.get(row.name, row.sigma)) for row in ASSUMPTIONS]
+    assumptions = [(row, s) for row, s in rows if s is not None]
+    correlation = deviations.get(CORRELATION_KEY) or CORRELATION
+    of_bodies = changed_residuals(
+        collocation, z, assumptions=assumptions, surface_correlation=correlation
+    )
+    of_nuisances = changes_of_nuisances(collocation, z, deviations=deviations)
+    both = zip(of_bodies.blocks, of_nuisances.blocks, strict=True)
+    blocks = [np.concatenate(each, axis=3) for each in both]
+    return ResidualChanges(of_bodies.names + of_nuisances.names, blocks)
+
+
+def changes_of_nuisances(
+    collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
+) -> ResidualChanges:
+    """Return the changes of the residuals by nuisance parameters that are not estimated, each off
+    by its standard deviation.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    z : array
+        Variables at the answer.
+    deviations : mapping
+        Standard deviation by the name of the nuisance parameter; None for an exact one. For those
+        not given the standard deviation of the kind is used.
+    """
+
+    def with_added_nuisances(experiment: Experiment) -> Experiment:
+        nuisance = experiment.nuisance
+        sigmas = {
+            row: deviations.get(row.name, row.considered) for row in KINDS
+        }
+        more = {
+            r.name: s
+            for r, s in sigmas.items()
+            if s and nuisance.sigma(r) is None
+        }
+        return replace(experiment, nuisance=replace(nuisance, **more))
+
+    wider = [
+        with_added_nuisances(experiment)
+        for experiment in collocation.experiments
+    ]
+    wide = replace(
+        collocation, experiments=wider, huber=UNWEIGHTED
+    )  # whatever their weights
+    p, positions = collocation.unpack(z)
+    values = dict(zip(collocation.parameter_names, p.tolist(), strict=True))
+    at = wide.pack(
+        np.array([values.get(name, 0.0) for name in wide.parameter_names]),
+        positions,
+    )
+    new = np.array(
+        [
+            k
+            for k, name in enumerate(wide.parameter_names)
+            if name not in values
+        ],
+        dtype=np.int64,
+    )
+    names: dict[int, str] = {}
+    for segment in wide.transcriptions:
+        own = zip(
+            segment.parameter_indices[wide.nq :],
+            segment.nuisance.entries,
+            strict=True,
+        )
+        names |= {int(place): entry.row.name for place, entry in own}
+    blocks = [
+        block.jacobian[..., new] for block in linearise_fit(wide, at).blocks
+    ]
+    return ResidualChanges(tuple(names[k] for k in new.tolist()), blocks)
+
+
+@one_blas_thread()
+def changed_residuals(
+    collocation: Collocation,
+    z: Array,
+    assumptions: Sequence[tuple[Assumption, float]],
+    *,
+    surface_correlation: float = CORRELATION,
+) -> ResidualChanges:
+    """Return the changes of the residuals by some assumptions, each off by its standard deviation.
+
+    An assumption with several components has a change for each of them, in the order of
+    `assumptions`. A change is zero where the assumption has no effect, as in experiments of
+    homogeneous specimens that it does not concern.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        The program.
+    z : (variables,) array
+        Variables that satisfy the equations of motion.
+    assumptions : sequence of (Assumption, float)
+        Assumptions with their standard deviations, in the unit of each.
+    surface_correlation : float
+        Correlation length of the surface's error over the longest extent of the body.
+    """
+    names = tuple(name for row, _ in assumptions for name in row.components)
+    changes: list[Array] = []
+    for part in collocation.iterates(z):
+        at = ExperimentAtAnswer(
+            part,
+            collocation.parameters,
+            surface_correlation=surface_correlation,
+        )
+        is_specimen = part.segment.experiment.specimen is not None
+        effects = [
+            (
+                None
+                if is_specimen and not row.of_specimens
+                else row.effect(at, axis),
+                sigma,
+            )
+            for row, sigma in assumptions
+            for axis in range(len(row.components))
+        ]
+        changes += _changes_by_effects(at, effects)
+    return ResidualChanges(names, changes)
+
+
+def _changes_by_effects(
+    fitted: ExperimentAtAnswer, effects: Sequence[tuple[Effect | None, float]]
+) -> Iterator[Array]:
+    """Yield the changes (T, M, 3, a) of the residuals of each measurement by a effects.
+
+    Parameters
+    ----------
+    fitted : ExperimentAtAnswer
+    effects : sequence of (Effect or None, float)
+        Effects per unit, each with its standard deviation in that unit; None has no effect.
+    """
+    part = fitted.iterate
+    count = len(effects)
+    segment = part.segment
+    prescribed = part.equations.prescribed
+    x = part.x
+    forces = np.zeros((*x.shape, count))
+    rows = np.zeros((*x.shape, count))
+    displacements_m = np.zeros((*prescribed.positions_m.shape, count))
+    for k, (effect, sigma) in enumerate(effects):
+        if effect is None:
+            continue
+        if effect.force_n is not None:
+            forces[..., k] = sigma * effect.force_n
+        if effect.mass_kg is not None:
+            rows[..., k] -= sigma * effect.mass_kg * fitted.acceleration
+        if effect.time_stretch:
+            mass = fitted.dynamics.mass.inertia_kg
+            rows[..., k] += (
+                2 * sigma * effect.time_stretch * mass * fitted.acceleration
+            )
+        if effect.displacement_m is not None:
+            displacements_m[..., k] = sigma * np.where(
+                np.isnan(prescribed.positions_m), 0.0, effect.displacement_m
+            )
+    forces[: fitted.dynamics.first_row] = rows[: fitted.dynamics.first_row] = (
+        0.0
+    )
+    solver = Sweep(segment)
+    columns = _EffectColumns(
+        part.equations,
+        count,
+        has_parameters=False,
+        prescribed=PrescribedColumns.from_columns(
+            solver, prescribed.dofs, displacements_m
+        ),
+        forces_n=forces,
+        rows_n=rows,
+    )
+    for reading, _, observation, by in propagate_columns(
+        part, solver, columns=columns, inertia_n=rows[:, segment.sensed_dofs]
+    ):
+        yield reading.residual_changes(observation, by, part.phi)
+
+
+def propagate_columns(
+    iterate: ExperimentIterate,
+    solver: Sweep,
+    columns: SweepColumns,
+    inertia_n: Array | float = 0.0,
+) -> Iterator[tuple[MeasurementResidual, ObservedMotion, Array, Array]]:
+    """Propagate columns of a forward substitution to the observables.
+
+    Yields, for each measurement: the measurement model, its motion, the values of its observable,
+    and their changes by the columns.
+
+    Parameters
+    ----------
+    iterate : ExperimentIterate
+        The experiment at the answer.
+    solver : Sweep
+        Factorised time steps.
+    columns : SweepColumns
+        Right-hand sides, not by parameters.
+    inertia_n : (N, g, c) array or 0
+        Changes of the equations of motion of the sensed dofs, which reaction forces do not contain
+        [N].
+    """
+    segment = iterate.segment
+    x = iterate.x
+    phi = iterate.phi
+    sensed = GraspForces.zeros(len(x), len(segment.sensed_dofs), columns.count)
+    response = iterate.observation.response_of_rows(
+        ForwardSubstitution(solver, columns, grasp_forces=sensed).iterate_rows(
+            x
+        ),
+        sensed,
+    )
+    columns_numbered = np.arange(columns.count)
+    size = columns.count + len(phi)
+    motions = iterate.observation.linearised_motions(
+        x, response, is_by_parameters=False
+    )
+    for reading, motion in zip(segment.residuals, motions, strict=True):
+        motion = _without_row_changes(motion, inertia_n)
+        values, slopes = reading.observable.linearise(
+            motion, phi, columns_numbered, size
+        )
+        yield reading, motion, values, slopes.by_common[..., : columns.count]
+
+
+def _without_row_changes(
+    motion: ObservedMotion, inertia_n: Array | float
+) -> ObservedMotion:
+    """Return the motion with `inertia_n` subtracted from the changes of its reaction forces."""
+
+    def forced() -> ReactionForces:
+        lacking = motion.reactions
+        assert lacking.reaction_by is not None  # along columns
+        return replace(lacking, reaction_by=lacking.reaction_by - inertia_n)
+
+    return ObservedMotion(motion.x, forced, changes=motion.changes)

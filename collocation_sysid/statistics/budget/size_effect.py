@@ -1,0 +1,138 @@
+"""Displacements of obstacles if the body is larger than its mesh, such that first contact is
+preserved.
+
+The depth of an indentation counts from first contact, and the prior of an obstacle's offset refers
+to the surface of the body. A larger body would penetrate obstacles that do not move, by its
+relative size times its distance from the grasps: for an indentation of 1 mm into a block of 15 mm,
+15 % of the depth for a size error of 1 %.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...model.contact import Contact
+from ...program.experiment_iterate import ExperimentIterate
+from ...recording.obstacle import Obstacle
+
+# Rows whose gaps are evaluated together.
+ROWS_AT_ONCE = 64
+
+
+@dataclass(frozen=True, eq=False)
+class FirstContact:
+    """First contact of an obstacle with a body, or its nearest approach.
+
+    Attributes
+    ----------
+    row : int
+        Index of the row in the grid.
+    place_m : (3,) array
+        Mean of the points in contact, weighted by their pressure, in the row before [m].
+    normal : (3,) array
+        Normal of the obstacle there, in the world.
+    """
+
+    row: int
+    place_m: Array
+    normal: Array
+
+    @classmethod
+    def from_motion(cls, contact: Contact, x: Array) -> FirstContact:
+        """Return the first contact in a motion x (N, 3n) [m], or the nearest approach if there is
+        none.
+        """
+        law = contact.law_of_contact
+        nearest_m = np.inf
+        row = 0
+        for first in range(0, len(x), ROWS_AT_ONCE):
+            gaps_m = law.gaps(
+                contact.points.vectors(x[first : first + ROWS_AT_ONCE])
+            )
+            touching = np.flatnonzero((gaps_m < law.widths_m).any(axis=1))
+            gaps_m = gaps_m.min(axis=1)
+            row_in_chunk = (
+                int(touching[0]) if len(touching) else int(gaps_m.argmin())
+            )
+            if gaps_m[row_in_chunk] < nearest_m:
+                nearest_m = float(gaps_m[row_in_chunk])
+                row = first + row_in_chunk
+            if len(touching):
+                break
+        y = contact.points.vectors(x[row : row + 1])
+        gaps_m, slopes = law.gap_function.evaluate_with_jacobian(
+            y, np.zeros((0, *y.shape[1:]))
+        )
+        gaps_m = gaps_m[0, 0]
+        weights = (
+            law.surface.area_m2
+            * contact.scaled_pressures(x[row : row + 1])[0, 0]
+        )
+        if not weights.any():
+            weights = (gaps_m == gaps_m.min()).astype(float)
+        weights = weights / weights.sum()
+        normal = slopes[0, :3, 0] @ weights
+        # The row before has the surface as it is without contact.
+        before = max(row - 1, 0)
+        origin_m = x[before].reshape(-1, 3)[law.obstacle.nodes[0]]
+        place_m = (
+            origin_m
+            + contact.points.vectors(x[before : before + 1])[:3, 0] @ weights
+        )
+        return cls(
+            row, place_m, normal / max(float(np.linalg.norm(normal)), 1e-9)
+        )
+
+
+def obstacle_shifts_m(
+    iterate: ExperimentIterate,
+) -> Iterator[tuple[Obstacle, Array]]:
+    """Yield each obstacle with the shift (N, 3) per relative size that preserves first contact [m].
+
+    The body scales about the middle of its grasps. Along axes that no grasp prescribes, it scales
+    about the place of its first contact; if several obstacles touch it at the same time, about that
+    of the one that moves least.
+    """
+    experiment = iterate.segment.experiment
+    forces = iterate.equations.dynamics.forces
+    t_s = iterate.equations.dynamics.t_s[: len(iterate.x)]
+    contacts = [
+        term for term in forces.external_terms if isinstance(term, Contact)
+    ]
+    if not contacts:
+        return
+    first_contacts = [
+        FirstContact.from_motion(contact, iterate.x) for contact in contacts
+    ]
+    travels_m = [
+        np.ptp(
+            iterate.x[:, c.law_of_contact.obstacle.prescribed_dofs], axis=0
+        ).max()
+        for c in contacts
+    ]
+    support = min(
+        zip(
+            (each.row for each in first_contacts),
+            travels_m,
+            range(len(contacts)),
+            strict=True,
+        )
+    )
+    prescribed_axes = set(
+        "".join(grasp.axes for grasp in experiment.body_grasps)
+    )
+    free = np.array([axis not in prescribed_axes for axis in "xyz"])
+    for contact, each in zip(contacts, first_contacts, strict=True):
+        obstacle = contact.law_of_contact.obstacle
+        turn, shift = (
+            values[0] for values in experiment.rigid_motion(t_s[each.row])
+        )
+        pivot_m = turn @ iterate.segment.nuisance.grasp_pivot_m + shift
+        pivot_m = np.where(free, first_contacts[support[-1]].place_m, pivot_m)
+        way_m = each.normal * (each.normal @ (each.place_m - pivot_m))
+        rotations, _ = obstacle.poses.at(t_s)
+        yield obstacle, rotations @ (rotations[each.row].T @ way_m)

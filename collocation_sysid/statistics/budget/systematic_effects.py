@@ -1,0 +1,1185 @@
+"""Systematic effects (type B): assumptions that are not estimated, and what changes if they are
+wrong.
+
+An assumption is a row of `ASSUMPTIONS`: its standard deviation, and its effect on the equations of
+motion, c = Σ w F − M a, or on the prescribed displacements; `consider_analysis` propagates effects
+to the residuals. Assumptions that change only the measurements (cameras, clocks) are nuisance
+parameters, see `recording.nuisance`. `Assumptions` is the table of the problem file in which users
+state standard deviations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.array_types import Array, Index
+from ...common.schema_tables import ByForm, Section
+from ...common.validated_types import Options, Positive
+from ...fem.body import Body
+from ...fem.laws.constants import GAMMA_R, without_region
+from ...fem.laws.materials import DAMPINGS, MATERIALS
+from ...fem.laws.moduli import engineering_constants
+from ...fem.rest_shape import RestShape
+from ...model.contact import Contact, contact_terms
+from ...model.dynamics import Dynamics
+from ...model.force_term import States
+from ...model.parameters import Parameters
+from ...program.collocation import ExperimentIterate
+from ...program.contact.contact_summary import surface_gaps_and_pressures
+from ...program.wrench.reaction_forces import forces_on_dofs, reaction_forces
+from ...recording.grasp import free_rigid_motions
+from ...recording.homogeneous_deformation import (
+    STRESS_PER_FORCE,
+    HomogeneousDeformation,
+)
+from ...recording.nuisance import DEGREE
+from .shape_error import (
+    CORRELATION,
+    SURFACE_MODES,
+    sag_m,
+    standing_nodes,
+    surface_modes,
+    thickness_m,
+)
+from .size_effect import obstacle_shifts_m
+
+# Differences by a scale.
+SMALL = 1e-4
+# Relative standard deviation of the density of the air: weather and room temperature, at the stated
+# altitude. At 2000 m the density is 18 % lower, and has to be stated.
+AIR_DENSITY_DEVIATION = 0.03
+# Relative standard deviation of the added mass and of the drag coefficient of a given body: they
+# depend on its shape, on edges, on amplitude and on frequency.
+AIR_COEFFICIENT_DEVIATION = 0.4
+_AXES = "xyz"
+# Poisson's ratio of an incompressible material.
+INCOMPRESSIBLE_POISSON = 0.5
+# Laws of damping that a real material may obey: Rayleigh's resists rotation, as no material does.
+OBJECTIVE_DAMPINGS = ("kelvin-voigt", "material")
+# Differences by a displacement: its largest entry over the length of an edge.
+SMALL_STRAIN = 1e-4
+_MODES = " ".join(str(number) for number in range(1, SURFACE_MODES + 1))
+# Beside the deviations: the correlation length of the error of the surface.
+CORRELATION_KEY = "surface_correlation"
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """Change of the equations of motion if an assumption is off by one unit.
+
+    Attributes
+    ----------
+    force_n : (N, 3n) array or None
+        Change of the forces at the evaluations [N]; None means no change.
+    mass_kg : (3n,) array or None
+        Change of the inertial masses, whose weight is not in `force_n` [kg]; None means no change.
+    time_stretch : float
+        Relative change of the times in the inertia.
+    displacement_m : (N, g) array or None
+        Change of the prescribed positions of the grasped dofs [m]; None means no change.
+    """
+
+    force_n: Array | None = None
+    mass_kg: Array | None = None
+    time_stretch: float = 0.0
+    displacement_m: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ExperimentAtAnswer:
+    """One experiment at the answer, as the effects of assumptions need it.
+
+    Attributes
+    ----------
+    iterate : ExperimentIterate
+        The experiment at the answer.
+    parameters : Parameters
+        Shared parameters.
+    surface_correlation : float
+        Correlation length of the surface's error over the longest extent of the body.
+    """
+
+    iterate: ExperimentIterate
+    parameters: Parameters
+    surface_correlation: float = CORRELATION
+
+    @property
+    def body(self) -> Body:
+        """Body of the experiment."""
+        return self.iterate.segment.body
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """Equations of motion at the answer."""
+        return self.iterate.equations.dynamics
+
+    @property
+    def theta(self) -> Array:
+        """Constants θ of the body (k,)."""
+        return self.dynamics.theta
+
+    @property
+    def gravity(self) -> Array:
+        """Gravity at each dof (3n,) [m/s²]."""
+        return self.dynamics.forces.weight.gravity
+
+    @cached_property
+    def own_mass_kg(self) -> Array:
+        """Masses (3n,) of the body without point masses [kg]."""
+        return self.body.mass_of_dofs(self.theta)
+
+    @cached_property
+    def acceleration(self) -> Array:
+        """Accelerations (N, 3n) of the rows [m/s²]."""
+        return self.dynamics.acceleration(self.iterate.x)
+
+    @cached_property
+    def states(self) -> tuple[Array, Array]:
+        """States ξ [m] and velocities ν [m/s] at the evaluations, (N, 3n) each; zero before the
+        first evaluation.
+        """
+        xi, nu = self.dynamics.evaluation_states(self.iterate.x)
+        return self.pad_rows(xi), self.pad_rows(nu)
+
+    def pad_rows(self, evaluated: Array) -> Array:
+        """Return values (N, 3n) of all rows from those of the evaluations, zero before the
+        first.
+        """
+        return np.concatenate(
+            [np.zeros((self.dynamics.first_row, evaluated.shape[1])), evaluated]
+        )
+
+    def internal_n(
+        self,
+        length_factor: float = 1.0,
+        time_factor: float = 1.0,
+        theta: Array | None = None,
+        body: Body | None = None,
+    ) -> Array:
+        """Return the material's forces (N, 3n) at scaled lengths or times, without γ_m [N].
+
+        Parameters
+        ----------
+        length_factor : float
+            Factor of lengths: positions and velocities are divided by it.
+        time_factor : float
+            Factor of times: velocities are divided by it.
+        theta : (k,) array, optional
+            Constants of the body; those of the answer by default.
+        body : Body, optional
+            Body with another stress-free shape.
+        """
+        undamped = (self.theta if theta is None else theta).copy()
+        undamped[list(self.body.tied_shares)] = 0.0
+        dynamics = self.dynamics.with_theta(undamped)
+        histories = dynamics.forces_with_histories(
+            dynamics.histories(self.iterate.x)
+        ).memory_state
+        xi, nu = dynamics.evaluation_states(self.iterate.x)
+        evaluated = self.body if body is None else body
+        return self.pad_rows(
+            evaluated.force(
+                xi / length_factor,
+                nu / (length_factor * time_factor),
+                undamped,
+                memory_input=histories,
+            )
+        )
+
+    @cached_property
+    def internal_force_n(self) -> Array:
+        """Forces (N, 3n) of the material at the answer, without γ_m [N]."""
+        return self.internal_n(
+            body=self.body.with_stress_free(self.stress_free_m)
+        )
+
+    @cached_property
+    def stress_free_m(self) -> Array:
+        """Stress-free positions (n, 3) of the nodes, without nodes of obstacle frames [m]."""
+        body = self.body
+        return (
+            body.nodes.points_m
+            if body.inverse_equilibrium is None
+            else self._rest_shape.positions_m
+        )
+
+    @cached_property
+    def _rest_shape(self) -> RestShape:
+        """Stress-free shape that follows from a mesh made under gravity."""
+        assert self.body.inverse_equilibrium is not None
+        return self.body.inverse_equilibrium.solve(self.theta)
+
+    def force_change_by_reference(self, moved_m: Array) -> Array:
+        """Return the first-order change (N, 3n) [N] of the material's forces if the stress-free
+        positions change by `moved_m` (n, 3) [m].
+        """
+        largest = float(np.abs(moved_m).max(initial=0.0))
+        if not largest:
+            return np.zeros_like(self.iterate.x)
+        step = SMALL_STRAIN * self.iterate.segment.length_m / largest
+        own = self.stress_free_m + step * moved_m[: len(self.stress_free_m)]
+        other = self.body.with_stress_free(own)
+        return (self.internal_n(body=other) - self.internal_force_n) / step
+
+    def force_change_by_scan_weight(self) -> Array:
+        """Return the change (N, 3n) of forces per relative change of the weight during the
+        scan; zero unless the mesh was made under gravity.
+        """
+        if self.body.inverse_equilibrium is None:
+            return np.zeros_like(self.iterate.x)
+        return self.force_change_by_reference(
+            self.body.inverse_equilibrium.weight_sensitivity(self.theta)
+        )
+
+    @cached_property
+    def surface_modes_m(self) -> Array:
+        """Modes (modes, n, 3) of an error of the surface along its normal: displacements [m] of the
+        nodes if the standard deviation of the error is the thickness of the body.
+
+        Places of the surface that are in contact with an obstacle are known and do not move.
+        """
+        segment = self.iterate.segment
+        gaps_m = surface_gaps_and_pressures(
+            segment.experiment, self.theta, x=self.iterate.x
+        )[0]
+        nearest = np.fmin.reduce(gaps_m, axis=0)
+        is_in_contact = np.nan_to_num(nearest, nan=np.inf) < segment.length_m
+        known = np.unique(self.body.mesh.surface[is_in_contact])
+        modes = surface_modes(
+            self.body, known, correlation=self.surface_correlation
+        )
+        return thickness_m(self.body) * modes
+
+    @cached_property
+    def likely_support_dofs(self) -> Index:
+        """Dofs that were probably supported while the mesh was made: those prescribed in the
+        recording or, if these leave rigid motions, those of the lowest nodes.
+        """
+        prescribed = self.iterate.equations.prescribed.dofs
+        own = prescribed[prescribed < self.body.nodes.points_m.size]
+        points_m = self.body.nodes.points_m
+        if len(free_rigid_motions(points_m, _dof_mask(own, len(points_m)))):
+            gravity = self.iterate.segment.experiment.gravity_m_s2
+            nodes = standing_nodes(self.body, gravity)
+            return (3 * nodes[:, None] + np.arange(3)).ravel()
+        return own
+
+    def weight_and_drag(self, mass_kg: Array) -> Array:
+        """Return the weight and the mass-proportional damping (N, 3n) [N] of masses (3n,) or (N,
+        3n) [kg].
+        """
+        return mass_kg * (
+            self.gravity
+            - self.body.tied_damping_rate(self.theta) * self.states[1]
+        )
+
+    @property
+    def buoyancy_n(self) -> Array:
+        """Buoyancy (N, 3n) in the model [N]; zero in a vacuum."""
+        lifted = -self.dynamics.mass.displaced_kg * self.gravity
+        return np.broadcast_to(lifted, self.iterate.x.shape)
+
+    @property
+    def added_mass_kg(self) -> Array:
+        """Added mass (3n,) of the air in the model [kg]; zero in a vacuum."""
+        return self.dynamics.mass.added_kg
+
+    @cached_property
+    def air_drag_n(self) -> Array:
+        """Drag of the air (N, 3n) in the model [N]; zero in a vacuum and where nothing moves."""
+        term = self.dynamics.forces.air_drag
+        if term is None:
+            return np.zeros_like(self.states[1])
+        drag = term.force(States(*self.states, self.theta))
+        drag[: self.dynamics.first_row] = 0.0
+        return drag
+
+    @cached_property
+    def grasp_force_n(self) -> Array:
+        """Reaction forces (N, g) on the grasped dofs [N]; zero while they are not prescribed."""
+        dofs = self.iterate.equations.prescribed.dofs
+        x = self.iterate.x
+        force = forces_on_dofs(self.dynamics, x, dofs=dofs)
+        mass = self.dynamics.mass.inertia_kg[:, dofs]
+        reaction_n = reaction_forces(
+            self.dynamics,
+            mass,
+            force=force,
+            acceleration=self.acceleration[:, dofs],
+        )
+        return np.where(
+            np.isnan(self.iterate.equations.prescribed.positions_m),
+            0.0,
+            reaction_n,
+        )
+
+    @cached_property
+    def contacts(self) -> dict[int, Contact]:
+        """Contact forces with an energy, by their index in `Forces.external_terms`."""
+        further = enumerate(self.dynamics.forces.external_terms)
+        return {
+            k: each
+            for k, each in further
+            if isinstance(each, Contact) and not each.is_complementarity
+        }
+
+    def contact_n(self, index: int) -> Array:
+        """Return the forces (N, 3n) [N] of one of `contacts` (its index) at the evaluations; zero
+        before the first.
+        """
+        xi, nu = self.dynamics.evaluation_states(self.iterate.x)
+        forces = self.dynamics.evaluated_forces
+        term = forces.external_terms[index]
+        return self.pad_rows(term.force(forces.states_of_terms(xi, nu)(term)))
+
+    @cached_property
+    def proportional_s(self) -> Array:
+        """Damping times γ_r (E,) of elements with Rayleigh damping γ_r K(x) v [s], zero of
+        others.
+        """
+        gamma_r_s = np.zeros(len(self.body.cells))
+        for part, start in zip(self.body.parts, self.body.starts, strict=False):
+            if (
+                GAMMA_R in part.damping.constants
+                and part.damping.stress is None
+            ):
+                gamma_r_s[part.cells] = self.theta[
+                    start + part.constants.index(GAMMA_R)
+                ]
+        return gamma_r_s
+
+    @cached_property
+    def young_pa(self) -> float:
+        """Young's modulus of the softest part at small strain [Pa]."""
+        return min(
+            engineering_constants(*moduli)[0]
+            for moduli in self.body.lame(self.theta).values()
+        )
+
+
+def _dof_mask(dofs: Index, nodes: int) -> NDArray[np.bool_]:
+    """Return the mask (n, 3) of the coordinates that are among the dofs (k,), for n = `nodes`
+    nodes.
+    """
+    mask = np.zeros(3 * nodes, dtype=bool)
+    mask[dofs] = True
+    return mask.reshape(nodes, 3)
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """Quantity that is taken as stated instead of being estimated.
+
+    Attributes
+    ----------
+    name : str
+        Name, as in problem files and budgets.
+    unit : str
+        Unit of its deviation.
+    sigma : float or None
+        Default standard deviation, as in a careful laboratory; None if the effect counts only where
+        a problem states its deviation.
+    description : str
+        Description.
+    effect : callable
+        Returns the effect of one unit, from an experiment at the answer and the index of the
+        component; None if there is no effect in this experiment.
+    component_names : str
+        Names of components with independent errors, separated by spaces; empty if there is one.
+    of_specimens : bool
+        Whether it concerns homogeneous specimens too, which have neither a mesh nor grips.
+    """
+
+    name: str
+    unit: str
+    sigma: float | None
+    description: str
+    effect: Callable[[ExperimentAtAnswer, int], Effect | None]
+    component_names: str = ""
+    of_specimens: bool = False
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Names of the components, each after that of the assumption."""
+        return tuple(
+            f"{self.name} {a}" for a in self.component_names.split()
+        ) or (self.name,)
+
+
+# What each changes ------------------------------------------------------------------------------
+
+
+def _size(at: ExperimentAtAnswer, _: int) -> Effect:
+    """Return the effect of a body that is larger by a share: f = s² f(x/s, v/s).
+
+    From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths. Goals of grasped nodes scale
+    about the middle of the grasps; obstacles keep their size and are moved so that they first touch
+    the body as before, see `size_effect.obstacle_shifts_m`. Contact areas grow by s², and a contact
+    stiffness that is not stated falls by s, as it follows the edges of the mesh.
+
+    Buoyancy and the mass of moved air grow by s³, and drag by s². The own mass grows by s³ unless
+    the mass of the body is declared, when it stays. For a mesh made under gravity, the weight
+    during the scan relative to the stiffness grows by s, or falls by s² if the mass is declared.
+    """
+    larger = 1 + SMALL
+    smaller = 1 - SMALL
+    force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(
+        smaller
+    )
+    force = force / (2 * SMALL)
+    # Of a body made under gravity the deflection over the size grows with the weight over s².
+    heavier = at.force_change_by_scan_weight() * (
+        -2.0 if at.body.has_declared_mass else 1.0
+    )
+    mass = (0.0 if at.body.has_declared_mass else 3.0) * at.own_mass_kg
+    for number, contact in at.contacts.items():
+        has_stiffness = (
+            contact.law_of_contact.obstacle.stiffness_pa_m is not None
+        )
+        force += (2.0 if has_stiffness else 1.0) * at.contact_n(number)
+    segment = at.iterate.segment
+    rotations: Array = np.nan_to_num(segment.prescribed_motion.pose_rows[0])
+    arms_m = (
+        segment.prescribed_motion.displaced_nodes(at.iterate.phi)[0]
+        - segment.nuisance.grasp_pivot_m
+    )
+    displacement_m = np.einsum("tgj,gj->tg", rotations, arms_m)
+    for obstacle, shift_m in obstacle_shifts_m(at.iterate):
+        obstacle_dofs = np.searchsorted(
+            segment.prescribed_motion.dofs, obstacle.prescribed_dofs
+        )
+        displacement_m[:, obstacle_dofs] = np.tile(shift_m, len(obstacle.nodes))
+    air = 3.0 * at.buoyancy_n + 2.0 * at.air_drag_n
+    return Effect(
+        force + heavier + at.weight_and_drag(mass) + air,
+        mass + 3.0 * at.added_mass_kg,
+        displacement_m=displacement_m,
+    )
+
+
+def _mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of a body that is heavier by a share; None if a density is estimated."""
+    if any(part.has_free_density for part in at.body.parts):
+        return None
+    return Effect(
+        at.weight_and_drag(at.own_mass_kg) + at.force_change_by_scan_weight(),
+        at.own_mass_kg,
+    )
+
+
+def _density_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
+    """Effect of a density that increases along an axis (index) of the body, by a share at one end,
+    and decreases as much towards the other.
+    """
+    place = at.body.nodes_m[:, axis]
+    middle = np.average(place, weights=at.own_mass_kg[::3])
+    mass = at.own_mass_kg * np.repeat(
+        (place - middle) / np.abs(place - middle).max(), 3
+    )
+    return Effect(at.weight_and_drag(mass), mass)
+
+
+def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
+    """Effect of a stiffness that is higher along one axis (index) by a share of E: the energy ½ E
+    e² of the strain e along it.
+
+    Rayleigh damping K(x) v follows by its time derivative. For specimens e is such that its stress
+    at large stretches λ, (λ − 1/λ²) / 3, is a constant share of that of Neo-Hooke's law.
+    """
+    body = at.body
+    xi, nu = at.states
+    count, points = body.geometry.shape[:2]
+    geometry = body.stress_free_geometry(at.theta)
+    slopes = geometry[..., :-1].reshape(count, points, -1, 3)[..., axis]
+    weight = at.young_pa * geometry[..., -1]
+    force = np.zeros_like(xi)
+    gamma = at.proportional_s[:, None, None]
+    for x, v, own in zip(xi, nu, force, strict=True):
+        stretch, rate = (
+            np.einsum("eqa,eaj->eqj", slopes, each.reshape(-1, 3)[body.cells])
+            for each in (x, v)
+        )
+        squared = np.sum(stretch**2, axis=2, keepdims=True)
+        strain = 0.5 * (squared - 1)
+        if at.iterate.segment.experiment.specimen is not None:
+            strain = (1 - squared**-1.5) / 3
+        pull = (
+            strain + gamma * np.sum(stretch * rate, axis=2, keepdims=True)
+        ) * stretch
+        pull = weight[..., None] * (pull + gamma * strain * rate)
+        np.subtract.at(
+            own.reshape(-1, 3),
+            body.cells,
+            np.einsum("eqa,eqj->eaj", slopes, pull),
+        )
+    force[: at.dynamics.first_row] = 0.0
+    return Effect(force)
+
+
+def _drift(at: ExperimentAtAnswer, _: int) -> Effect:
+    """Effect of a stiffness that is higher at the end than at the beginning, by a share."""
+    t_s = at.dynamics.evaluated_s
+    since = (t_s - t_s.mean()) / max(np.ptp(t_s), 1e-300)
+    return Effect(at.internal_n() * since[:, None])
+
+
+def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of clocks that are fast by a share, so that less time passes than they show;
+    None for a static experiment.
+    """
+    if at.iterate.segment.experiment.is_static:
+        return None
+    slower = at.internal_n(time_factor=1 + SMALL)
+    faster = at.internal_n(time_factor=1 - SMALL)
+    drag = (
+        at.body.tied_damping_rate(at.theta)
+        * at.dynamics.mass.damped_kg
+        * at.states[1]
+    )
+    air = 2.0 * at.air_drag_n
+    return Effect(
+        (faster - slower) / (2 * SMALL) - drag + air, time_stretch=-1.0
+    )
+
+
+def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of a larger Poisson's ratio where it is stated (fixed, or tied to a fixed one); None
+    if there is none.
+    """
+    items = {item.name: item for item in at.parameters.items}
+    constants = {
+        name
+        for name, item in items.items()
+        if without_region(name) == "poisson"
+        and (items[item.tied.to] if item.tied else item).is_fixed
+    }
+    if not constants:
+        return None
+    values = at.parameters.values(at.iterate.q)
+    # Both differences stay below ½, where the bulk modulus would be infinite.
+    largest = max(values[name] for name in constants)
+    step = min(SMALL, (INCOMPRESSIBLE_POISSON - largest) / 2)
+    larger, smaller = (
+        at.internal_n(
+            theta=at.body.theta_from_values(
+                {n: v + way * (n in constants) for n, v in values.items()}
+            )
+        )
+        for way in (step, -step)
+    )
+    return Effect((larger - smaller) / (2 * step))
+
+
+def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of a compliant layer of the body's own material between body and grippers; None
+    without a gripper.
+
+    A grasp that prescribes some axes only is a platen or a plane of symmetry, not a gripper.
+    """
+    prescribed = at.iterate.equations.prescribed
+    holding = at.iterate.segment.experiment.body_grasps
+    gripped = [
+        grasp.prescribed_dofs
+        for grasp in holding
+        if len(grasp.axes) == len(_AXES)
+    ]
+    if not gripped:
+        return None
+    area_m2 = at.body.dof_volume_m3[prescribed.dofs] ** (2 / 3)
+    is_gripped = np.isin(prescribed.dofs, np.concatenate(gripped))
+    displacement_m = np.zeros_like(at.grasp_force_n)
+    displacement_m[:, is_gripped] = -at.grasp_force_n[:, is_gripped] / (
+        at.young_pa * area_m2[is_gripped]
+    )
+    return Effect(displacement_m=displacement_m)
+
+
+def _is_driven(at: ExperimentAtAnswer) -> NDArray[np.bool_]:
+    """Return the mask (g,) of grasped dofs whose prescribed position changes; times at which a dof
+    is free (NaN) are ignored.
+    """
+    goals = at.iterate.equations.prescribed.positions_m
+    return np.asarray(np.nanmax(goals, axis=0) > np.nanmin(goals, axis=0))
+
+
+def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of the compliance of a test bench: displacements are measured behind its frame. None
+    for dynamic experiments, and if no prescribed position changes.
+    """
+    experiment = at.iterate.segment.experiment
+    prescribed = at.iterate.equations.prescribed
+    if experiment.specimen is not None:
+        return _machine_of_specimen(at, experiment.specimen)
+    if not experiment.is_static or not (driven := _is_driven(at)).any():
+        return None
+    displacement_m = np.zeros_like(at.grasp_force_n)
+    for grasp in experiment.grasps:
+        for axis in range(3):
+            here = np.flatnonzero(
+                np.isin(prescribed.dofs, grasp.prescribed_dofs)
+                & (prescribed.dofs % 3 == axis)
+            )
+            if driven[here].any():
+                displacement_m[:, here] = -at.grasp_force_n[:, here].sum(
+                    axis=1, keepdims=True
+                )
+    return Effect(displacement_m=displacement_m)
+
+
+def _machine_of_specimen(
+    at: ExperimentAtAnswer, deformation: HomogeneousDeformation
+) -> Effect | None:
+    """Effect of the compliance C of a test bench on a homogeneous specimen of area A and length L,
+    whose strain is smaller than the displacement over the length by C A P / L, with its nominal
+    stress P. None if the strain was measured on the specimen.
+    """
+    if not deformation.area_over_length_m:
+        return None
+    dofs = at.iterate.equations.prescribed.dofs
+    direction, normal = (_AXES.index(axis) for axis in deformation.first_stress)
+    loaded = np.searchsorted(dofs, 3 * (1 + normal) + direction)
+    stress_pa = STRESS_PER_FORCE * at.grasp_force_n[:, loaded]
+    strain_m_n = -deformation.area_over_length_m * stress_pa
+    displacement_m = np.zeros_like(at.grasp_force_n)
+    for node, (by_strain_m, _) in deformation.displaced_nodes().items():
+        columns = np.searchsorted(dofs, 3 * node + np.arange(3))
+        displacement_m[:, columns] = strain_m_n[:, None] * by_strain_m
+    return Effect(displacement_m=displacement_m)
+
+
+def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of friction on nodes that slide along platens, perpendicular to the loading axis; None
+    for a dynamic experiment and without platens.
+
+    Friction has the size of the normal force and is opposite to the displacement. Planes of
+    symmetry have no normal force in the loading direction, and no friction.
+    """
+    experiment = at.iterate.segment.experiment
+    prescribed = at.iterate.equations.prescribed
+    if not experiment.is_static:
+        return None
+    pressed = {_AXES[k] for k in np.unique(prescribed.dofs[_is_driven(at)] % 3)}
+    platens = [
+        g
+        for g in experiment.grasps
+        if len(g.axes) < 3 and pressed & set(g.axes)
+    ]
+    force = np.zeros_like(at.iterate.x)
+    x = at.iterate.x
+    start = at.body.nodes_m.ravel()
+    for grasp in platens:
+        across = [k for k, name in enumerate(_AXES) if name not in grasp.axes]
+        for node in grasp.nodes:
+            normal = np.isin(
+                prescribed.dofs, [3 * node + _AXES.index(a) for a in grasp.axes]
+            )
+            press = np.linalg.norm(at.grasp_force_n[:, normal], axis=1)
+            dofs = [3 * node + k for k in across]
+            way = x[:, dofs] - start[dofs]
+            length = np.linalg.norm(way, axis=1, keepdims=True)
+            force[:, dofs] -= press[:, None] * way / np.maximum(length, 1e-9)
+    return Effect(force) if platens else None
+
+
+def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of rigid contact in place of the pressure law, to first order; None without contact
+    that has an energy.
+    """
+    if not at.contacts:
+        return None
+    xi, nu = at.dynamics.evaluation_states(at.iterate.x)
+    forces = at.dynamics.evaluated_forces
+    change_n = np.zeros_like(xi)
+    for contact in contact_terms(at.iterate.segment.experiment):
+        if not contact.is_complementarity:
+            change_n += contact.rigid_limit_n(
+                forces.states_of_terms(xi, nu)(contact)
+            )
+    return Effect(at.pad_rows(change_n))
+
+
+def _buoyancy(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of more buoyancy, as a share of that in the model; None in a vacuum."""
+    return Effect(at.buoyancy_n) if at.added_mass_kg.any() else None
+
+
+def _added_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of more added mass, as a share of that in the model; None in a vacuum and for a static
+    experiment.
+    """
+    if at.iterate.segment.experiment.is_static or not at.added_mass_kg.any():
+        return None
+    return Effect(mass_kg=at.added_mass_kg)
+
+
+def _air_drag(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of more drag, as a share of that in the model; None in a vacuum."""
+    return (
+        Effect(at.air_drag_n)
+        if at.iterate.segment.experiment.has_air_drag
+        else None
+    )
+
+
+def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
+    """Effect of replacing the stated damping law by another (its name in `DAMPINGS`) with the same
+    γ_r.
+
+    Parts with a custom law keep it, and so do parts of linear material, for which all laws agree.
+    None if there is no difference, or the experiment is static.
+    """
+    body = at.body
+    names = body.constants.items()
+    is_damped = any(
+        constant is GAMMA_R and value
+        for (_, constant), value in zip(names, at.theta, strict=False)
+    )
+    if at.iterate.segment.experiment.is_static or not is_damped:
+        return None
+    parts = tuple(
+        replace(part, damping=DAMPINGS[law])
+        if part.damping in DAMPINGS.values()
+        and part.material is not MATERIALS["linear"]
+        else part
+        for part in body.parts
+    )
+    if all(
+        own.damping is other.damping
+        for own, other in zip(body.parts, parts, strict=True)
+    ):
+        return None
+    xi, nu = at.dynamics.evaluation_states(at.iterate.x)
+    histories = at.dynamics.forces_with_histories(
+        at.dynamics.histories(at.iterate.x)
+    ).memory_state
+    forces_n = (
+        each.force(xi, nu, at.theta, memory_input=histories)
+        for each in (body.with_parts(parts), body)
+    )
+    return Effect(at.pad_rows(next(forces_n) - next(forces_n)))
+
+
+def _objective_damping(at: ExperimentAtAnswer, index: int) -> Effect | None:
+    """Effect of another objective damping law, by its index in `OBJECTIVE_DAMPINGS`."""
+    return _other_damping(at, OBJECTIVE_DAMPINGS[index])
+
+
+def _rayleigh_damping(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Effect of Rayleigh damping, which is not objective, instead of the stated law."""
+    return _other_damping(at, "rayleigh")
+
+
+def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
+    """Effect of a mesh that was made under the body's own weight along one of its axes (index).
+
+    None if the problem states the rest shape.
+    """
+    if at.body.rest_shape is not None:
+        return None
+    return Effect(
+        at.force_change_by_reference(
+            sag_m(
+                at.body,
+                at.theta,
+                support_dofs=at.likely_support_dofs,
+                axis=axis,
+            )
+        )
+    )
+
+
+def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
+    """Effect of an error of the surface along its normal, by one mode (index) of a smooth random
+    field; grasped nodes move with the surface.
+    """
+    moved_m = at.surface_modes_m[mode]
+    prescribed_motion = at.iterate.segment.prescribed_motion
+    rotations: Array = np.nan_to_num(prescribed_motion.pose_rows[0])
+    offsets_m = moved_m.ravel()[
+        3 * (at.iterate.equations.prescribed.dofs // 3)[:, None] + np.arange(3)
+    ]
+    return Effect(
+        at.force_change_by_reference(moved_m),
+        displacement_m=np.einsum("tgj,gj->tg", rotations, offsets_m),
+    )
+
+
+ASSUMPTIONS = (
+    Assumption(
+        "body_scale",
+        "1",
+        sigma=0.01,
+        description="size of the mesh",
+        effect=_size,
+    ),
+    Assumption(
+        "rest_shape",
+        "1",
+        sigma=0.58,
+        description="weight under which the mesh was deformed when it was made, along each axis, if "
+        "object.rest_shape is not stated",
+        effect=_rest_shape,
+        component_names="x y z",
+    ),
+    Assumption(
+        "surface",
+        "1",
+        sigma=0.005,
+        description="displacement of the surface along its normal, relative to the thickness",
+        effect=_surface,
+        component_names=_MODES,
+    ),
+    Assumption(
+        "mass",
+        "1",
+        sigma=0.01,
+        description="mass of the body, if it is not estimated",
+        effect=_mass,
+    ),
+    Assumption(
+        "density_gradient",
+        "1",
+        sigma=0.05,
+        description="density at one end of the body relative to that in its middle",
+        effect=_density_gradient,
+        component_names="x y z",
+    ),
+    Assumption(
+        "anisotropy",
+        "1",
+        sigma=0.05,
+        description="stiffness along one axis relative to that across it",
+        effect=_anisotropy,
+        component_names="x y z",
+        of_specimens=True,
+    ),
+    Assumption(
+        "stiffness_drift",
+        "1",
+        sigma=0.02,
+        description="stiffness at the end of a recording relative to that at its beginning",
+        effect=_drift,
+        of_specimens=True,
+    ),
+    Assumption(
+        "time_scale",
+        "1",
+        sigma=1e-4,
+        description="rate of all clocks",
+        effect=_time_scale,
+    ),
+    Assumption(
+        "poisson",
+        "",
+        sigma=0.02,
+        description="Poisson's ratio, if it is stated",
+        effect=_poisson,
+        of_specimens=True,
+    ),
+    Assumption(
+        "damping_law",
+        "1",
+        sigma=1.0,
+        description="damping force of another objective law, as a fraction of its difference from the "
+        "stated law",
+        effect=_objective_damping,
+        component_names=" ".join(OBJECTIVE_DAMPINGS),
+    ),
+    Assumption(
+        "rayleigh_damping",
+        "1",
+        sigma=None,
+        description="damping force of the Rayleigh law, as a fraction of its difference from the stated "
+        "law",
+        effect=_rayleigh_damping,
+    ),
+    Assumption(
+        "grip_layer_m",
+        "m",
+        sigma=2e-4,
+        description="compliance of grip and skin, as the thickness of a layer of the body's material",
+        effect=_grip,
+    ),
+    Assumption(
+        "machine_compliance_m_n",
+        "m/N",
+        sigma=1e-6,
+        description="compliance of the test bench",
+        effect=_machine,
+        of_specimens=True,
+    ),
+    Assumption(
+        "platen_friction",
+        "",
+        sigma=0.1,
+        description="coefficient of friction of platens between which nodes slide",
+        effect=_platen_friction,
+    ),
+    Assumption(
+        "contact_stiffness",
+        "1",
+        sigma=1.0,
+        description="compliance of the contact with obstacles, as a fraction of that of the pressure law",
+        effect=_contact_stiffness,
+    ),
+    Assumption(
+        "buoyancy",
+        "1",
+        sigma=AIR_DENSITY_DEVIATION,
+        description="buoyancy relative to that of the model, because of the density of the air",
+        effect=_buoyancy,
+    ),
+    Assumption(
+        "added_mass",
+        "1",
+        sigma=AIR_COEFFICIENT_DEVIATION,
+        description="added mass of the air relative to that of the model",
+        effect=_added_mass,
+    ),
+    Assumption(
+        "air_drag",
+        "1",
+        sigma=AIR_COEFFICIENT_DEVIATION,
+        description="drag of the air relative to that of the model",
+        effect=_air_drag,
+    ),
+)
+
+
+class KnownEffect(Section):
+    """Systematic effect of known sign and size, for which estimates are corrected to first order.
+
+    Attributes
+    ----------
+    mean : float
+        Size of the effect, positive.
+    deviation : float
+        Standard deviation of the size.
+    """
+
+    mean: Positive
+    deviation: Positive
+
+
+Deviation = Annotated[Literal["none"] | Positive, ByForm(str)]
+KnownDeviation = Annotated[KnownEffect | Deviation, ByForm((dict, KnownEffect))]
+# Rows that are never negative, of which a mean may be stated: what gives way does not push.
+OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assumptions(Options):
+    """Standard deviations of systematic effects; "none" for what is exact.
+
+    An effect that is known to exist, such as the compliance of a machine, has a table of mean and
+    deviation. Nuisance parameters of recordings, by their names, count if they are not estimated.
+    There is a field for each row of `ASSUMPTIONS` and of `recording.nuisance.KINDS`.
+
+    Attributes
+    ----------
+    body_scale
+        Size of the mesh [1].
+    rest_shape
+        Weight under which the mesh was deformed when it was made, along each axis, if
+        object.rest_shape is not stated [1].
+    surface
+        Displacement of the surface along its normal, relative to the thickness [1].
+    mass
+        Mass of the body, if it is not estimated [1].
+    density_gradient
+        Density at one end of the body relative to that in its middle [1].
+    anisotropy
+        Stiffness along one axis relative to that across it [1].
+    stiffness_drift
+        Stiffness at the end of a recording relative to that at its beginning [1].
+    time_scale
+        Rate of all clocks [1].
+    poisson
+        Poisson's ratio, if it is stated [1].
+    damping_law
+        Damping force of another objective law, as a fraction of its difference from the stated law
+        [1].
+    rayleigh_damping
+        Damping force of the Rayleigh law, as a fraction of its difference from the stated law [1].
+    grip_layer_m
+        Compliance of grip and skin, as the thickness of a layer of the body's material [m].
+    machine_compliance_m_n
+        Compliance of the test bench [m/N].
+    platen_friction
+        Coefficient of friction of platens between which nodes slide [1].
+    contact_stiffness
+        Compliance of the contact with obstacles, as a fraction of that of the pressure law [1].
+    buoyancy
+        Buoyancy relative to that of the model, because of the density of the air [1].
+    added_mass
+        Added mass of the air relative to that of the model [1].
+    air_drag
+        Drag of the air relative to that of the model [1].
+    marker_offset_m
+        Errors of the positions in reference_m without a reference_sigma_m; they rotate with the
+        body [m].
+    camera_offset_m
+        A constant offset of each marker in the cameras' frame [m].
+    calibration_scale
+        Scale error of all lengths that the cameras measure: the factor minus one [1].
+    calibration_distortion_1_m2
+        Radial distortion of first order about the body's middle: a factor 1 + k r² [1/m²].
+    time_shift_s
+        How much later than stated the markers were measured, on the grasps' clock [s].
+    clock_rate
+        How much slower than the grasps' clock that of the markers runs [1].
+    pose_turn_rad
+        A constant rotation of grasps and body in the cameras' frame, which rotates gravity in the
+        body's frame [rad].
+    pose_shift_m
+        A constant translation of grasps and body in the cameras' frame [m].
+    gravity_rad
+        A tilt of the direction of gravity [rad].
+    hand_eye_rad
+        A constant rotation of the body in its grasps [rad].
+    hand_eye_m
+        A constant translation of the body in its grasps; both if the start is an equilibrium and
+        markers measure it [m].
+    strain_zero
+        A constant offset of the strains of a specimen [1].
+    displacement_zero_m
+        A constant offset of each displacement along each of its axes [m].
+    obstacle_offset_m
+        A constant offset of each obstacle along its normal, or along the axis of its displacement,
+        which changes the beginning of the contact [m].
+    obstacle_tilt_rad
+        A constant tilt of each obstacle that is a plane or a box, about its point or middle [rad].
+    obstacle_time_s
+        Delay of each obstacle's motion, to first order [s].
+    tension_factor
+        Scale error of the tension of each tendon: the factor minus one [1].
+    tension_lost_n
+        Tension of each tendon that is lost by friction [N].
+    pressure_factor
+        Scale error of each pressure: the factor minus one [1].
+    pressure_lost_pa
+        Offset by which each pressure is lower than stated [Pa].
+    pressure_lag
+        Lag of each pressure: the logarithm of its ratio to the stated lag_s [1].
+    joining_s
+        Delay with which each point mass or force begins or ends, if it does so within the recording
+        [s].
+    tare
+        A constant offset of each component of a wrench, in multiples of its sigma [σ].
+    sensor_time_s
+        Delay of the measured wrenches; at most three standard deviations [s].
+    sensor_lag_s
+        Time constant of a first-order low-pass in the sensor; from zero to three standard
+        deviations [s].
+    tool_kg
+        Mass of the tool between a sensor and the body [kg].
+    tool_m
+        Centre of the tool relative to the sensor's point; in the world's frame, relative to that of
+        the grasped nodes [m].
+    depth_turn_rad
+        Rotation of each depth camera about the middle of the body, along the camera's axes [rad].
+    depth_shift_m
+        Translation of each depth camera; if neither is given, the first image is first aligned with
+        the body [m].
+    depth_bias_m
+        Offset that is added to each depth of an image [m].
+    depth_scale
+        Scale error of each depth of an image: the factor minus one [1].
+    depth_time_s
+        Delay of a depth camera; at most three standard deviations [s].
+    depth_edge_px
+        Distance by which silhouettes in the images of each depth camera end inside the outline of
+        the body, in pixels [px].
+    """
+
+    body_scale: Deviation = 0.01
+    rest_shape: Deviation = 0.58
+    surface: Deviation = 0.005
+    mass: Deviation = 0.01
+    density_gradient: Deviation = 0.05
+    anisotropy: Deviation = 0.05
+    stiffness_drift: Deviation = 0.02
+    time_scale: Deviation = 0.0001
+    poisson: Deviation = 0.02
+    damping_law: Deviation = 1.0
+    rayleigh_damping: Deviation = "none"
+    grip_layer_m: KnownDeviation = 0.0002
+    machine_compliance_m_n: KnownDeviation = 1e-06
+    platen_friction: Deviation = 0.1
+    contact_stiffness: Deviation = 1.0
+    buoyancy: Deviation = AIR_DENSITY_DEVIATION
+    added_mass: Deviation = AIR_COEFFICIENT_DEVIATION
+    air_drag: Deviation = AIR_COEFFICIENT_DEVIATION
+    marker_offset_m: Deviation = "none"
+    camera_offset_m: Deviation = "none"
+    calibration_scale: Deviation = 0.002
+    calibration_distortion_1_m2: Deviation = 0.02
+    time_shift_s: Deviation = "none"
+    clock_rate: Deviation = 0.0001
+    pose_turn_rad: Deviation = "none"
+    pose_shift_m: Deviation = "none"
+    gravity_rad: Deviation = "none"
+    hand_eye_rad: Deviation = "none"
+    hand_eye_m: Deviation = "none"
+    strain_zero: Deviation = "none"
+    displacement_zero_m: Deviation = "none"
+    obstacle_offset_m: Deviation = "none"
+    obstacle_tilt_rad: Deviation = 0.2 * DEGREE
+    obstacle_time_s: Deviation = 0.001
+    tension_factor: Deviation = "none"
+    tension_lost_n: Deviation = "none"
+    pressure_factor: Deviation = "none"
+    pressure_lost_pa: Deviation = "none"
+    pressure_lag: Deviation = "none"
+    joining_s: Deviation = "none"
+    tare: Deviation = "none"
+    sensor_time_s: Deviation = "none"
+    sensor_lag_s: Deviation = "none"
+    tool_kg: Deviation = "none"
+    tool_m: Deviation = "none"
+    depth_turn_rad: Deviation = "none"
+    depth_shift_m: Deviation = "none"
+    depth_bias_m: Deviation = "none"
+    depth_scale: Deviation = "none"
+    depth_time_s: Deviation = "none"
+    depth_edge_px: Deviation = "none"
+
+    @classmethod
+    def exact(cls) -> Assumptions:
+        """Return the table with all assumptions exactly true ("none"), as for a simulated
+        recording.
+        """
+        exact: dict[str, Literal["none"]] = dict.fromkeys(
+            vars(Assumptions()), "none"
+        )
+        return Assumptions(**exact)
+
+    @property
+    def deviations(self) -> dict[str, float | None]:
+        """Standard deviations by name; None for what is exact."""
+        by_name: dict[str, float | None] = {}
+        for name, deviation in vars(self).items():
+            known = (
+                deviation.deviation
+                if isinstance(deviation, KnownEffect)
+                else deviation
+            )
+            by_name[name] = None if known == "none" else known
+        return by_name
+
+    @property
+    def means(self) -> dict[str, float]:
+        """Known effects by name, the mean of each over its standard deviation; other assumptions
+        are omitted.
+        """
+        return {
+            name: deviation.mean / deviation.deviation
+            for name, deviation in vars(self).items()
+            if isinstance(deviation, KnownEffect)
+        }

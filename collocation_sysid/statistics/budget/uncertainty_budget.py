@@ -1,0 +1,453 @@
+"""Uncertainty budget: share of each source in the variance of each estimate.
+
+Sources are noise, nuisance parameters, discretisation, differences between recordings, and
+systematic effects. With J the derivatives of a fit's residuals and J_c their changes if an
+assumption is off by its standard deviation, the estimates change by C = −(JᵀJ)⁻¹ Jᵀ J_c and have
+the covariance P + C Cᵀ, P being that of the fit (considered parameters: Schmidt, NASA TN D-1235,
+1962; type B evaluation: JCGM 100:2008, 4.3). Differences of parameters between recordings are
+estimated from the recordings, see `recording_scatter`; where they dominate, intervals are Student's
+with their degrees of freedom (Welch & Satterthwaite: ibid., G.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...model.parameters import Parameters
+from ..distributions import student_ppf
+from ..estimates import Estimate, IntervalCoordinate
+from ..linearised import LinearisedFit, least_squares_of_fit
+from ..uncertainty import Uncertainty
+from .combined_intervals import NORMAL_95, Interval, combine, widened_interval
+from .consider_analysis import ResidualChanges
+from .discretisation_error import DiscretisationError, estimate_changes
+
+NOISE = "noise"
+NUISANCES = "nuisance parameters"
+NUMERICAL = "step and mesh"
+BETWEEN = "between recordings"
+
+
+@dataclass(frozen=True)
+class BudgetLine:
+    """Uncertainty budget of one estimate.
+
+    Attributes
+    ----------
+    value : float
+        The estimate, corrected for the discretisation error and known effects.
+    shares : mapping of str to float
+        Share of each source in the variance, largest first; they sum to one.
+    combined95 : (lower, upper)
+        95 % interval due to all sources.
+    combined_std_error : float
+        Standard uncertainty due to all sources.
+    systematic : float
+        Standard deviation of the systematic effects and of the differences between recordings, in
+        the coordinate of the estimate, see `IntervalCoordinate`.
+    known_effect : float
+        Correction for known effects in the same coordinate, contained in `value`.
+    """
+
+    value: float
+    shares: Mapping[str, float]
+    combined95: Interval
+    combined_std_error: float
+    systematic: float
+    known_effect: float = 0.0
+
+    def with_source(
+        self, source: str, deviation: float, coordinate: IntervalCoordinate
+    ) -> BudgetLine:
+        """Return the budget with one more source of variance.
+
+        Parameters
+        ----------
+        source : str
+            Name of the source.
+        deviation : float
+            Its standard deviation in the coordinate of the estimate.
+        coordinate : IntervalCoordinate
+            That coordinate.
+        """
+        low, high = map(coordinate.from_value, self.combined95)
+        known_variance = ((high - low) / 2 / NORMAL_95) ** 2
+        total = known_variance + deviation**2
+        shares = {
+            name: share * known_variance / total
+            for name, share in self.shares.items()
+        }
+        shares[source] = deviation**2 / total
+        least, most = widened_interval(
+            (low, high), coordinate.from_value(self.value), deviation=deviation
+        )
+        return BudgetLine(
+            self.value,
+            _ranked(shares),
+            combined95=(coordinate.to_value(least), coordinate.to_value(most)),
+            combined_std_error=(most - least)
+            / 2
+            / NORMAL_95
+            / coordinate.derivative(self.value),
+            systematic=float(np.hypot(self.systematic, deviation)),
+            known_effect=self.known_effect,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class VarianceSources:
+    """Covariances and sensitivities from which budgets are computed.
+
+    Attributes
+    ----------
+    names : (a,) tuple of str
+        Names of the assumptions with their components.
+    sensitivities : (nq, a) array
+        Changes of the shared parameters q if each is off by its standard deviation.
+    covariance_free : (nq, nq) array
+        Covariance of q for the stated noise, with free nuisance parameters.
+    covariance_known : (nq, nq) array
+        Covariance of q for the stated noise, with known nuisance parameters.
+    derivatives : mapping of str to (nq,) array
+        Derivatives of each estimate.
+    widening : (nq,) array
+        Factor by which intervals are widened because recordings disagree.
+    recording_sensitivities : (nq, b) array
+        Changes of q with the differences of parameters between recordings, in their standard
+        deviations.
+    freedom : int
+        Degrees of freedom of these deviations: recordings less one.
+    means : mapping of str to float
+        Known effects over their standard deviations, for which estimates are corrected.
+    """
+
+    names: tuple[str, ...]
+    sensitivities: Array
+    covariance_free: Array
+    covariance_known: Array
+    derivatives: Mapping[str, Array]
+    widening: Array
+    recording_sensitivities: Array
+    freedom: int = 0
+    means: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def from_fit(
+        cls,
+        fit: LinearisedFit,
+        assumed: ResidualChanges,
+        parameters: Parameters,
+        q: Array,
+        uncertainty: Uncertainty,
+        means: Mapping[str, float] | None = None,
+    ) -> VarianceSources:
+        """Compute the sources of a fit.
+
+        Parameters
+        ----------
+        fit : LinearisedFit
+            The fit at its answer.
+        assumed : ResidualChanges
+            Changes of its residuals by the assumptions.
+        parameters : Parameters
+            Shared parameters.
+        q : (nq,) array
+            Estimates in the solver's coordinates.
+        uncertainty : Uncertainty
+            Statistical uncertainty of the fit.
+        means : mapping of str to float, optional
+            Known effects over their standard deviations; None if there are none.
+        """
+        free = np.flatnonzero(~fit.at_bound)
+        shared = free[free < fit.shared_count]
+        all_free, known = (
+            np.zeros((fit.shared_count, fit.shared_count)) for _ in range(2)
+        )
+        information = least_squares_of_fit(fit).information
+        for own, here in ((all_free, free), (known, shared)):
+            inverse = np.linalg.pinv(
+                information[np.ix_(here, here)], hermitian=True
+            )
+            own[np.ix_(shared, shared)] = inverse[: len(shared), : len(shared)]
+        moved = estimate_changes(fit, assumed.blocks)[: fit.shared_count]
+        by_q = _estimate_derivatives(fit, parameters, q=q)
+        scatter = uncertainty.scatter
+        between = np.zeros((fit.shared_count, 0))
+        freedom = 0
+        if scatter is not None:
+            between = scatter.sensitivities[: fit.shared_count]
+            freedom = len(scatter.recordings) - 1
+        wider = uncertainty.widening
+        known_effects = dict(means or {})
+        return cls(
+            assumed.names,
+            moved,
+            all_free,
+            known,
+            by_q,
+            wider,
+            between,
+            freedom,
+            known_effects,
+        )
+
+    def noise_shares(self, by_q: Array) -> tuple[float, float]:
+        """Return shares of the statistical variance of an estimate with the derivative `by_q`
+        (nq,).
+
+        Returns
+        -------
+        (float, float)
+            Share that would remain with known nuisance parameters; and share that would remain if
+            recordings agreed. Both are 1 if the variance is 0 or not finite.
+        """
+        scaled_by_noise = self.widening * by_q
+        known, all_free, all_scaled_by_noise = (
+            float(g @ of_q @ g)
+            for g, of_q in (
+                (by_q, self.covariance_known),
+                (by_q, self.covariance_free),
+                (scaled_by_noise, self.covariance_free),
+            )
+        )
+        if not all_free > 0:
+            return 1.0, 1.0
+        agreed = (
+            1.0
+            if (self.widening == 1).all()
+            else all_free / all_scaled_by_noise
+        )
+        return float(np.clip(known / all_free, 0.0, 1.0)), agreed
+
+    def variance_between_recordings(
+        self, by_q: Array, others: float, counted: float
+    ) -> float:
+        """Return the variance due to differences of parameters between recordings, beyond what is
+        counted already.
+
+        It is enlarged such that a normal interval is as wide as Student's interval of the sum.
+
+        Parameters
+        ----------
+        by_q : (nq,) array
+            Derivatives of the estimate.
+        others : float
+            Variance of all other sources.
+        counted : float
+            Variance between recordings that is counted already.
+        """
+        more = max(
+            0.0,
+            float(np.sum((by_q @ self.recording_sensitivities) ** 2)) - counted,
+        )
+        if not more:
+            return 0.0
+        freedom = self.freedom * ((others + more) / more) ** 2
+        return more * float(student_ppf(0.975, freedom) / NORMAL_95) ** 2
+
+    def known_effect(self, by_q: Array) -> float:
+        """Return the change of an estimate with the derivative `by_q` (nq,) by all known effects,
+        to first order.
+        """
+        sizes = [
+            self.means.get(name.partition(" ")[0], 0.0) for name in self.names
+        ]
+        return float(by_q @ self.sensitivities @ sizes)
+
+    def variances_of_assumptions(self, by_q: Array) -> dict[str, float]:
+        """Return the variance by each assumption, its components summed, of an estimate with the
+        derivative `by_q` (nq,), by the assumption's name.
+        """
+        variances: dict[str, float] = {}
+        for name, way in zip(
+            self.names, by_q @ self.sensitivities, strict=True
+        ):
+            row = name.partition(" ")[0]
+            variances[row] = variances.get(row, 0.0) + float(way) ** 2
+        return variances
+
+
+def budget(
+    sources: VarianceSources,
+    uncertainty: Uncertainty,
+    numerical: Mapping[str, DiscretisationError],
+    parameters: Parameters,
+) -> dict[str, BudgetLine]:
+    """Return the uncertainty budget of every estimate that has a statistical interval, by name.
+
+    Parameters
+    ----------
+    sources : VarianceSources
+        Covariances and sensitivities of the fit.
+    uncertainty : Uncertainty
+        Statistical uncertainty of the fit.
+    numerical : mapping of estimate to DiscretisationError
+        Discretisation errors; estimates without an entry have none, or an unknown one.
+    parameters : Parameters
+        The parameters of the problem, with their coordinates and bounds.
+    """
+    lines = {}
+    for name, estimate in {
+        **uncertainty.estimates,
+        **uncertainty.derived,
+    }.items():
+        by_q = sources.derivatives[name]
+        if estimate.statistical95 is not None and by_q.any():
+            lines[name] = _line(
+                name,
+                estimate,
+                sources=sources,
+                error=numerical.get(name),
+                parameters=parameters,
+            )
+    return lines
+
+
+def _line(
+    name: str,
+    estimate: Estimate,
+    sources: VarianceSources,
+    error: DiscretisationError | None,
+    parameters: Parameters,
+) -> BudgetLine:
+    """Return the budget of one estimate that has a statistical interval.
+
+    Parameters
+    ----------
+    name : str
+        Name of the estimate.
+    estimate : Estimate
+    sources : VarianceSources
+    error : DiscretisationError or None
+        None if the discretisation error is not known.
+    parameters : Parameters
+        Provides scale and bounds.
+    """
+    assert estimate.statistical95 is not None
+    linear, bounds = parameters.scale_and_bounds(name)
+    ends = estimate.statistical95
+    if error is not None and error.interval95 is not None:
+        ends = error.interval95
+    at = IntervalCoordinate.for_estimate(
+        name, (estimate.value, *estimate.statistical95, *ends), linear
+    )
+    noise = _variance(at, estimate.value, ends=estimate.statistical95)
+    middle = estimate.value if error is None else error.extrapolated
+    by_q = sources.derivatives[name]
+    own, agreed = sources.noise_shares(by_q)
+    excess = noise * (1 - agreed)
+    parts = {NOISE: noise * agreed * own, NUISANCES: noise * agreed * (1 - own)}
+    parts[NUMERICAL] = max(0.0, _variance(at, middle, ends=ends) - noise)
+    by_coordinate = by_q * at.derivative(estimate.value)
+    by_assumption = sources.variances_of_assumptions(by_coordinate)
+    others = sum(parts.values()) + sum(by_assumption.values())
+    between = sources.variance_between_recordings(by_coordinate, others, excess)
+    systematic = float(np.sqrt(sum(by_assumption.values()) + between))
+    variances = parts | {BETWEEN: excess + between} | by_assumption
+    total = sum(variances.values())
+    known_effect = sources.known_effect(by_coordinate)
+    combined = combine(
+        name,
+        estimate,
+        error,
+        systematic,
+        known_effect=known_effect,
+        linear=linear,
+        bounds=bounds,
+    )
+    assert combined.combined95 is not None
+    assert combined.combined_std_error is not None
+    return BudgetLine(
+        combined.value,
+        _ranked(
+            {
+                source: part / total
+                for source, part in variances.items()
+                if part > 0
+            }
+        ),
+        combined95=combined.combined95,
+        combined_std_error=combined.combined_std_error,
+        systematic=systematic,
+        known_effect=known_effect,
+    )
+
+
+def _variance(at: IntervalCoordinate, middle: float, ends: Interval) -> float:
+    """Return the variance, in the coordinate of the interval, of a 95 % interval about a middle
+    value, one end of which may be cut off by a bound: the mean of both sides.
+    """
+    centre = at.from_value(middle)
+    low, high = map(at.from_value, ends)
+    if np.isclose(centre - low, high - centre, rtol=1e-6):
+        return ((high - low) / 2 / NORMAL_95) ** 2
+    return float(
+        np.mean(
+            [
+                ((centre - low) / NORMAL_95) ** 2,
+                ((high - centre) / NORMAL_95) ** 2,
+            ]
+        )
+    )
+
+
+def _ranked(shares: Mapping[str, float]) -> dict[str, float]:
+    """Sort shares of a variance, the largest first."""
+    return dict(sorted(shares.items(), key=lambda part: -part[1]))
+
+
+def _estimate_derivatives(
+    fit: LinearisedFit, parameters: Parameters, q: Array
+) -> dict[str, Array]:
+    """Return the derivatives (nq,) of each estimate by q, by name: parameters, tied ones and
+    derived moduli; zero for fixed ones.
+    """
+    values = parameters.values(q)
+    slopes = {name: np.zeros(len(q)) for name in values}
+    for k, item in enumerate(parameters.free):
+        slopes[item.name][k] = item.value_derivative(values[item.name])
+    for item in parameters.items:
+        if item.tied is not None:
+            slopes[item.name] = item.tied.ratio * slopes[item.tied.to]
+    return slopes | dict(fit.derived.derivatives)
+
+
+def main_sources(
+    shares: Mapping[str, Mapping[str, float]], minimum_share: float
+) -> list[str]:
+    """Return the sources with at least a share `minimum_share` in the variance of some estimate,
+    the largest first.
+
+    Parameters
+    ----------
+    shares : mapping of str to mapping of str to float
+        Shares by estimate and source.
+    minimum_share : float
+        Smallest share of interest.
+    """
+    largest: dict[str, float] = {}
+    for source, share in (
+        each for line in shares.values() for each in line.items()
+    ):
+        largest[source] = max(share, largest.get(source, 0.0))
+    return sorted(
+        (s for s in largest if largest[s] >= minimum_share),
+        key=lambda s: -largest[s],
+    )
+
+
+def source_label(source: str) -> str:
+    """Return the name of a source as text, without unit suffix."""
+    unit = next(
+        (
+            u
+            for u in ("_m_n", "_1_m2", "_rad", "_m", "_s")
+            if source.endswith(u)
+        ),
+        "",
+    )
+    return source.removesuffix(unit).replace("_", " ")

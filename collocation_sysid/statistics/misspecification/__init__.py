@@ -1,0 +1,9 @@
+"""Misspecification hypotheses: mistakes in a description that would explain the misfit.
+
+- `misspecification_hypothesis`: a hypothesis, its strength and how hypotheses are ranked.
+- `plausibility`: contradictions that no simulation is needed for; `placement_causes`: loose parts,
+  and bodies inside obstacles; `modal_misspecifications`: predictions by natural modes.
+- `wrench_causes`: force sensors; `camera_misspecifications`: depth cameras;
+  `specimen_misspecifications`: homogeneous tests.
+- `fit_misspecifications`: hypotheses after a fit.
+"""

@@ -1,0 +1,434 @@
+"""Misspecification hypotheses for a fit that misses its data: refits without a mistake, ranked by
+misfit.
+
+The tests of `modal_misspecifications` cost little. The others change the experiment that fits
+worst: it is fitted again with each mistake corrected, and the factor by which its misfit decreases
+is the strength of the hypothesis. Of the directions of gravity, the natural modes choose the one
+that is refitted.
+
+Hypotheses about measured wrenches are in `wrench_causes`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from ...common.array_types import Array, root_mean
+from ...errors import InputError, SimulationError
+from ...methods.continuation import first_samples
+from ...methods.reduced_space import ReducedSpace
+from ...methods.solution import Solution, Status
+from ...program.modes.modal_prediction import DeclaredMotion
+from ...recording.experiment import Experiment
+from ...recording.grasp import Grasp
+from ...recording.poses import PoseSequence
+from .misspecification_hypothesis import (
+    Hypothesis,
+    HypothesisTest,
+    clock_hypothesis,
+    rank,
+)
+from .modal_misspecifications import (
+    ModalComparison,
+    find_misspecifications_by_modes,
+    gravity_hypotheses,
+)
+from .plausibility import load_sign_hypotheses
+from .specimen_misspecifications import find_specimen_misspecifications
+from .wrench_causes import wrench_causes
+
+# RMS residual in standard deviations up to which there is nothing to explain.
+NOISE = 1.15
+# Factor by which the misfit of a refit must decrease, unless only noise remains.
+BETTER = 1.5
+# Factor by which two means, before and after, must explain residuals better than one.
+SLIP = 2.0
+# Largest number of samples of a refit.
+MOST_SAMPLES = 100
+# Largest number of refits for the lag of a clock.
+CLOCK_REFITS = 4
+# Fewest sweeps of one refit.
+FEWEST_SWEEPS = 15
+# Most sweeps of one refit; within these limits, as many as the fit took iterations.
+MOST_SWEEPS = 40
+# Work of all refits over that of the fit.
+EFFORT = 3
+# Most sweeps of all refits.
+BUDGET = 150
+# Length of the last step of a parameter's logarithm.
+TOLERANCE = 1e-2
+# Factor of the misfit from which on no other hypothesis is tested.
+CERTAIN = 4.0
+# Change of the lag that ends the search [s].
+SAME_LAG_S = 5e-4
+# Fewest samples before and after a slip.
+SHORTEST = 4
+
+
+def find_misspecifications(
+    solution: Solution, budget: int | None = None
+) -> tuple[Hypothesis, ...]:
+    """Return hypotheses of what is described wrongly, likeliest first; empty where the residuals
+    are noise.
+
+    Parameters
+    ----------
+    solution : Solution
+        The fit.
+    budget : int, optional
+        Largest number of sweeps over the first samples for all refits together; by default three
+        times the work of the fit, at most 150.
+
+    Returns
+    -------
+    tuple of Hypothesis
+        `strength` is the factor by which the misfit decreases without the mistake.
+    """
+    fitted = [
+        segment.experiment for segment in solution.collocation.transcriptions
+    ]
+    misfits = [
+        _misfit(e, read)
+        for e, read in zip(fitted, solution.readings_m, strict=True)
+    ]
+    hypotheses = [
+        *wrench_causes(solution),
+        *(cause for e in fitted for cause in load_sign_hypotheses(e)),
+        *find_specimen_misspecifications(solution),
+    ]
+    if max(misfits) > NOISE:
+        worst = fitted[int(np.argmax(misfits))]
+        hypotheses += find_misspecifications_by_modes(
+            worst, solution.parameters, huber=solution.collocation.huber
+        )
+        if max((each.strength for each in hypotheses), default=0.0) < CERTAIN:
+            hypotheses += _refit_hypotheses(solution, worst, budget=budget)
+    return rank(hypotheses)
+
+
+def _refit_hypotheses(
+    solution: Solution, experiment: Experiment, budget: int | None
+) -> list[Hypothesis]:
+    """Return the hypotheses whose correction lets the first samples of an experiment fit far
+    better; empty if these cannot be fitted.
+
+    Parameters
+    ----------
+    solution : Solution
+        The fit; refits begin at the guess of its problem.
+    experiment : Experiment
+    budget : int or None
+        Largest number of sweeps for all refits together; None for the default, see
+        `find_misspecifications`.
+    """
+    first = first_samples(experiment, MOST_SAMPLES)
+    alone = _Refitter(solution, first, sweeps=budget)
+    fitted_m = alone.fit(first)
+    if fitted_m is None:
+        return []
+    trial = HypothesisTest(
+        _misfit(first, fitted_m),
+        alone.misfit_after_refit,
+        required_factor=BETTER,
+        smallest_misfit=1.0,
+        noise_level=NOISE,
+    )
+    of = f"'{experiment.name}'"
+    lags = (
+        [] if first.is_static else _clock_hypotheses(alone, first, fitted_m, of)
+    )
+    comparison = ModalComparison.from_experiment(first, solution.parameters)
+    turned = (
+        [] if comparison is None else _gravity_hypotheses(first, comparison)
+    )
+    return [
+        *trial.accepted(
+            [
+                *lags,
+                *_slip_hypotheses(first, fitted_m, of),
+                *turned,
+                *_grasp_layer_hypotheses(first, of),
+            ]
+        )
+    ]
+
+
+def _gravity_hypotheses(
+    declared: Experiment, comparison: ModalComparison
+) -> Iterator[Hypothesis]:
+    """Yield the direction of gravity that suits the natural modes best, as a hypothesis."""
+    others = gravity_hypotheses(comparison.declared)
+    nearest = min(
+        others,
+        key=lambda each: comparison.misfit_m(each.corrected),
+        default=None,
+    )
+    if nearest is not None:
+        gravity_m_s2 = nearest.corrected.gravity_m_s2
+        yield replace(
+            nearest, corrected=replace(declared, gravity_m_s2=gravity_m_s2)
+        )
+
+
+def _grasp_layer_hypotheses(
+    declared: Experiment, of: str
+) -> Iterator[Hypothesis]:
+    """Yield hypotheses, about the subject `of`, of grasps one layer of elements deeper or less
+    deep, where that is possible.
+    """
+    for deeper, deep in ((True, "deeper"), (False, "less deep")):
+        if (layered := _with_shifted_grasps(declared, deeper)) is not None:
+            yield Hypothesis(
+                "grasp-layer", of, data={"deep": deep}, corrected=layered
+            )
+
+
+def _slip_hypotheses(
+    declared: Experiment, fitted_m: Array, of: str
+) -> Iterator[Hypothesis]:
+    """Yield the hypothesis, about the subject `of`, that the marker whose residuals change most
+    abruptly slipped; `corrected` is the experiment without it. None if no change is abrupt, or too
+    few markers remain.
+    """
+    residual = _residual(declared, fitted_m)
+    described = DeclaredMotion.from_experiment(declared)
+    if described is not None:
+        residual = np.einsum(
+            "tji,tmj->tmi", described.rotations, residual[: len(described.t_s)]
+        )
+    clearest = [_largest_step(residual[:, m]) for m in range(residual.shape[1])]
+    m = int(np.argmax([ratio for ratio, _ in clearest]))
+    if clearest[m][0] < SLIP or residual.shape[1] < 2:
+        return
+    tracks = np.array(declared.markers.positions_m)
+    tracks[:, m] = np.nan
+    data = {
+        "marker": declared.markers.names[m],
+        "t_s": declared.t_s[clearest[m][1]],
+    }
+    without = replace(
+        declared, markers=replace(declared.markers, positions_m=tracks)
+    )
+    yield Hypothesis("marker-slip", of, data=data, corrected=without)
+
+
+def _largest_step(residual: Array) -> tuple[float, int]:
+    """Return the factor by which two means explain residuals (T, 3) better than one, and the index
+    of the sample at which the second begins; 1 and 0 for too few samples. NaN is ignored.
+    """
+    present = np.flatnonzero(np.isfinite(residual[:, 0]))
+    if len(present) < 2 * SHORTEST:
+        return 1.0, 0
+    x = residual[present]
+    total = np.cumsum(x, axis=0)[:-1]
+    count = np.arange(1, len(x))[:, None]
+    before = total / count
+    after = (x.sum(axis=0) - total) / (len(x) - count)
+    gain = np.sum(count * before**2 + (len(x) - count) * after**2, axis=1)
+    k = SHORTEST - 1 + int(np.argmax(gain[SHORTEST - 1 : len(x) - SHORTEST]))
+    one = np.sum((x - x.mean(axis=0)) ** 2)
+    two = np.sum(x**2) - gain[k]
+    return float(np.sqrt(one / max(two, 1e-30))), int(present[k + 1])
+
+
+class _Refitter:
+    """Fits of one experiment at a time from the problem's guess, with a limited number of
+    sweeps.
+    """
+
+    def __init__(
+        self, solution: Solution, declared: Experiment, sweeps: int | None
+    ) -> None:
+        self.collocation = solution.collocation
+        fitted = [
+            segment.experiment for segment in self.collocation.transcriptions
+        ]
+        rows = sum(len(experiment.t_s) for experiment in fitted)
+        self.each = min(MOST_SWEEPS, max(FEWEST_SWEEPS, solution.iterations))
+        work = EFFORT * self.each * rows // len(declared.t_s)
+        self.sweeps = min(BUDGET, work) if sweeps is None else sweeps
+        self.known: dict[Experiment, Array | None] = {}
+        if len(fitted) == 1 and len(declared.t_s) == rows:
+            self.known[declared] = solution.readings_m[0]
+
+    def fit(self, experiment: Experiment) -> Array | None:
+        """Return the fitted markers (T, M, 3) [m]; None if there is no fit. Results are cached."""
+        if experiment not in self.known:
+            self.known[experiment] = self._fit(experiment)
+        return self.known[experiment]
+
+    def misfit_after_refit(self, experiment: Experiment) -> float | None:
+        """Return the misfit after a refit; None if there is no fit."""
+        fitted_m = self.fit(experiment)
+        return None if fitted_m is None else _misfit(experiment, fitted_m)
+
+    def _fit(self, experiment: Experiment) -> Array | None:
+        """Return the markers (T, M, 3) [m] of a fit of one experiment, and subtract its sweeps from
+        those allowed; None if none are left, or the fit fails.
+        """
+        if self.sweeps <= 0:
+            return None
+        method = ReducedSpace(
+            max_iterations=min(self.each, self.sweeps), tolerance=TOLERANCE
+        )
+        try:
+            solution = method(
+                replace(self.collocation, experiments=(experiment,))
+            )
+        except (InputError, SimulationError):
+            return None
+        self.sweeps -= solution.iterations
+        solution.unless_interrupted()
+        ended = (
+            solution.status.converged
+            or solution.status is Status.ITERATION_LIMIT
+        )
+        return solution.readings_m[0] if ended else None
+
+
+def _clock_hypotheses(
+    alone: _Refitter, declared: Experiment, fitted_m: Array, of: str
+) -> Iterator[Hypothesis]:
+    """Yield the clock lag for which residuals and velocities agree best, after a few refits.
+
+    Parameters
+    ----------
+    alone : _Refitter
+    declared : Experiment
+        Experiment as stated.
+    fitted_m : (T, M, 3) array
+        Markers of its fit [m].
+    of : str
+        Subject of the hypothesis.
+    """
+    least = _misfit(declared, fitted_m)
+    lag_s = 0.0
+    shifted = declared
+    best = None
+    for _ in range(CLOCK_REFITS):
+        more_s = _marker_lag_s(shifted, fitted_m)
+        lag_s += more_s
+        if abs(more_s) < SAME_LAG_S:
+            break
+        later = with_pose_lag(declared, lag_s)
+        fitted = None if later is None else alone.fit(later)
+        if later is None or fitted is None:
+            break
+        shifted = later
+        fitted_m = fitted
+        if (now := _misfit(shifted, fitted_m)) < least:
+            best = clock_hypothesis(of, lag_s, corrected=shifted)
+            least = now
+    if best is not None:
+        yield best
+
+
+def with_pose_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
+    """Return the experiment with its poses `lag_s` [s] later (negative: earlier); None if fewer
+    than three samples remain, or the result is no valid experiment.
+    """
+    t_s = experiment.t_s
+    is_covered = t_s <= t_s[-1] + min(lag_s, 0.0) + 1e-9
+    if is_covered.sum() < 3:
+        return None
+    markers = experiment.markers
+    try:
+        return replace(
+            experiment,
+            t_s=t_s[is_covered],
+            grasps=[
+                replace(g, poses=_delayed_poses(g, t_s, lag_s=lag_s))
+                for g in experiment.grasps
+            ],
+            markers=replace(
+                markers,
+                t_s=t_s[is_covered],
+                positions_m=markers.positions_m[is_covered],
+            ),
+        )
+    except InputError:
+        return None
+
+
+def _delayed_poses(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
+    """Return the poses of a grasp, `lag_s` later [s]."""
+    poses = grasp.poses
+    if len(poses.t_s) < 2:
+        return poses
+    times = poses.t_s + lag_s
+    first = slice(0, 1)
+    if lag_s <= 0:
+        return replace(poses, t_s=times)
+    # Before its first pose the grasp rests there.
+    return replace(
+        poses,
+        t_s=np.r_[min(t_s[0], poses.t_s[0]), times],
+        positions_m=np.concatenate(
+            [poses.positions_m[first], poses.positions_m]
+        ),
+        quaternions_xyzw=np.concatenate(
+            [poses.quaternions_xyzw[first], poses.quaternions_xyzw]
+        ),
+    )
+
+
+def _marker_lag_s(experiment: Experiment, predicted_m: Array) -> float:
+    """Return by how much the markers lag behind predicted tracks (T, M, 3) [m], in seconds: Σ r·v /
+    Σ v·v of residuals (fitted less measured) and velocities; 0 without motion. Missing samples are
+    ignored.
+    """
+    v = np.gradient(predicted_m, experiment.timestep_s, axis=0)
+    residual = np.where(
+        np.isfinite(experiment.markers.positions_m),
+        _residual(experiment, predicted_m),
+        0.0,
+    )
+    moving = np.where(experiment.markers.is_present[..., None], v, 0.0)
+    return float(np.sum(residual * moving) / max(np.sum(moving**2), 1e-300))
+
+
+def _with_shifted_grasps(
+    experiment: Experiment, deeper: bool
+) -> Experiment | None:
+    """Return the experiment with every grasp one layer of elements deeper or less deep;
+    None if that is impossible.
+    """
+    cells = experiment.body.cells
+    n = len(experiment.body.nodes_m)
+    grasps = []
+    for grasp in experiment.grasps:
+        is_grasped = np.isin(np.arange(n), grasp.nodes)
+        # The layer that touches what is held, or of what is held that which touches the rest.
+        is_shifted = is_grasped if deeper else ~is_grasped
+        grown = np.zeros(n, dtype=bool)
+        grown[cells[is_shifted[cells].any(axis=1)]] = True
+        nodes = np.flatnonzero(grown if deeper else is_grasped & ~grown)
+        if len(nodes) < 3 or len(nodes) > n - 1:
+            return None
+        grasps.append(replace(grasp, nodes=nodes))
+    try:
+        return replace(experiment, grasps=grasps)
+    except InputError:
+        return None
+
+
+def _residual(experiment: Experiment, predicted_m: Array) -> Array:
+    """Return predicted less measured markers (T, M, 3) [m], NaN where missing."""
+    return np.where(
+        experiment.markers.is_present[..., None],
+        predicted_m - experiment.markers.positions_m,
+        np.nan,
+    )
+
+
+def _misfit(experiment: Experiment, predicted_m: Array) -> float:
+    """Return the root mean square of the residuals of predicted markers (T, M, 3) [m] in standard
+    deviations; missing samples are ignored.
+    """
+    scaled = (
+        _residual(experiment, predicted_m) / experiment.markers.sigma_m[:, None]
+    )
+    return root_mean(scaled[experiment.markers.is_present] ** 2)

@@ -1,0 +1,148 @@
+"""Misspecification hypotheses: what may be described wrongly, how it is tested, and its message.
+
+A hypothesis is tested by the misfit with the mistake corrected: by natural modes for many
+stiffnesses (`modal_misspecifications`), by another fit, or by the wrench of a fit to the markers
+alone (`wrench_causes`). Contradictions and jumps need no test (`plausibility`). All are ranked by
+the factor by which the misfit decreases. An accepted hypothesis becomes a concern of the topic
+"description".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from ..concerns import Concern, Grade
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One possible mistake in the description of a problem.
+
+    Attributes
+    ----------
+    code : str
+        Cause and how it shows, such as "marker-slip/alone".
+    subject : str
+        What is described, as the beginning of the message; may be empty.
+    data : mapping of str to value
+        Values of the placeholders in the message.
+    corrected : Any
+        Description with the mistake corrected, of the type that its test expects; None if no test
+        is needed.
+    handicap : float
+        Factor by which a hypothesis with fitted numbers must fit better than one without.
+    strength : float
+        Factor by which the misfit decreases if the hypothesis is true; 0 until it is tested.
+    """
+
+    code: str
+    subject: str = ""
+    data: Mapping[str, Any] = field(default_factory=dict)
+    corrected: Any = None
+    handicap: float = 1.0
+    strength: float = 0.0
+
+    @property
+    def cause(self) -> str:
+        """Short name of the mistake, such as "poses-inverted"."""
+        return self.code.partition("/")[0]
+
+    @property
+    def message(self) -> str:
+        """Message with the likely mistake and the remedy."""
+        return self.concern().message
+
+    def concern(self, grade: Grade = "check") -> Concern:
+        """Return the hypothesis as a concern of a given grade."""
+        tried = {} if self.corrected is None else {"nearer": self.strength}
+        of = {"of": self.subject} if self.subject else {}
+        return Concern(
+            f"description/{self.code}", grade, data={**of, **self.data, **tried}
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return cause, message and strength for JSON and tables."""
+        return {
+            "cause": self.cause,
+            "sentence": self.message,
+            "strength": self.strength,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesisTest:
+    """Test of hypotheses by the misfit that remains.
+
+    Attributes
+    ----------
+    misfit : float
+        Misfit of the description as stated.
+    misfit_of : callable
+        Returns the misfit of a corrected description; None if it is unknown.
+    required_factor : float
+        Factor by which the misfit must decrease.
+    smallest_misfit : float
+        Smallest meaningful misfit; smaller ones count as this.
+    noise_level : float
+        If the misfit decreases from above this level to below it, any factor suffices.
+    """
+
+    misfit: float
+    misfit_of: Callable[[Any], float | None]
+    required_factor: float
+    smallest_misfit: float = 0.0
+    noise_level: float = 0.0
+
+    def accepted(
+        self, hypotheses: Iterable[Hypothesis]
+    ) -> Iterator[Hypothesis]:
+        """Yield those hypotheses, with their strength, whose correction decreases the misfit by the
+        required factor, or from above the noise to below it.
+
+        The strength is the factor by which the misfit decreases, divided by the handicap. A
+        hypothesis whose misfit cannot be computed (None) is omitted.
+        """
+        for each in hypotheses:
+            if (misfit := self.misfit_of(each.corrected)) is None:
+                continue
+            strength = (
+                self.misfit / max(self.smallest_misfit, misfit) / each.handicap
+            )
+            if (
+                strength > self.required_factor
+                or misfit < self.noise_level < self.misfit
+            ):
+                yield replace(each, strength=strength)
+
+
+def clock_hypothesis(
+    subject: str, lag_s: float, corrected: Any, handicap: float = 1.0
+) -> Hypothesis:
+    """Return the hypothesis that the markers' clock is late by `lag_s` [s] (negative: early)
+    compared with the poses.
+
+    Parameters
+    ----------
+    subject : str
+        Beginning of the message.
+    lag_s : float
+    corrected : object
+        Description with the mistake corrected.
+    handicap : float
+        Divisor of the hypothesis' strength.
+    """
+    when, do = ("late", "add") if lag_s > 0 else ("early", "subtract")
+    data = {"when": when, "by_ms": 1e3 * abs(lag_s), "do": do}
+    return Hypothesis(
+        "clock", subject, data=data, corrected=corrected, handicap=handicap
+    )
+
+
+def rank(hypotheses: Iterable[Hypothesis]) -> tuple[Hypothesis, ...]:
+    """Return each cause once, with its strongest hypothesis, strongest first."""
+    strongest: dict[str, Hypothesis] = {}
+    for each in sorted(hypotheses, key=lambda each: -each.strength):
+        strongest.setdefault(each.cause, each)
+    return tuple(strongest.values())

@@ -1,0 +1,501 @@
+"""Misspecification hypotheses tested before any solve, by natural modes for many stiffnesses.
+
+The markers of bodies of many stiffnesses (`program.modes.modal_prediction`) are compared with the
+measured tracks, for the description as stated and with each common mistake corrected. A correction
+that fits far better is reported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse.linalg import ArpackError
+from scipy.spatial.transform import Rotation
+
+from ...common.array_types import Array, Index
+from ...errors import SimulationError
+from ...program.modes.modal_prediction import (
+    DeclaredMotion,
+    ModalResponse,
+    delayed_tracks,
+)
+from ...recording.experiment import Experiment
+from ..axes import OTHER_AXES
+from .misspecification_hypothesis import (
+    Hypothesis,
+    HypothesisTest,
+    clock_hypothesis,
+    rank,
+)
+from .plausibility import (
+    load_sign_hypotheses,
+    name_exchange_hypotheses,
+    step_hypotheses,
+    undriven_motion,
+)
+
+# Factor by which the misfit must decrease.
+LEAST_IMPROVEMENT = 2.0
+# Additional factor for hypotheses with fitted numbers.
+FITTED = 1.5
+# Accuracy of small strains and a few modes, over the size of the body.
+ROUGHLY = 0.005
+# Share of the samples that are used, the best ones; others may be exchanged labels or reflections.
+USED = 0.9
+# Clock lags that are tried [s].
+LAGS_S = np.concatenate([-np.arange(15, 0, -1), np.arange(1, 16)]) * 0.01
+# Longest lag over the length of the recording.
+LONGEST_LAG = 0.3
+# Alternations between the best stiffness and the best rigid motion.
+REFITS = 3
+# Additional factor for each of many variants of one mistake.
+ONE_OF_MANY = 1.05
+# Deformation of an equilibrium over the body's diagonal that needs no explanation.
+DEFORMED = 0.1
+# Distance of the tracks over the body's diagonal from which on no stiffness explains them.
+LARGEST_MISFIT = 0.3
+
+
+def find_misspecifications_by_modes(
+    experiment: Experiment,
+    constants: Mapping[str, float],
+    huber: float | None = None,
+) -> tuple[Hypothesis, ...]:
+    """Return hypotheses about a recording's description, likeliest first; mostly empty.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The recording.
+    constants : mapping of str to float
+        Constants of the body; only ratios of stiffness within it matter.
+    huber : float, optional
+        Threshold of Huber's loss; None means a quadratic loss.
+    """
+    if not experiment.markers.names:
+        return rank(load_sign_hypotheses(experiment))
+    if experiment.is_static:
+        return rank(
+            [*load_sign_hypotheses(experiment), *_rigid_axes(experiment)]
+        )
+    comparison = ModalComparison.from_experiment(experiment, constants)
+    tried = (
+        _rigid_axes(experiment)
+        if comparison is None
+        else comparison.hypotheses()
+    )
+    hypotheses = [
+        *tried,
+        *name_exchange_hypotheses(experiment, huber),
+        *step_hypotheses(experiment),
+    ]
+    hypotheses += undriven_motion(experiment)
+    if comparison is not None and not hypotheses and not experiment.obstacles:
+        hypotheses += comparison.unlike()
+    return rank(hypotheses)
+
+
+def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Yield hypotheses of other axes of the tracks that bring them far nearer to the
+    undeformed body.
+    """
+    markers = experiment.markers
+    body = experiment.body
+    places_m = markers.predict_positions(
+        experiment.rigid_positions(experiment.t_s)
+    )
+    size_m = float(np.linalg.norm(np.ptp(body.mesh.bounds_m, axis=0)))
+
+    def remaining_misfit(tracks_m: Array) -> float:
+        distances_m = np.linalg.norm(tracks_m - places_m, axis=2)
+        return float(np.hypot(np.nanmedian(distances_m), DEFORMED * size_m))
+
+    if markers.sample_count:
+        trial = HypothesisTest(
+            remaining_misfit(markers.positions_m),
+            remaining_misfit,
+            required_factor=LEAST_IMPROVEMENT,
+        )
+        yield from trial.accepted(
+            _axes(f"'{experiment.name}'", markers.positions_m)
+        )
+
+
+def _axes(name: str, tracks_m: Array) -> Iterator[Hypothesis]:
+    """Yield the tracks (T, M, 3) with their axes in every other order and of either sign, as
+    hypotheses about the experiment of a name; the tracks are their `corrected`.
+    """
+    for axes, (order, signs) in OTHER_AXES.items():
+        turned = np.array(signs) * tracks_m[..., list(order)]
+        yield Hypothesis(
+            "markers-axes",
+            name,
+            data={"axes": axes},
+            corrected=turned,
+            handicap=ONE_OF_MANY,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ModalComparison:
+    """Comparison of descriptions of one experiment with its tracks.
+
+    Attributes
+    ----------
+    declared : DeclaredMotion
+        Description as stated.
+    names : (M,) tuple of str
+        Names of the markers.
+    response : ModalResponse
+        Natural modes at the markers.
+    floor_m : float
+        Smallest misfit that can be expected [m].
+    """
+
+    declared: DeclaredMotion
+    names: tuple[str, ...]
+    response: ModalResponse
+    floor_m: float
+
+    @classmethod
+    def from_experiment(
+        cls, experiment: Experiment, constants: Mapping[str, float]
+    ) -> ModalComparison | None:
+        """Build the comparison for an experiment, see `hypotheses`.
+
+        None if the body has no modes, no single grasp carries it, there are too few tracks, or
+        tendons or pressures drive it.
+        """
+        declared = (
+            None
+            if experiment.actuators
+            else DeclaredMotion.from_experiment(experiment)
+        )
+        if declared is None or np.isfinite(declared.tracks_m[..., 0]).sum() < 3:
+            return None
+        try:
+            response = ModalResponse.from_experiment(experiment, constants)
+        except (SimulationError, np.linalg.LinAlgError, ArpackError):
+            return None
+        markers = experiment.markers
+        noise_m = np.sqrt(3) * np.median(markers.sigma_m)
+        return cls(
+            declared,
+            markers.names,
+            response,
+            float(np.hypot(noise_m, ROUGHLY * response.size_m)),
+        )
+
+    def misfit_m(self, declared: DeclaredMotion) -> float:
+        """Return the misfit of the best stiffness [m]."""
+        return float(
+            self._misfits_m(declared, self.response.predict(declared)).min()
+        )
+
+    def best_prediction(self, declared: DeclaredMotion) -> Array:
+        """Return the markers (T, M, 3) [m] as predicted from a description with the stiffness and
+        damping that fit best.
+        """
+        predicted = self.response.predict(declared)
+        return predicted[int(self._misfits_m(declared, predicted).argmin())]
+
+    def hypotheses(self) -> Iterator[Hypothesis]:
+        """Iterate over the hypotheses that fit far better than the description as stated."""
+        trial = HypothesisTest(
+            self.misfit_m(self.declared),
+            self.misfit_m,
+            required_factor=LEAST_IMPROVEMENT,
+        )
+        yield from trial.accepted(
+            [
+                *simple_hypotheses(self.declared),
+                *self._frame_hypotheses(),
+                *self._clock_hypotheses(),
+            ]
+        )
+        yield from self._name_hypotheses()
+        yield from self._other_axes()
+
+    def unlike(self) -> Iterator[Hypothesis]:
+        """Yield the hypothesis that no stiffness explains the tracks, if they are far from
+        all predictions.
+        """
+        misfit_m = self.misfit_m(self.declared)
+        size_m = self.response.size_m
+        strength = misfit_m / (LARGEST_MISFIT * size_m)
+        if strength > 1:
+            data = {"by_mm": 1e3 * misfit_m, "size_mm": 1e3 * size_m}
+            yield Hypothesis(
+                "unlike", self.declared.name, data=data, strength=strength
+            )
+
+    def _other_axes(self) -> Iterator[Hypothesis]:
+        """Yield hypotheses of other axes of the tracks, tested by the modes."""
+        predicted = self.response.predict(self.declared)
+
+        def remaining_misfit(tracks_m: Array) -> float:
+            turned = replace(self.declared, tracks_m=tracks_m)
+            return float(self._misfits_m(turned, predicted).min())
+
+        declared_m = self.declared.tracks_m
+        yield from HypothesisTest(
+            remaining_misfit(declared_m),
+            remaining_misfit,
+            required_factor=LEAST_IMPROVEMENT,
+        ).accepted(_axes(self.declared.name, declared_m))
+
+    def _misfits_m(self, declared: DeclaredMotion, predicted: Array) -> Array:
+        """Return the misfit (S,) [m] of each prediction (S, T, M, 3): the root of the mean squared
+        distance of the nearest 90 % of the samples plus the squared floor.
+        """
+        present = np.isfinite(declared.tracks_m[..., 0]) & np.isfinite(
+            predicted[0, ..., 0]
+        )
+        distance = np.linalg.norm(predicted - declared.tracks_m, axis=3)[
+            :, present
+        ]
+        squares = np.sort(distance**2, axis=1)
+        used = max(1, int(np.ceil(USED * squares.shape[1])))
+        return np.sqrt(squares[:, :used].mean(axis=1) + self.floor_m**2)
+
+    def _frame_hypotheses(self) -> Iterator[Hypothesis]:
+        """Yield hypotheses of a rigid motion before the poses, and of a rigid motion of the
+        tracks.
+        """
+        declared = self.declared
+        places_m = self.response.places_m
+        if not _determines_rotation(places_m):
+            return
+        moved_poses = moved_tracks = declared
+        for k in range(REFITS):
+            best = (
+                moved_poses.to_grasp_frame(self.best_prediction(moved_poses))
+                if k
+                else np.broadcast_to(places_m, declared.tracks_m.shape)
+            )
+            moved_poses = moved_poses.with_prior_motion(
+                *_fit_rigid_motion(
+                    best, moved_poses.to_grasp_frame(moved_poses.tracks_m)
+                )
+            )
+            turn, shift_m = _fit_rigid_motion(
+                moved_tracks.tracks_m, self.best_prediction(moved_tracks)
+            )
+            moved_tracks = replace(
+                moved_tracks, tracks_m=moved_tracks.tracks_m @ turn.T + shift_m
+            )
+        yield Hypothesis(
+            "gripper-frame",
+            declared.name,
+            corrected=moved_poses,
+            handicap=FITTED,
+        )
+        yield Hypothesis(
+            "camera-frame",
+            declared.name,
+            corrected=moved_tracks,
+            handicap=FITTED,
+        )
+
+    def _clock_hypotheses(self) -> Iterator[Hypothesis]:
+        """Yield the hypothesis of the clock lag that fits best, unless the allowed lags are
+        none.
+        """
+        declared = self.declared
+        predicted = self.response.predict(declared)
+        allowed = LAGS_S[
+            np.abs(LAGS_S) < LONGEST_LAG * np.ptp(declared.t_s)
+        ].tolist()
+        delayed = (
+            delayed_tracks(predicted, declared.t_s, lag_s=lag_s)
+            for lag_s in allowed
+        )
+        misfits = [self._misfits_m(declared, each).min() for each in delayed]
+        if misfits:
+            lag_s = allowed[int(np.argmin(misfits))]
+            yield clock_hypothesis(
+                declared.name,
+                lag_s,
+                corrected=replace(declared, lag_s=lag_s),
+                handicap=FITTED,
+            )
+
+    def _name_hypotheses(self) -> Iterator[Hypothesis]:
+        """Yield the hypothesis that markers have each other's names, tested on these markers; none
+        with fewer than two markers or a marker without samples.
+        """
+        declared = self.declared
+        squares = np.sum(
+            (
+                declared.tracks_m[:, :, None]
+                - self.best_prediction(declared)[:, None]
+            )
+            ** 2,
+            axis=3,
+        )
+        is_complete = np.isfinite(squares).any(axis=0).all()
+        if not is_complete or len(self.names) < 2:
+            return
+        _, chosen = linear_sum_assignment(np.nanmean(squares, axis=0))
+        exchanged = np.flatnonzero(chosen != np.arange(len(chosen)))
+        if not len(exchanged):
+            return
+        few, renamed = (
+            _with_markers(
+                declared, declared.tracks_m[:, order], markers=exchanged
+            )
+            for order in (np.arange(len(chosen)), np.argsort(chosen))
+        )
+        listed = ", ".join(
+            f"{self.names[k]} is {self.names[chosen[k]]}" for k in exchanged
+        )
+        hypothesis = Hypothesis(
+            "markers-exchanged",
+            declared.name,
+            data={"names": listed},
+            corrected=renamed,
+        )
+        yield from HypothesisTest(
+            self.misfit_m(few), self.misfit_m, required_factor=LEAST_IMPROVEMENT
+        ).accepted([hypothesis])
+
+
+def _with_markers(
+    declared: DeclaredMotion, tracks_m: Array, markers: Index
+) -> DeclaredMotion:
+    """Return the description with the tracks `tracks_m` (T, M, 3) [m] of some markers (indices)
+    only; the others are missing (NaN).
+    """
+    few_m = np.full_like(tracks_m, np.nan)
+    few_m[:, markers] = tracks_m[:, markers]
+    return replace(declared, tracks_m=few_m)
+
+
+def _fit_rigid_motion(from_m: Array, to_m: Array) -> tuple[Array, Array]:
+    """Return rotation (3, 3) and translation (3,) that map points `from_m` to `to_m`, both (T, M,
+    3) [m], by least squares; points that are NaN in either are ignored.
+    """
+    both = np.isfinite(from_m[..., 0]) & np.isfinite(to_m[..., 0])
+    a = from_m[both]
+    b = to_m[both]
+    rotation = Rotation.align_vectors(b - b.mean(axis=0), a - a.mean(axis=0))[
+        0
+    ].as_matrix()
+    return rotation, b.mean(axis=0) - rotation @ a.mean(axis=0)
+
+
+def _determines_rotation(places_m: Array) -> bool:
+    """Whether places (M, 3) are not collinear, so that they determine a rotation."""
+    if len(places_m) < 3:
+        return False
+    extents = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)
+    return bool(extents[1] > 0.1 * extents[0])
+
+
+# Factors of lengths in a wrong unit, with the unit to state; empty where none is certain.
+UNITS = {1e-3: "mm", 1e-2: "cm", 0.0254: "in", 1e3: "", 1e2: ""}
+# Cosine of some 20 degrees, above which a direction is not another axis.
+SAME_DIRECTION = 0.94
+
+
+def simple_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
+    """Iterate over the hypotheses without fitted numbers, each with the mistake corrected."""
+    moving = (
+        np.ptp(declared.rotations, axis=0).any()
+        or np.ptp(declared.translations_m, axis=0).any()
+    )
+    if moving or np.abs(declared.translations_m).any():
+        yield from _pose_hypotheses(declared)
+        yield from _unit_hypotheses(
+            declared,
+            "translations_m",
+            who="the poses would fit if they",
+            section="grasp",
+        )
+    yield from _unit_hypotheses(
+        declared,
+        "tracks_m",
+        who="the markers would fit if they",
+        section="markers",
+    )
+    yield from _unit_hypotheses(
+        declared, "mesh_scale", who="the mesh would fit if it", section="object"
+    )
+    yield from gravity_hypotheses(declared)
+
+
+def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
+    """Yield hypotheses of inverted poses, inverted rotations and other quaternion orders."""
+    inverse = declared.rotations.transpose(0, 2, 1)
+    shift = -np.einsum("tij,tj->ti", inverse, declared.translations_m)
+    inverted = replace(declared, rotations=inverse, translations_m=shift)
+    yield Hypothesis("poses-inverted", declared.name, corrected=inverted)
+    yield Hypothesis(
+        "rotation-inverted",
+        declared.name,
+        corrected=replace(declared, rotations=inverse),
+    )
+    quaternions = Rotation.from_matrix(declared.rotations).as_quat()
+    # Signs are free; neighbours of one sign keep the reordered ones continuous.
+    flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
+    quaternions *= np.cumprod(np.r_[1.0, np.where(flips, -1.0, 1.0)])[:, None]
+    for order, turn in (("wxyz", -1), ("xyzw", 1)):
+        reordered = Rotation.from_quat(
+            np.roll(quaternions, turn, axis=1)
+        ).as_matrix()
+        without = replace(declared, rotations=reordered)
+        yield Hypothesis(
+            "quaternion-order",
+            declared.name,
+            data={"order": order},
+            corrected=without,
+        )
+
+
+def _unit_hypotheses(
+    declared: DeclaredMotion, what: str, who: str, section: str
+) -> Iterator[Hypothesis]:
+    """Yield hypotheses that an attribute of the description is in another unit of length.
+
+    Parameters
+    ----------
+    declared : DeclaredMotion
+        Description as stated.
+    what : str
+        Attribute of the description.
+    who : str
+        Beginning of the message.
+    section : str
+        Section of the problem file.
+    """
+    key = f"{section}.length_unit"
+    for factor, unit in UNITS.items():
+        remedy = f'set {key} = "{unit}"' if unit else f"check {key}"
+        data = {"who": who, "factor": factor, "remedy": remedy}
+        without = replace(declared, **{what: factor * getattr(declared, what)})
+        yield Hypothesis(
+            "length-unit", declared.name, data=data, corrected=without
+        )
+
+
+def gravity_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
+    """Iterate over the hypotheses of gravity along the other axes, and with the other sign."""
+    size = float(np.linalg.norm(declared.gravity_m_s2))
+    for axis, name in enumerate("xyz"):
+        for sign, plus in ((1.0, "+"), (-1.0, "−")):
+            other: Array = np.where(np.arange(3) == axis, sign * size, 0.0)
+            if (
+                size
+                and other @ declared.gravity_m_s2 <= SAME_DIRECTION * size**2
+            ):
+                data = {
+                    "axis": plus + name,
+                    "vector": ", ".join(f"{x:g}" for x in other),
+                }
+                without = replace(declared, gravity_m_s2=other)
+                yield Hypothesis(
+                    "gravity", declared.name, data=data, corrected=without
+                )

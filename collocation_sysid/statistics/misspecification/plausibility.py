@@ -1,0 +1,532 @@
+"""Plausibility of a description: contradictions and impossible values, found without any
+simulation.
+
+- Sizes and densities that soft objects cannot have, which indicate a wrong unit.
+- Deforming a body takes work: loads that fall as their grasp advances have a wrong sign.
+- Sudden lasting steps of a pose that the markers do not follow, or of one marker alone. A step of h
+between two samples shows in the second differences as h followed by −h; a motion that starts or
+stops suddenly shows one of them only.
+- Markers that exchange names at some sample, as trackers do after an occlusion. In the frame of the
+grasp a marker hardly moves from one sample to the next; if names fit far better in another order,
+they have been exchanged. The first order is assumed right, unless another lasts more than twice as
+long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ...common.array_types import Array, Index
+from ...errors import InputError
+from ...fem.body import Body
+from ...fem.laws.moduli import engineering_constants
+from ...program.modes.modal_prediction import carrying_grasp
+from ...recording.experiment import Experiment
+from ...recording.grasp import Grasp
+from ...recording.obstacle import Obstacle
+from .misspecification_hypothesis import Hypothesis
+
+# Densities of soft objects [kg/m³].
+DENSITIES_KG_M3 = (10.0, 25_000.0)
+# Diagonals of soft objects [m].
+SIZES_M = (1e-4, 10.0)
+# Densities from which on a body contains metal [kg/m³].
+METAL_KG_M3 = 5e3
+# Smallest Young's modulus of a metal [Pa].
+SOFTEST_METAL_PA = 1e9
+# Factor outside these ranges from which on a value is rejected.
+IMPOSSIBLE = 100.0
+
+
+def size_and_density_hypotheses(body: Body) -> tuple[Hypothesis, ...]:
+    """Return hypotheses about an implausible size or density of a body; mostly empty.
+
+    Their strength is the factor by which the value is outside the plausible range.
+
+    Raises
+    ------
+    InputError
+        If a value is outside by more than a factor of a hundred.
+    """
+    size_m = float(np.linalg.norm(np.ptp(body.mesh.bounds_m, axis=0)))
+    density_kg_m3 = body.mass_kg / body.mesh.volume_m3
+    little_m, much_m = SIZES_M
+    thin, dense = DENSITIES_KG_M3
+    size = {
+        "size_m": size_m,
+        "least": little_m,
+        "most": much_m,
+        "likely": _likely_length(body, too_large=size_m > much_m),
+    }
+    density = {
+        "density_kg_m3": density_kg_m3,
+        "least": thin,
+        "most": dense,
+        "likely": f"probably {1e3 * density_kg_m3:.4g} kg/m³, if the value is in g/cm³"
+        if density_kg_m3 < thin
+        else f"probably {density_kg_m3 / 1e3:.4g} kg/m³, if the mass is in g",
+    }
+    tried = (
+        Hypothesis(
+            "length-unit/size",
+            data=size,
+            strength=_excess_factor(size_m, SIZES_M),
+        ),
+        Hypothesis(
+            "density",
+            data=density,
+            strength=_excess_factor(density_kg_m3, DENSITIES_KG_M3),
+        ),
+    )
+    for each in tried:
+        if each.strength > IMPOSSIBLE:
+            raise InputError(each.message, None, where="object")
+    return tuple(each for each in tried if each.strength > 1)
+
+
+def _likely_length(body: Body, *, too_large: bool) -> str:
+    """Return what to check of a body that is too large, or too small."""
+    if body.mesh.is_generated:
+        return "its lengths, which are in metres"
+    unit = 'likely "mm"' if too_large else "the mesh may be in metres already"
+    return f"object.length_unit, {unit}"
+
+
+def material_hypothesis(body: Body, theta: Array) -> Hypothesis | None:
+    """Return the hypothesis that no material is as dense and as soft as a body with constants θ
+    (k,); None if there may be one.
+
+    Motion determines the stiffness over the density only, so a wrong density leaves no other trace.
+    """
+    density_kg_m3 = (
+        float(body.mass_of_dofs(theta).sum()) / 3 / body.mesh.volume_m3
+    )
+    young_pa = max(
+        float(engineering_constants(*lame)[0])
+        for lame in body.lame(theta).values()
+    )
+    if density_kg_m3 < METAL_KG_M3 or young_pa > SOFTEST_METAL_PA:
+        return None
+    return Hypothesis(
+        "density/metal",
+        data={"density_kg_m3": density_kg_m3, "young_pa": young_pa},
+    )
+
+
+def _excess_factor(value: float, limits: tuple[float, float]) -> float:
+    """Return the factor by which a value is outside limits; below 1 inside."""
+    return max(limits[0] / value, value / limits[1])
+
+
+# Correlation of load and displacement below which a sign is wrong; noise and hysteresis leave it
+# positive.
+AGAINST = -0.8
+# Fewest samples for this correlation.
+FEWEST_SAMPLES = 3
+# Loads of an obstacle below this share of the largest may be those of no contact.
+TOUCHING = 0.05
+
+
+def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Yield hypotheses of a wrong sign of a wrench, where displacement and load of a static
+    experiment are anticorrelated.
+
+    Dynamic experiments are not tested, because of inertia.
+    """
+    for k, grasp in enumerate(
+        experiment.grasps if experiment.is_static else (), start=1
+    ):
+        if grasp.wrench is None:
+            continue
+        shifts_m = grasp.poses.at(grasp.wrench.t_s)[1]
+        for axis in grasp.zero or _pushing_axis(grasp, shifts_m):
+            axis_index = "xyz".index(axis)
+            displacement_m = shifts_m[:, axis_index]
+            load_n = grasp.wrench.values[:, axis_index]
+            is_measured = np.isfinite(load_n)
+            if isinstance(grasp, Obstacle):
+                # Before contact the load is noise.
+                is_measured &= np.abs(load_n) > TOUCHING * np.nanmax(
+                    np.abs(load_n), initial=0.0
+                )
+            if is_measured.sum() < FEWEST_SAMPLES or not (
+                np.ptp(displacement_m[is_measured])
+                and np.ptp(load_n[is_measured])
+            ):
+                continue
+            correlation = float(
+                np.corrcoef(displacement_m[is_measured], load_n[is_measured])[
+                    0, 1
+                ]
+            )
+            if correlation < AGAINST:
+                data = {"axis": axis, "grasp": k, "correlation": correlation}
+                strength = 1 / (1 + correlation + 1e-3)
+                yield Hypothesis(
+                    "sign", f"'{experiment.name}'", data=data, strength=strength
+                )
+
+
+def _pushing_axis(grasp: Grasp, shifts_m: Array) -> str:
+    """Return the world axis along which an obstacle moves most, from its shifts (S, 3) [m]; "" for
+    a grasp, if the obstacle does not move, or if its force is not in world axes.
+    """
+    moved_m = np.ptp(shifts_m, axis=0)
+    if not isinstance(grasp, Obstacle) or grasp.wrench is None:
+        return ""
+    if not moved_m.any() or grasp.wrench.frame != "world":
+        return ""
+    return "xyz"[int(moved_m.argmax())]
+
+
+# Size of a step over usual changes between samples.
+SUDDEN = 4.0
+# Quantile of the changes that counts as usual.
+LIVELY = 0.9
+# Fewest samples in which steps are searched.
+FEWEST = 8
+
+
+def step_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Yield hypotheses of poses that jump and of markers that slip."""
+    if len(experiment.markers.positions_m) < FEWEST:
+        return
+    if (grasp := carrying_grasp(experiment)) is not None:
+        moved_m = grasp.poses.moved_positions(
+            _marker_box_m(experiment), experiment.t_s
+        )
+        yield from _pose_jump_hypotheses(experiment, moved_m)
+        yield from _common_jump(experiment, moved_m)
+    yield from _slip_hypotheses(experiment)
+
+
+def _common_jump(
+    experiment: Experiment, moved_m: Array
+) -> Iterator[Hypothesis]:
+    """Yield the hypothesis of the largest step of all markers together that the poses do not have;
+    only samples with all markers are used.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    moved_m : (T, m, 3) array
+        Points carried by the poses [m].
+    """
+    tracks_m = experiment.markers.positions_m
+    sigma_m = experiment.markers.sigma_m
+    complete = np.isfinite(tracks_m).all(axis=(1, 2))
+    # A gap hides a step: samples around it are taken as neighbours.
+    rows = np.flatnonzero(complete)
+    if len(rows) < FEWEST:
+        return
+    sizes = step_sizes(tracks_m[rows]).min(axis=1)
+    k = int(sizes.argmax())
+    grasp_step_m = step_sizes(moved_m[rows]).max(axis=1)[k]
+    usual_m = max(
+        _usual_change(sizes), float(grasp_step_m), 2 * float(np.median(sigma_m))
+    )
+    yield from _step_hypothesis(
+        "markers-jump",
+        experiment,
+        k=int(rows[k]),
+        size_m=float(sizes[k]),
+        usual_m=usual_m,
+    )
+
+
+# Motion of markers that may be none, over the size of the body.
+STILL_OF_SIZE = 0.01
+# Additional motion that may be noise, over sigma_m.
+STILL_SIGMAS = 6.0
+
+
+def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Yield the hypothesis that poses are wrong, if markers move although the body starts at rest
+    and neither grasps nor loads change.
+    """
+    t_s = experiment.t_s
+    grasps = experiment.grasps
+    if (
+        experiment.start != "equilibrium"
+        or experiment.actuators
+        or experiment.obstacles
+    ):
+        return
+    is_grasped_throughout = (
+        grasp.from_s <= t_s[0] and grasp.until_s >= t_s[-1] for grasp in grasps
+    )
+    motions = [part for grasp in grasps for part in grasp.poses.at(t_s)]
+    loads = [
+        experiment.declared_node_forces_n(t_s),
+        experiment.point_mass_at_nodes_kg(t_s),
+    ]
+    if (
+        not grasps
+        or not all(is_grasped_throughout)
+        or any(_changes(each) for each in (*motions, *loads))
+    ):
+        return
+    markers = experiment.markers
+    size_m = float(np.ptp(experiment.body.nodes_m, axis=0).max())
+    is_measured = markers.is_present.sum(axis=0) >= FEWEST_SAMPLES
+    if not is_measured.any():
+        return
+    tracks_m = markers.positions_m[:, is_measured]
+    motion_m = np.sqrt(np.nanmean(np.nanvar(tracks_m, axis=0).sum(axis=1)))
+    still_m = STILL_OF_SIZE * size_m + STILL_SIGMAS * float(
+        np.median(markers.sigma_m)
+    )
+    if motion_m > still_m:
+        data = {"by_mm": 1e3 * motion_m}
+        of = f"'{experiment.name}'"
+        yield Hypothesis(
+            "poses-constant", of, data=data, strength=float(motion_m / still_m)
+        )
+
+
+def _changes(values: Array) -> bool:
+    """Whether any row of values (T, …) differs from the first."""
+    return bool(np.ptp(values, axis=0).max(initial=0.0) > 1e-9)
+
+
+def _marker_box_m(experiment: Experiment) -> Array:
+    """Return two corners (2, 3) of the bounding box of the markers' places on the
+    undeformed body [m].
+    """
+    places = experiment.markers.predict_positions(experiment.body.nodes_m)
+    return np.vstack([places.min(axis=0), places.max(axis=0)])
+
+
+def step_sizes(x: Array) -> Array:
+    """Return the size (T − 3, M) [m] of a step between samples k + 1 and k + 2 of tracks x (T, M,
+    3), from second differences of opposite directions; 0 for smooth motion, NaN in gaps.
+    """
+    second = x[2:] - 2 * x[1:-1] + x[:-2]
+    opposite = -np.sum(second[:-1] * second[1:], axis=2)
+    return np.sqrt(np.maximum(opposite, 0.0))
+
+
+def _pose_jump_hypotheses(
+    experiment: Experiment, moved_m: Array
+) -> Iterator[Hypothesis]:
+    """Yield the hypothesis of the largest jump of points `moved_m` (T, m, 3) [m] carried by the
+    poses, if the markers do not follow it.
+    """
+    sizes = step_sizes(moved_m).max(axis=1)
+    k = int(sizes.argmax())
+    markers = step_sizes(experiment.markers.positions_m)[k]
+    moved = np.linalg.norm(np.diff(moved_m, 2, axis=0), axis=2).max(axis=1)
+    sigma_m = float(np.median(experiment.markers.sigma_m))
+    if np.isfinite(markers).any():
+        usual_m = max(
+            _usual_change(moved), float(np.nanmedian(markers)), 2 * sigma_m
+        )
+        yield from _step_hypothesis(
+            "pose-jump",
+            experiment,
+            k=k,
+            size_m=float(sizes[k]),
+            usual_m=usual_m,
+        )
+
+
+def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Yield a hypothesis for each marker that steps alone and stays displaced."""
+    markers = experiment.markers
+    sizes = step_sizes(markers.positions_m)
+    for m, name in enumerate(markers.names):
+        if not np.isfinite(sizes[:, m]).any():
+            continue
+        k = int(np.nanargmax(sizes[:, m]))
+        others = np.delete(sizes[k], m)
+        size_m = float(sizes[k, m])
+        most_m = float(others[np.isfinite(others)].max(initial=0.0))
+        usual_m = max(
+            _usual_change(sizes[:, m]), most_m, 2 * float(markers.sigma_m[m])
+        )
+        if _is_lasting(markers.positions_m, m, sample=k + 2, step_m=size_m):
+            yield from _step_hypothesis(
+                "marker-slip/alone",
+                experiment,
+                k=k,
+                size_m=size_m,
+                usual_m=usual_m,
+                marker=name,
+            )
+
+
+def _step_hypothesis(
+    code: str,
+    experiment: Experiment,
+    k: int,
+    size_m: float,
+    usual_m: float,
+    marker: str = "",
+) -> Iterator[Hypothesis]:
+    """Yield the hypothesis of a step between samples k + 1 and k + 2, if it is far larger than
+    usual.
+
+    Parameters
+    ----------
+    code : str
+        Code of the concern.
+    experiment : Experiment
+    k : int
+        Index as in `step_sizes`.
+    size_m, usual_m : float
+        Size of the step, and of usual changes [m].
+    marker : str
+        Name of the marker; empty for all.
+    """
+    data = {
+        "marker": marker,
+        "by_mm": 1e3 * size_m,
+        "t_s": experiment.t_s[k + 2],
+    }
+    if size_m >= SUDDEN * usual_m:
+        yield Hypothesis(
+            code, f"'{experiment.name}'", data=data, strength=size_m / usual_m
+        )
+
+
+def _is_lasting(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
+    """Whether the distances of a marker (index) from the others in tracks (T, M, 3) remain changed
+    from the index `sample` on, by a part of the step `step_m` [m]; true if there are no others.
+    """
+    to_others = np.linalg.norm(tracks - tracks[:, marker : marker + 1], axis=2)
+    others = np.delete(to_others, marker, axis=1)
+    if not others.shape[1]:
+        return True
+    before = others[:sample]
+    after = others[sample:]
+    both = np.isfinite(before).any(axis=0) & np.isfinite(after).any(axis=0)
+    change = np.nanmedian(after[:, both], axis=0) - np.nanmedian(
+        before[:, both], axis=0
+    )
+    return bool(np.abs(change).max(initial=0.0) > 0.3 * step_m)
+
+
+def _usual_change(sizes: Array) -> float:
+    """Return the 90 % quantile of changes of any shape, without NaN and the largest three; 0 if
+    there are no others.
+    """
+    rest = np.sort(sizes[np.isfinite(sizes)])[:-3]
+    return float(np.quantile(rest, LIVELY)) if len(rest) else 0.0
+
+
+# Factor by which exchanged names must fit better.
+CLEARLY = 2.5
+# With Huber's loss, exchanges of a smaller share of the samples are tolerated as outliers.
+TAMED = 0.2
+
+
+def name_exchange_hypotheses(
+    experiment: Experiment, huber: float | None = None
+) -> tuple[Hypothesis, ...]:
+    """Return hypotheses that names of markers are exchanged for a part of the recording.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The recording.
+    huber : float, optional
+        Threshold of Huber's loss, which tolerates short exchanges; None means a quadratic loss.
+    """
+    order, strength = _marker_identities(experiment)
+    kinds, counts = np.unique(order, axis=0, return_counts=True)
+    right = kinds[
+        int(np.argmax(np.where((kinds == order[0]).all(axis=1), 2, 1) * counts))
+    ]
+    wrong = order != right
+    share = float(wrong.mean(axis=0).max(initial=0.0))
+    if not share or (huber is not None and share < TAMED):
+        return ()
+    affected = np.flatnonzero(wrong.any(axis=1))
+    first = int(affected[0])
+    t_s = experiment.t_s
+    names = experiment.markers.names
+    same = (order[first:] == order[first]).all(axis=1)
+    end = first + (len(same) if same.all() else int(same.argmin()))
+    when = f"from t = {t_s[first]:.4g} s " + (
+        "on" if end == len(t_s) else f"to {t_s[end - 1]:.4g} s"
+    )
+    real = np.argsort(right)[order[first]]
+    listed = ", ".join(
+        f"{names[k]} is {names[real[k]]}" for k in np.flatnonzero(wrong[first])
+    )
+    also = ", and at other times" if affected[-1] >= end else ""
+    data = {"when": f"{when}{also}", "names": listed}
+    return (
+        Hypothesis(
+            "markers-exchanged/later",
+            f"'{experiment.name}'",
+            data=data,
+            strength=strength,
+        ),
+    )
+
+
+def _marker_identities(experiment: Experiment) -> tuple[Index, float]:
+    """Return the identity (T, M) of each marker among those of the first samples, and the factor by
+    which exchanged names fit better; 0 if no names are exchanged.
+    """
+    markers = experiment.markers
+    grasp = carrying_grasp(experiment)
+    in_grasp_m = np.array(markers.positions_m)
+    if grasp is not None:
+        rotations, translations_m = grasp.poses.at(experiment.t_s)
+        in_grasp_m = np.einsum(
+            "tji,tmj->tmi", rotations, in_grasp_m - translations_m[:, None]
+        )
+    order = np.tile(np.arange(len(markers.names)), (len(in_grasp_m), 1))
+    strength = 0.0
+    last_m = np.full(in_grasp_m.shape[1:], np.nan)
+    for k, now_m in enumerate(in_grasp_m):
+        is_present = np.isfinite(now_m[:, 0])
+        known = np.flatnonzero(is_present & np.isfinite(last_m[:, 0]))
+        chosen, clearly = _best_assignment(
+            last_m[known], now_m[known], sigma_m=markers.sigma_m[known]
+        )
+        if clearly > CLEARLY:
+            order[k:, known] = order[k, known[chosen]]
+            strength = max(strength, clearly)
+        last_m[is_present] = now_m[is_present]
+    return order, strength
+
+
+def _best_assignment(
+    before_m: Array, now_m: Array, sigma_m: Array
+) -> tuple[Index, float]:
+    """Return the assignment (M,) of markers to those of the sample before, and the factor by which
+    it is nearer than no exchange.
+
+    Element k of the assignment is the index in `before_m` of marker k of `now_m`. The factor is the
+    ratio of root-sum-square distances of the exchanged markers, without and with the exchange; it
+    is 1 if nothing is exchanged. Distances below the noise count as the noise.
+
+    Parameters
+    ----------
+    before_m, now_m : (M, 3) arrays
+        Positions at both samples [m], all present; a common shift does not matter.
+    sigma_m : (M,) array
+        Standard deviation of each marker [m], which gives the noise.
+    """
+    same = np.arange(len(now_m))
+    if len(now_m) < 2:
+        return same, 1.0
+    differences_m = (now_m - now_m.mean(axis=0))[:, None] - (
+        before_m - before_m.mean(axis=0)
+    )
+    cost = np.sum(differences_m**2, axis=2)
+    if (cost.argmin(axis=1) == same).all():
+        return same, 1.0
+    _, chosen = linear_sum_assignment(cost)
+    exchanged = np.flatnonzero(chosen != same)
+    noise = 6 * float(np.sum(sigma_m[exchanged] ** 2))
+    remaining = max(
+        float(cost[exchanged, chosen[exchanged]].sum()), noise, 1e-300
+    )
+    return chosen, float(np.sqrt(cost[exchanged, exchanged].sum() / remaining))

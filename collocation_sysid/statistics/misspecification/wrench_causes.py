@@ -1,0 +1,503 @@
+"""Misspecification hypotheses for measured wrenches: signs, axes, units, frames, points, clocks.
+
+A measured wrench is compared with the prediction of a fit to the markers alone, which a wrong
+wrench cannot distort. Each common mistake is corrected in turn. Tares are allowed for by their
+priors. Where neither a density nor a load is known, the predicted wrench is known up to one
+positive factor, which is estimated in each comparison.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...errors import InputError, SimulationError
+from ...methods.continuation import first_samples
+from ...methods.reduced_space import ReducedSpace
+from ...methods.solution import Solution
+from ...program.collocation import Collocation, ExperimentIterate
+from ...program.observables import ReactionForces
+from ...program.transcription import Transcription
+from ...program.wrench.wrench_residual import (
+    WrenchResidual,
+    without_grasp_sensors,
+)
+from ...recording.measured_wrench import Frame, Wrench
+from ..axes import OTHER_AXES
+from .misspecification_hypothesis import Hypothesis, HypothesisTest
+
+# RMS residual in standard deviations that needs an explanation; a correct description must leave
+# less.
+MISFIT = 1.3
+# Factor by which the misfit must decrease.
+BETTER = 1.5
+# RMS residual of the markers in standard deviations above which the prediction is useless.
+MARKERS_MISFIT = 3.0
+# Largest number of sweeps of the fit to the markers, after a solve.
+MOST_SWEEPS = 40
+# Samples of the fit before a solve.
+CHECKED_SAMPLES = 100
+# Its largest number of sweeps.
+CHECKED_SWEEPS = 15
+# Length of its last step of a parameter's logarithm.
+CHECKED_TOLERANCE = 1e-2
+# Largest clock shift that is tried, over the length of the recording.
+LATEST = 0.25
+# Number of intervals of the clock shifts that are tried.
+SHIFTS = 60
+# Columns of the forces.
+FORCES = slice(0, 3)
+# Columns of the torques.
+TORQUES = slice(3, 6)
+# Columns of forces and torques.
+BOTH = slice(0, 6)
+# Wrong units of forces and of torques that are tried, with their factors.
+UNITS = (
+    (
+        "forces",
+        {
+            "kilograms-force": 9.80665,
+            "grams-force": 9.80665e-3,
+            "millinewtons": 1e-3,
+            "pounds-force": 4.4482216,
+        },
+        FORCES,
+    ),
+    (
+        "torques",
+        {"newton millimetres": 1e-3, "kilogram-force metres": 9.80665},
+        TORQUES,
+    ),
+)
+# Offset over the standard deviation of the tare's prior from which on the sensor was not zeroed.
+LARGEST_TARE = 3.0
+# Error of a calibration that gives no concern.
+SAME_GAIN = 0.05
+# Error of the reference point that gives no concern [m].
+SAME_POINT_M = 0.005
+# Additional factor for hypotheses with fitted numbers.
+FITTED = 1.5
+# Additional factor for each of many variants of one mistake.
+ONE_OF_MANY = 1.05
+
+
+@dataclass(frozen=True, eq=False)
+class DescribedWrench:
+    """Description of a wrench to be tested.
+
+    Attributes
+    ----------
+    wrench : Wrench
+        Samples as they would be without the mistake.
+    tare : float
+        Standard deviation of each tare, in standard deviations of the noise; inf for a free tare.
+    """
+
+    wrench: Wrench
+    tare: float
+
+
+def wrench_causes(solution: Solution) -> list[Hypothesis]:
+    """Return hypotheses about wrongly described wrenches after a fit; empty if the wrenches fit."""
+    if not any(map(_misses, solution.parts)):
+        return []
+    with_markers = [
+        s
+        for s in solution.collocation.transcriptions
+        if s.experiment.markers.sample_count
+    ]
+    return _of_parts(
+        _from_markers(
+            solution.collocation,
+            with_markers,
+            method=ReducedSpace(max_iterations=MOST_SWEEPS),
+        )
+    )
+
+
+def wrench_mistakes(collocation: Collocation) -> list[Hypothesis]:
+    """Return hypotheses about wrongly described wrenches before any solve.
+
+    The first samples of the experiments with markers and wrenches are fitted to their markers
+    alone. Empty where that fit does not explain the markers.
+    """
+    with_both = [
+        s
+        for s in collocation.transcriptions
+        if s.sensors and s.experiment.markers.sample_count
+    ]
+    shorter = [first_samples(s.experiment, CHECKED_SAMPLES) for s in with_both]
+    if not shorter:
+        return []
+    beginning = replace(collocation, experiments=shorter)
+    method = ReducedSpace(
+        max_iterations=CHECKED_SWEEPS, tolerance=CHECKED_TOLERANCE
+    )
+    parts = _from_markers(beginning, beginning.transcriptions, method=method)
+    return _of_parts(
+        [part for part in parts if _markers_misfit(part) < MARKERS_MISFIT]
+    )
+
+
+def _misses(part: ExperimentIterate) -> bool:
+    """Whether the residuals of any wrench sensor of an experiment are larger than the noise by a
+    factor; false without sensors.
+    """
+    # They are behind the markers.
+    pairs = zip(part.segment.sensors, part.observables[1:], strict=False)
+    return any(
+        float(np.sum(sensor.residuals(observation, part.phi) ** 2))
+        > MISFIT**2 * sensor.is_compared_by_component.sum()
+        for sensor, observation in pairs
+    )
+
+
+def _markers_misfit(part: ExperimentIterate) -> float:
+    """Return the root mean square of the markers' residuals in standard deviations."""
+    residuals = part.segment.markers.residuals(part.observables[0], part.phi)
+    return float(
+        np.sqrt(
+            np.sum(residuals**2)
+            / max(1, 3 * part.segment.experiment.markers.sample_count)
+        )
+    )
+
+
+def _from_markers(
+    collocation: Collocation,
+    transcriptions: Sequence[Transcription],
+    method: ReducedSpace,
+) -> list[ExperimentIterate]:
+    """Return experiments fitted to their markers alone by a method, with the nuisance parameters of
+    the wrenches at zero; empty if there are none or the fit fails.
+    """
+    if not transcriptions:
+        return []
+    without_wrenches = [
+        without_grasp_sensors(segment.experiment) for segment in transcriptions
+    ]
+    try:
+        solution = method(replace(collocation, experiments=without_wrenches))
+    except (InputError, SimulationError):
+        return []
+    solution.unless_interrupted()
+    parts = []
+    for segment, part in zip(transcriptions, solution.parts, strict=True):
+        values = dict(zip(part.segment.nuisance.names, part.phi, strict=True))
+        phi = np.array(
+            [values.get(name, 0.0) for name in segment.nuisance.names]
+        )
+        parts.append(ExperimentIterate(segment, part.q, phi=phi, x=part.x))
+    return parts
+
+
+def _of_parts(parts: Sequence[ExperimentIterate]) -> list[Hypothesis]:
+    """Return the hypotheses for all wrench sensors of experiments fitted to their markers alone."""
+    hypotheses: list[Hypothesis] = []
+    for part in parts:
+        forced = part.motion.reactions
+        for sensor in part.segment.sensors:
+            hypotheses += _OneSensor(part, sensor, forced=forced).causes()
+    return hypotheses
+
+
+class _OneSensor:
+    """Comparison of one wrench sensor with the prediction from the markers.
+
+    Attributes
+    ----------
+    scale_known : bool
+        Whether densities or loads determine the size of the prediction.
+
+    Parameters
+    ----------
+    part : ExperimentIterate
+        The experiment, fitted to its markers alone.
+    sensor : WrenchResidual
+        Measurement model of the sensor.
+    forced : ReactionForces
+        Predicted reaction forces.
+    """
+
+    scale_known: bool
+
+    def __init__(
+        self,
+        part: ExperimentIterate,
+        sensor: WrenchResidual,
+        forced: ReactionForces,
+    ) -> None:
+        segment = part.segment
+        self.part = part
+        self.sensor = sensor
+        self.forced = forced
+        blind = without_grasp_sensors(segment.experiment)
+        self.scale_known = (
+            not segment.body.mass_derivatives or blind.has_known_force
+        )
+        self._known: dict[tuple[bytes, Frame, bytes], Array] = {}
+        self.declared = DescribedWrench(
+            sensor.wrench, segment.experiment.nuisance.tare or 0.0
+        )
+
+    def causes(self) -> Iterator[Hypothesis]:
+        """Yield the hypotheses whose correction improves the fit far enough; if there is none, that
+        of a large tare.
+        """
+        accepted: list[Hypothesis] = []
+        misfit = self.misfit(self.declared)
+        if misfit > MISFIT:
+            test = HypothesisTest(
+                misfit, self.misfit, required_factor=BETTER, smallest_misfit=1.0
+            )
+            accepted = list(test.accepted(self._mistakes()))
+        yield from accepted or self._large_tare()
+
+    def _large_tare(self) -> Iterator[Hypothesis]:
+        """Yield the hypothesis that the tare of the fit is far beyond its prior."""
+        tare = self.declared.tare
+        if not tare:
+            return
+        measured, predicted = self._scaled_by_sigma(
+            DescribedWrench(self.declared.wrench, 0.0)
+        )
+        factor = 1.0 if self.scale_known else _slope(measured, predicted)
+        differences = measured - factor * predicted
+        is_measured = np.isfinite(differences).any(axis=0)
+        largest = (
+            np.abs(np.nanmean(differences[:, is_measured], axis=0)).max() / tare
+            if is_measured.any()
+            else 0.0
+        )
+        if largest > LARGEST_TARE:
+            of = f"the wrench of '{self.part.segment.experiment.name}'"
+            yield Hypothesis(
+                "wrench-tare", of, strength=float(largest / LARGEST_TARE)
+            )
+
+    def misfit(self, trial: DescribedWrench) -> float:
+        """Return the root mean square of the residuals of a description in standard
+        deviations; infinite without samples.
+        """
+        measured, predicted = self._scaled_by_sigma(trial)
+        if not np.isfinite(measured).any():
+            return np.inf
+        factor = (
+            1.0 if self.scale_known else max(0.0, _slope(measured, predicted))
+        )
+        return float(np.sqrt(np.nanmean((measured - factor * predicted) ** 2)))
+
+    def _scaled_by_sigma(self, trial: DescribedWrench) -> tuple[Array, Array]:
+        """Return samples and prediction (S, 6) over the noise, without tares; NaN in the
+        same places.
+        """
+        wrench = trial.wrench
+        sigmas = trial.wrench.sigmas
+        predicted = (
+            np.where(wrench.is_measured, self._predicted(wrench), np.nan)
+            / sigmas
+        )
+        measured = np.where(
+            np.isfinite(predicted), wrench.values / sigmas, np.nan
+        )
+        return _without_tare(measured, trial.tare), _without_tare(
+            predicted, trial.tare
+        )
+
+    def _predicted(self, wrench: Wrench) -> Array:
+        """Return the predicted wrench (S, 6) at the times, in the frame and about the point
+        of a wrench; cached.
+        """
+        at = (wrench.t_s.tobytes(), wrench.frame, wrench.point_m.tobytes())
+        if at not in self._known:
+            phi = np.zeros(self.part.segment.nuisance.size)
+            self._known[at] = self.sensor.with_wrench(wrench).predict_reactions(
+                self.forced, phi
+            )
+        return self._known[at]
+
+    def _gain(self, columns: slice) -> float:
+        """Return the positive factor with which the samples of some columns (slice) fit best,
+        relative to the other columns if the scale of the prediction is unknown; NaN if there is
+        none.
+        """
+        measured, predicted = self._scaled_by_sigma(self.declared)
+        slope = _slope(measured[:, columns], predicted[:, columns])
+        # A common factor cannot be told where the scale is unknown, that of one kind can.
+        if not self.scale_known:
+            others = np.delete(np.arange(6), np.arange(6)[columns])
+            slope /= (
+                _slope(measured[:, others], predicted[:, others])
+                if len(others)
+                else np.nan
+            )
+        return 1 / slope if slope > 0 else np.nan
+
+    def _point_shift_m(self) -> Array:
+        """Return the shift (3,) of the torques' reference point with which they fit best [m]; zero
+        if unknown.
+
+        About a point shifted by d, a torque is smaller by d × f.
+        """
+        measured, predicted = self._scaled_by_sigma(self.declared)
+        if not np.isfinite(measured[:, TORQUES]).any():
+            return np.zeros(3)
+        factor = 1.0
+        if (
+            not self.scale_known
+            and not (
+                factor := _slope(measured[:, FORCES], predicted[:, FORCES])
+            )
+            > 0
+        ):
+            return np.zeros(3)
+        wrench = self.declared.wrench
+        forces = self._predicted(wrench)[:, FORCES]
+        by_shift = (
+            np.cross(forces[:, None], np.eye(3)[None]) / wrench.sigmas[3]
+        )  # (S, shift, 3)
+        by_shift = np.where(
+            np.isfinite(measured[:, None, TORQUES]), by_shift, np.nan
+        )
+        slopes = np.stack(
+            [
+                _without_tare(by_shift[:, k], self.declared.tare)
+                for k in range(3)
+            ],
+            axis=2,
+        )
+        differences = (measured - factor * predicted)[:, TORQUES]
+        is_measured = np.isfinite(differences)
+        solution = np.linalg.lstsq(
+            factor * slopes[is_measured], differences[is_measured], rcond=1e-6
+        )
+        shift_m: Array = np.asarray(solution[0], dtype=np.float64)
+        return shift_m
+
+    def _mistakes(self) -> Iterator[Hypothesis]:
+        """Yield each common mistake with the description that corrects it."""
+        of = f"the wrench of '{self.part.segment.experiment.name}'"
+        wrench = self.declared.wrench
+
+        def hypothesis(
+            code: str, without: Wrench, handicap: float = 1.0, **data
+        ) -> Hypothesis:
+            return Hypothesis(
+                code,
+                of,
+                data=data,
+                corrected=replace(self.declared, wrench=without),
+                handicap=handicap,
+            )
+
+        values = np.array(wrench.values)
+        yield hypothesis("wrench-sign", replace(wrench, values=-values))
+        for what, columns in (("forces", FORCES), ("torques", TORQUES)):
+            if wrench.measured_components[columns].any():
+                yield hypothesis(
+                    "wrench-sign/part",
+                    _multiplied(wrench, columns, factor=-1.0),
+                    what=what,
+                )
+        other: Frame = "grasp" if wrench.frame == "world" else "world"
+        yield hypothesis(
+            "wrench-frame", replace(wrench, frame=other), other=other
+        )
+        for axes, (order, signs) in OTHER_AXES.items():
+            if len({*signs}) == 1 and order == (0, 1, 2):
+                continue  # a matter of the sign
+            turned = (
+                np.tile(signs, 2) * values[:, [*order, *(3 + k for k in order)]]
+            )
+            without = replace(wrench, values=turned)
+            yield hypothesis("wrench-axes", without, ONE_OF_MANY, axes=axes)
+        for what, units, columns in UNITS:
+            for unit, factor in (
+                units.items()
+                if wrench.measured_components[columns].any()
+                else ()
+            ):
+                without = _multiplied(wrench, columns, factor=factor)
+                yield hypothesis(
+                    "wrench-unit", without, what=what, unit=unit, factor=factor
+                )
+        for what, columns in (
+            ("forces and torques", BOTH),
+            ("forces", FORCES),
+            ("torques", TORQUES),
+        ):
+            factor = self._gain(columns)
+            if factor > 0 and abs(factor - 1) > SAME_GAIN:
+                data = {"what": what, "factor": factor}
+                yield hypothesis(
+                    "wrench-gain",
+                    _multiplied(wrench, columns, factor=factor),
+                    FITTED,
+                    **data,
+                )
+        shift_m = self._point_shift_m()
+        if np.linalg.norm(shift_m) > SAME_POINT_M:
+            point_m = wrench.point_m + shift_m
+            data = {
+                "by_mm": 1e3 * np.linalg.norm(shift_m),
+                "point": str(np.round(point_m, 3).tolist()),
+            }
+            yield hypothesis(
+                "wrench-point", replace(wrench, point_m=point_m), FITTED, **data
+            )
+        span_s = LATEST * float(np.ptp(wrench.t_s))
+        for shift_s in np.linspace(-span_s, span_s, SHIFTS + 1):
+            data = {
+                "by_ms": 1e3 * abs(shift_s),
+                "when": "later" if shift_s < 0 else "earlier",
+            }
+            yield hypothesis(
+                "wrench-clock",
+                replace(wrench, t_s=wrench.t_s + shift_s),
+                **data,
+            )
+        yield Hypothesis(
+            "wrench-tare", of, corrected=replace(self.declared, tare=np.inf)
+        )
+
+
+def _without_tare(values: Array, tare: float) -> Array:
+    """Return columns (S, c) in standard deviations, without the offset that a tare with a prior of
+    `tare` standard deviations explains: none for 0, the mean if infinite. NaN is ignored.
+    """
+    is_measured = np.isfinite(values)
+    prior_weight = (
+        0.0 if np.isinf(tare) else np.inf if not tare else 1 / tare**2
+    )
+    return values - np.nansum(values, axis=0) / np.maximum(
+        is_measured.sum(axis=0) + prior_weight, 1e-12
+    )
+
+
+def _slope(measured: Array, predicted: Array) -> float:
+    """Return the factor of the prediction that fits the samples best, by least squares; NaN if the
+    prediction is zero. NaN in either is ignored.
+    """
+    square = float(np.nansum(predicted**2))
+    return float(np.nansum(measured * predicted)) / square if square else np.nan
+
+
+def _multiplied(wrench: Wrench, columns: slice, factor: float) -> Wrench:
+    """Return the wrench with the values of some columns (slice) multiplied by a factor; its noise
+    is increased with a large factor, but not decreased.
+    """
+    values: Array = np.array(wrench.values)
+    values[:, columns] *= factor
+    larger = max(1.0, abs(factor))
+    of_forces = columns.start == 0
+    of_torques = columns.stop == 6
+    return replace(
+        wrench,
+        values=values,
+        sigma_n=wrench.sigma_n * (larger if of_forces else 1.0),
+        sigma_nm=wrench.sigma_nm
+        and wrench.sigma_nm * (larger if of_torques else 1.0),
+    )

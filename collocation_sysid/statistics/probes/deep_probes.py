@@ -1,0 +1,262 @@
+"""Deeper checks of a fit: refits of parts of the data, and with assumptions relaxed.
+
+Windows of time and recordings are fitted alone by one Gauss–Newton step from the answer, as for
+`recording_scatter`. An assumption that is relaxed joins the linearised fit as one more nuisance
+parameter, with the deviation of the budget as its prior and the changes of the residuals as its
+derivative, see `consider_analysis`. Where its amplitude is significant, the effect is computed
+again at the parameters that the step leads to, and a step is taken from there, until parameters
+settle; the remaining error is of second order in the amplitude. Error bars are those of any fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...methods.initial_trajectories import simulate_trajectories
+from ..budget.systematic_effects import CORRELATION_KEY
+from ..distributions import normal_isf
+from ..linearised import (
+    LinearisedFit,
+    ResidualBlock,
+    gauss_newton_step,
+    least_squares_of_fit,
+    linearise_fit,
+)
+from ..residuals.recording_scatter import (
+    blocks_by_recording,
+    fit_part,
+    single_fits,
+)
+from .relaxed_assumptions import (
+    Kind,
+    Probe,
+    SolvedFit,
+    assumption_name,
+    probed_changes,
+    relaxed_probe,
+    with_relaxed_assumption,
+)
+from .routine_probes import (
+    ROUTINE,
+    WIDENING,
+    is_alarming,
+    routine_probes,
+    significance_limit,
+)
+
+# Into so many windows of time the data are cut.
+WINDOWS = ("first third", "middle third", "last third")
+# Probability that a faultless run has any significant probe, beside those of every solve.
+CHANCE = 0.01
+# Most linear steps of a significant assumption: each is a simulation.
+STEPS = 4
+# Change of a parameter's logarithm in a step that is the last.
+SETTLED = 0.02
+
+
+def routine_probes_with_steps(fit: SolvedFit) -> tuple[Probe, ...]:
+    """Return the probes that relax the routine assumptions by one linear step each; the most
+    significant of those that give concern is iterated.
+
+    A linear step suffices to find that an assumption is wrong, but not for estimates that change by
+    much of their value. That assumption therefore takes a few further steps, each with a
+    simulation.
+    """
+    probes = routine_probes(fit)
+    alarming = [probe for probe in probes if is_alarming(probe)]
+    if not alarming:
+        return probes
+    worst = max(alarming, key=lambda probe: probe.chi_squared)
+    with_steps = replace(
+        _iterate_probe(fit, worst, limit=significance_limit(fit.changes)),
+        routine=True,
+    )
+    return tuple(with_steps if probe is worst else probe for probe in probes)
+
+
+def deep_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
+    """Refit windows of time, recordings where there are several, and with assumptions relaxed.
+
+    Routine assumptions have the same prior and level of significance as in `routine_probes`.
+    """
+    parts = [*_window_probes(solved_fit), *_recording_probes(solved_fit)]
+    relaxed = [*_relaxed_probes(solved_fit)]
+    tests = sum(len(probe.moves) for probe in parts) + len(relaxed)
+    limit = float(normal_isf(CHANCE / 2 / max(1, tests)))
+    limits = dict.fromkeys(ROUTINE, significance_limit(solved_fit.changes))
+    return (
+        *(_with_significant_moves(each, limit) for each in parts),
+        *(
+            _iterate_probe(
+                solved_fit, probe, limit=limits.get(probe.name, limit)
+            )
+            for probe in relaxed
+        ),
+    )
+
+
+def _window_probes(at: SolvedFit) -> Iterator[Probe]:
+    """Yield the refits of a third of every recording's time."""
+    for k, name in enumerate(WINDOWS):
+        cuts = [_third(block, k) for block in at.fit.blocks]
+        blocks = [
+            _restrict(block, cut)
+            for block, cut in zip(at.fit.blocks, cuts, strict=True)
+        ]
+        alone = fit_part(at.fit, blocks, columns=np.arange(len(at.fit.names)))
+        yield from _part_probe(at, "window", name, *alone)
+
+
+def _third(block: ResidualBlock, k: int) -> slice:
+    """Return the slice of the samples in third k (an index) of a block's samples."""
+    ends = np.round(np.linspace(0, len(block.t_s), len(WINDOWS) + 1)).astype(
+        int
+    )
+    return slice(int(ends[k]), int(ends[k + 1]))
+
+
+def _restrict(block: ResidualBlock, cut: slice) -> ResidualBlock:
+    """Return the block with the samples in the slice `cut` only."""
+    own = ("t_s", "is_present", "residual", "jacobian", "misfit", "components")
+    there = {
+        name: each[cut]
+        for name in own
+        if (each := getattr(block, name)) is not None
+    }
+    shaken = block.disturbances
+    return replace(
+        block, **there, disturbances=None if shaken is None else shaken[:, cut]
+    )
+
+
+def _recording_probes(at: SolvedFit) -> Iterator[Probe]:
+    """Yield the refits of single recordings; none if there is only one."""
+    if len(blocks_by_recording(at.fit)) < 2:
+        return
+    for alone, step in single_fits(at.fit):
+        yield from _part_probe(
+            at, "recording", name=alone.blocks[0].name, alone=alone, step=step
+        )
+
+
+def _part_probe(
+    at: SolvedFit, kind: Kind, name: str, alone: LinearisedFit, step: Array
+) -> Iterator[Probe]:
+    """Yield the probe of a part of the data, unless it has fewer measurements than parameters.
+
+    Parameters
+    ----------
+    at : SolvedFit
+        Fit to all data.
+    kind : str
+        Kind of part: "window" or "recording".
+    name : str
+        Name of the part.
+    alone : LinearisedFit
+        Fit to the part.
+    step : array
+        Parameters of the part's fit less those of the joint one.
+    """
+    if alone.measurement_count <= len(alone.names):
+        return
+    uncertainty = at.uncertainty_of_refit(
+        alone, at.parameters[: alone.shared_count] + step[: alone.shared_count]
+    )
+    remaining = least_squares_of_fit(alone)
+    falls = remaining.loss(-step) - remaining.loss(np.zeros(len(step)))
+    yield Probe(
+        kind,
+        name,
+        chi_squared=falls,
+        moves=at.changes_of_estimates(uncertainty),
+    )
+
+
+def _with_significant_moves(probe: Probe, limit: float) -> Probe:
+    """Return the probe with the names, in `sentences`, of the estimates that differ by more than
+    `limit` of their standard errors.
+
+    A part of the data differs from all data with less than its own error bar (Hausman 1978).
+    """
+    significant = (
+        n
+        for n, move in probe.moves.items()
+        if abs(move.change) > limit * move.std_error
+    )
+    return replace(probe, sentences=tuple(significant))
+
+
+# Freed assumptions --------------------------------------------------------------------------------
+
+
+def _relaxed_probes(at: SolvedFit) -> Iterator[Probe]:
+    """Relax each assumption that changes anything, by one linear step."""
+    for name in dict.fromkeys(at.changes.names):
+        wide = with_relaxed_assumption(
+            at.fit, at.changes, name=name, widening=_widening(name)
+        )
+        if any(
+            block.jacobian[..., len(at.fit.names) :].any()
+            for block in wide.blocks
+        ):
+            yield relaxed_probe(at, name, wide=wide, p=at.parameters)
+
+
+def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
+    """Iterate a significant probe by further steps, from where its first step leads.
+
+    Parameters
+    ----------
+    at : SolvedFit
+        The fit.
+    probe : Probe
+        Probe of an assumption after one linear step; it is returned unchanged if it is not
+        significant.
+    limit : float
+        Least significant size, in its standard errors.
+    """
+    if not probe.is_beyond(limit):
+        return probe
+    first = len(at.fit.names)
+    collocation = at.collocation
+    accepted_names = assumption_name(probe.name), CORRELATION_KEY
+    alone = {
+        name: size if name in accepted_names else None
+        for name, size in at.deviations.items()
+    }
+    wide = with_relaxed_assumption(
+        at.fit, at.changes, name=probe.name, widening=_widening(probe.name)
+    )
+    p = at.parameters
+    _, positions = collocation.unpack(at.z)
+    for _ in range(STEPS):
+        step = gauss_newton_step(wide)[:first]
+        p = p + step
+        positions, failure = simulate_trajectories(
+            collocation, p, guess=positions
+        )
+        if failure is not None:
+            break
+        z = collocation.pack(p, positions)
+        changes = probed_changes(collocation, z, deviations=alone)
+        there = linearise_fit(collocation, z).with_disturbances(
+            b.disturbances for b in at.fit.blocks
+        )
+        wide = with_relaxed_assumption(
+            there, changes, name=probe.name, widening=_widening(probe.name)
+        )
+        probe = relaxed_probe(at, probe.name, wide=wide, p=p)
+        if np.abs(step[: wide.shared_count]).max(initial=0.0) < SETTLED:
+            break
+    return replace(
+        probe, sentences=(probe.name,) if probe.is_beyond(limit) else ()
+    )
+
+
+def _widening(name: str) -> float:
+    """Return the deviation of an assumption's prior, in deviations of the budget."""
+    return WIDENING if name in ROUTINE else 1.0

@@ -1,0 +1,392 @@
+"""Relaxed assumptions: fits near an answer with one assumption estimated, and the changes of the
+estimates.
+
+A relaxed assumption joins the linearised fit as one or several nuisance parameters: its prior has
+the deviation of the uncertainty budget, or a multiple of it, and its derivatives are the changes of
+the residuals if the assumption is wrong, see `consider_analysis`. `routine_probes` uses this in
+every solve, `deep_probes` for a deeper check.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...fem.laws.constants import is_field_coefficient, is_modulus
+from ...program.collocation import Collocation, ExperimentIterate
+from ..budget.consider_analysis import ResidualChanges, changes_of_assumptions
+from ..budget.systematic_effects import ExperimentAtAnswer
+from ..budget.uncertainty_budget import BudgetLine
+from ..estimates import Estimate
+from ..linearised import (
+    DerivedModuli,
+    LinearisedFit,
+    gauss_newton_step,
+    least_squares_of_fit,
+)
+from ..residuals.recording_scatter import TELLING
+from ..uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
+
+DRIFT = "stiffness_drift"
+# Share of the range of the load by which it may return in a static recording that still counts as
+# monotonic: measured displacements scatter.
+RETURN = 0.02
+# Fewest samples of a static recording in which the load can return.
+FEWEST_SAMPLES = 3
+Kind = Literal["window", "recording", "assumption"]
+
+
+@dataclass(frozen=True)
+class EstimateChange:
+    """Change of an estimate in a refit.
+
+    Attributes
+    ----------
+    value, std_error : float
+        Estimate of the refit, and its standard error.
+    change : float
+        Estimate of the refit less that of the fit of all data.
+    of_statistical95, of_combined95 : float or None
+        `change` over the half widths of the statistical and of the combined interval of the fit;
+        None where there is no such interval.
+    """
+
+    value: float
+    std_error: float
+    change: float
+    of_statistical95: float | None
+    of_combined95: float | None
+
+
+@dataclass(frozen=True)
+class Probe:
+    """One refit, of a part of the data or with an assumption relaxed.
+
+    Attributes
+    ----------
+    kind : {"window", "recording", "assumption"}
+        What was refitted.
+    name : str
+        Name of the window, of the recording, or of the assumption with its component.
+    chi_squared : float
+        Decrease of χ², with the stated σ and with priors.
+    moves : mapping of str to EstimateChange
+        Changes of the estimates that the refit determines.
+    size, size_error : float or None
+        Estimated error of a relaxed assumption in its unit, and its standard error; None for parts
+        of the data.
+    sentences : tuple of str
+        What is significant: for a part of the data the estimates that differ, for an assumption its
+        name.
+    routine : bool
+        Whether this is one of the probes of every solve, with one linear step.
+    relevance : float or None
+        For an assumption the largest change of an estimate, in half widths of the statistical
+        interval, see `relevance`; None for parts of the data.
+    """
+
+    kind: Kind
+    name: str
+    chi_squared: float
+    moves: Mapping[str, EstimateChange]
+    size: float | None = None
+    size_error: float | None = None
+    sentences: tuple[str, ...] = ()
+    routine: bool = False
+    relevance: float | None = None
+
+    def is_beyond(self, limit: float) -> bool:
+        """Whether the size of a relaxed assumption exceeds `limit` of its standard errors;
+        false if there is no size.
+        """
+        if self.size is None or not self.size_error:
+            return False
+        return abs(self.size) > limit * self.size_error
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedFit:
+    """A fit at its answer, with the data that probes need.
+
+    Attributes
+    ----------
+    collocation : Collocation
+        The program.
+    z : (variables,) array
+        The answer.
+    fit : LinearisedFit
+        The linearised fit.
+    error_model : ErrorModel
+        Assumptions about the errors.
+    statistical : mapping of str to Estimate
+        Estimates with statistical intervals.
+    budget : mapping of str to BudgetLine
+        Uncertainty budgets.
+    deviations : mapping of str to float or None
+        Standard deviations of all assumptions and nuisance parameters; None if exact.
+    changes : ResidualChanges
+        Changes of the residuals by these assumptions, see `probed_changes`.
+    """
+
+    collocation: Collocation
+    z: Array
+    fit: LinearisedFit
+    error_model: ErrorModel
+    statistical: Mapping[str, Estimate]
+    budget: Mapping[str, BudgetLine]
+    deviations: Mapping[str, float | None]
+    changes: ResidualChanges
+
+    def uncertainty_of_refit(self, fit: LinearisedFit, p: Array) -> Uncertainty:
+        """Return estimates and error bars of another fit at its parameters p (p,), with the error
+        model of this one.
+        """
+        q = p[: fit.shared_count]
+        constants = (
+            segment.constants for segment in self.collocation.transcriptions
+        )
+        fit = replace(fit, derived=DerivedModuli.from_bodies(constants, q))
+        return uncertainty_from_fit(
+            fit, self.collocation.parameters, q=q, error_model=self.error_model
+        )
+
+    def changes_of_estimates(
+        self, uncertainty: Uncertainty
+    ) -> dict[str, EstimateChange]:
+        """Return the changes of the estimates that a refit determines precisely, from those of the
+        joint fit, by name.
+        """
+        changes = {}
+        for name, each in {
+            **uncertainty.estimates,
+            **uncertainty.derived,
+        }.items():
+            error = each.statistical_std_error
+            joint = self.statistical[name]
+            if error and error < TELLING * abs(each.value):
+                change = each.value - joint.value
+                combined95 = (
+                    self.budget[name].combined95
+                    if name in self.budget
+                    else None
+                )
+                of_statistical = _share_of_interval(change, joint.statistical95)
+                of_combined = _share_of_interval(change, combined95)
+                changes[name] = EstimateChange(
+                    each.value,
+                    error,
+                    change=change,
+                    of_statistical95=of_statistical,
+                    of_combined95=of_combined,
+                )
+        return changes
+
+    @property
+    def parameters(self) -> Array:
+        """All parameters (p,) at the answer."""
+        return self.collocation.parameters_from(self.z)
+
+
+def _share_of_interval(
+    change: float, interval: tuple[float, float] | None
+) -> float | None:
+    """Return a change over the half width of an interval, with its sign; None without an
+    interval.
+    """
+    return (
+        None
+        if interval is None
+        else 2 * change / max(interval[1] - interval[0], 1e-300)
+    )
+
+
+# Columns of assumptions ---------------------------------------------------------------------------
+
+
+def probed_changes(
+    collocation: Collocation,
+    z: Array,
+    deviations: Mapping[str, float | None],
+    changes: ResidualChanges | None = None,
+) -> ResidualChanges:
+    """Return the changes of the residuals by each assumption that the data can test.
+
+    In a static recording whose load only rises, or only falls, "stiffer at the end" and "stiffer at
+    large strain" are the same, so that a wrong material law would look like a drift: there the
+    column of the drift is zero.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        The program.
+    z : (variables,) array
+        The answer.
+    deviations : mapping of str to float or None
+        Standard deviation of each assumption or nuisance parameter; None if exact.
+    changes : ResidualChanges, optional
+        Result of `changes_of_assumptions` for these deviations, if it is known.
+    """
+    known = (
+        changes_of_assumptions(collocation, z, deviations=deviations)
+        if changes is None
+        else changes
+    )
+    columns = [k for k, name in enumerate(known.names) if name == DRIFT]
+    if not columns:
+        return known
+    blocks = iter(known.blocks)
+    masked = []
+    for part in collocation.iterates(z):
+        hidden = part.segment.experiment.is_static and has_monotonic_load(
+            part, collocation
+        )
+        for _ in part.segment.residuals:
+            change = next(blocks)
+            if hidden:
+                change = change.copy()
+                change[..., columns] = 0.0
+            masked.append(change)
+    return ResidualChanges(known.names, masked)
+
+
+def has_monotonic_load(
+    iterate: ExperimentIterate, collocation: Collocation
+) -> bool:
+    """Whether the internal forces of a static recording only grow, or only shrink, in time;
+    true for very few samples.
+    """
+    load_n = np.linalg.norm(
+        ExperimentAtAnswer(iterate, collocation.parameters).internal_n(), axis=1
+    )
+    if len(load_n) < FEWEST_SAMPLES:
+        return True
+    steps = np.diff(load_n)
+    slack = RETURN * float(np.ptp(load_n))
+    return bool((steps >= -slack).all() or (steps <= slack).all())
+
+
+def with_relaxed_assumption(
+    fit: LinearisedFit,
+    changes: ResidualChanges,
+    name: str,
+    widening: float = 1.0,
+) -> LinearisedFit:
+    """Return a fit in which an assumption is one more nuisance parameter, or several of its name.
+
+    Parameters
+    ----------
+    fit : LinearisedFit
+        The fit.
+    changes : ResidualChanges
+        Changes of its residuals by the assumptions, each off by its standard deviation, which is
+        the unit of the new parameters.
+    name : str
+        Name of the assumption with its component. If `changes` does not contain it, no parameter is
+        added.
+    widening : float
+        Standard deviation of the prior of the new parameters, in these deviations.
+    """
+    columns = [k for k, other in enumerate(changes.names) if other == name]
+    blocks = []
+    for block, change in zip(fit.blocks, changes.blocks, strict=True):
+        more = (
+            change[..., columns]
+            * (block.root_weight * block.is_measured)[..., None]
+        )
+        blocks.append(
+            replace(
+                block, jacobian=np.concatenate([block.jacobian, more], axis=3)
+            )
+        )
+    count = len(columns)
+    return replace(
+        fit,
+        blocks=tuple(blocks),
+        names=(*fit.names, *(f"{name} {k}" for k in range(count))),
+        prior_residual=np.append(fit.prior_residual, np.zeros(count)),
+        prior_jacobian=np.append(
+            fit.prior_jacobian, np.full(count, 1 / widening)
+        ),
+        at_bound=np.append(fit.at_bound, np.zeros(count, dtype=bool)),
+    )
+
+
+def relaxed_probe(
+    fit: SolvedFit, name: str, wide: LinearisedFit, p: Array
+) -> Probe:
+    """Return the optimum of a fit with one assumption relaxed, by one linear step.
+
+    Parameters
+    ----------
+    fit : SolvedFit
+        The fit.
+    name : str
+        The assumption with its component.
+    wide : LinearisedFit
+        Result of `with_relaxed_assumption`, linearised at p.
+    p : (p,) array
+        All parameters without those of the assumption.
+
+    Returns
+    -------
+    Probe
+        Its size is that of the most significant amplitude, if there are several; its `sentences`
+        are empty.
+    """
+    first = len(fit.fit.names)
+    step = gauss_newton_step(wide)
+    after = wide.after_step(step)
+    own = step[first:]
+    uncertainty = fit.uncertainty_of_refit(after, p + step[:first])
+    before = least_squares_of_fit(fit.fit)
+    remaining = least_squares_of_fit(after)
+    decrease = before.loss(np.zeros(first)) - remaining.loss(
+        np.zeros(len(step))
+    )
+    unit = fit.deviations[assumption_name(name)] or 1.0
+    errors = np.array(
+        [*uncertainty.nuisance.values()][first - wide.shared_count :]
+    )
+    worst = int(np.argmax(np.nan_to_num(np.abs(own) / errors)))
+    probe = Probe(
+        "assumption",
+        name,
+        chi_squared=decrease,
+        moves=fit.changes_of_estimates(uncertainty),
+    )
+    probe = replace(
+        probe,
+        size=float(unit * own[worst]),
+        size_error=float(unit * errors[worst]),
+    )
+    return replace(probe, relevance=relevance(fit, probe))
+
+
+def relevance(fit: SolvedFit, probe: Probe) -> float:
+    """Return the largest change of an estimate by a probe, in half widths of its statistical
+    interval.
+
+    For a drift, half of it counts as a change of the moduli too: by so much the stiffness at either
+    end of a recording differs from the one that is reported.
+    """
+    shares = [0.0]
+    for name, move in probe.moves.items():
+        if move.of_statistical95 is None or is_field_coefficient(name):
+            continue
+        shares.append(abs(move.of_statistical95))
+        interval = fit.statistical[name].statistical95
+        if probe.name == DRIFT and is_modulus(name) and interval is not None:
+            half_width = max((interval[1] - interval[0]) / 2, 1e-300)
+            shares.append(
+                abs(0.5 * (probe.size or 0.0) * move.value) / half_width
+            )
+    return max(shares)
+
+
+def assumption_name(name: str) -> str:
+    """Return the name of an assumption without its component."""
+    return name.partition(" ")[0]

@@ -1,0 +1,115 @@
+"""Tests of two assumptions in every solve: constant stiffness, and clocks of equal rate.
+
+A drift of the stiffness and a rate of the cameras' clock join the linearised fit as one more column
+each, see `relaxed_assumptions`. The uncertainty budget needs these columns anyway, so that a probe
+costs one least-squares problem and no simulation. `deep_probes` (``solve --probe``) relaxes all
+other assumptions, refits parts of the data, and follows effects that are too large for one linear
+step.
+
+A probe is *significant* if its amplitude is farther from zero than noise explains, and *relevant*
+if relaxing the assumption changes what is reported. Only what is both gives concern, see
+`trust.probe_concerns`: with much data any imperfection is significant, and with little data any
+change is large.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from ...recording.nuisance import CLOCK_RATE
+from ..budget.consider_analysis import ResidualChanges
+from ..budget.systematic_effects import ASSUMPTIONS
+from ..distributions import normal_isf
+from .relaxed_assumptions import (
+    DRIFT,
+    Probe,
+    SolvedFit,
+    relaxed_probe,
+    with_relaxed_assumption,
+)
+
+# Assumptions that are probed in every solve: both can be wrong while the residuals look white, bias
+# the estimates, and are determined by a single recording.
+ROUTINE = (DRIFT, CLOCK_RATE.name)
+# Probability that any routine probe of a faultless run is significant, as of every other test of
+# the verdict. The first order that a probe rests on is not exact: at a level of 1/200 one of six
+# draws of the noise of one faultless recording was significant.
+FALSE_ALARMS = 1e-4
+# Standard deviation of the prior of a probe's amplitude, in deviations of the budget: it must not
+# shrink towards the assumption that it tests, and stay bounded where the data say nothing.
+WIDENING = 10.0
+# Least change of an estimate that is relevant, in half widths of its statistical interval. A bias
+# of a quarter of that (half a standard error) lowers the coverage of a 95 % interval to 92 %.
+RELEVANT = 0.25
+
+
+def probed_deviations(
+    deviations: Mapping[str, float | None],
+) -> dict[str, float | None]:
+    """Return deviations in which none of the routine probes is None.
+
+    A quantity stated as exact is left out of the budget but still tested, with the default
+    deviation of the table.
+
+    Parameters
+    ----------
+    deviations : mapping of str to float or None
+        Standard deviation of each assumption or nuisance parameter; None if exact.
+    """
+    usual = {row.name: row.sigma for row in ASSUMPTIONS}
+    usual[CLOCK_RATE.name] = CLOCK_RATE.considered or 0.0
+    exact = [name for name in ROUTINE if deviations.get(name) is None]
+    return {**deviations, **{name: usual[name] for name in exact}}
+
+
+def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
+    """Relax each routine assumption by one linear step from the answer.
+
+    Parameters
+    ----------
+    solved_fit : SolvedFit
+        The fit. An assumption that has no column in its `changes`, because it is estimated or has
+        no effect, is not probed.
+
+    Returns
+    -------
+    tuple of Probe
+        Probes with `routine` set; `sentences` is empty where the amplitude is not significant.
+    """
+    limit = significance_limit(solved_fit.changes)
+    probes = []
+    for name in ROUTINE:
+        wide = with_relaxed_assumption(
+            solved_fit.fit, solved_fit.changes, name=name, widening=WIDENING
+        )
+        if any(
+            block.jacobian[..., len(solved_fit.fit.names) :].any()
+            for block in wide.blocks
+        ):
+            probe = relaxed_probe(
+                solved_fit, name, wide=wide, p=solved_fit.parameters
+            )
+            significant = (name,) if probe.is_beyond(limit) else ()
+            probes.append(replace(probe, routine=True, sentences=significant))
+    return tuple(probes)
+
+
+def significance_limit(changes: ResidualChanges) -> float:
+    """Return the least significant amplitude of a routine probe, in its standard errors.
+
+    Bonferroni's bound over all amplitudes: a drift has one, the clock rate one for each recording.
+    """
+    amplitudes = sum(name in ROUTINE for name in changes.names)
+    return float(normal_isf(FALSE_ALARMS / 2 / max(1, amplitudes)))
+
+
+def is_alarming(probe: Probe) -> bool:
+    """Whether a relaxed assumption is significant, and relevant to the estimates that are
+    reported.
+    """
+    return (
+        bool(probe.sentences)
+        and probe.kind == "assumption"
+        and (probe.relevance or 0.0) >= RELEVANT
+    )

@@ -1,0 +1,259 @@
+"""Differences between recordings in the parameters that they share.
+
+To first order the estimate from one recording alone is a Gauss–Newton step away from the joint
+answer: with S its derivatives by the shared parameters and its own nuisance parameters, and P the
+derivatives of the latter's priors, (SᵀS + PᵀP)⁻¹ Sᵀ r. Its covariance is that of any fit. For each
+parameter
+
+    χ² = Σ (x_e − x̄)² / v_e,   x̄ = Σ x_e / v_e / Σ 1 / v_e,
+
+has one degree of freedom less than there are recordings that determine it. If it is larger than
+chance allows, model error differs among recordings. Error bars are then √(χ² / f) times as large
+(Birge 1932), and intervals are Student's. The joint fit may contain that error in its residuals
+already; not to count it twice, 1 / Σ 1 / v_e widened so is enough.
+
+A parameter that hardly any recording determines alone may look certain because all together
+determine it. So each parameter k in turn may differ between recordings, while all others are
+shared: with W the information that remains for these numbers and s their score, they differ by
+
+    Q_k = sᵀP s,   P = W⁺ − 11ᵀ / 1ᵀW1,   E Q_k = E_k + Σ_l τ_l² tr M_klᵀ P M_kl,
+
+E_k being the contribution of noise, the number of recordings less one or more for correlated
+errors, and M_kl the change of s if parameter l differs with the variance τ_l² between recordings.
+All τ_l² ≥ 0 follow by moments (DerSimonian & Laird 1986, for several parameters and with the
+recordings' own covariance). Estimates change by −A⁻¹ (SᵀS)_e.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from ...common.array_types import Array, Index
+from ..distributions import chi2_sf
+from ..linearised import (
+    LinearisedFit,
+    ResidualBlock,
+    gauss_newton_step,
+    least_squares_of_blocks,
+    least_squares_of_fit,
+)
+
+# Probability that consistent recordings are reported to disagree, for all parameters together.
+SIGNIFICANT = 0.01
+# Standard deviation of q below which a recording determines a parameter; otherwise a linear step is
+# meaningless.
+TELLING = 0.5
+# Share of the information that is rounding.
+SILENT = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingComparison:
+    """Comparison of single recordings, in the solver's coordinates.
+
+    Attributes
+    ----------
+    recordings : (n,) tuple of str
+        Names.
+    differences : (n, nq) array
+        Estimates from each alone less the joint ones; NaN where it does not determine them.
+    deviations : (n, nq) array
+        Their standard deviations; NaN likewise.
+    sensitivities : (p, nq n) array
+        Changes of the joint estimates if a parameter differs in one recording by its standard
+        deviation between recordings.
+    """
+
+    recordings: tuple[str, ...]
+    differences: Array
+    deviations: Array
+    sensitivities: Array
+
+    @property
+    def chi_squared(self) -> Array:
+        """χ² of the disagreement on each parameter (nq,); recordings that do not determine it (NaN)
+        are left out.
+        """
+        with np.errstate(invalid="ignore", divide="ignore"):
+            weight = np.nan_to_num(1 / self.deviations**2)
+            mean = np.nansum(weight * self.differences, axis=0) / weight.sum(
+                axis=0
+            )
+        return np.nansum(
+            weight * np.nan_to_num(self.differences - mean) ** 2, axis=0
+        )
+
+    @property
+    def degrees_of_freedom(self) -> NDArray[np.int64]:
+        """Degrees of freedom (nq,) of χ²."""
+        return np.maximum(np.isfinite(self.deviations).sum(axis=0) - 1, 0)
+
+    @property
+    def is_disagreeing(self) -> NDArray[np.bool_]:
+        """Mask (nq,) of the parameters on which the recordings disagree more than by chance."""
+        freedom = self.degrees_of_freedom
+        p = chi2_sf(self.chi_squared, np.maximum(freedom, 1))
+        return np.asarray((freedom > 0) & (p < SIGNIFICANT / len(freedom)))
+
+    def widen(self, variances: Array) -> Array:
+        """Return the variances (nq,) of q of the joint fit, increased for parameters on which the
+        recordings disagree.
+        """
+        ratio = self.chi_squared / np.maximum(self.degrees_of_freedom, 1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            of_all = 1 / np.nansum(1 / self.deviations**2, axis=0)
+            enough = np.maximum(
+                variances, ratio * np.minimum(variances, of_all)
+            )
+        return np.where(self.is_disagreeing, enough, variances)
+
+
+def blocks_by_recording(fit: LinearisedFit) -> dict[str, list[int]]:
+    """Return the indices of the blocks of each recording, by its name."""
+    blocks: dict[str, list[int]] = {}
+    for k, block in enumerate(fit.blocks):
+        blocks.setdefault(block.name, []).append(k)
+    return blocks
+
+
+def single_fits(fit: LinearisedFit) -> Iterator[tuple[LinearisedFit, Array]]:
+    """Yield for each recording the fit to it alone, and the step from the joint parameters to its
+    own, in the order of its names.
+    """
+    for name, block_numbers in blocks_by_recording(fit).items():
+        # What recordings share they have to find alone, too.
+        mine = [
+            other.startswith((f"{name}: ", "shared"))
+            for other in fit.names[fit.shared_count :]
+        ]
+        columns = np.r_[
+            np.arange(fit.shared_count), fit.shared_count + np.flatnonzero(mine)
+        ]
+        yield fit_part(
+            fit, [fit.blocks[k] for k in block_numbers], columns=columns
+        )
+
+
+def fit_part(
+    fit: LinearisedFit, blocks: Sequence[ResidualBlock], columns: Index
+) -> tuple[LinearisedFit, Array]:
+    """Return the fit of some parameters to some data alone, and these parameters less the joint
+    ones.
+
+    Priors of shared parameters belong to all the data and are left out.
+
+    Parameters
+    ----------
+    fit : LinearisedFit
+        The joint fit.
+    blocks : sequence of ResidualBlock
+        Data of the part.
+    columns : array
+        Indices of the parameters that are fitted.
+    """
+    prior_residual, prior_slope = (
+        np.where(columns < fit.shared_count, 0.0, prior[columns])
+        for prior in (fit.prior_residual, fit.prior_jacobian)
+    )
+    alone = replace(
+        fit,
+        blocks=tuple(
+            replace(each, jacobian=each.jacobian[..., columns])
+            for each in blocks
+        ),
+        names=tuple(fit.names[k] for k in columns),
+        prior_residual=prior_residual,
+        prior_jacobian=prior_slope,
+        at_bound=np.zeros(len(columns), dtype=bool),
+    )
+    step = gauss_newton_step(alone)
+    return alone.after_step(step), step
+
+
+def compare_recordings(
+    fit: LinearisedFit, alone: Mapping[str, tuple[Array, Array, Array]]
+) -> RecordingComparison:
+    """Compare recordings by the result of each alone; a parameter that a recording hardly
+    determines has NaN there.
+
+    Parameters
+    ----------
+    fit : LinearisedFit
+        The joint fit.
+    alone : mapping of str to three arrays, each (nq,)
+        For each recording: step from the joint answer, variances of q, and variances of q for
+        independent errors of the stated σ.
+    """
+    steps, variances, independent = (
+        np.array(each) for each in zip(*alone.values(), strict=True)
+    )
+    deviations = np.sqrt(variances)
+    is_determined = deviations < TELLING
+    with np.errstate(invalid="ignore"):
+        excess = variances / independent
+    return RecordingComparison(
+        tuple(alone),
+        np.where(is_determined, steps, np.nan),
+        deviations=np.where(is_determined, deviations, np.nan),
+        sensitivities=_sensitivities_to_differences(
+            fit, [*alone], excess=np.where(np.isfinite(excess), excess, 1.0)
+        ),
+    )
+
+
+def _sensitivities_to_differences(
+    fit: LinearisedFit, names: Sequence[str], excess: Array
+) -> Array:
+    """Return `RecordingComparison.sensitivities` (p, nq n) for n recordings, by name; zero for
+    parameters at a bound.
+    """
+    own = [
+        least_squares_of_blocks(fit, blocks_by_recording(fit)[name])
+        for name in names
+    ]
+    each = np.array([o.information for o in own])
+    scores = np.array([o.score for o in own])
+    together = least_squares_of_fit(fit)
+    information = together.information
+    score = together.score
+    free = np.flatnonzero(~fit.at_bound)
+    inverse = np.linalg.pinv(information[np.ix_(free, free)], hermitian=True)
+    shared = free[free < fit.shared_count]
+    excess_scatter = np.zeros(len(shared))
+    by_each = np.zeros((len(shared), len(shared)))
+    for row, k in enumerate(shared.tolist()):
+        others = free[free != k]
+        cross = each[:, k, others] @ np.linalg.pinv(
+            information[np.ix_(others, others)], hermitian=True
+        )
+        own_s = scores[:, k] - cross @ score[others]
+        by_own = [
+            np.diag(each[:, k, l]) - cross @ each[:, others, l].T
+            for l in shared
+        ]
+        remaining = by_own[row]
+        if not remaining.sum() > SILENT * information[k, k]:
+            continue
+        projection = (
+            np.linalg.pinv(remaining, rcond=SILENT, hermitian=True)
+            - 1 / remaining.sum()
+        )
+        noise = remaining * np.sqrt(np.outer(excess[:, k], excess[:, k]))
+        excess_scatter[row] = own_s @ projection @ own_s - np.trace(
+            projection @ noise
+        )
+        by_each[row] = [np.trace(m.T @ projection @ m) for m in by_own]
+    sizes = np.where(np.diag(by_each) > 0, np.diag(by_each), 1.0)
+    variances = nnls(
+        by_each / np.sqrt(np.outer(sizes, sizes)),
+        excess_scatter / np.sqrt(sizes),
+    )[0]
+    sensitivities = np.zeros((len(fit.names), fit.shared_count, len(names)))
+    for k, tau in zip(shared, np.sqrt(variances / np.sqrt(sizes)), strict=True):
+        sensitivities[free, k] = -tau * inverse @ each[:, free, k].T
+    return sensitivities.reshape(len(fit.names), -1)

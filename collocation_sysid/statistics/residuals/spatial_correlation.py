@@ -1,0 +1,179 @@
+"""Errors of a depth camera that are correlated over the surface.
+
+Errors due to lens, model or neighbouring pixels are similar in neighbouring patches of the surface.
+Their covariance is modelled as
+
+    Cov(e_i, e_j) = s² ((1 − a) δ_ij + a exp(−d_ij / ℓ)),
+
+with distances d_ij on the undeformed body. a, ℓ and s maximise the likelihood of the residuals in
+directions that the parameters do not affect (restricted maximum likelihood; Patterson and Thompson
+1971).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...common.array_types import Array
+from ..distributions import chi2_sf
+from ..linearised import ResidualBlock
+
+# Correlated shares a that are tried.
+SHARES = (0.25, 0.5, 0.75, 0.95)
+# Number of correlation lengths that are tried.
+LENGTHS = 10
+# Longest correlation length over the extent of the body.
+LONGEST = 0.5
+# Directions in which the data determine more than this share of a parameter are left out.
+LEAST_CORRELATION = 0.1
+# Largest number of images that are used.
+MOST_SAMPLES = 20
+
+
+@dataclass(frozen=True, eq=False)
+class SpatialCorrelation:
+    """Spatial correlation of the errors of one sample of a block.
+
+    Attributes
+    ----------
+    covariance : (n, n) array
+        Covariance of its channels, in units of σ².
+    length_m : float
+        Correlation length ℓ [m].
+    p_value : float
+        p-value of the likelihood ratio, for independent errors.
+    freedom : float
+        Degrees of freedom of the variance.
+    """
+
+    covariance: Array
+    length_m: float
+    p_value: float
+    freedom: float
+
+
+def estimate_spatial_correlation(
+    block: ResidualBlock, slope: Array
+) -> SpatialCorrelation | None:
+    """Estimate the spatial correlation of a block's errors.
+
+    Parameters
+    ----------
+    block : ResidualBlock
+        The block.
+    slope : (T, n, r) array
+        Its D = S L, see `linearised`.
+
+    Returns
+    -------
+    SpatialCorrelation or None
+        None if the block has no places, no samples, or too few points in each.
+    """
+    residual, _, present = block.channels
+    if block.places_m is None or not present.any():
+        return None
+    distances_m = np.linalg.norm(
+        block.places_m[:, None] - block.places_m, axis=2
+    )
+    contrasts = []
+    samples = np.unique(
+        np.linspace(0, len(residual) - 1, MOST_SAMPLES).astype(int)
+    )
+    for t in samples:
+        present_channels = np.flatnonzero(present[t])
+        directions, singular_values, _ = np.linalg.svd(
+            slope[t, present_channels]
+        )
+        free = directions[
+            :,
+            np.concatenate(
+                [
+                    singular_values,
+                    np.zeros(len(present_channels) - len(singular_values)),
+                ]
+            )
+            < LEAST_CORRELATION,
+        ]
+        if free.shape[1] > 2:
+            contrasts.append(
+                (
+                    free.T @ residual[t, present_channels],
+                    free,
+                    distances_m[np.ix_(present_channels, present_channels)],
+                )
+            )
+    if not contrasts:
+        return None
+    count = sum(len(z) for z, _, _ in contrasts)
+    nearest = float(
+        np.median(np.where(distances_m > 0, distances_m, np.inf).min(axis=1))
+    )
+    longest = max(LONGEST * float(distances_m.max()), 2 * nearest)
+    white, _ = _restricted_likelihood(contrasts, 0.0, length_m=1.0)
+    candidates = [
+        (
+            *_restricted_likelihood(contrasts, share, length_m=length),
+            share,
+            length,
+        )
+        for share in SHARES
+        for length in np.geomspace(nearest / 2, longest, LENGTHS)
+    ]
+    least, level, share, length = min(candidates)
+    p = float(chi2_sf(max(0.0, white - least), 2))
+    shape = _correlation_matrix(distances_m, share, length_m=float(length))
+    share_known = count / max(1, sum(len(f) for _, f, _ in contrasts))
+    freedom = max(
+        1.0,
+        len(contrasts)
+        * share_known
+        * np.trace(shape) ** 2
+        / float(np.sum(shape**2)),
+    )
+    return SpatialCorrelation(
+        level * shape, float(length), p_value=p, freedom=freedom
+    )
+
+
+def _correlation_matrix(
+    distances_m: Array, share: float, length_m: float
+) -> Array:
+    """Return the correlation matrix (n, n) of distances `distances_m` (n, n) for a share a and a
+    length [m].
+    """
+    return (1 - share) * np.eye(len(distances_m)) + share * np.exp(
+        -distances_m / length_m
+    )
+
+
+def _restricted_likelihood(
+    contrasts: list[tuple[Array, Array, Array]], share: float, length_m: float
+) -> tuple[float, float]:
+    """Return −2 log-likelihood up to a constant, and the variance s² that maximises the likelihood.
+
+    Parameters
+    ----------
+    contrasts : list of (array, array, array)
+        For each sample, contrasts z (k,), the matrix (n, k) that forms them from n points, and the
+        distances (n, n) of the points [m].
+    share : float
+        Share a of the variance that is correlated.
+    length_m : float
+        Correlation length [m].
+    """
+    squares = 0.0
+    logarithms = 0.0
+    count = 0
+    for z, free, distances_m in contrasts:
+        root = np.linalg.cholesky(
+            free.T
+            @ _correlation_matrix(distances_m, share, length_m=length_m)
+            @ free
+        )
+        squares += float(np.sum(np.linalg.solve(root, z) ** 2))
+        logarithms += 2 * float(np.log(np.diag(root)).sum())
+        count += len(z)
+    variance = max(squares / count, 1e-300)
+    return count * float(np.log(variance)) + logarithms, variance

@@ -1,0 +1,386 @@
+"""`compare-methods` and `sweep` from the command line: runs, output and files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from kit.problem_files import (
+    TRUTH,
+    Outcome,
+    run_command,
+    state_vacuum,
+    write_problem,
+)
+from kit.results import a_result
+from matplotlib.image import imread
+from rich.console import Console
+
+from collocation_sysid.cli import study_commands
+from collocation_sysid.common.serialisation import as_json
+from collocation_sysid.extras.studies import run_execution
+from collocation_sysid.extras.studies import study_progress as display
+from collocation_sysid.methods.solution import Iteration
+
+KNOWN = [
+    word
+    for name, value in TRUTH.items()
+    for word in ("--truth", f"{name}={value}")
+]
+METHODS = ("interior-point", "reduced-space")
+# Answers with the guess, as a run that did not move; the second start never ends.
+STAND_IN = """
+import json, sys
+planned, out = json.loads(sys.stdin.readline()), sys.argv[-1]
+if planned["start"] == 1:
+    sys.stdin.read()
+times = [0.0, 0.01]
+record = {
+    "outcome": "finished",
+    "message": "Converged.",
+    "result": json.loads(sys.argv[1]),
+    "tip": {
+        "experiment": "swing", "marker": "low", "max_m": 1e-3, "t_s": times,
+        "measured_m": [[0, 0, 0], [None, None, None]], "rolled_out_m": [[0, 0, 0], [1, 1, 1]],
+    },
+}
+record["result"]["parameters"] = {
+    name: like | {
+        "value": guess, "combined_std_error": 0.1 * guess, "combined95": [0.8 * guess, 1.2 * guess]
+    }
+    for like in record["result"]["parameters"].values() for name, guess in planned["guess"].items()
+}
+with open(out, "w") as file:
+    json.dump(record, file)
+"""
+HISTORY = tuple(
+    Iteration(k, 10.0 / k, 1e-3, 10.0**-k, {}, 0.1 * k, 1.0) for k in (1, 2)
+)
+
+
+@pytest.fixture
+def stand_in(tmp_path, monkeypatch):
+    """Replaces the runs' processes."""
+    script = tmp_path / "stand_in.py"
+    script.write_text(STAND_IN)
+    found = as_json(a_result(history=HISTORY))
+    monkeypatch.setattr(
+        run_execution, "COMMAND", (sys.executable, str(script), found)
+    )
+
+
+def table(file: Path) -> list[dict[str, str]]:
+    with open(file, newline="", encoding="utf-8") as text:
+        return list(csv.DictReader(text))
+
+
+def drawn(folder: Path) -> set[str]:
+    files = list(folder.glob("*.png"))
+    assert all(imread(file).size for file in files)
+    return {file.stem for file in files}
+
+
+# A real comparison --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """Two methods from two starts, and the same command once more."""
+    folder = tmp_path_factory.mktemp("compared")
+    file = state_vacuum(write_problem(folder, {"swing": 6}))
+    out = folder / "study"
+    command = [
+        "compare-methods",
+        file,
+        "--methods",
+        ",".join(METHODS),
+        "--starts",
+        2,
+        "--spread",
+        2,
+    ]
+    command += ["--workers", 2, "--out", out, *KNOWN]
+    first = run_command(*command)
+    written = {
+        path.name: path.stat().st_mtime_ns for path in (out / "runs").iterdir()
+    }
+    return SimpleNamespace(
+        out=out,
+        first=first,
+        written=written,
+        again=run_command(*command, "--json"),
+    )
+
+
+@pytest.mark.long
+def test_every_method_runs_from_every_start(compared):
+    assert compared.first.code == 0, compared.first.err
+    rows = table(compared.out / "runs.csv")
+    assert [(row["method"], row["start"]) for row in rows] == [
+        (method, str(start)) for start in range(2) for method in METHODS
+    ]
+    assert {row["status"] for row in rows} == {"converged"}
+    assert {row["success"] for row in rows} == {"True"}
+    for row in rows:
+        for name, value in TRUTH.items():
+            assert float(row[f"value_{name}"]) == pytest.approx(value, rel=1e-4)
+            assert float(row[f"error_{name}"]) < 1e-4
+
+
+@pytest.mark.long
+def test_the_summary_has_a_row_for_each_method(compared):
+    rows = table(compared.out / "summary.csv")
+    assert [row["method"] for row in rows] == list(METHODS)
+    for row in rows:
+        assert (row["runs"], row["successes"], row["success_rate"]) == (
+            "2",
+            "2",
+            "1.0",
+        )
+        assert float(row["success_low"]) == pytest.approx(0.3424, abs=1e-4)
+        numbers = (
+            "violation_n",
+            "violation_relative",
+            "rms_m",
+            "rollout_rms_m",
+            "tip_max_m",
+        )
+        costs = (
+            "iterations",
+            "build_s",
+            "evaluations_s",
+            "linear_algebra_s",
+            "total_s",
+        )
+        assert all(float(row[name]) >= 0 for name in numbers + costs)
+        assert all(float(row[f"error_{name}"]) < 1e-4 for name in TRUTH)
+
+
+@pytest.mark.long
+def test_the_tables_fit_a_terminal_and_the_plots_are_drawn(compared):
+    lines = compared.first.out.splitlines()
+    assert [line for line in lines if line in ("Success", "Quality", "Cost")]
+    assert max(len(line) for line in lines if "written to" not in line) <= 90
+    assert "2/2  34–100 %" in compared.first.out
+    assert drawn(compared.out) == {"convergence", "tip", "success", "basins"}
+    text = (compared.out / "summary.md").read_text()
+    assert "| interior-point | 2 | 2/2 | 34–100 % |" in text
+    assert "within 1 % of the truth" in text
+
+
+@pytest.mark.long
+def test_progress_tells_the_time_left(compared):
+    lines = compared.first.err.splitlines()
+    assert len(lines) == 4
+    assert lines[0].startswith("1/4 runs: ")
+    assert lines[0].endswith(" left")
+    assert "; about" not in lines[-1]
+
+
+@pytest.mark.long
+def test_finished_runs_are_not_done_again(compared):
+    assert compared.again.err == "4 of 4 runs are finished already\n"
+    runs = compared.out / "runs"
+    assert {
+        path.name: path.stat().st_mtime_ns for path in runs.iterdir()
+    } == compared.written
+    content = json.loads(compared.again.out)
+    assert content["truth"] == TRUTH
+    assert [row["method"] for row in content["methods"]] == list(METHODS)
+    assert len(content["runs"]) == 4
+
+
+# Late, interrupted and missing runs ---------------------------------------------------------------
+
+
+def compare(*more: object) -> Outcome:
+    return run_command(
+        "compare-methods",
+        "problem.toml",
+        "--methods",
+        "reduced-space",
+        "--out",
+        "out",
+        *more,
+    )
+
+
+@pytest.mark.long
+def test_a_late_run_is_a_row(tiny, stand_in):
+    outcome = compare("--starts", 3, "--time-limit", 3, "--workers", 3, *KNOWN)
+    assert outcome.code == 0
+    rows = table(tiny / "out" / "runs.csv")
+    assert [row["status"] for row in rows] == [
+        "converged",
+        "timeout",
+        "converged",
+    ]
+    late = "reduced-space, start 1: timeout: ended at the time limit of 3 s"
+    assert late in outcome.out
+    assert late in (tiny / "out" / "summary.md").read_text()
+    (summary,) = table(tiny / "out" / "summary.csv")
+    assert (summary["runs"], summary["converged"], summary["rms_m"]) == (
+        "3",
+        "2",
+        "0.001",
+    )
+
+
+def test_an_interrupted_study_says_how_to_resume(tiny, stand_in, monkeypatch):
+    done = display.StudyProgress.count_run
+
+    def interrupt(self, record, slots):
+        done(self, record, slots)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(display.StudyProgress, "count_run", interrupt)
+    outcome = compare("--starts", 2, "--workers", 2)
+    assert outcome.code == 130
+    assert outcome.out == ""
+    assert (
+        "interrupted: 1 of 2 runs are kept in out; go on with: " in outcome.err
+    )
+    assert outcome.err.endswith("--out out --starts 2 --workers 2\n")
+    assert [row["status"] for row in table(tiny / "out" / "runs.csv")] == [
+        "converged",
+        "missing",
+    ]
+    assert (
+        "1 of 2 runs remain to be done."
+        in (tiny / "out" / "summary.md").read_text()
+    )
+
+
+@pytest.mark.long
+def test_progress_is_one_line_on_a_terminal(tiny, stand_in, monkeypatch):
+    shown = io.StringIO()
+    monkeypatch.setattr(
+        study_commands,
+        "error_console",
+        Console(force_terminal=True, width=80, file=shown),
+    )
+    monkeypatch.setenv("TERM", "xterm")
+    assert compare().code == 0
+    assert "0/1 runs" in shown.getvalue()
+
+
+# Plans only ---------------------------------------------------------------------------------------
+
+
+def test_a_dry_run_only_lists_the_runs(tiny):
+    outcome = compare("--starts", 2, "--dry-run")
+    assert outcome.code == 0
+    assert outcome.out.count("to do") == 2
+    assert "reduced-space, start 1" in outcome.out
+    assert not (tiny / "out").exists()
+    listed = json.loads(compare("--starts", 2, "--dry-run", "--json").out)
+    assert [run["start"] for run in listed] == [0, 1]
+    assert len(listed[1]["overrides"]) == 5
+    assert {run["overrides"][0] for run in listed} == {
+        "transcription.substeps=1"
+    }
+    assert not listed[0]["finished"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["compare-methods", "problem.toml", "--methods", "interior"],
+            "did you mean 'interior-point'?",
+        ),
+        (
+            ["compare-methods", "nowhere.toml", "--methods", "reduced-space"],
+            "there is no such file",
+        ),
+        (
+            ["sweep", "problem.toml", "--over", "a=1:2"],
+            "error: --over: found 1:2 for a; expected",
+        ),
+        (
+            ["sweep", "problem.toml", "--over", "title=x", "--method", "nome"],
+            "error: --method: ",
+        ),
+        (
+            ["sweep", "problem.toml", "--over", "object.mesh=a.vtu,b.vtu"],
+            "a.vtu",
+        ),
+    ],
+)
+def test_bad_input_is_refused_before_anything_runs(tiny, arguments, message):
+    outcome = run_command(*arguments, "--out", "out")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert message in outcome.err
+    assert not (tiny / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        (
+            ("compare", "problem.toml", "--materials", "yeoh"),
+            ("compare-methods", "compare-models"),
+        ),
+        (("topics", "trial.mcap"), ("log LOG",)),
+    ],
+)
+def test_an_old_name_ends_with_the_new_names(tiny, words, names):
+    outcome = run_command(*words)
+    assert (outcome.code, outcome.out) == (2, "")
+    assert f"No such command '{words[0]}': it was" in outcome.err
+    assert all(name in outcome.err for name in names)
+
+
+# Sweeps -------------------------------------------------------------------------------------------
+
+
+def test_a_sweep_tabulates_estimates_against_the_swept_values(tiny, stand_in):
+    outcome = run_command(
+        "sweep", "problem.toml", "--method", "reduced-space", "--out", "out",
+        "--over", "parameters.mu_pa.guess=50:5000:log:3", "--over", "transcription.substeps=1,2",
+    )  # fmt: skip
+    assert outcome.code == 0
+    rows = table(tiny / "out" / "runs.csv")
+    assert [
+        (row["parameters.mu_pa.guess"], row["transcription.substeps"])
+        for row in rows
+    ] == [(mu, m) for mu in ("50", "500", "5000") for m in ("1", "2")]
+    assert [float(row["value_mu_pa"]) for row in rows] == [
+        50,
+        50,
+        500,
+        500,
+        5000,
+        5000,
+    ]
+    assert "500 2 400 ± 40 500 ± 50" in " ".join(outcome.out.split())
+    assert max(map(len, outcome.out.splitlines())) <= 80
+    assert drawn(tiny / "out") == {"sweep"}
+    content = json.loads((tiny / "out" / "summary.json").read_text())
+    assert content["varied_values"] == [
+        "parameters.mu_pa.guess",
+        "transcription.substeps",
+    ]
+    assert (
+        "| mu_pa.guess | substeps |"
+        in (tiny / "out" / "summary.md").read_text()
+    )
+
+
+def test_words_and_lists_can_be_swept(tiny, stand_in):
+    outcome = run_command(
+        "sweep", "problem.toml", "--out", "out", "--json", "-q",
+        "--over", "solver.method=interior-point,reduced-space",
+        "--over", "experiment.swing.gravity_m_s2=[0, 0, -9.81],[0, 0, 0]",
+    )  # fmt: skip
+    assert (outcome.code, outcome.err) == (0, "")
+    rows = json.loads(outcome.out)["runs"]
+    assert [row["method"] for row in rows] == [
+        m for m in METHODS for _ in range(2)
+    ]
+    assert rows[1]["experiment.swing.gravity_m_s2"] == "[0, 0, 0]"

@@ -1,0 +1,112 @@
+"""Pages of the documentation in a terminal, and the references of messages and reports."""
+
+from __future__ import annotations
+
+import io
+from email.message import Message
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from kit.problem_files import run_command
+
+from collocation_sysid.cli.markdown import TerminalPage
+from collocation_sysid.common.console import PlainConsole
+from collocation_sysid.common.display import plain_text
+from collocation_sysid.common.pages import page_files, page_text, page_url
+from collocation_sysid.result.run_sections import _remedy_lines, remedy_command
+from collocation_sysid.statistics.concerns import TOPICS, Concern
+
+ROOT = Path(__file__).parents[2]
+CONCERNS = (
+    Concern("residuals/persist"),
+    Concern("scheme/step"),
+    Concern("solve/no-start"),
+)
+
+
+def test_topics_are_listed_with_a_line_each():
+    lines = run_command("explain").out.splitlines()
+    assert len(lines) == 1 + len(page_files())
+    assert next(line for line in lines if line.startswith("verdict")).split(
+        maxsplit=1
+    )[1].strip() == ("Reading the verdict")
+
+
+def test_a_page_is_shown_with_its_links_as_topics():
+    shown = run_command("explain", "trust").out
+    assert shown.startswith("# When the answer can't be trusted\n")
+    assert (
+        "The verdict (`explain verdict`) says which of these is the case."
+        in shown
+    )
+    for topic in page_files():
+        assert ".md)" not in page_text(topic), topic
+
+
+def test_an_unknown_topic_is_refused_with_the_likely_one():
+    outcome = run_command("explain", "verdit")
+    assert outcome.code == 2
+    assert "TOPIC: found 'verdit'; expected one of actuation, " in outcome.err
+    assert "did you mean 'verdict'?" in outcome.err
+
+
+def test_code_of_a_page_can_be_copied_from_a_narrow_terminal():
+    file = io.StringIO()
+    console = PlainConsole(
+        file=file, width=40, force_terminal=True, color_system=None
+    )
+    console.print(
+        TerminalPage(page_text("forces"), hyperlinks=False), crop=False
+    )
+    (line,) = [
+        each
+        for each in page_text("forces").splitlines()
+        if each.startswith("wrench = {")
+    ]
+    assert len(line) > 40
+    assert line in [each.strip() for each in file.getvalue().splitlines()]
+    prose = [
+        each
+        for each in file.getvalue().splitlines()
+        if each.startswith("Markers alone")
+    ]
+    assert all(len(each.rstrip()) <= 40 for each in prose)
+
+
+def test_what_to_do_is_a_command_that_works():
+    (line,) = remedy_command(CONCERNS)
+    said = plain_text(line)
+    assert said == "what to do: collocation-sysid explain trust scheme"
+    shown = run_command(*said.removeprefix("what to do: ").split()[1:])
+    assert shown.code == 0
+    assert "# When the answer can't be trusted\n" in shown.out
+    assert "# Choosing a scheme\n" in shown.out
+
+
+def test_every_topic_of_concerns_has_a_page():
+    assert {topic.page for topic in TOPICS.values()} <= page_files().keys()
+
+
+@pytest.mark.parametrize("base", [None, "https://example.org/docs/"])
+def test_reports_link_to_the_documentation_that_the_project_states(
+    base: str | None, monkeypatch: pytest.MonkeyPatch
+):
+    stated = Message()
+    stated["Project-URL"] = "Source, https://example.org/code"
+    if base is not None:
+        stated["Project-URL"] = f"Documentation, {base}"
+    monkeypatch.setattr(metadata, "metadata", lambda name: stated)
+    links = [
+        span.to
+        for cure in _remedy_lines(CONCERNS)
+        for span in cure.spans
+        if span.to
+    ]
+    if base is None:
+        assert page_url("theory") is None
+        assert links == []
+    else:
+        assert page_url("theory") == f"{base}theory.html"
+        assert links[0] == f"{base}howto/trust.html"
+        assert len(links) == len(CONCERNS)

@@ -1,0 +1,261 @@
+"""Study scripts run on very small problems."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import study_faults
+import study_methods
+import study_mismatch
+import study_noise
+import study_table1
+from studies import HEADS, TRUTH, Variant, markdown, run_variants, worst_error
+
+pytestmark = pytest.mark.long
+
+SIGMA_M = 1e-3
+
+
+def cells(table: str) -> list[list[str]]:
+    """Rows of a Markdown table, without its head and rule."""
+    return [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in table.split("\n")
+    ][2:]
+
+
+def row(**changes) -> dict:
+    """What a study knows of a run that found the truth."""
+    found = {f"value_{name}": value for name, value in TRUTH.items()}
+    errors = {f"error_{name}": 0.0 for name in TRUTH}
+    numbers = dict.fromkeys(
+        ("rms_m", "violation_n", "violation_relative", "tip_max_m"), 0.0
+    )
+    rest = {"iterations": 8, "total_s": 1.0, "wall_s": 3.0, "converged": True}
+    return {
+        **found,
+        **errors,
+        **numbers,
+        **rest,
+        "status": "converged",
+        **changes,
+    }
+
+
+# Starts -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def small_problem(tmp_path_factory) -> Path:
+    return study_methods.write_problem(
+        tmp_path_factory.mktemp("starts"), 2, 10, 0.02
+    )
+
+
+def test_a_variant_is_solved_from_every_start(small_problem):
+    variants = [Variant("shooting", "shooting", {"gradient": "forward"})]
+    rows = run_variants(
+        small_problem, variants, small_problem.parent, starts=2, spread=1.5
+    )
+    (result,) = (study_methods.score(name, each) for name, each in rows.items())
+    assert (result.runs, result.hits, result.converged, result.misled) == (
+        2,
+        2,
+        2,
+        0,
+    )
+    (line,) = cells(study_methods.table([result]))
+    assert line[:3] == ["shooting", "2 of 2", "100"]
+
+
+def test_a_slow_variant_gets_the_first_starts(small_problem, monkeypatch):
+    monkeypatch.setattr("studies.run_all", lambda *_, **__: None)
+    variants = [
+        Variant("all", "shooting"),
+        Variant("few", "penalty", share=0.25),
+    ]
+    rows = run_variants(
+        small_problem, variants, small_problem.parent / "none", starts=8
+    )
+    assert [len(each) for each in rows.values()] == [8, 2]
+    guesses = [
+        [each[k][f"guess_{n}"] for n in TRUTH]
+        for each in rows.values()
+        for k in (0, 1)
+    ]
+    assert guesses[:2] == guesses[2:]
+
+
+def test_a_run_without_an_answer_counts_as_a_failure():
+    lost = row(
+        total_s=None,
+        converged=False,
+        **{f"error_{name}": None for name in TRUTH},
+    )
+    far = row(error_mu_pa=0.5)
+    result = study_methods.score("some", [row(), far, lost])
+    assert (result.hits, result.converged, result.misled) == (1, 2, 1)
+    assert worst_error(lost) == np.inf
+    low, high = result.interval
+    assert 0 < low < 1 / 3 < high < 1
+
+
+# Table I ------------------------------------------------------------------------------------------
+
+
+def test_table_1_sets_every_method_beside_truth_and_paper():
+    stopped = row(rms_m=None, total_s=None, status="timeout")
+    lines = cells(study_table1.table({"one": [row()], "other": [stopped]}))
+    truth, paper, one, other = lines
+    assert {len(line) for line in lines} == {12}
+    assert one[1:5] == truth[1:5] == ["200", "300", "0.009", "1"]
+    assert paper[1] == "734.3"
+    assert (other[5], other[-1]) == ("–", "timeout")
+
+
+def test_table_1_names_options_that_the_methods_have(monkeypatch, tmp_path):
+    monkeypatch.setattr("studies.run_all", lambda *_, **__: None)
+    rows = run_variants(study_table1.PROBLEM, study_table1.VARIANTS, tmp_path)
+    assert {len(each) for each in rows.values()} == {1}
+
+
+# Integrators --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fits() -> dict[str, list[study_mismatch.Fit]]:
+    experiment = study_mismatch.measured(layers=2, samples=15, fine_s=1e-3)
+    return {
+        scheme: [study_mismatch.identify(experiment, scheme, m) for m in (2, 4)]
+        for scheme in ("backward-euler", "midpoint")
+    }
+
+
+def test_finer_steps_bias_the_parameters_less(fits):
+    for coarse, fine in fits.values():
+        assert coarse.converged
+        assert fine.converged
+        assert np.abs(fine.errors).max() < np.abs(coarse.errors).max()
+
+
+def test_the_midpoint_rule_biases_stiffness_by_the_square_of_the_step(fits):
+    assert study_mismatch.orders(fits["midpoint"])[1] == pytest.approx(
+        2, abs=0.4
+    )
+
+
+def test_steps_with_an_estimate_at_its_bound_say_nothing_of_the_order():
+    fits = [
+        study_mismatch.Fit(
+            "midpoint",
+            h,
+            True,
+            np.full(4, -3 * h),
+            np.arange(4) == bounded,
+            0.0,
+            0.0,
+        )
+        for h, bounded in ((0.01, None), (0.02, None), (0.04, 2))
+    ]
+    assert study_mismatch.orders(fits) == pytest.approx(1)
+    assert np.isnan(study_mismatch.orders(fits[1:])).all()
+    assert [line[4] for line in cells(study_mismatch.table(fits))] == [
+        "-3",
+        "-6",
+        "-12*",
+    ]
+    everything, finest = cells(study_mismatch.order_table(fits[1:]))
+    assert everything[1:] == finest[1:] == ["–"] * 4
+
+
+# Noise --------------------------------------------------------------------------------------------
+
+
+def test_methods_turn_the_same_noise_into_the_same_error():
+    expected = np.array(study_noise.predicted(SIGMA_M))
+    reduced, shooting = (
+        study_noise.run(case, SIGMA_M, 0) for case in study_noise.CASES[:2]
+    )
+    assert reduced.converged
+    assert shooting.converged
+    assert reduced.errors == pytest.approx(shooting.errors, abs=1e-4)
+    assert (np.abs(reduced.errors) < 5 * expected).all()
+
+
+def test_noise_is_summed_up_over_converged_runs():
+    errors = [np.full(4, 0.01), np.full(4, -0.01), np.full(4, 9.0)]
+    outcomes = [
+        study_noise.Outcome(converged, each, 1.0)
+        for converged, each in zip((True, True, False), errors, strict=True)
+    ]
+    predicted, line = cells(study_noise.table({"some": outcomes}, [0.02] * 4))
+    assert predicted[4] == "2"
+    assert line[:5] == ["some", "3", "2", "+0 ± 1", "1.41"]
+
+
+def test_tables_are_markdown():
+    assert (
+        markdown(("a", *HEADS[:1]), [("x", "1")])
+        == "| a | λ |\n| --- | ---: |\n| x | 1 |"
+    )
+
+
+# Faults -------------------------------------------------------------------------------------------
+
+
+def test_a_twin_with_noisy_poses_is_identified_and_listed():
+    found = study_faults.run("poses 0.1 mm, 0.06°, judged", (0, 1))
+    assert found.converged
+    assert found.held.sum() >= 3
+    (line,) = cells(
+        f"{study_faults.table_head()}\n{study_faults.table_row('poses', [found])}"
+    )
+    assert line[0] == "poses"
+    assert float(line[13]) == pytest.approx(100 * found.relative[0], rel=0.05)
+    assert line[-1] == "0"
+
+
+def test_a_twin_of_which_all_that_is_assumed_is_wrong_is_in_the_whole_intervals():
+    found = study_faults.run("assumed: all of these", (0, 1))
+    assert found.converged
+    assert found.held.sum() < found.whole.sum()
+    assert found.whole.sum() >= 5
+
+
+def test_faults_are_as_large_as_they_are_called():
+    rng, measured = np.random.default_rng(0), study_faults.measured()
+    before = measured.markers.positions_m
+    late, stated = study_faults.FAULTS["clock 2 ms late"](measured, rng)
+    speed = np.gradient(before, measured.timestep_s, axis=0)
+    change = late.markers.positions_m - stated.markers.positions_m
+    assert np.abs(change + 0.002 * speed).max() < 0.1 * np.abs(change).max()
+    actual, noisy = study_faults.FAULTS["poses 0.5 mm, 0.3°, given"](
+        measured, rng
+    )
+    shaken, smooth = noisy.grasps[0].poses, actual.grasps[0].poses
+    assert (shaken.positions_m - smooth.positions_m).std() == pytest.approx(
+        5e-4, rel=0.2
+    )
+    assert noisy.grasps[0].sigma_rad == pytest.approx(np.radians(0.3))
+    moved, _ = study_faults.FAULTS["places 1 mm"](measured, rng)
+    offsets = moved.markers.positions_m - before
+    assert np.linalg.norm(offsets, axis=2).mean() == pytest.approx(
+        1.6e-3, rel=0.4
+    )
+
+
+@pytest.mark.parametrize(
+    ("count", "shown"), [(190, "95"), (182, "91*"), (199, "99.5*")]
+)
+def test_shares_beyond_chance_are_starred(count, shown):
+    outcome = study_faults.Outcome(
+        True, *(np.ones(6) for _ in range(4)), correlated=False
+    )
+    missed = replace(outcome, held=np.zeros(6))
+    row = study_faults.table_row(
+        "none", [outcome] * count + [missed] * (200 - count)
+    )
+    assert cells(f"a\nb\n{row}")[0][1] == shown

@@ -1,0 +1,653 @@
+"""Studies: plans, supervision of worker processes, and summaries."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kit.problem_files import TRUTH
+from kit.results import a_result, value
+
+from collocation_sysid.common import cluster
+from collocation_sysid.common.serialisation import as_json, content
+from collocation_sysid.errors import InputError
+from collocation_sysid.extras.studies import (
+    PlannedRun,
+    RunOptions,
+    RunStore,
+    Starts,
+    plan_comparison,
+    plan_sweep,
+    run_all,
+    run_execution,
+    run_worker,
+)
+from collocation_sysid.extras.studies.study_arguments import (
+    parse_methods,
+    parse_varied_keys,
+    read_truth,
+)
+from collocation_sysid.extras.studies.study_planning import shortened_keys
+from collocation_sysid.extras.studies.study_progress import remaining_time_s
+from collocation_sysid.extras.studies.study_rows import (
+    SuccessCriterion,
+    method_rows,
+    run_row,
+    wilson_interval,
+)
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.solution import Iteration
+from collocation_sysid.problem import Problem
+
+NAMES = tuple(TRUTH)
+# Stands in for a run's process: it reads the run, and ends as its first argument says.
+STAND_IN = """
+import json, os, sys
+behaviour, place, out = sys.argv[1:]
+planned = json.loads(sys.stdin.readline())
+with open(os.path.join(place, planned["key"]), "a") as tries:
+    tries.write("x")
+    first = tries.tell() == 1
+if behaviour == "dies" or (behaviour == "dies once" and first):
+    sys.stderr.write("Bus error\\n")
+    sys.stderr.flush()
+    os._exit(3)
+if behaviour == "hangs":
+    sys.stdin.read()
+with open(out, "w") as file:
+    threads = os.environ["OMP_NUM_THREADS"], os.environ["COLLOCATION_SYSID_THREADS"]
+    json.dump({"outcome": "finished", "message": "", "threads": threads}, file)
+"""
+
+
+@pytest.fixture
+def stand_in(tmp_path, monkeypatch):
+    """``stand_in(behaviour)`` replaces the runs' processes; gives the tries of a run."""
+    script, place = tmp_path / "stand_in.py", tmp_path / "tries"
+    script.write_text(STAND_IN)
+    place.mkdir()
+
+    def behave(behaviour: str):
+        command = (sys.executable, str(script), behaviour, str(place))
+        monkeypatch.setattr(run_execution, "COMMAND", command)
+        return lambda key: len((place / key).read_text())
+
+    return behave
+
+
+@pytest.fixture
+def without_distributed(monkeypatch):
+    monkeypatch.setattr(cluster, "find_spec", lambda name: None)
+
+
+@pytest.fixture
+def a_scheduler():
+    """The address of one."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1,
+        threads_per_worker=2,
+        processes=False,
+        protocol="tcp",
+        dashboard_address=":0",
+    ) as there:
+        yield there.scheduler_address
+
+
+def planned_runs(count: int) -> list[PlannedRun]:
+    return [
+        PlannedRun(f"key{k}", "problem.toml", "interior-point", k)
+        for k in range(count)
+    ]
+
+
+# The command line's words -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("a.b=1,2,4", ["1", "2", "4"]),
+        ("a.b=10:1000:log:3", ["10", "100", "1000"]),
+        ("a.b=0:1:3", ["0", "0.5", "1"]),
+        ("a.b=1:4:lin:4", ["1", "2", "3", "4"]),
+        ("a.b=0.1:0.3:3", ["0.1", "0.2", "0.3"]),
+        (
+            'a.b=[0, 1],{c = 1, d = 2},"x,y"',
+            ["[0, 1]", "{c = 1, d = 2}", '"x,y"'],
+        ),
+        ("a.b=midpoint,bdf2", ["midpoint", "bdf2"]),
+        ("a.b=7", ["7"]),
+    ],
+)
+def test_swept_values_are_lists_or_ranges(text, values):
+    assert parse_varied_keys([text]) == {"a.b": tuple(values)}
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (["parameters.mu_pa.guess"], "expected key=values"),
+        (["=1,2"], "expected key=values"),
+        (["a="], "expected key=values"),
+        (["a=1:2"], "expected first:last:count"),
+        (["a=1:2:log:x"], "expected first:last:count"),
+        (["a=1:2:3:4:5"], "expected first:last:count"),
+        (["a=1:2:lgo:3"], "found the spacing 'lgo'"),
+        (["a=0:2:log:3"], "needs ends above 0"),
+        (["a=1:2:0"], "expected first:last:count"),
+        (["a=1", "a=2"], "given twice"),
+        ([], "at least one key"),
+    ],
+)
+def test_swept_values_that_cannot_be_read_are_quoted(texts, message):
+    with pytest.raises(InputError, match=message) as refused:
+        parse_varied_keys(texts)
+    assert refused.value.where == "--over"
+
+
+def test_methods_are_listed_once_and_misspelt_ones_recognised():
+    assert parse_methods("reduced-space, interior-point,reduced-space") == (
+        "reduced-space",
+        "interior-point",
+    )
+    with pytest.raises(InputError, match="did you mean 'reduced-space'"):
+        parse_methods("interior-point,reduced_space")
+    with pytest.raises(InputError, match="found no name; expected some of"):
+        parse_methods(" , ")
+
+
+def test_the_truth_is_a_file_or_values(tmp_path):
+    file = tmp_path / "truth.toml"
+    file.write_text(
+        "[parameters]\nlambda_pa = 1\nmu_pa = 300.0\ngamma_r_s = 0.009\n"
+    )
+    truth = read_truth(
+        [str(file), "lambda_pa=200,gamma_m_1_s=1.0"], NAMES, NAMES
+    )
+    assert truth == TRUTH
+    assert read_truth([], NAMES, NAMES) == {}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("mu=3", "found 'mu'; expected one of .*; did you mean 'mu_pa'"),
+        ("mu_pa=x", "found mu_pa = x; expected a positive number"),
+        ("mu_pa=-1", "expected a positive number"),
+        ("mu_pa=3", "lambda_pa, gamma_r_s, gamma_m_1_s missing"),
+        ("nowhere.toml", "there is no such file"),
+    ],
+)
+def test_a_truth_that_cannot_be_used_is_refused(given, message):
+    with pytest.raises(InputError, match=message) as refused:
+        read_truth([given], NAMES, NAMES)
+    assert refused.value.where == "--truth"
+
+
+# Plans --------------------------------------------------------------------------------------------
+
+
+def test_every_method_has_the_same_starts(tiny):
+    problem = Problem.read("problem.toml")
+    planned = plan_comparison(
+        problem, ["interior-point", "reduced-space"], (), Starts(3, seed=4)
+    )
+    assert [run.label for run in planned] == [
+        f"{method}, start {start}"
+        for start in range(3)
+        for method in ("interior-point", "reduced-space")
+    ]
+    assert len({run.key for run in planned}) == 6
+    for one, other in zip(planned[::2], planned[1::2], strict=True):
+        assert one.guess == other.guess
+    assert planned[0].guess == {
+        item.name: item.guess for item in problem.parameters.free
+    }
+
+
+def test_more_starts_are_further_ones(tiny):
+    problem = Problem.read("problem.toml")
+    few, many = (
+        plan_comparison(problem, ["reduced-space"], (), Starts(n))
+        for n in (2, 5)
+    )
+    assert many[:2] == few
+    others = plan_comparison(problem, ["reduced-space"], (), Starts(2, seed=1))
+    assert others[0] == few[0]
+    assert others[1].guess != few[1].guess
+
+
+def test_starts_lie_around_the_truth_within_the_bounds(tiny):
+    problem = Problem.read("problem.toml", ["parameters.mu_pa.upper=310"])
+    overrides = ["parameters.mu_pa.upper=310"]
+    planned = plan_comparison(
+        problem, ["reduced-space"], overrides, Starts(40, 2.0), TRUTH
+    )
+    guesses = np.array([list(run.guess.values()) for run in planned[1:]])
+    ratios = guesses / np.array(list(TRUTH.values()))
+    assert ratios.min() >= 0.5
+    assert ratios.max() <= 2.0
+    assert guesses[:, 1].max() == 310
+    assert np.abs(np.log(ratios[:, 0]).mean()) < 0.2
+
+
+def test_starts_lie_around_the_guess_where_the_truth_is_unknown(tiny):
+    problem = Problem.read("problem.toml")
+    start = plan_comparison(problem, ["reduced-space"], (), Starts(2, 1.0))[1]
+    assert start.guess == pytest.approx(
+        {item.name: item.guess for item in problem.parameters.free}
+    )
+
+
+def test_fixed_parameters_stay(tiny):
+    fixed = ["parameters.mu_pa={fixed = 300}"]
+    problem = Problem.read("problem.toml", fixed)
+    start = plan_comparison(problem, ["reduced-space"], fixed, Starts(2))[1]
+    assert list(start.guess) == ["lambda_pa", "gamma_r_s", "gamma_m_1_s"]
+    assert not any("mu_pa.guess" in override for override in start.overrides)
+
+
+def test_other_data_are_other_runs(tiny):
+    def key(*overrides: str) -> str:
+        problem = Problem.read("problem.toml", overrides)
+        return plan_comparison(problem, ["reduced-space"], overrides)[0].key
+
+    before = key()
+    assert key() == before
+    assert key("solver.reduced-space.tolerance=1e-6") != before
+    assert (
+        key("solver.shooting.tolerance=1e-6") == before
+    )  # an option of another method
+    assert (
+        key("solver.method=reduced-space") == before
+    )  # the method it had anyhow
+    markers = tiny / "swing_markers.csv"
+    markers.write_text(markers.read_text() + "\n")
+    assert key() != before
+
+
+def test_a_sweep_has_every_combination(tiny):
+    over = parse_varied_keys(
+        ["parameters.mu_pa.guess=100:400:log:3", "transcription.substeps=1,2"]
+    )
+    planned = plan_sweep(Path("problem.toml"), over, method="reduced-space")
+    assert [tuple(run.varied_values.values()) for run in planned] == [
+        (mu, m) for mu in ("100", "200", "400") for m in ("1", "2")
+    ]
+    assert [run.guess["mu_pa"] for run in planned] == [
+        100,
+        100,
+        200,
+        200,
+        400,
+        400,
+    ]
+    assert planned[1].label == "mu_pa.guess=100, substeps=2"
+    assert {run.method for run in planned} == {"reduced-space"}
+
+
+def test_a_sweep_can_be_over_methods(tiny):
+    over = parse_varied_keys(["solver.method=interior-point,reduced-space"])
+    planned = plan_sweep(Path("problem.toml"), over)
+    assert [run.method for run in planned] == [
+        "interior-point",
+        "reduced-space",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("over", "message"),
+    [
+        ("parameters.mu_pa.gues=1,2", "did you mean 'guess'"),
+        ("transcription.substeps=1,x", "transcription.substeps: found 'x'"),
+        ("title.text=1", "--over: title.text goes beyond the value"),
+    ],
+)
+def test_swept_keys_the_problem_has_not_are_refused(tiny, over, message):
+    with pytest.raises(InputError, match=message):
+        plan_sweep(Path("problem.toml"), parse_varied_keys([over]))
+
+
+def test_keys_are_shortened_while_they_differ():
+    keys = [
+        "parameters.mu_pa.guess",
+        "transcription.substeps",
+        "a.sigma_m",
+        "b.sigma_m",
+    ]
+    shorts = ["mu_pa.guess", "substeps", "a.sigma_m", "b.sigma_m"]
+    assert list(shortened_keys(keys)) == list(zip(keys, shorts, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("options", "where"),
+    [
+        ({"starts": 0}, "starts"),
+        ({"spread": 0.5}, "spread"),
+        ({"seed": -1}, "seed"),
+    ],
+)
+def test_starts_that_cannot_be_are_refused(options, where):
+    with pytest.raises(InputError, match=f"^{where}: found"):
+        Starts(**options)
+
+
+# One run's process --------------------------------------------------------------------------------
+
+
+def test_a_run_has_one_thread(stand_in):
+    stand_in("answers")
+    record = run_execution.execute(planned_runs(1)[0].as_dict())
+    assert record["outcome"] == "finished"
+    assert record["threads"] == ["1", "1"]
+    assert record["attempts"] == 1
+
+
+def test_a_process_that_dies_once_is_tried_again(stand_in):
+    tries = stand_in("dies once")
+    record = run_execution.execute(planned_runs(1)[0].as_dict())
+    assert (record["outcome"], record["attempts"], tries("key0")) == (
+        "finished",
+        2,
+        2,
+    )
+
+
+def test_a_process_that_always_dies_is_a_record(stand_in):
+    tries = stand_in("dies")
+    record = run_execution.execute(planned_runs(1)[0].as_dict(), retries=2)
+    assert (record["outcome"], tries("key0")) == ("crashed", 3)
+    assert record["message"] == "its process ended with code 3: Bus error"
+
+
+def test_a_late_run_is_killed(stand_in):
+    tries = stand_in("hangs")
+    record = run_execution.execute(
+        planned_runs(1)[0].as_dict(), time_limit_s=0.5
+    )
+    assert (record["outcome"], tries("key0")) == ("timeout", 1)
+    assert record["message"] == "ended at the time limit of 0.5 s"
+
+
+OBEDIENT = """
+import json, pathlib, signal, sys
+file, ready = map(pathlib.Path, (sys.argv[-1], sys.argv[-2]))
+def end(*_, **__):
+    file.write_text(json.dumps({"outcome": "finished", "result": json.loads(sys.argv[1])}))
+    sys.exit()
+signal.signal(signal.SIGTERM, end)
+ready.touch()
+signal.pause()
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_late_run_keeps_the_answer_that_it_had(tmp_path, monkeypatch):
+    ready = tmp_path / "ready"
+    found = as_json(a_result(status="interrupted", converged=False))
+    monkeypatch.setattr(
+        run_execution,
+        "COMMAND",
+        (sys.executable, "-c", OBEDIENT, found, str(ready)),
+    )
+    monkeypatch.setattr(
+        run_execution.time,
+        "monotonic",
+        lambda: 100.0 if ready.exists() else 0.0,
+    )
+    planned = planned_runs(1)[0]
+    record = run_execution.execute(planned.as_dict(), time_limit_s=10.0)
+    assert record["outcome"] == "timeout"
+    assert record["result"] == json.loads(found)
+    assert run_row(planned, record, SuccessCriterion())["status"] == "timeout"
+
+
+def test_a_stopped_study_ends_its_runs(stand_in):
+    stand_in("hangs")
+    record = run_execution.execute(
+        planned_runs(1)[0].as_dict(), is_stopped=lambda: True
+    )
+    assert record["outcome"] == "stopped"
+
+
+def test_what_goes_wrong_in_a_run_becomes_its_record(tiny, monkeypatch):
+    def __call__(self, *_):
+        raise ZeroDivisionError("nothing to divide by")
+
+    monkeypatch.setattr(ReducedSpace, "__call__", __call__)
+    planned = plan_comparison(Problem.read("problem.toml"), ["reduced-space"])[
+        0
+    ].as_dict()
+    record = run_worker.record_of_run(planned)
+    assert record["outcome"] == "error"
+    assert record["message"] == "ZeroDivisionError: nothing to divide by"
+    assert "in __call__" in record["traceback"]
+    refused = run_worker.record_of_run(
+        {**planned, "overrides": ["parameters.mu_pa.guess=1e9"]}
+    )
+    assert refused["outcome"] == "error"
+    assert "mu_pa: guess = 1e+09" in refused["message"]
+
+
+# Many runs ----------------------------------------------------------------------------------------
+
+
+def assert_all_runs_are_kept(folder: Path, limits: RunOptions) -> None:
+    store, seen = RunStore(folder), []
+    runs = planned_runs(4)
+    run_all(
+        runs,
+        store,
+        limits,
+        lambda record, slots: seen.append((record["key"], slots)),
+    )
+    assert sorted(key for key, _ in seen) == [run.key for run in runs]
+    assert all(store.load(run.key)["start"] == run.start for run in runs)
+    assert {slots for _, slots in seen} == {limits.workers or 2}
+
+
+def test_runs_are_done_without_a_cluster(
+    stand_in, without_distributed, tmp_path
+):
+    stand_in("dies once")
+    assert_all_runs_are_kept(tmp_path / "runs", RunOptions(workers=3))
+
+
+def test_runs_are_done_on_a_scheduler_by_its_address(
+    stand_in, a_scheduler, tmp_path
+):
+    stand_in("dies once")
+    assert_all_runs_are_kept(
+        tmp_path / "runs", RunOptions(scheduler=a_scheduler)
+    )
+
+
+def test_a_scheduler_without_the_library_names_the_extra(
+    without_distributed, tmp_path
+):
+    with pytest.raises(
+        InputError, match=r"pip install 'collocation-sysid\[cluster\]'"
+    ):
+        run_all(
+            planned_runs(1),
+            RunStore(tmp_path),
+            RunOptions(scheduler="tcp://127.0.0.1:1"),
+        )
+
+
+def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(cluster, "CONNECT_WITHIN_S", 0.5)
+    with pytest.raises(
+        InputError,
+        match=r"found 'tcp://127\.0\.0\.1:1', where no scheduler answers",
+    ):
+        run_all(
+            planned_runs(1),
+            RunStore(tmp_path),
+            RunOptions(scheduler="tcp://127.0.0.1:1"),
+        )
+
+
+@pytest.mark.parametrize("clustered", [True, False])
+def test_an_interrupted_study_keeps_what_is_finished(
+    stand_in, tmp_path, request, clustered
+):
+    address = request.getfixturevalue("a_scheduler") if clustered else None
+    stand_in("answers")
+    store, runs = RunStore(tmp_path / "runs"), planned_runs(20)
+
+    def interrupt(record, slots):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_all(
+            runs,
+            store,
+            RunOptions(None if clustered else 1, address),
+            interrupt,
+        )
+    assert sum(store.load(run.key) is not None for run in runs) == 1
+
+
+def test_a_run_is_done_again_when_there_is_hope(tmp_path):
+    store = RunStore(tmp_path / "runs")
+    outcomes = {"a": "finished", "b": "error", "c": "crashed", "d": "timeout"}
+    for key, outcome in outcomes.items():
+        store.save({"key": key, "outcome": outcome, "time_limit_s": 10.0})
+
+    def kept(limit):
+        return [key for key in outcomes if store.load_finished(key, limit)]
+
+    assert kept(10.0) == kept(5.0) == ["a", "b", "d"]
+    assert kept(20.0) == kept(None) == ["a", "b"]
+
+
+def test_half_a_file_is_no_run(tmp_path):
+    store = RunStore(tmp_path)
+    store.save({"key": "a", "outcome": "finished"})
+    file = tmp_path / "a.json"
+    file.write_text(file.read_text()[:10])
+    assert store.load("a") is None
+
+
+@pytest.mark.parametrize(
+    ("options", "where"),
+    [
+        ({"workers": 0}, "workers"),
+        ({"time_limit_s": 0.0}, "time_limit_s"),
+        ({"workers": 2, "scheduler": "tcp://x:1"}, "workers"),
+    ],
+)
+def test_limits_that_cannot_be_are_refused(options, where):
+    with pytest.raises(InputError, match=f"^{where}: "):
+        RunOptions(**options)
+
+
+# Numbers ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "interval"),
+    [  # R. G. Newcombe, Statistics in Medicine 17, 1998, table I, method 3
+        (81, 263, (0.2553, 0.3662)),
+        (15, 148, (0.0624, 0.1605)),
+        (0, 20, (0.0, 0.1611)),
+        (1, 29, (0.0061, 0.1718)),
+        (20, 20, (0.8389, 1.0)),
+        (0, 0, (0.0, 1.0)),
+    ],
+)
+def test_wilson_intervals_agree_with_published_ones(
+    successes, trials, interval
+):
+    assert wilson_interval(successes, trials) == pytest.approx(
+        interval, abs=6e-5
+    )
+
+
+def answer(
+    run: PlannedRun, factor: float = 1.0, status: str = "converged"
+) -> dict:
+    """A record as a run's process writes it, off by a factor."""
+    values = {name: value(factor * true) for name, true in TRUTH.items()}
+    found = a_result(
+        values,
+        status=status,
+        converged=status == "converged",
+        iterations=7,
+        history=(Iteration(1, factor, 1e-3, 1e-9, {}, 0.1, 1.0),),
+    )
+    return {**run.as_dict(), "outcome": "finished", "result": content(found)}
+
+
+def test_success_needs_convergence_and_the_truth():
+    runs = [
+        PlannedRun(f"{k}", "p", "a", k, guess=dict.fromkeys(TRUTH, 1.0))
+        for k in range(5)
+    ]
+    records = [
+        answer(runs[0], 1.005),
+        answer(runs[1], 1.02),
+        answer(runs[2], 1.0, "iteration-limit"),
+        {**runs[3].as_dict(), "outcome": "timeout", "message": "killed"},
+        None,
+    ]
+    rows = [
+        run_row(r, c, SuccessCriterion(TRUTH))
+        for r, c in zip(runs, records, strict=True)
+    ]
+    assert [row["success"] for row in rows] == [
+        True,
+        False,
+        False,
+        False,
+        False,
+    ]
+    assert [row["status"] for row in rows[2:]] == [
+        "iteration-limit",
+        "timeout",
+        "missing",
+    ]
+    (summary,) = method_rows(rows)
+    assert (summary["runs"], summary["converged"], summary["successes"]) == (
+        4,
+        2,
+        1,
+    )
+    assert summary["error_mu_pa"] == pytest.approx(0.005)
+    assert summary["iterations"] == 7
+    assert run_row(runs[1], records[1], SuccessCriterion(TRUTH, within=0.05))[
+        "success"
+    ]
+    assert run_row(runs[1], records[1], SuccessCriterion())["success"]
+
+
+def test_the_time_left_follows_from_each_methods_runs():
+    walls = {"fast": [1.0, 3.0], "slow": [10.0]}
+    assert remaining_time_s(
+        ["fast", "fast", "slow"], walls, worker_count=1
+    ) == pytest.approx(14.0)
+    assert remaining_time_s(
+        ["fast"] * 8, walls, worker_count=2
+    ) == pytest.approx(8.0)
+    assert remaining_time_s(["slow"], walls, worker_count=8) == pytest.approx(
+        10.0
+    )
+    assert remaining_time_s(
+        ["unknown"], {"fast": [2.0]}, worker_count=1
+    ) == pytest.approx(2.0)
+    assert remaining_time_s(["fast"], {}, 1) is None
+    assert remaining_time_s([], walls, 1) is None
+
+
+def test_records_are_json(tmp_path):
+    RunStore(tmp_path).save(
+        {"key": "a", "outcome": "finished", "loss": float("nan")}
+    )
+    assert json.loads((tmp_path / "a.json").read_text())["loss"] is None

@@ -1,0 +1,1 @@
+"""Bodies, experiments, problems and files that several tests use."""

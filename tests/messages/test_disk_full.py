@@ -1,0 +1,199 @@
+"""A full disk leaves existing files complete, and the message names the file."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from kit.problem_files import (
+    Outcome,
+    contents,
+    run_command,
+    settings,
+    write_problem,
+)
+
+from collocation_sysid.common.files import replaced_file, write_text_file
+from collocation_sysid.result.run_writers import replaced_folder
+
+resource = pytest.importorskip("resource", reason="limits of POSIX")
+
+
+@contextmanager
+def room_for(size: int) -> Iterator[None]:
+    """No file may grow beyond so many bytes, which meets writers as a full disk does."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def run_without_room(*words: object, size: int = 300) -> Outcome:
+    with room_for(size):
+        return run_command(*words)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("finished")
+    file = write_problem(folder, {"swing": 6})
+    method = settings("solver.method=reduced-space")
+    assert (
+        run_command("solve", file, *method, "--out", folder / "run", "-q").code
+        == 0
+    )
+    return folder / "run"
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    shutil.copytree(finished, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def refused(folder: Path, names: str, *words: object) -> None:
+    before = contents(folder)
+    outcome = run_without_room(*words)
+    assert outcome.code == 2, outcome
+    assert outcome.err.startswith("error: ")
+    assert outcome.err.count("\n") == 1, outcome.err
+    assert f"{names}: cannot be written: File too large" in outcome.err
+    assert contents(folder) == before
+
+
+def test_a_page_is_there_whole_or_as_before(run: Path, tmp_path: Path):
+    refused(tmp_path, "report.html", "report", run)
+    (tmp_path / "page.html").write_text("an earlier page")
+    refused(
+        tmp_path, "page.html", "report", run, "--to", tmp_path / "page.html"
+    )
+    refused(
+        tmp_path, "view.html", "view", run, "--html", tmp_path / "view.html"
+    )
+
+
+@pytest.mark.long
+def test_pictures_and_films_are_there_whole_or_not_at_all(
+    run: Path, tmp_path: Path
+):
+    refused(tmp_path, ".png", "plot", run)
+    refused(
+        tmp_path,
+        "film.gif",
+        "animate",
+        run,
+        "--to",
+        tmp_path / "film.gif",
+        "--fps",
+        "2",
+    )
+
+
+def test_an_export_is_there_whole_or_not_at_all(run: Path, tmp_path: Path):
+    refused(
+        tmp_path,
+        "out",
+        "export",
+        run,
+        "--to",
+        "sofa",
+        "--out",
+        tmp_path / "out",
+    )
+
+
+def test_a_problem_is_begun_whole_or_not_at_all(tmp_path: Path):
+    with room_for(300):
+        outcome = run_command("new", tmp_path / "mine")
+    assert outcome.code == 2
+    assert "problem.toml: cannot be written" in outcome.err
+    assert not list(tmp_path.rglob("*.toml"))
+
+
+@pytest.mark.long
+def test_a_simulation_writes_all_its_files_or_none(tiny: Path):
+    command = ["simulate", "problem.toml", "--out", "data", "--frames"]
+    assert run_command(*command).code == 0
+    largest = max(file.stat().st_size for file in Path("data").glob("*.csv"))
+    shutil.rmtree("data")
+    for size, named in ((300, "swing_markers.csv"), (largest + 1, "swing")):
+        outcome = run_without_room(*command, size=size)
+        assert outcome.code == 2
+        assert f"data/{named}: cannot be written" in outcome.err
+        assert not [each for each in Path("data").rglob("*") if each.is_file()]
+
+
+def test_an_answer_that_finds_no_room_leaves_the_earlier_run(tiny: Path):
+    method = settings("solver.method=reduced-space")
+    command = ["solve", "problem.toml", *method, "--out", "run", "-q"]
+    assert run_command(*command).code == 0
+    before = contents(tiny)
+    for size in (100, 3000):
+        outcome = run_without_room(*command, size=size)
+        assert outcome.code == 2
+        assert "run: cannot be written" in outcome.err
+        assert contents(tiny) == before
+
+
+def test_a_file_keeps_its_ending_while_it_is_written(tmp_path: Path):
+    with replaced_file(tmp_path / "deep" / "a.tar.png") as draft:
+        assert draft.suffix == ".png"
+        draft.write_text("x")
+    assert [file.name for file in (tmp_path / "deep").iterdir()] == [
+        "a.tar.png"
+    ]
+
+
+def test_into_a_pipe_is_written_directly(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe")
+    got: list[str] = []
+    reader = threading.Thread(
+        target=lambda: got.append((tmp_path / "pipe").read_text()), daemon=True
+    )
+    reader.start()
+    write_text_file(tmp_path / "pipe", "a page")
+    reader.join(10)
+    assert got == ["a page"]
+    assert (tmp_path / "pipe").is_fifo()
+
+
+def test_the_message_names_the_folder_and_not_the_passing_one(tmp_path: Path):
+    with (
+        room_for(10),
+        pytest.raises(ValueError, match="run: cannot be written") as caught,
+        replaced_folder(tmp_path / "run") as place,
+    ):
+        write_text_file(place / "table.csv", 100 * "x")
+    assert ".partial" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.long
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="no such device here"
+)
+def test_an_output_that_is_full_is_told():
+    program = [
+        sys.executable,
+        "-c",
+        "from collocation_sysid.cli import main; main()",
+        "schema",
+    ]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            program, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120
+        )
+    assert done.returncode == 2
+    assert done.stderr.startswith(
+        "error: standard output, or a temporary file: No space left"
+    )
+    assert done.stderr.count("\n") == 1

@@ -1,0 +1,96 @@
+"""The script that damages input: its counts, and that every case ends with a message."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("resource", reason="limits of POSIX")
+
+import hostile
+from hostile import Ended
+
+TRACEBACK = "Traceback (most recent call last):\n  ...\nKeyError: 3\n"
+
+
+@pytest.mark.parametrize(
+    ("ended", "is_clean", "outcome"),
+    [
+        (Ended(2, "", "error: a.csv: no number\n"), True, "refused"),
+        (Ended(2, "", "error: a.csv: no number\n"), False, "unclear"),
+        (
+            Ended(2, "", "a library's line\nerror: a.csv: no number\n"),
+            True,
+            "unclear",
+        ),
+        (Ended(2, "", "error: \x1b[31m\n"), True, "unclear"),
+        (Ended(0, "valid\n", ""), True, "accepted"),
+        (Ended(1, "found 2\n", ""), True, "accepted"),
+        (Ended(0, "\x1b[31m\n", ""), True, "unclear"),
+        (Ended(1, "", TRACEBACK), True, "traceback"),
+        (Ended(-signal.SIGSEGV, "", ""), True, "crash"),
+        (Ended(-signal.SIGXCPU, "", ""), True, "hang"),
+        (Ended(None, "", ""), True, "hang"),
+    ],
+)
+def test_an_end_has_the_outcome_that_a_user_sees(
+    ended: Ended, is_clean: bool, outcome: str
+):
+    assert ended.outcome(is_clean) == outcome
+
+
+@pytest.mark.long
+def test_commands_end_in_a_fork_as_in_a_shell(tmp_path: Path):
+    def crash() -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def fail() -> None:
+        raise KeyError(3)
+
+    def spin() -> None:
+        while True:
+            pass
+
+    version = hostile.run(["--version"], tmp_path, 30)
+    assert (version.code, version.err) == (0, "")
+    refused = hostile.run(["check", "none.toml"], tmp_path, 30)
+    assert refused.err.startswith("error: none.toml")
+    ends = [version, refused]
+    ends += [
+        hostile.run(["--version"], tmp_path, 1, before)
+        for before in (fail, crash, spin)
+    ]
+    expected = ["accepted", "refused", "traceback", "crash", "hang"]
+    assert [each.outcome() for each in ends] == expected
+
+
+def test_damage_is_drawn_from_the_seed():
+    content = bytes(range(256))
+    found = [
+        hostile.damaged(np.random.default_rng(3), content, (b"word",))
+        for _ in range(2)
+    ]
+    assert found[0] == found[1]
+    others = {
+        hostile.damaged(np.random.default_rng(k), content, (b"word",))
+        for k in range(50)
+    }
+    assert len(others) > 40
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", list(hostile.KINDS))
+def test_no_case_ends_without_a_message(kind: str, tmp_path: Path):
+    table = hostile.table(2, seed=0, only=[kind], limit_s=60.0, kept=tmp_path)
+    cells = [
+        cell.strip() for cell in table.splitlines()[-1].strip("|").split("|")
+    ]
+    failures = dict(zip(hostile.OUTCOMES, cells[2:], strict=False))
+    assert {
+        name: failures[name]
+        for name in ("traceback", "unclear", "hang", "crash")
+    } == {name: "0" for name in ("traceback", "unclear", "hang", "crash")}

@@ -1,0 +1,461 @@
+"""The reduced-space method: solutions, options, statuses and interruption."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from kit.problems import (
+    EXPERIMENTS_AND_SCHEMES,
+    GUESS,
+    SMALL_EXPERIMENTS,
+    TRUTH,
+    as_theta,
+    bar_in_two_hands,
+    bar_let_go,
+    hung_cube,
+    measured,
+    noisy,
+    relative_errors,
+    released_cube,
+)
+
+from collocation_sysid.errors import SimulationError
+from collocation_sysid.fem.laws.moduli import engineering_constants
+from collocation_sysid.methods.horizon import Horizon, Iterate
+from collocation_sysid.methods.initial_trajectories import (
+    initial_variables,
+    rigid_trajectory,
+)
+from collocation_sysid.methods.interior_point import InteriorPoint
+from collocation_sysid.methods.loss_curvature import (
+    secant_update,
+    with_curvature,
+)
+from collocation_sysid.methods.reduced_space import ReducedSpace, memory_mb
+from collocation_sysid.methods.solution import Iteration, Solution, Status
+from collocation_sysid.model.parameters import Parameter, Parameters
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.least_squares import SquareRootInformation
+from collocation_sysid.program.simulation import with_markers
+
+KKT = 1e-8
+
+
+def with_parameter(name: str, **changes) -> Parameters:
+    return Parameters(
+        tuple(
+            replace(item, **changes) if item.name == name else item
+            for item in GUESS.items
+        )
+    )
+
+
+@cache
+def cube() -> Collocation:
+    return Collocation([measured(hung_cube())], GUESS)
+
+
+@cache
+def solved_cube() -> Solution:
+    return ReducedSpace()(cube())
+
+
+# The answer
+
+
+@pytest.mark.parametrize(("experiment", "scheme"), EXPERIMENTS_AND_SCHEMES)
+def test_the_true_parameters_are_recovered(experiment: str, scheme: str):
+    made = measured(SMALL_EXPERIMENTS[experiment](), scheme)
+    solution = ReducedSpace()(Collocation([made], GUESS, scheme))
+    assert solution.status is Status.CONVERGED
+    assert np.abs(relative_errors(solution)).max() < 1e-6
+    assert solution.rms_m < 1e-9
+    assert solution.kkt_residual < KKT
+
+
+@pytest.mark.parametrize("make", [hung_cube, released_cube, bar_in_two_hands])
+def test_with_noise_it_is_the_optimum_of_interior_point(make):
+    collocation = Collocation([noisy(make(15))], GUESS)
+    solution = ReducedSpace()(collocation)
+    reference = InteriorPoint(tolerance=1e-12)(collocation)
+    assert solution.status.converged
+    assert reference.status.converged
+    np.testing.assert_allclose(solution.theta, reference.theta, rtol=1e-6)
+    np.testing.assert_allclose(
+        solution.positions_m[0], reference.positions_m[0], atol=1e-8
+    )
+    np.testing.assert_allclose(
+        solution.multipliers, reference.multipliers, atol=1e-6
+    )
+    assert solution.kkt_residual < KKT
+
+
+def test_experiments_of_different_lengths_and_grasps_are_fitted_together():
+    held_out = replace(measured(hung_cube(5)), name="held out", validation=True)
+    made = [
+        measured(hung_cube(9)),
+        measured(bar_in_two_hands(14)),
+        measured(released_cube(8)),
+    ]
+    solution = ReducedSpace()(Collocation([*made, held_out], GUESS))
+    assert np.abs(relative_errors(solution)).max() < 1e-6
+    assert [len(x) for x in solution.positions_m] == [10, 15, 9]
+    assert solution.kkt_residual < KKT
+
+
+@pytest.mark.parametrize(
+    "options", [{"substeps": 3}, {"has_grasp_constraints": True}]
+)
+def test_every_layout_is_fitted(options: dict):
+    made = measured(hung_cube(8), substeps=options.get("substeps", 1))
+    solution = ReducedSpace()(Collocation([made], GUESS, **options))
+    assert np.abs(relative_errors(solution)).max() < 1e-6
+    assert solution.kkt_residual < KKT
+
+
+def test_fixed_parameters_stay_and_the_others_are_found():
+    fixed = [
+        Parameter(name, TRUTH[name], is_fixed=True)
+        for name in ("gamma_r_s", "gamma_m_1_s")
+    ]
+    collocation = Collocation(
+        [measured(hung_cube())], Parameters((*GUESS.items[:2], *fixed))
+    )
+    solution = ReducedSpace()(collocation)
+    assert np.abs(relative_errors(solution)).max() < 1e-6
+    assert solution.parameters["gamma_r_s"] == TRUTH["gamma_r_s"]
+
+
+def test_with_all_parameters_fixed_it_simulates():
+    fixed = Parameters(
+        tuple(Parameter(name, TRUTH[name], is_fixed=True) for name in TRUTH)
+    )
+    solution = ReducedSpace()(Collocation([measured(hung_cube())], fixed))
+    assert solution.status is Status.CONVERGED
+    assert solution.rms_m < 1e-9
+    assert solution.kkt_residual < KKT
+
+
+def test_young_and_poisson_are_found_as_well():
+    elastic = (
+        Parameter("young_pa", 300.0, 10.0, 1e5),
+        Parameter("poisson", 0.4, 0.01, 0.49),
+    )
+    parameters = Parameters((*elastic, *GUESS.items[2:]))
+    solution = ReducedSpace()(Collocation([measured(hung_cube())], parameters))
+    young_pa, poisson = engineering_constants(
+        TRUTH["lambda_pa"], TRUTH["mu_pa"]
+    )
+    assert solution.parameters["young_pa"] == pytest.approx(young_pa, rel=1e-6)
+    assert solution.parameters["poisson"] == pytest.approx(poisson, rel=1e-6)
+
+
+@pytest.mark.parametrize("bound", [{"lower": 350.0}, {"upper": 250.0}])
+def test_a_bound_that_excludes_the_truth_is_active_at_the_answer(bound: dict):
+    parameters = with_parameter(
+        "mu_pa", guess=next(iter(bound.values())), **bound
+    )
+    collocation = Collocation([measured(hung_cube())], parameters)
+    solution = ReducedSpace()(collocation)
+    reference = InteriorPoint(tolerance=1e-11)(collocation)
+    assert solution.status is Status.CONVERGED
+    assert solution.parameters["mu_pa"] == pytest.approx(
+        next(iter(bound.values())), rel=1e-12
+    )
+    np.testing.assert_allclose(solution.theta, reference.theta, rtol=1e-4)
+    assert solution.kkt_residual < KKT
+
+
+def test_a_prior_pulls_as_it_does_in_interior_point():
+    parameters = with_parameter("lambda_pa", prior=(220.0, 0.01))
+    collocation = Collocation([measured(hung_cube())], parameters)
+    solution = ReducedSpace()(collocation)
+    reference = InteriorPoint(tolerance=1e-12)(collocation)
+    np.testing.assert_allclose(solution.theta, reference.theta, rtol=1e-6)
+    assert 201 < solution.parameters["lambda_pa"] < 220
+    assert solution.kkt_residual < KKT
+
+
+@pytest.mark.parametrize("factorisation", ["band", "sparse"])
+def test_every_factorisation_leads_to_the_same_answer(factorisation):
+    solution = ReducedSpace(factorisation=factorisation)(cube())
+    np.testing.assert_allclose(solution.theta, solved_cube().theta, rtol=1e-9)
+
+
+def test_memory_grows_no_faster_than_the_number_of_timesteps():
+    short, long = (
+        Collocation([hung_cube(steps)], GUESS) for steps in (49, 199)
+    )
+    assert memory_mb(short) < memory_mb(long) <= 4 * memory_mb(short)
+
+
+# The start
+
+
+@pytest.mark.long
+def test_a_guess_that_cannot_be_simulated_is_a_status_that_tells_what_to_change():
+    soft = [
+        replace(item, guess=guess, lower=1e-4, upper=guess * 1.001)
+        for item, guess in zip(GUESS.items[:2], (0.4, 0.15), strict=True)
+    ]
+    collocation = Collocation(
+        [measured(hung_cube())], Parameters((*soft, *GUESS.items[2:]))
+    )
+    solution = ReducedSpace()(collocation)
+    assert solution.status is Status.NOT_SIMULABLE
+    for part in (
+        "stiffer or less damped parameters",
+        "rest state",
+        "t = 0 s, element ",
+    ):
+        assert part in solution.message
+    assert np.isfinite(solution.z).all()
+    assert solution.rms_m > 0
+
+
+def test_it_starts_from_given_variables():
+    seen: list[Iteration] = []
+    again = ReducedSpace()(cube(), seen.append, solved_cube().z)
+    assert again.status is Status.CONVERGED
+    assert again.iterations < 3
+    assert seen[0].parameters == solved_cube().parameters
+    assert seen[0].rms_m < 1e-9
+
+
+@pytest.mark.parametrize("make", [hung_cube, released_cube, bar_let_go])
+@pytest.mark.parametrize("explicit", [False, True])
+def test_positions_to_start_from_need_satisfy_neither_dynamics_nor_grasps(
+    make, explicit, rng
+):
+    collocation = Collocation(
+        [measured(make())], GUESS, has_grasp_constraints=explicit
+    )
+    q, (x,) = collocation.unpack(initial_variables(collocation)[0])
+    start = collocation.pack(q + 0.2, [x + 1e-4 * rng.normal(size=x.shape)])
+    solution = ReducedSpace()(collocation, start=start)
+    assert solution.status is Status.CONVERGED
+    assert np.abs(relative_errors(solution)).max() < 1e-6
+
+
+def test_a_start_whose_positions_lead_nowhere_is_simulated_at_its_parameters():
+    seen: list[Iteration] = []
+    start = cube().pack(solved_cube().q, [np.zeros((11, 81))])
+    solution = ReducedSpace()(cube(), seen.append, start)
+    assert solution.status is Status.CONVERGED
+    assert seen[0].parameters == pytest.approx(
+        solved_cube().parameters, rel=1e-7
+    )
+    np.testing.assert_allclose(solution.theta, solved_cube().theta, rtol=1e-6)
+
+
+@pytest.mark.long
+def test_few_starts_far_away_all_succeed():
+    from study_starts import Case, guesses, hanging_cylinder, study
+
+    case = Case(hanging_cylinder(layers=4, steps=24, scheme="midpoint"), TRUTH)
+    outcomes = study(case, guesses(8, 10.0, seed=0))
+    assert [outcome.number for outcome in outcomes if not outcome.success] == []
+    assert np.median([outcome.sweeps for outcome in outcomes]) < 14
+
+
+# Ends other than convergence
+
+
+def test_no_progress_is_a_status(monkeypatch: pytest.MonkeyPatch):
+    def first_only(self: Horizon, q, before, step):
+        if not np.array_equal(q, GUESS.guess_q):
+            raise SimulationError("it fails", 0.0)
+        return tried(self, q, before, step)
+
+    tried = Horizon.evaluate_step
+    monkeypatch.setattr(Horizon, "evaluate_step", first_only)
+    solution = ReducedSpace()(cube())
+    assert solution.status is Status.STALLED
+    np.testing.assert_allclose(solution.theta, as_theta(GUESS), rtol=1e-12)
+    assert solution.max_violation_relative < 1e-3
+
+
+def test_rows_that_can_be_simulated_are_solved_first(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """As long as the parameters are those of the guess, the last rows cannot be reached."""
+
+    def short_at_the_guess(self: Horizon, q, x=None):
+        (found,), failure = extend(self, q, x)
+        if np.array_equal(q, GUESS.guess_q) and len(found.x) > 12:
+            return [found.x[:12]], SimulationError("it fails", 0.12)
+        return [found], failure
+
+    extend = Horizon.simulate
+    monkeypatch.setattr(Horizon, "simulate", short_at_the_guess)
+    collocation = Collocation([measured(hung_cube(30))], GUESS)
+    solution = ReducedSpace(ladder=(0.5, 1.0))(collocation)
+    assert solution.status is Status.CONVERGED
+    assert np.abs(relative_errors(solution)).max() < 1e-6
+
+
+def test_rows_that_stay_out_of_reach_are_a_status(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    def short(self: Horizon, q, x=None):
+        (found,), _ = extend(self, q, x)
+        return [found.x[:12]], SimulationError("it fails", 0.12, 7)
+
+    extend = Horizon.simulate
+    monkeypatch.setattr(Horizon, "simulate", short)
+    solution = ReducedSpace()(Collocation([measured(hung_cube(30))], GUESS))
+    assert solution.status is Status.NOT_SIMULABLE
+    assert solution.message.endswith("it fails (t = 0.12 s, element 7).")
+
+
+def test_the_iteration_limit_is_a_status():
+    solution = ReducedSpace(max_iterations=3)(cube())
+    assert solution.status is Status.ITERATION_LIMIT
+    assert solution.iterations <= 4
+    assert solution.parameters == solution.history[-1].parameters
+
+
+@pytest.mark.parametrize("number", [2, 5])
+def test_an_interruption_keeps_the_best_iterate(number: int):
+    def interrupt(iteration: Iteration) -> None:
+        if iteration.number >= number:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    solution = ReducedSpace()(cube(), watch=interrupt)
+    assert solution.status is Status.INTERRUPTED
+    assert solution.parameters == solution.history[-1].parameters
+    assert np.isfinite(solution.z).all()
+
+
+def test_rows_not_reached_are_carried_by_the_grasp():
+    def interrupt(_: Iteration) -> None:
+        raise KeyboardInterrupt
+
+    solution = ReducedSpace()(
+        Collocation([measured(hung_cube(40))], GUESS), watch=interrupt
+    )
+    (segment,) = solution.collocation.transcriptions
+    (found,), expected = (
+        solution.positions_m,
+        rigid_trajectory(segment, as_theta(GUESS)),
+    )
+    away_m = np.abs(found - expected.reshape(found.shape)).max(axis=(1, 2))
+    reached = 10  # a quarter of 41 rows
+    assert (away_m[1:reached] > 1e-5).all()
+    np.testing.assert_allclose(away_m[reached:], 0, atol=1e-12)
+
+
+def test_an_error_in_the_callers_function_reaches_the_caller():
+    def broken(iteration: Iteration) -> None:
+        raise ZeroDivisionError("in watch")
+
+    with pytest.raises(ZeroDivisionError, match="in watch"):
+        ReducedSpace()(cube(), watch=broken)
+
+
+def test_a_misfit_far_above_the_noise_is_noted():
+    made = measured(hung_cube())
+    shifted = with_markers(
+        made, made.markers.positions_m + np.array([0.01, 0.0, 0.0])
+    )
+    solution = ReducedSpace()(Collocation([shifted], GUESS))
+    assert "times their standard deviations" in solution.notes[-1]
+    assert not solved_cube().notes
+
+
+# The curvature that Gauss–Newton leaves out
+
+
+def residuals(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(q - 1)² of every entry, scaled, and their slopes."""
+    weights = np.random.default_rng(0).uniform(1, 2, len(q))
+    return weights * (q - 1) ** 2 + 1, np.diag(2 * weights * (q - 1))
+
+
+def point_of(q: np.ndarray, before: Iterate | None = None) -> Iterate:
+    """A point that has these."""
+    residual, slope = residuals(q)
+    crossed = (
+        np.zeros(len(q))
+        if before is None
+        else residuals(before.p)[1].T @ residual
+    )
+    return Iterate(
+        q,
+        [],
+        [],
+        SquareRootInformation.empty(len(q)).with_rows(residual, slope),
+        crossed,
+    )
+
+
+def test_the_learned_curvature_explains_the_last_step():
+    before = point_of(np.array([2.0, 3.0]))
+    after = point_of(np.array([2.1, 3.2]), before)
+    b = secant_update(np.zeros((2, 2)), before, after)
+    residual, slope = residuals(after.p)
+    missing = (slope - residuals(before.p)[1]).T @ residual
+    np.testing.assert_allclose(b @ (after.p - before.p), missing)
+    np.testing.assert_allclose(b, b.T)
+
+
+def test_curvature_joins_the_triangle_unless_that_is_indefinite(rng):
+    triangle, right = (
+        np.triu(rng.normal(size=(4, 4))) + 3 * np.eye(4),
+        rng.normal(size=4),
+    )
+    b = rng.normal(size=(4, 4))
+    b += b.T
+    fit = SquareRootInformation(np.column_stack([triangle, right]))
+    joined = with_curvature(fit, b)
+    np.testing.assert_allclose(
+        joined.information, triangle.T @ triangle + b, atol=1e-12
+    )
+    np.testing.assert_allclose(joined.score, triangle.T @ right, atol=1e-12)
+    assert with_curvature(fit, -100 * np.eye(4)) is fit
+
+
+def test_curvature_that_rounding_makes_indefinite_is_left_out():
+    """B is positive semidefinite, and many times the least curvature of SᵀS."""
+    rng = np.random.default_rng(0)
+    for _ in range(3000):
+        triangle = np.triu(rng.normal(size=(4, 4)))
+        triangle *= np.logspace(0, -rng.integers(3, 11), 4)[:, None]
+        slopes = rng.normal(size=(4, 2))
+        curvature = slopes @ slopes.T * 10 ** rng.uniform(0, 4)
+        fit = SquareRootInformation(np.column_stack([triangle, np.ones(4)]))
+        assert np.isfinite(with_curvature(fit, curvature).jacobian).all()
+
+
+# History and timing
+
+
+def test_the_history_is_what_was_watched_and_ends_at_the_answer():
+    seen: list[Iteration] = []
+    solution = ReducedSpace()(cube(), watch=seen.append)
+    assert list(solution.history) == seen
+    numbers = [iteration.number for iteration in seen]
+    assert numbers == sorted(numbers)
+    assert numbers[-1] <= solution.iterations
+    np.testing.assert_allclose([*seen[0].parameters.values()], as_theta(GUESS))
+    np.testing.assert_allclose([*seen[-1].parameters.values()], solution.theta)
+    assert seen[-1].loss == pytest.approx(
+        cube().objective(solution.z) * cube().measurement_count
+    )
+
+
+def test_timings_are_parts_of_the_whole():
+    timing = solved_cube().timing
+    parts = (timing.build, timing.evaluations, timing.linear_algebra)
+    assert min(parts) > 0
+    assert sum(parts) <= timing.total
+
+
+def test_nothing_is_printed(capfd):
+    ReducedSpace()(cube())
+    assert capfd.readouterr() == ("", "")

@@ -1,0 +1,126 @@
+"""Classes with one field for each nuisance parameter or systematic effect."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from dataclasses import fields
+from typing import Any, get_type_hints
+
+import pytest
+from pydantic_core import PydanticUndefined
+
+from collocation_sysid import Nuisance
+from collocation_sysid.common.declarations import documented
+from collocation_sysid.problem.nuisance_schema import KEYS, NuisanceSection
+from collocation_sysid.problem.validation_messages import _table_models
+from collocation_sysid.recording.nuisance import KINDS, NuisanceRow
+from collocation_sysid.statistics.budget.systematic_effects import (
+    ASSUMPTIONS,
+    OF_KNOWN_SIGN,
+    Assumptions,
+    Deviation,
+    KnownDeviation,
+)
+
+
+def as_sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}."
+
+
+def described_prior(row: NuisanceRow) -> str:
+    """Key of a prior, followed by its default if it has one."""
+    return (
+        row.prior
+        if row.sigma is None
+        else f"{row.prior}, {row.usual} by default"
+    )
+
+
+# Nuisance parameters -------------------------------------------------------------------------
+
+
+def test_nuisance_has_a_field_for_each_kind():
+    names = [field.name for field in fields(Nuisance)]
+    assert names == [*(row.name for row in KINDS), "scope", "own"]
+    standard = Nuisance()
+    assert [standard.sigma(row) for row in KINDS] == [
+        row.sigma for row in KINDS
+    ]
+
+
+def test_fields_of_nuisance_are_described_as_the_kinds():
+    described = documented(Nuisance)
+    for row in KINDS:
+        assert described[row.name] == as_sentence(row.description)
+
+
+def test_the_table_has_a_key_for_each_kind():
+    assert list(NuisanceSection.model_fields) == [*KEYS, "own"]
+    for key, rows in KEYS.items():
+        description = " ".join(
+            as_sentence(f"{row.description}: {described_prior(row)}")
+            for row in rows
+        )
+        assert NuisanceSection.model_fields[key].description == description
+
+
+def prior_section(key: str) -> Any:
+    """Class of the table of a key of [experiment.nuisance]."""
+    return next(
+        iter(_table_models(NuisanceSection.model_fields[key].annotation))
+    )
+
+
+@pytest.mark.parametrize(("key", "rows"), KEYS.items(), ids=KEYS)
+def test_the_table_of_a_key_has_the_priors_of_its_kinds(
+    key: str, rows: list[NuisanceRow]
+):
+    section = prior_section(key)
+    stated = section.model_fields
+    assert list(stated) == ["scope", *(row.prior for row in rows)]
+    assert (
+        section.__doc__
+        == f"Prior of a nuisance parameter: {rows[0].description}."
+    )
+    assert section.has_default == any(row.sigma is not None for row in rows)
+    # A prior that refers to another one needs it.
+    needs_all = any(row.reference is not None for row in rows)
+    for row in rows:
+        assert (
+            stated[row.prior].description == f"Standard deviation [{row.unit}]."
+        )
+        missing = PydanticUndefined if needs_all else None
+        assert stated[row.prior].default == (row.reference or missing)
+
+
+# Systematic effects ---------------------------------------------------------------------------
+
+
+def test_assumptions_have_a_field_for_each_row():
+    defaults = {row.name: row.sigma for row in ASSUMPTIONS}
+    defaults |= {row.name: row.considered for row in KINDS}
+    assert [field.name for field in fields(Assumptions)] == list(defaults)
+    assert Assumptions().deviations == defaults
+
+
+def test_only_effects_of_known_sign_have_a_mean():
+    forms = get_type_hints(Assumptions, include_extras=True)
+    for field in fields(Assumptions):
+        known = field.name in OF_KNOWN_SIGN
+        assert forms[field.name] == (KnownDeviation if known else Deviation)
+
+
+def test_fields_of_assumptions_are_described_as_the_rows():
+    section = inspect.cleandoc(Assumptions.__doc__ or "").partition(
+        "Attributes\n----------\n"
+    )[2]
+    blocks = re.findall(r"^(\w+)\n((?: +.*(?:\n|$))+)", section, re.M)
+    described = {name: " ".join(text.split()) for name, text in blocks}
+    expected = {
+        row.name: f"{row.description} [{row.unit or 1}]" for row in ASSUMPTIONS
+    }
+    expected |= {row.name: f"{row.description} [{row.unit}]" for row in KINDS}
+    assert described == {
+        name: as_sentence(text) for name, text in expected.items()
+    }

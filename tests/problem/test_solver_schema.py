@@ -1,0 +1,184 @@
+"""The table [solver] of a problem file: keys of every method agree with its options."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import fields
+
+import pytest
+from kit.problem_files import EXPERIMENT, PROBLEM, run_command
+
+from collocation_sysid.common.declarations import documented
+from collocation_sysid.errors import InputError
+from collocation_sysid.methods import METHODS
+from collocation_sysid.problem.problem_reading import read_problem_file
+from collocation_sysid.problem.schema import ProblemFile
+from collocation_sysid.problem.solver_schema import SolverSection
+
+each_method = pytest.mark.parametrize("method", METHODS)
+
+
+def solver_of(tables: str) -> SolverSection:
+    content = tomllib.loads(
+        PROBLEM.replace('[solver]\nmethod = "interior-point"', tables)
+    )
+    return ProblemFile.model_validate(
+        content | tomllib.loads(EXPERIMENT)
+    ).solver
+
+
+@each_method
+def test_the_schema_tells_what_the_method_does_by_default(method: str):
+    schema = json.loads(run_command("schema").out)
+    table = schema["$defs"]["SolverSection"]["properties"][method]
+    defaults = {
+        name: option["default"] for name, option in table["properties"].items()
+    }
+    descriptions = {
+        name: option["description"]
+        for name, option in table["properties"].items()
+    }
+    kind = METHODS[method]
+    expected = {
+        field.name: getattr(kind(), field.name) for field in fields(kind)
+    }
+    assert defaults == json.loads(json.dumps(expected))
+    assert descriptions == documented(kind)
+    assert table["additionalProperties"] is False
+
+
+def test_every_method_has_a_key():
+    methods = solver_of("").methods
+    assert {name: type(method) for name, method in methods.items()} == METHODS
+
+
+@each_method
+def test_without_a_table_a_method_has_its_defaults(method: str):
+    assert solver_of("").methods[method] == METHODS[method]()
+
+
+def test_tables_of_several_methods_stand_side_by_side():
+    solver = solver_of(
+        """
+        [solver]
+        method = "penalty"
+        [solver.penalty]
+        rho = 3.0
+        [solver.reduced-space]
+        ladder = [0.5, 1]
+        [solver."casadi:sqpmethod"]
+        casadi = { min_iter = 1 }
+        [solver.continuation]
+        stage = { method = "shooting", gradient = "adjoint" }
+        """
+    )
+    assert solver.method == "penalty"
+    assert solver.methods["penalty"].rho == 3.0
+    assert solver.methods["augmented-lagrangian"].rho == 1e5
+    assert solver.methods["reduced-space"].ladder == (0.5, 1.0)
+    assert solver.methods["casadi:sqpmethod"].casadi == {"min_iter": 1}
+    assert solver.methods["continuation"].method == METHODS["shooting"](
+        gradient="adjoint"
+    )
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        (
+            "solver.tolerance=1e-6",
+            "solver: the options of a method have a table of their own: move tolerance to "
+            "[solver.interior-point]",
+        ),
+        (
+            "solver={method = 'casadi:sleqp', hessian = 'exact', casadi = {}, rho = 1, inner = ''}",
+            'move hessian, casadi to [solver."casadi:sleqp"] and rho, inner to [solver.penalty]',
+        ),
+        (
+            "solver.reduced-space.warm_up=0",
+            "solver.reduced-space: warm_up is an option of interior-point; reduced-space has",
+        ),
+        (
+            "solver.reduced-space.ladde=[1]",
+            "'reduced-space' has no option 'ladde'; it has toler",
+        ),
+        ("solver.reduced-space.ladde=[1]", "did you mean 'ladder'?"),
+        (
+            "solver.reduced_space.ladder=[1]",
+            "unknown key; did you mean 'reduced-space'?",
+        ),
+        (
+            "solver.penalty=3",
+            "solver.penalty: found 3; expected a table of options",
+        ),
+        (
+            "solver.penalty.rho_max=1",
+            "solver.penalty.rho_max: found 1 with rho = 100; expected",
+        ),
+        (
+            "solver.penalty.rho_factor=1",
+            "solver.penalty.rho_factor: found 1; expected a number ab",
+        ),
+    ],
+)
+def test_what_does_not_belong_in_a_table_is_refused(
+    tiny, override: str, message: str
+):
+    with pytest.raises(InputError) as refused:
+        read_problem_file("problem.toml", [override])
+    assert message in str(refused.value)
+
+
+# The command --------------------------------------------------------------------------------------
+
+
+def test_the_methods_are_listed_with_a_line_on_each():
+    listed = run_command("methods").out
+    assert all(method in listed for method in METHODS)
+    assert (
+        "Interior-point method (IPOPT) for parameters and trajectories together."
+        in listed
+    )
+    told = json.loads(run_command("methods", "--json").out)
+    assert list(told) == list(METHODS)
+    assert (
+        told["interior-point"]
+        == "Interior-point method (IPOPT) for parameters and trajectories together."
+    )
+
+
+@each_method
+def test_a_method_tells_its_options(method: str):
+    text = run_command("methods", method).out
+    told = json.loads(run_command("methods", method, "--json").out)[
+        "properties"
+    ]
+    assert list(told) == [field.name for field in fields(METHODS[method])]
+    for name in told:
+        assert f"\n{name} " in text
+
+
+def test_an_option_is_told_with_its_default_and_what_it_can_be():
+    told = " ".join(run_command("methods", "reduced-space").out.split())
+    assert (
+        "ladder [0.25, 0.5, 1] list, each a number above 0; Shares of the recording"
+        in told
+    )
+    assert (
+        "hessian gauss-newton gauss-newton, exact; Once a step moves no parameter"
+        in told
+    )
+    assert "by more than 10 %" in told
+    reference = " ".join(run_command("methods", "interior-point").out.split())
+    assert (
+        "all of them once parameters move by less than `warm_up`" in reference
+    )
+    assert "under [solver.reduced-space]" in told
+
+
+def test_a_method_that_there_is_not_cannot_tell():
+    outcome = run_command("methods", "interior")
+    assert outcome.code == 2
+    assert "NAME: found 'interior'" in outcome.err
+    assert "did you mean 'interior-point'?" in outcome.err

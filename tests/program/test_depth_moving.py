@@ -1,0 +1,115 @@
+"""A moving body that only a depth camera observes, from `check` to the run folder."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from kit.depth import MATRIX, NOISE_M, POSE, SHAPE, TRUTH, bar
+from kit.problems import smooth_poses, times
+
+import collocation_sysid as cs
+from collocation_sysid.extras.studies.model_choice import reserve_test_data
+from collocation_sysid.methods.continuation import first_samples
+from collocation_sysid.program.depth.visible_surface import VisibleSurface
+from collocation_sysid.result.run_record import replays
+from collocation_sysid.runs.check import check_problem
+
+MADE = {**TRUTH, "young_pa": 3e5, "gamma_r_s": 5e-3}
+SAMPLES, SEEN = 15, [2, 5, 8, 11, 14]
+
+
+def swung(depth: cs.Depth) -> cs.Experiment:
+    t_s = times(SAMPLES)
+    held = cs.Grasp(
+        np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), smooth_poses(t_s)
+    )
+    kept = cs.Nuisance.none(depth_bias_m=0.005)
+    return cs.Experiment(
+        bar(), t_s, [held], name="swing", depths=[depth], nuisance=kept
+    )
+
+
+@cache
+def problem() -> cs.Problem:
+    camera, at_s = cs.DepthCamera(MATRIX, pose=POSE), times(SAMPLES)[SEEN]
+    blind = cs.Depth("none", at_s, [np.zeros((1, 3))] * len(at_s), 1e-3)
+    x, skin = (
+        cs.simulate(swung(blind), MADE).positions_m,
+        VisibleSurface.from_body(bar(), blind),
+    )
+    images_m = [
+        cs.depth_image(
+            camera,
+            SHAPE,
+            (skin.subdivided_triangles(x[k][skin.nodes], 2) - POSE[:3, 3])
+            @ POSE[:3, :3],
+        )
+        for k in SEEN
+    ]
+    noise = NOISE_M * np.random.default_rng(0).normal(size=np.shape(images_m))
+    seen = images_m + noise
+    depth = cs.Depth.of_images(
+        "front", seen, camera, NOISE_M, at_s, spacing_m=0.008
+    )
+    unknown = {**MADE, "young_pa": cs.Unknown(2.9e5)}
+    return cs.Problem([swung(depth)], unknown, substeps=1)
+
+
+@pytest.fixture(scope="module")
+def run() -> cs.Run:
+    return cs.run(problem(), seek_causes=False)
+
+
+@pytest.mark.long
+def test_the_interval_holds_the_truth_beside_what_the_step_does(run):
+    low, high = run.interval("young_pa")
+    assert low < MADE["young_pa"] < high
+    # Steps of a whole sample make it stiffer, and the run says by how much.
+    error = run.result.numerical_errors["young_pa"]
+    found = run.solution.parameters["young_pa"], error.extrapolated
+    off = [each / MADE["young_pa"] - 1 for each in found]
+    assert off[0] > 0.003
+    assert abs(off[1]) < 0.5 * off[0]
+
+
+def test_all_images_are_kept_for_pictures_and_four_of_them_with_outlines(run):
+    (replay,) = replays(run)
+    rows = replay.visible_points["front"]
+    points = rows[np.isfinite(rows[:, 4])]
+    np.testing.assert_array_equal(np.unique(points[:, 0]), replay.t_s[SEEN])
+    assert len(np.unique(rows[np.isnan(rows[:, 3]), 0])) == 4
+    assert [len(replay.depth_points_m(t)) > 0 for t in range(SAMPLES)] == [
+        t in SEEN for t in range(SAMPLES)
+    ]
+
+
+@pytest.mark.long
+def test_a_check_looks_at_the_first_images():
+    findings = check_problem(problem())
+    assert findings.derivatives_agree
+    assert not findings.causes
+
+
+def test_first_samples_have_the_images_of_their_time():
+    (whole,) = problem().experiments
+    for count, samples, images in ((3, 9, 3), (12, 12, 4), (15, 15, 5)):
+        part = first_samples(whole, count)
+        assert (len(part.t_s), len(part.depths[0].sample_times_s)) == (
+            samples,
+            images,
+        )
+
+
+def test_images_that_are_held_out_are_not_fitted():
+    known, start_s = reserve_test_data(problem(), "swing")
+    (whole,), (left,) = problem().experiments, known.experiments
+    np.testing.assert_array_equal(
+        left.depths[0].sample_times_s, times(SAMPLES)[[2, 5, 8]]
+    )
+    assert (
+        left.depths[0].sample_times_s[-1]
+        <= start_s
+        < whole.depths[0].sample_times_s[3]
+    )

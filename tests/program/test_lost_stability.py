@@ -1,0 +1,122 @@
+"""Static paths that end because the body becomes unstable."""
+
+from __future__ import annotations
+
+import pickle
+from functools import cache
+
+import numpy as np
+import pytest
+
+import collocation_sysid as cs
+from collocation_sysid.errors import SimulationError
+from collocation_sysid.program.forward.loss_of_stability import (
+    BIOT_RATIO,
+    StabilityLoss,
+    _on_surface,
+)
+
+LAW = {"young_pa": 2e4, "poisson": 0.45, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+SIZE_M = (0.08, 0.01, 0.06)
+
+
+def compressed(
+    divisions: tuple[int, int, int], size_m: tuple[float, float, float]
+) -> cs.Experiment:
+    """Return a block that is compressed along x to three tenths, in plane strain, free above."""
+    body = cs.Body(cs.box_mesh(size_m, divisions), density_kg_m3=1000.0)
+    t_s = np.arange(15.0)
+    way_m = np.outer(np.linspace(0, -0.7 * size_m[0], 15), [1.0, 0.0, 0.0])
+    ends = cs.PoseSequence(t_s, way_m, np.tile([0.0, 0.0, 0.0, 1.0], (15, 1)))
+    fixed = cs.PoseSequence.fixed()
+
+    def face(axis: int, place_m: float) -> np.ndarray:
+        return np.flatnonzero(np.abs(body.nodes_m[:, axis] - place_m) < 1e-9)
+
+    # A slender body is clamped at its ends instead of lying on a smooth plane.
+    slender = size_m[2] < size_m[0] / 4
+    axes = "xz" if slender else "x"
+    grasps = [
+        cs.Grasp(face(0, 0.0), fixed, axes=axes),
+        cs.Grasp(
+            face(0, size_m[0]),
+            ends,
+            axes=axes,
+            wrench=cs.Wrench(t_s, np.zeros((15, 3)), 1.0),
+        ),
+        cs.Grasp(face(1, 0.0), fixed, axes="y"),
+        cs.Grasp(face(1, size_m[1]), fixed, axes="y"),
+    ]
+    if not slender:
+        grasps.append(cs.Grasp(face(2, 0.0), fixed, axes="z"))
+    return cs.Experiment(
+        body,
+        t_s,
+        grasps,
+        kind="static",
+        gravity_m_s2=(0.0, 0.0, 0.0),
+        nuisance=cs.Nuisance.none(),
+    )
+
+
+@cache
+def failure(
+    divisions: tuple[int, int, int], size_m: tuple[float, float, float]
+) -> SimulationError:
+    with pytest.raises(SimulationError) as failed:
+        cs.simulate(compressed(divisions, size_m), LAW)
+    return failed.value
+
+
+def test_a_compressed_surface_that_wrinkles_is_named_with_its_stretch():
+    error = failure((8, 1, 6), SIZE_M)
+    lost = error.stability_loss
+    assert isinstance(lost, StabilityLoss)
+    assert lost.is_surface_instability
+    assert lost.critical_stretch == pytest.approx(np.sqrt(BIOT_RATIO), rel=1e-6)
+    assert 0.3 < lost.smaller_stretch < 0.56
+    assert lost.larger_stretch == pytest.approx(1.0)
+    # On top, where the block is free.
+    assert lost.place_m[2] == pytest.approx(SIZE_M[2])
+    assert "physical instability of the surface" in str(error)
+    assert "finer mesh may help" not in str(error)
+
+
+def test_a_slender_body_buckles_and_does_not_wrinkle():
+    error = failure((12, 1, 1), (0.12, 0.01, 0.01))
+    assert error.stability_loss is not None
+    assert not error.stability_loss.is_surface_instability
+    assert "buckles" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("stretch", "across", "critical"),
+    [(0.544, 1.0, 0.544), (0.666, 0.666, 0.666), (0.444, 0.444**-0.5, 0.444)],
+)
+def test_critical_stretches_are_biots(stretch, across, critical):
+    mesh = cs.box_mesh((0.1, 0.1, 0.1), (3, 3, 3))
+    moved_m = mesh.points_m * [stretch, across, 1 / stretch / across]
+    mode = np.zeros_like(moved_m)
+    top = mesh.points_m[:, 2] > 0.0999
+    mode[top, 2] = np.sin(40 * mesh.points_m[top, 0])
+    lost = _on_surface(mesh.points_m, moved_m, mode, mesh.surface)
+    assert (lost.smaller_stretch, lost.larger_stretch) == pytest.approx(
+        (stretch, max(across, stretch))
+    )
+    assert lost.critical_stretch == pytest.approx(critical, abs=1e-3)
+    assert lost.is_surface_instability
+
+
+@pytest.mark.long
+def test_a_picture_shows_the_mode():
+    from collocation_sysid.result.pictures.instability import (
+        instability_picture,
+    )
+
+    figure = instability_picture(failure((8, 1, 6), SIZE_M).stability_loss)
+    assert "wavelength" in figure.axes[0].texts[0].get_text()
+
+
+def test_an_error_of_another_process_keeps_its_message():
+    error = failure((8, 1, 6), SIZE_M)
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)

@@ -1,0 +1,224 @@
+"""Import order of the packages, the interface of the core, and unique class names."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from collections import Counter
+from functools import cache
+from graphlib import TopologicalSorter
+from itertools import chain, pairwise
+from pathlib import Path
+
+import pytest
+
+import collocation_sysid
+
+PACKAGE = Path(collocation_sysid.__file__).parent
+# As in CONTRIBUTING.md.
+LAYERS = (
+    {"errors"},
+    {"common"},
+    {"fem"},
+    {"recording"},
+    {"model"},
+    {"program"},
+    {"methods"},
+    {"statistics"},
+    {"problem"},
+    {"datasets"},
+    {"runs"},
+    {"result"},
+    {"pipeline", "installation_check"},
+    {"extras"},
+    {"cli", "testing"},
+    {"__main__"},
+)
+
+
+def modules() -> dict[str, Path]:
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+MODULES = modules()
+
+
+@cache
+def tree_of(name: str) -> ast.Module:
+    return ast.parse(MODULES[name].read_text())
+
+
+@cache
+def imports(name: str) -> set[str]:
+    """Modules of the package that one imports, also those inside functions and for types alone."""
+    path = MODULES[name]
+    folder = (
+        name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
+    )
+    found = set()
+    for statement in ast.walk(tree_of(name)):
+        if not isinstance(statement, ast.ImportFrom) or statement.level == 0:
+            continue
+        base = folder[: len(folder) - statement.level + 1]
+        target = ".".join([*base, *(statement.module or "").split(".")]).strip(
+            "."
+        )
+        for alias in statement.names:
+            inner = f"{target}.{alias.name}".strip(".")
+            found.add(inner if inner in MODULES else target)
+    return found - {name}
+
+
+def layer(name: str) -> int:
+    top = name.split(".")[0]
+    return next(k for k, names in enumerate(LAYERS) if top in names)
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if name])
+def test_a_module_imports_nothing_from_above(name):
+    for other in imports(name):
+        assert other, f"{name} imports the package itself"
+        assert layer(other) <= layer(name), f"{name} imports {other}"
+
+
+def test_no_imports_go_in_circles():
+    graph = {
+        name: {other for other in imports(name) if other} for name in MODULES
+    }
+    assert len([*TopologicalSorter(graph).static_order()]) >= len(MODULES)
+
+
+# Packages with the mathematics of an identification, and those that use it; see docs/core.md.
+CORE = ("fem", "recording", "model", "program", "methods", "statistics")
+OUTER = (
+    "runs",
+    "result",
+    "extras",
+    "cli",
+    "testing",
+    "pipeline",
+    "installation_check",
+)
+# The module of `program` that live estimation imports, and the largest number of its names.
+STREAMING = "program.streaming"
+STREAMING_NAMES = 12
+
+
+def test_the_core_is_loaded_without_the_packages_that_use_it():
+    """Also without imports at run time, which no statement of a module shows."""
+    core = [name for name in MODULES if name.split(".")[0] in CORE]
+    code = (
+        "import importlib, sys\n"
+        f"for name in {core}: importlib.import_module('collocation_sysid.' + name)\n"
+        "ours = [name for name in sys.modules if name.startswith('collocation_sysid.')]\n"
+        "print(*{name.split('.')[1] for name in ours})"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    loaded = set(done.stdout.split())
+    assert set(CORE) <= loaded
+    assert not loaded & {*OUTER, "problem"}
+
+
+def test_no_module_imports_the_package_by_its_name():
+    """Imports are relative, so that the other tests of this file see them."""
+    for name in MODULES:
+        for statement in ast.walk(tree_of(name)):
+            if isinstance(statement, ast.Import):
+                assert not any(
+                    each.name.startswith("collocation_sysid")
+                    for each in statement.names
+                )
+            if isinstance(statement, ast.ImportFrom) and not statement.level:
+                assert not (statement.module or "").startswith(
+                    "collocation_sysid"
+                ), name
+
+
+def test_live_estimation_uses_a_small_interface_of_the_program():
+    used = set()
+    for name in MODULES:
+        if not name.startswith("extras.live"):
+            continue
+        assert {
+            each for each in imports(name) if each.startswith("program")
+        } <= {STREAMING}, name
+        for statement in ast.walk(tree_of(name)):
+            if not isinstance(statement, ast.ImportFrom):
+                continue
+            assert statement.module != "program", (
+                f"{name} does not name what it uses of {STREAMING}"
+            )
+            if statement.module == STREAMING:
+                used |= {each.name for each in statement.names}
+    assert "StreamingSweep" in used
+    assert len(used) <= STREAMING_NAMES
+
+
+def imported_names(name: str, packages: tuple[str, ...]) -> dict[str, str]:
+    """Names that a module imports from the modules of some packages, with these modules."""
+    path = MODULES[name]
+    parts = name.split(".")
+    folder = parts if path.name == "__init__.py" else parts[:-1]
+    found = {}
+    for statement in ast.walk(tree_of(name)):
+        if not isinstance(statement, ast.ImportFrom) or statement.level == 0:
+            continue
+        base = folder[: len(folder) - statement.level + 1]
+        target = [*base, *(statement.module or "").split(".")]
+        if target[0] in packages:
+            found |= dict.fromkeys(
+                (each.name for each in statement.names), ".".join(target)
+            )
+    return found
+
+
+def test_extras_import_from_the_program_only_the_names_on_the_page_of_the_core():
+    page = (PACKAGE.parent / "docs" / "core.md").read_text()
+    (paragraph,) = (
+        part
+        for part in page.split("\n- ")
+        if "extras import only these names" in part
+    )
+    listed = set(re.findall(r"`(\w+)`", paragraph.split(":", 1)[1]))
+    extras = [name for name in MODULES if name.startswith("extras.")]
+    imported = {
+        name: module
+        for extra in extras
+        for name, module in imported_names(
+            extra, ("model", "program", "methods")
+        ).items()
+        if module != STREAMING
+    }
+    assert set(imported) == listed
+
+
+def test_the_contribution_guide_names_the_layers():
+    guide = (PACKAGE.parent / "CONTRIBUTING.md").read_text()
+    drawn = next(
+        line for line in guide.splitlines() if line.strip().startswith("fem →")
+    )
+    order = [
+        name.strip() for part in drawn.split("→") for name in part.split(",")
+    ]
+    assert all(layer(a) <= layer(b) for a, b in pairwise(order))
+
+
+# Names that two classes of different rooms still have.
+TWICE = "Branch Columns Design Grid Model Motion Picture Replay Scatter Section Slopes View _Emitter"
+
+
+def test_a_class_name_occurs_once():
+    nodes = chain.from_iterable(ast.walk(tree_of(name)) for name in MODULES)
+    names = Counter(
+        node.name for node in nodes if isinstance(node, ast.ClassDef)
+    )
+    twice = {name for name, count in names.items() if count > 1}
+    assert twice <= set(TWICE.split())

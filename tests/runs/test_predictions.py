@@ -1,0 +1,336 @@
+"""Verdicts of predictions, and baselines of validation recordings."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kit.problems import TRUTH, hung_cube
+from scipy.interpolate import CubicSpline
+
+import collocation_sysid as cs
+from collocation_sysid.common.display import plain_text
+from collocation_sysid.common.serialisation import as_json, read
+from collocation_sysid.program.depth.depth_comparison import DepthError
+from collocation_sysid.program.depth.visible_surface import VisibleSurface
+from collocation_sysid.result.run_record import replays
+from collocation_sysid.result.run_sections import run_summary
+from collocation_sysid.runs.prediction import CopyError, nearest_recording_error
+from collocation_sysid.runs.result_content import Result
+from collocation_sysid.statistics.assessment import prediction_concerns
+
+NOISE_M = 1e-3
+
+
+def shown(finished: cs.Run) -> str:
+    return plain_text(run_summary(finished.result, Path("runs")))
+
+
+def stored(finished: cs.Run) -> dict:
+    """What result.json holds of the recordings, fitted and simulated."""
+    written = json.loads(as_json(finished.result))
+    assert read(Result, written) is not None
+    return {key: written[key]["experiments"] for key in ("fit", "rollout")}
+
+
+# Nothing is estimated -----------------------------------------------------------------------------
+
+
+@cache
+def predicted(softer: float) -> cs.Run:
+    """A swinging cube whose motion is predicted with stated parameters."""
+    hung = hung_cube(30)
+    tracks = cs.simulate(hung, TRUTH).markers_m
+    tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(
+        tracks.shape
+    )
+    sigma_m = np.full(tracks.shape[1], NOISE_M)
+    seen = replace(hung.markers, positions_m=tracks, sigma_m=sigma_m)
+    stated = {
+        n: v * softer if n.endswith("_pa") else v for n, v in TRUTH.items()
+    }
+    problem = cs.Problem([replace(hung, markers=seen)], stated, substeps=4)
+    return cs.run(problem, seek_causes=False)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("softer", "verdict"), [(1.0, "good"), (0.75, "check"), (0.3, "doubtful")]
+)
+def test_a_prediction_is_judged_by_its_misfit_over_sigma(softer, verdict):
+    finished = predicted(softer)
+    assert finished.uncertainty is None
+    assert finished.trust.verdict == verdict
+    concerns = [c for c in finished.trust.concerns if c.topic == "prediction"]
+    assert len(concerns) == (verdict != "good")
+    for concern in concerns:
+        rms_mm = 1e3 * finished.rollouts["hung cube"].rms_m
+        assert concern.grade == verdict
+        assert "deviates from the markers by" in concern.message
+        assert f"{rms_mm:.3g} mm RMS" in concern.message
+        assert concern.data["sigmas"] == pytest.approx(
+            rms_mm / np.sqrt(3), rel=0.01
+        )
+
+
+def test_few_numbers_that_are_off_by_chance_are_no_concern():
+    def grades(
+        sigmas: float, numbers: int, tame: float | None = None
+    ) -> list[str]:
+        how = sigmas, tame or sigmas, numbers
+        return [
+            c.grade
+            for c in prediction_concerns("a", "the markers", "sigma_m", *how)
+        ]
+
+    assert grades(1.4, 1000) == []
+    assert grades(2.0, 1000) == ["check"]
+    assert grades(2.0, 3) == []
+    assert grades(6.0, 1000) == ["doubtful"]
+    assert grades(6.0, 1000, tame=1.2) == []  # a few wild points
+
+
+# Depth --------------------------------------------------------------------------------------------
+
+BAR_TRUTH = {
+    "young_pa": 1.5e5,
+    "poisson": 0.3,
+    "gamma_r_s": 1e-3,
+    "gamma_m_1_s": 0.1,
+}
+MATRIX, SHAPE = [[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]], (120, 160)
+POSE = np.array(  # looks along y at a bar from 0.3 m away
+    [[1, 0, 0, 0.06], [0, 0, 1, -0.3], [0, -1, 0, -0.01], [0, 0, 0, 1]],
+    dtype=float,
+)
+DEPTH_NOISE_M = 2e-4
+NOTHING = cs.Depth("none", [0.0], [np.zeros((1, 3))], 1e-3)
+
+
+@cache
+def bar() -> cs.Body:
+    mesh = cs.box_mesh((0.12, 0.03, 0.02), (4, 1, 1))
+    return cs.Body(mesh, density_kg_m3=1070.0)
+
+
+def hanging(
+    gravity: tuple[float, float, float], depth: cs.Depth, **changes
+) -> cs.Experiment:
+    """The bar held at one end, pulled towards the camera or away from it by gravity."""
+    held = cs.Grasp(
+        np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed()
+    )
+    settings = {
+        "kind": "static",
+        "nuisance": cs.Nuisance.none(),
+        "gravity_m_s2": gravity,
+    }
+    return cs.Experiment(
+        bar(), [0.0], [held], depths=[depth], **settings | changes
+    )
+
+
+@cache
+def recorded(gravity: tuple[float, float, float], **changes) -> cs.Experiment:
+    """The same with a depth image, taken at the truth."""
+    x = cs.simulate(hanging(gravity, NOTHING), BAR_TRUTH).positions_m[0]
+    skin, camera = (
+        VisibleSurface.from_body(bar(), NOTHING),
+        cs.DepthCamera(MATRIX, pose=POSE),
+    )
+    shape_m = x[skin.nodes]
+    image_m = cs.depth_image(
+        camera,
+        SHAPE,
+        (skin.subdivided_triangles(shape_m) - POSE[:3, 3]) @ POSE[:3, :3],
+    )
+    image_m = image_m + DEPTH_NOISE_M * np.random.default_rng(0).normal(
+        size=SHAPE
+    )
+    depth = cs.Depth.of_images(
+        "front", image_m, camera, DEPTH_NOISE_M, spacing_m=0.004
+    )
+    return hanging(gravity, depth, **changes)
+
+
+ACROSS, ALONG = (0.0, 9.81, 0.0), (9.81, 0.0, 0.0)
+
+
+@cache
+def image_predicted(young_pa: float) -> cs.Run:
+    problem = cs.Problem([recorded(ACROSS)], BAR_TRUTH | {"young_pa": young_pa})
+    return cs.run(problem, seek_causes=False)
+
+
+@pytest.mark.long
+def test_predicted_depth_is_compared_with_the_image_and_graded():
+    right, wrong = image_predicted(1.5e5), image_predicted(0.3e5)
+    good, bad = (
+        each.rollouts["experiment"].depth["front"] for each in (right, wrong)
+    )
+    assert right.trust.verdict == "good"
+    assert good.rms_m == pytest.approx(DEPTH_NOISE_M, rel=0.25)
+    assert good.share_beyond_gate == 0.0
+    assert wrong.trust.verdict == "doubtful"
+    assert "deviates from the depth of front by" in wrong.trust.reasons[0]
+    assert bad.rms_m > 0.008
+    found = stored(wrong)
+    assert (
+        found["rollout"]["experiment"]["depth"]["front"]["rms_m"] == bad.rms_m
+    )
+    assert found["fit"]["experiment"]["depth"]["front"]["points"] > 100
+    assert (
+        f"depth of front {1e3 * bad.rms_m:.3g} mm RMS of {bad.points} points"
+        in shown(wrong)
+    )
+
+
+def test_gate_and_rms_of_depth_belong_to_the_same_points():
+    bad = image_predicted(0.3e5).rollouts["experiment"].depth["front"]
+    assert bad.gate_m == 0.01 < bad.reach_m
+    assert bad.rms_within_gate_m <= bad.gate_m
+    assert 0.1 < bad.share_beyond_gate < 0.9
+    beyond = (
+        bad.rms_m**2 - (1 - bad.share_beyond_gate) * bad.rms_within_gate_m**2
+    )
+    assert bad.gate_m < np.sqrt(beyond / bad.share_beyond_gate) <= bad.reach_m
+    assert f"{bad.share_beyond_gate:.0%} beyond the gate of 10 mm" in shown(
+        image_predicted(0.3e5)
+    )
+
+
+def test_notes_of_a_depth_recording_do_not_speak_of_wrenches():
+    notes = " ".join(image_predicted(0.3e5).result.notes)
+    assert "wrench" not in notes
+    assert "the residuals of the points of depth cameras are" in notes
+
+
+def test_points_that_are_nowhere_near_the_prediction_are_doubtful():
+    experiment = recorded(ACROSS)
+    (depth,) = experiment.depths
+    away = [cloud + np.array([0.0, 0.0, 0.2]) for cloud in depth.clouds]
+    far = replace(experiment, depths=[replace(depth, clouds=away)])
+    finished = cs.run(cs.Problem([far], BAR_TRUTH), seek_causes=False)
+    assert finished.trust.verdict == "doubtful"
+    assert "prediction/unseen" in [c.code for c in finished.trust.concerns]
+
+
+@pytest.mark.long
+def test_depth_of_a_validation_recording_is_compared_drawn_and_judged():
+    fitted = recorded(ACROSS, name="fitted")
+    away = recorded((0.0, -9.81, 0.0), name="away", validation=True)
+    wrong = replace(away, gravity_m_s2=(0.0, 0.0, -9.81), name="wrong")
+    unknown = BAR_TRUTH | {"young_pa": cs.Unknown(1.4e5)}
+    finished = cs.run(
+        cs.Problem([fitted, away, wrong], unknown), seek_causes=False
+    )
+    (predicted,) = finished.rollouts["away"].depth.values()
+    assert isinstance(predicted, DepthError)
+    assert predicted.rms_m == pytest.approx(DEPTH_NOISE_M, rel=0.3)
+    drawn = {
+        replay.name: replay.visible_points for replay in replays(finished)
+    }["away"]["front"]
+    assert np.isfinite(drawn[:, 4]).sum() == predicted.points
+    assert "points of depth cameras cannot be compared" in shown(finished)
+    (concern,) = (
+        c for c in finished.trust.concerns if c.code == "roll-out/predicted"
+    )
+    assert concern.data["experiment"] == "wrong/front"
+
+
+# Yardsticks of a validation recording -------------------------------------------------------------
+
+
+def swing(
+    name: str, late_s: float, seed: int, steps: int = 16, **changes
+) -> cs.Experiment:
+    """The cube, swung alike every time, seen by cameras that are late."""
+    hung = hung_cube(
+        steps, nuisance=cs.Nuisance.none(time_shift_s=5e-3), **changes
+    )
+    tracks = CubicSpline(hung.t_s, cs.simulate(hung, TRUTH).markers_m)
+    seen = tracks(np.maximum(hung.t_s - late_s, 0.0))
+    seen = seen + 2e-4 * np.random.default_rng(seed).standard_normal(seen.shape)
+    sigma_m = np.full(seen.shape[1], 2e-4)
+    markers = replace(hung.markers, positions_m=seen, sigma_m=sigma_m)
+    return replace(hung, name=name, markers=markers)
+
+
+@cache
+def validated(late_s: float) -> cs.Run:
+    """A recording that is predicted from another, whose cameras are 4 ms late."""
+    unknown = {**TRUTH, "mu_pa": cs.Unknown(290.0)}
+    both = [
+        swing("fitted", 4e-3, 0),
+        replace(swing("new", late_s, 1), validation=True),
+    ]
+    finished = cs.run(cs.Problem(both, unknown, substeps=3), seek_causes=False)
+    return finished
+
+
+@pytest.mark.long
+def test_a_blind_prediction_has_the_nuisance_parameters_of_the_fitted_recordings():
+    alike, other = validated(4e-3), validated(-4e-3)
+    for finished in (alike, other):
+        rollout = finished.rollouts["new"]
+        assert rollout.rms_m == pytest.approx(np.sqrt(3) * 2e-4, rel=0.2)
+        assert rollout.blind_error is not None
+    assert alike.rollouts["new"].blind_error.rms_m == pytest.approx(
+        alike.rollouts["new"].rms_m, rel=0.05
+    )
+    assert (
+        other.rollouts["new"].blind_error.rms_m
+        > 3 * other.rollouts["new"].rms_m
+    )
+    found = stored(other)["rollout"]
+    assert (
+        found["new"]["blind"]["rms_m"]
+        == other.rollouts["new"].blind_error.rms_m
+    )
+    assert "blind" not in found["fitted"]
+    said = shown(other)
+    assert (
+        "with the nuisance parameters of the fitted recordings (blind): "
+        in said
+    )
+    assert f"{1e3 * other.rollouts['new'].blind_error.rms_m:.3f} mm RMS" in said
+
+
+def test_a_prediction_stands_beside_the_copy_of_a_fitted_recording():
+    alike = validated(4e-3)
+    copied = alike.rollouts["new"].copy_error
+    assert isinstance(copied, CopyError)
+    assert copied.copied == "fitted"
+    assert copied.error.rms_m == pytest.approx(
+        np.sqrt(6) * 2e-4, rel=0.1
+    )  # the noise of both
+    assert stored(alike)["rollout"]["new"]["copied"]["copied"] == "fitted"
+    assert "the measurements of 'fitted' as the prediction: " in shown(alike)
+
+
+@pytest.mark.long
+def test_the_nearest_recording_is_copied_or_the_output_says_why_none_is():
+    new = swing("new", 0.0, 1)
+    near, far = swing("near", 1e-3, 2), swing("far", 8e-3, 3)
+    found = nearest_recording_error(new, [far, near])
+    assert isinstance(found, CopyError)
+    assert found.copied == "near"
+    assert nearest_recording_error(new, [swing("long", 0.0, 2, steps=17)]) == (
+        "no fitted recording can be copied (long: 18 samples instead of 17)"
+    )
+    faster = replace(
+        near,
+        t_s=0.9 * near.t_s,
+        markers=replace(near.markers, t_s=0.9 * near.t_s),
+    )
+    assert "other times" in nearest_recording_error(new, [faster])
+    renamed = replace(
+        near.markers, names=[f"{name}'" for name in near.markers.names]
+    )
+    assert "other markers" in nearest_recording_error(
+        new, [replace(near, markers=renamed)]
+    )

@@ -1,0 +1,301 @@
+"""Routine probes of every solve: drift of stiffness and clock rates."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from assumed_twins import wrong
+from kit.problems import (
+    EDGE_M,
+    IDEAL,
+    box,
+    hung_cube,
+    nodes_where,
+    smooth_poses,
+    vertex_markers,
+)
+from scipy.interpolate import CubicSpline
+
+from collocation_sysid import (
+    Body,
+    Experiment,
+    Grasp,
+    PoseSequence,
+    Problem,
+    Run,
+    UncertaintyOptions,
+    Unknown,
+    run,
+)
+from collocation_sysid.common.display import plain_text
+from collocation_sysid.methods.initial_trajectories import initial_variables
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.result.probe_sections import (
+    DEEPER_CHECK_ADVICE,
+    is_deeper_check_worthwhile,
+)
+from collocation_sysid.result.run_sections import run_summary
+from collocation_sysid.statistics.assessment import Assessment, probe_concerns
+from collocation_sysid.statistics.budget.systematic_effects import Assumptions
+from collocation_sysid.statistics.linearised import (
+    gauss_newton_step,
+    linearise_fit,
+)
+from collocation_sysid.statistics.probes.relaxed_assumptions import (
+    EstimateChange,
+    Probe,
+    SolvedFit,
+    has_monotonic_load,
+    probed_changes,
+)
+from collocation_sysid.statistics.probes.routine_probes import (
+    FALSE_ALARMS,
+    RELEVANT,
+    is_alarming,
+    probed_deviations,
+    routine_probes,
+)
+from collocation_sysid.statistics.uncertainty import AUTO
+
+TRUTH = {"young_pa": 8e3, "poisson": 0.3, "gamma_r_s": 6e-3, "gamma_m_1_s": 1.0}
+NOISE_M = 2.5e-4
+# Timesteps of the truth, and of the fit, between two samples: else the scheme's own error shows.
+FINER, SUBSTEPS = 6, 4
+DRIFT, CLOCK = "stiffness_drift", "clock_rate"
+
+
+@cache
+def swung(fault: str = "", off: float = 0.0, samples: int = 60) -> Problem:
+    """A cube that was swung, of which something is off, described as if nothing were."""
+    hung = hung_cube(samples)
+    hung = replace(hung, body=Body(hung.body.mesh, density_kg_m3=60.0))
+    fine_s = np.linspace(0.0, hung.t_s[-1], FINER * (len(hung.t_s) - 1) + 1)
+    fine = replace(
+        hung,
+        t_s=fine_s,
+        markers=vertex_markers(
+            hung.body, nodes_where(hung.body, 2, 0.0), fine_s
+        ),
+        grasps=(Grasp(hung.grasps[0].nodes, smooth_poses(fine_s)),),
+    )
+    recorded = wrong(fine, TRUTH, {fault: off} if fault == DRIFT else {})
+    tracks = recorded.markers.positions_m[::FINER]
+    if fault == CLOCK:  # the times of the cameras are too large
+        tracks = CubicSpline(hung.t_s, tracks)(hung.t_s * (1 - off))
+    tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(
+        tracks.shape
+    )
+    sigma_m = np.full(tracks.shape[1], NOISE_M)
+    seen = replace(hung.markers, positions_m=tracks, sigma_m=sigma_m)
+    estimated = {
+        name: Unknown(TRUTH[name])
+        for name in ("young_pa", "poisson", "gamma_r_s")
+    }
+    parameters = Parameters.from_mapping(TRUTH | estimated)
+    # Nothing but the probes is to give concern: all assumptions are stated as exact.
+    exact = Assumptions(**dict.fromkeys(Assumptions().deviations, "none"))
+    options = UncertaintyOptions(assumptions=exact)
+    recorded = replace(hung, markers=seen)
+    return Problem(
+        [recorded], parameters, substeps=SUBSTEPS, uncertainty=options
+    )
+
+
+@cache
+def solved(fault: str = "", off: float = 0.0) -> Run:
+    return run(swung(fault, off), "reduced-space", seek_causes=False)
+
+
+def named(finished: Run, name: str) -> Probe:
+    (probe,) = (each for each in finished.probes if each.name == name)
+    return probe
+
+
+# Whole solves -------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_a_faultless_solve_has_both_probes_and_no_alarm():
+    faultless = solved()
+    assert [probe.name for probe in faultless.probes] == [DRIFT, CLOCK]
+    assert not any(probe.sentences for probe in faultless.probes)
+    assert faultless.trust.verdict == "good"
+    assert not is_deeper_check_worthwhile(faultless.result)
+    assert "solve --probe" not in plain_text(
+        run_summary(faultless.result, Path("runs"))
+    )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("fault", "off", "size"), [(DRIFT, -0.15, -0.15), (CLOCK, 7e-4, -7e-4)]
+)
+def test_a_drift_and_a_wrong_clock_rate_mean_check_with_corrected_estimates(
+    fault, off, size
+):
+    wrongly = solved(fault, off)
+    probe = named(wrongly, fault)
+    assert probe.sentences
+    assert abs(probe.size - size) < 3 * probe.size_error
+    assert probe.chi_squared > 15
+    assert wrongly.trust.verdict == "check"
+    (concern,) = wrongly.trust.concerns
+    assert concern.code == "assumption/contradicted"
+    assert fault.replace("_", " ") in concern.message
+    for symbol in ("E = ", "ν = ", "γ_r = "):
+        assert symbol in concern.message
+    for name, move in probe.moves.items():
+        if name in TRUTH:  # the corrected estimates are right
+            assert abs(move.value - TRUTH[name]) < 3.5 * move.std_error
+    assert is_deeper_check_worthwhile(wrongly.result)
+    assert DEEPER_CHECK_ADVICE in plain_text(
+        run_summary(wrongly.result, Path("runs"))
+    )
+
+
+# Level of significance ----------------------------------------------------------------------------
+
+
+def answered(problem: Problem) -> SolvedFit:
+    """The fit of a problem at its guess, as if that were the answer."""
+    collocation = replace(problem.collocation(), substeps=1)
+    z, _ = initial_variables(collocation)
+    fit = linearise_fit(collocation, z)
+    deviations = probed_deviations(Assumptions().deviations)
+    kept = {
+        name: deviations[name] if name in (DRIFT, CLOCK) else None
+        for name in deviations
+    }
+    return SolvedFit(
+        collocation=collocation,
+        z=z,
+        fit=fit,
+        error_model=AUTO,
+        statistical={},
+        budget={},
+        deviations=kept,
+        changes=probed_changes(collocation, z, kept),
+    )
+
+
+def test_faultless_fits_have_no_significant_probe():
+    at = answered(swung(samples=24))
+    rng, draws, alarms = np.random.default_rng(3), 60, 0
+    for _ in range(draws):
+        noisy = [
+            replace(
+                b,
+                residual=rng.standard_normal(b.residual.shape) * b.is_measured,
+                misfit=None,
+            )
+            for b in at.fit.blocks
+        ]
+        fit = replace(at.fit, blocks=tuple(noisy))
+        fit = fit.after_step(gauss_newton_step(fit))
+        here = replace(at, fit=fit)
+        of_fit = here.uncertainty_of_refit(fit, here.parameters)
+        here = replace(here, statistical={**of_fit.estimates, **of_fit.derived})
+        alarms += any(probe.sentences for probe in routine_probes(here))
+    assert FALSE_ALARMS == 1e-4
+    assert alarms == 0
+
+
+def test_what_is_stated_as_exact_is_tested_too():
+    exact = dict.fromkeys(Assumptions().deviations)
+    assert {n: s for n, s in probed_deviations(exact).items() if s} == {
+        DRIFT: 0.02,
+        CLOCK: 1e-4,
+    }
+    assert probed_deviations({**exact, DRIFT: 0.1})[DRIFT] == 0.1
+
+
+# Judgement of a probe -----------------------------------------------------------------------------
+
+
+def probe(
+    relevance: float,
+    is_significant: bool = True,
+    name: str = DRIFT,
+    fall: float = 20.0,
+) -> Probe:
+    moves = {"young_pa": EstimateChange(8100.0, 40.0, 100.0, 2.0, 0.5)}
+    own = (name,) if is_significant else ()
+    return Probe(
+        "assumption", name, fall, moves, -0.05, 0.01, own, True, relevance
+    )
+
+
+def test_a_probe_alarms_if_it_is_significant_and_relevant():
+    assert is_alarming(probe(2 * RELEVANT))
+    assert not is_alarming(probe(0.5 * RELEVANT))
+    assert not is_alarming(probe(2 * RELEVANT, is_significant=False))
+    assert not is_alarming(replace(probe(2.0), kind="window"))
+
+
+def test_the_concern_names_the_assumption_and_every_corrected_estimate():
+    both = [probe(1.0, name=CLOCK, fall=12.0), probe(1.0)]
+    (concern,) = probe_concerns(both, {"young_pa": 1.01, "poisson": 1.0})
+    assert concern.grade == "check"
+    assert Assessment.from_concerns([concern]).verdict == "check"
+    assert concern.message == (
+        "the data contradict the assumption that the stiffness is constant during a recording: "
+        "with stiffness drift = -0.05 ± 0.01 χ² decreases by 20, and the estimates become E = "
+        "8181 ± 40 Pa and ν not determined; alternatives that decrease χ² less: clock rate (12)"
+    )
+    assert probe_concerns([probe(0.0)], {"young_pa": 1.0}) == []
+
+
+# Static recordings --------------------------------------------------------------------------------
+
+
+def pressed(heights_m: list[float]) -> Experiment:
+    """A cube on the floor under a platen at some heights, one after the other."""
+    body, t_s = box(), np.arange(float(len(heights_m)))
+    positions = np.outer(heights_m, [0.0, 0.0, 1.0])
+    platen = PoseSequence(
+        t_s, positions, np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1)), "linear"
+    )
+    grasps = [
+        Grasp(nodes_where(body, 2, 0.0), PoseSequence.fixed()),
+        Grasp(nodes_where(body, 2, EDGE_M), platen),
+    ]
+    markers = vertex_markers(body, nodes_where(body, 0, EDGE_M), t_s)
+    still = {
+        "gravity_m_s2": (0.0, 0.0, 0.0),
+        "nuisance": IDEAL,
+        "kind": "static",
+    }
+    return Experiment(body, t_s, grasps, markers, **still)
+
+
+@pytest.mark.parametrize(
+    ("heights_m", "drifts"),
+    [
+        (
+            [0.0, -0.005, -0.01, -0.015],
+            False,
+        ),  # as a wrong law of the material would look
+        ([0.0, -0.01], False),
+        ([0.0, -0.01, 0.0, -0.01, -0.005], True),
+    ],
+)
+def test_a_static_recording_shows_a_drift_only_where_its_load_returns(
+    heights_m, drifts
+):
+    stiffness = {"lambda_pa": Unknown(800.0), "mu_pa": Unknown(600.0)}
+    guess = Parameters.from_mapping(
+        {**stiffness, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+    )
+    collocation = Collocation([pressed(heights_m)], guess)
+    z, _ = initial_variables(collocation)
+    (part,) = collocation.iterates(z)
+    assert has_monotonic_load(part, collocation) is not drifts
+    none = dict.fromkeys(Assumptions().deviations)
+    changes = probed_changes(collocation, z, {**none, DRIFT: 0.02})
+    column = changes.names.index(DRIFT)
+    assert any(block[..., column].any() for block in changes.blocks) is drifts

@@ -1,0 +1,367 @@
+"""Verdicts: correct answers are good, and hidden faults are found."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kit.fits import PARAMETERS, autoregressive, problem
+from kit.problem_files import run_command, settings, write_problem
+from twins import BODIES, NOISE_M, SOFT, twin
+from wrong_twins import FAULTS
+
+from collocation_sysid import Run, UncertaintyOptions, run
+from collocation_sysid.common.display import plain_text
+from collocation_sysid.common.serialisation import as_json, content, read
+from collocation_sysid.methods.solution import Status
+from collocation_sysid.problem import Problem
+from collocation_sysid.result.run_sections import run_summary
+from collocation_sysid.statistics.assessment import (
+    GROSS_MISFIT,
+    MISFIT,
+    Assessment,
+    fit_concerns,
+    forward_simulation_concerns,
+    nuisance_concerns,
+    parameter_concerns,
+    rms_expected_from_noise_m,
+    scheme_concerns,
+)
+from collocation_sysid.statistics.budget.systematic_effects import Assumptions
+from collocation_sysid.statistics.concerns import TOPICS, Concern
+from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
+    Hypothesis,
+)
+from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
+
+RNG = np.random.default_rng
+PACKAGE = Path(__file__).parents[2] / "collocation_sysid"
+VERDICT_PAGE = Path(__file__).parents[2] / "docs" / "howto" / "verdict.md"
+FOAM_CYLINDER = (
+    Path(__file__).parents[2] / "problems" / "foam_cylinder" / "problem.toml"
+)
+# Of λ = 800 Pa and μ = 600 Pa, with which its tracks were made.
+EXACT = UncertaintyOptions(assumptions=Assumptions.exact())
+FOAM_YOUNG_PA = 600 * (3 * 800 + 2 * 600) / (800 + 600)
+OF = problem((80,), markers=3)
+
+
+def slow(*values):
+    """A whole run of which a like one is done every time."""
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
+def verdict_of_fit(errors: np.ndarray) -> Assessment:
+    fit, wrong = OF.fit([errors], np.zeros(len(OF.names)))
+    found = uncertainty_from_fit(fit, PARAMETERS, wrong[:4])
+    return Assessment.from_concerns(
+        fit_concerns(found) + parameter_concerns(found)
+    )
+
+
+# The verdict of single findings
+
+
+def test_the_gravest_concern_gives_the_verdict():
+    light, grave = (
+        Concern("solve/acceptable"),
+        Concern("solve/no-error-bars", "doubtful"),
+    )
+    assert Assessment.from_concerns([]).verdict == "good"
+    assert Assessment.from_concerns([light, light]) == Assessment((light,))
+    assert Assessment.from_concerns([light, grave]) == Assessment(
+        (grave, light)
+    )
+    assert (
+        Assessment((light,)).verdict,
+        Assessment((grave, light)).verdict,
+    ) == (
+        "check",
+        "doubtful",
+    )
+
+
+def test_a_concern_keeps_its_code_and_its_numbers_in_files():
+    found = Assessment.from_concerns(
+        nuisance_concerns(["time"], [4.0], [-9.0], [9.0])
+    )
+    stored = json.loads(as_json(found))
+    assert stored["reasons"] == [
+        "time is 4.0 standard deviations of its prior away from zero"
+    ]
+    (concern,) = stored["concerns"]
+    assert concern["code"] == "nuisance/far"
+    assert concern["data"] == {"name": "time", "deviations": 4.0}
+    assert read(Assessment, stored) == found
+
+
+def test_every_code_that_gives_concern_has_a_sentence_and_a_remedy():
+    sources = "".join(file.read_text() for file in PACKAGE.rglob("*.py"))
+    codes = re.findall(rf'"((?:{"|".join(TOPICS)})/[a-z/-]+)"', sources)
+    assert len(codes) > 30
+    for code in codes:
+        topic, _, rest = code.partition("/")
+        assert rest in TOPICS[topic].messages, code
+        assert TOPICS[topic].remedy
+
+
+def test_white_residuals_of_the_stated_size_are_good():
+    found = [
+        verdict_of_fit(RNG(seed).normal(size=(80, 3, 3))).verdict
+        for seed in range(80)
+    ]
+    assert found.count("good") >= 79
+
+
+@pytest.mark.parametrize(
+    ("factors", "words"),
+    [
+        ([2.5, 2.5, 2.5], "times as large as expected from sigma_m"),
+        ([0.3, 0.3, 0.3], "times too large"),
+        ([4.0, 1.0, 1.0], "the residuals of swing 0/m0 are"),
+    ],
+)
+def test_a_wrong_sigma_is_to_be_checked(factors, words):
+    for seed in range(5):
+        errors = np.array(factors)[:, None] * RNG(seed).normal(size=(80, 3, 3))
+        found = verdict_of_fit(errors)
+        assert found.verdict == "check"
+        assert any(words in reason for reason in found.reasons)
+
+
+def test_persistent_residuals_are_to_be_checked_and_gross_ones_doubtful():
+    for seed in range(5):
+        errors = autoregressive(RNG(seed), 80, 3, 0.8)
+        found = verdict_of_fit(1.2 * errors)
+        assert found.verdict == "check"
+        assert "consecutive samples are correlated" in found.reasons[0]
+        assert verdict_of_fit(5 * errors).verdict == "doubtful"
+        assert verdict_of_fit(0.02 * errors).verdict != "doubtful"
+
+
+def test_the_page_states_the_threshold_of_doubtful_residuals_that_the_code_uses():
+    words = re.sub(r"\s+", " ", VERDICT_PAGE.read_text(encoding="utf-8"))
+    (check, doubtful) = re.findall(r"more than ([\d.]+) times `sigma_m`", words)
+    assert (float(check), float(doubtful)) == (MISFIT, GROSS_MISFIT)
+    for seed in range(3):
+        errors = autoregressive(RNG(seed), 80, 3, 0.97)
+        (larger,) = (
+            c
+            for c in verdict_of_fit(20 * errors).concerns
+            if c.code == "noise/larger"
+        )
+        unit = float(doubtful) / (larger.data["factor"] / 20)
+        below, above = (verdict_of_fit(f * unit * errors) for f in (0.9, 1.1))
+        assert (below.verdict, above.verdict) == ("check", "doubtful")
+        (persistent,) = (
+            c for c in below.concerns if c.code == "residuals/persist"
+        )
+        assert persistent.data["autocorrelation"] > 0.9
+
+
+def test_gross_residuals_of_single_samples_are_doubtful():
+    """Nothing tells whether they are noise."""
+    singles = problem((1,) * 8, markers=4, offsets=False)
+    for size, verdict in ((1.0, "good"), (50.0, "doubtful")):
+        errors = [size * RNG(k).normal(size=(1, 4, 3)) for k in range(8)]
+        fit, _ = singles.fit(errors, np.zeros(len(singles.names)))
+        found = uncertainty_from_fit(fit, PARAMETERS, np.zeros(4))
+        assert np.isfinite(found.dependence.lag1)
+        assert Assessment.from_concerns(fit_concerns(found)).verdict == verdict
+
+
+def test_nuisance_parameters_far_from_their_prior():
+    many = [f"n{k}" for k in range(100)]
+    nowhere, infinite = np.zeros(100), np.full(100, np.inf)
+    assert not nuisance_concerns(many, nowhere, -infinite, infinite)
+    assert not nuisance_concerns(
+        many, nowhere + 3.5, -infinite, infinite
+    )  # one in forty such runs
+    (found,) = nuisance_concerns(["time"], [4.0], [-9.0], [9.0])
+    assert (found.code, found.grade) == ("nuisance/far", "check")
+    for phi, low, high in (
+        (-7.0, -9.0, 9.0),
+        (2.0, -2.0, 2.0),
+        (2.0, 2.0, 6.0),
+    ):
+        (found,) = nuisance_concerns(["time"], [phi], [low], [high])
+        assert found.grade == "doubtful"
+
+
+def test_a_roll_out_is_measured_by_the_fit_and_the_noise():
+    assert not forward_simulation_concerns("a", 1.05, 1.0, 1.0, is_fitted=True)
+    assert not forward_simulation_concerns(
+        "a", 0.1, 0.001, 1.0, is_fitted=True
+    )  # far below the noise
+    strengths = [
+        forward_simulation_concerns("a", rms, 1.0, 1.0, is_fitted=True)[0].grade
+        for rms in (1.5, 4.0)
+    ]
+    assert strengths == ["check", "doubtful"]
+    assert not forward_simulation_concerns("a", 2.0, 1.0, 1.0, is_fitted=False)
+    strengths = [
+        forward_simulation_concerns("a", rms, 1.0, 1.0, is_fitted=False)[
+            0
+        ].grade
+        for rms in (4.0, 20.0)
+    ]
+    assert strengths == ["check", "doubtful"]
+
+
+def test_a_scheme_that_damps_or_slows_is_a_concern():
+    assert not scheme_concerns("a", 0.05, 0.0, 0.01)
+    (damped,) = scheme_concerns("a", 0.05, 0.02, 0.0)
+    assert damped.grade == "check"
+    assert "0.02 to the 0.05" in damped.message
+    assert scheme_concerns("a", 0.05, 0.06, 0.0)[0].grade == "doubtful"
+    assert scheme_concerns("a", 0.05, 0.0, -0.05)[0].grade == "check"
+
+
+def test_what_noise_alone_would_leave():
+    assert rms_expected_from_noise_m(
+        np.array([1e-3]), np.array([100.0]), 0
+    ) == pytest.approx(1e-3 * np.sqrt(3))
+    fewer = rms_expected_from_noise_m(
+        np.array([1e-3, 2e-3]), np.array([50.0, 50.0]), 30.0
+    )
+    assert fewer == pytest.approx(1e-3 * np.sqrt(3 * 2.5 * 0.9))
+
+
+# Whole runs
+
+
+@cache
+def judged(fault: str, seed: int = 100) -> Run:
+    problem = twin(list(BODIES)[seed % len(BODIES)], SOFT, seed)
+    if fault != "none":
+        problem = FAULTS[fault](problem, RNG(seed))
+    # With one step a sample the scheme itself is a reason to check.
+    problem = replace(problem, substeps=2, uncertainty=EXACT)
+    return run(problem, "reduced-space")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [100, slow(101)])
+def test_faultless_twins_are_good(seed):
+    found = judged("none", seed)
+    assert found.trust == Assessment(())
+    assert found.noise_rms_m == pytest.approx(found.solution.rms_m, rel=0.1)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "fault", ["gravity", slow("clock 100 ms late"), slow("markers exchanged")]
+)
+def test_faults_that_spoil_the_answer_are_doubtful(fault):
+    found = judged(fault)
+    assert found.trust.verdict == "doubtful"
+    assert found.causes[0].cause in FAULTS[fault].causes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "fault", ["clock 30 ms late", "grasp one layer deeper"]
+)
+def test_no_hidden_fault_is_good(fault):
+    assert judged(fault).trust.verdict != "good"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("factor", "words"), [slow(0.3, "as large as"), (3.0, "too large")]
+)
+def test_a_wrong_sigma_of_a_whole_run_is_to_be_checked(factor, words):
+    problem = twin("block", SOFT, 100)
+    (experiment,) = problem.experiments
+    claimed = replace(
+        experiment.markers, sigma_m=factor * experiment.markers.sigma_m
+    )
+    stated = replace(experiment, markers=claimed)
+    stated = replace(problem, experiments=[stated], substeps=2)
+    found = run(stated, "reduced-space")
+    assert found.trust.verdict == "check"
+    assert words in found.trust.reasons[0]
+    assert found.uncertainty is not None
+    assert found.uncertainty.noise == "estimated"
+    said = [diagnosis.sentence for diagnosis in found.diagnoses]
+    assert not any("consistent with noise" in sentence for sentence in said)
+
+
+@pytest.mark.parametrize(
+    ("substeps", "verdict"), [(1, "check"), slow(2, "good")]
+)
+def test_a_step_that_dominates_the_error_bars_is_corrected_and_to_be_checked(
+    substeps, verdict
+):
+    problem = replace(
+        Problem.read(FOAM_CYLINDER), substeps=substeps, uncertainty=EXACT
+    )
+    found = run(problem, "reduced-space")
+    low, high = found.interval("young_pa")
+    assert low < FOAM_YOUNG_PA < high
+    off = abs(found.estimates["young_pa"].value - FOAM_YOUNG_PA)
+    assert off < 0.5 * abs(found.estimates["young_pa"].optimum - FOAM_YOUNG_PA)
+    assert found.trust.verdict == verdict
+
+
+@pytest.mark.long
+def test_the_verdict_is_shown_stored_and_fed():
+    found = judged("none")
+    assert ", good: " in repr(found)
+    assert content(found.result)["trust"] == {
+        "verdict": "good",
+        "reasons": [],
+        "concerns": [],
+    }
+    lines = plain_text(run_summary(found.result, Path("runs"))).splitlines()
+    assert lines[1] == "Verdict: good"
+    assert (
+        "γ_r refers to the damping law rayleigh, which also damps rigid rotation"
+        in lines
+    )
+    (markers,) = [line for line in lines if line.startswith("markers: ")]
+    assert "mm expected from noise alone" in markers
+    noise_mm = float(markers.partition("RMS, ")[2].partition(" mm")[0])
+    assert noise_mm == pytest.approx(1e3 * np.sqrt(3) * NOISE_M, rel=0.1)
+    caused = replace(
+        found, causes=(Hypothesis("wrench-tare", "the wrench", strength=9.0),)
+    )
+    assert caused.trust.verdict == "doubtful"
+    assert caused.trust.reasons[0].startswith(
+        "likely: the wrench: the sensor was probably zeroed while it carried the body"
+    )
+
+
+def test_an_answer_that_did_not_converge_is_doubtful():
+    found = judged("none")
+    lost = replace(
+        found, solution=replace(found.solution, status=Status.STALLED)
+    )
+    assert lost.trust.verdict == "doubtful"
+    assert "did not converge" in lost.trust.reasons[0]
+
+
+@pytest.mark.long
+def test_strict_fails_where_the_verdict_is_doubtful(tmp_path):
+    file = write_problem(tmp_path, {"swing": 25})
+    precise = "experiment.swing.markers.sigma_m=2e-4"
+    method = settings(
+        "solver.method=reduced-space", "transcription.scheme=midpoint", precise
+    )
+    wrong = settings("experiment.swing.gravity_m_s2=[0.0, -9.81, 0.0]")
+    out = ("--out", tmp_path / "run")
+    assert run_command("solve", file, *method, "--strict", *out).code == 0
+    lax = run_command("solve", file, *method, *wrong, *out)
+    strict = run_command("solve", file, *method, *wrong, "--strict", *out)
+    assert "Verdict: doubtful" in lax.out
+    assert (lax.code, strict.code) == (0, 1)
+    assert run_command("report", tmp_path / "run").code == 0
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert '<div class="verdict doubtful">' in page
+    stored = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert stored["trust"]["reasons"]

@@ -1,0 +1,117 @@
+"""Misspecification hypotheses about wrenches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from kit.problems import GUESS
+from kit.wrench_fits import UNKNOWN, swung
+from wrong_twins import WRENCH_FAULTS
+
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.problem import Problem
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.recording import Nuisance, Wrench
+from collocation_sysid.runs.check import check_problem
+from collocation_sysid.statistics.assessment import cause_concerns
+from collocation_sysid.statistics.misspecification.fit_misspecifications import (
+    find_misspecifications,
+)
+from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
+    rank,
+)
+from collocation_sysid.statistics.misspecification.wrench_causes import (
+    wrench_mistakes,
+)
+
+
+def changed(change: Callable[[Wrench], Wrench]) -> Collocation:
+    experiment = swung()
+    (grasp,) = experiment.grasps
+    assert grasp.wrench is not None
+    wrong = replace(grasp, wrench=change(grasp.wrench))
+    return Collocation([replace(experiment, grasps=[wrong])], GUESS)
+
+
+def in_kilograms(wrench: Wrench) -> Wrench:
+    values = np.array(wrench.values)
+    values[:, :3] /= 9.80665
+    return replace(wrench, values=values)
+
+
+MISTAKES = {
+    "wrench-sign": lambda w: replace(w, values=-w.values),
+    "wrench-frame": lambda w: replace(w, frame="world"),
+    "wrench-unit": in_kilograms,
+    "wrench-clock": lambda w: replace(w, t_s=w.t_s + 0.04),
+    "wrench-axes": lambda w: replace(w, values=w.values[:, [0, 2, 1, 3, 5, 4]]),
+    "wrench-sign/part": lambda w: replace(
+        w, values=w.values * [-1, -1, -1, 1, 1, 1]
+    ),
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("cause", "change"), MISTAKES.items(), ids=MISTAKES)
+def test_a_mistake_is_the_likeliest_cause(
+    cause: str, change: Callable[[Wrench], Wrench]
+):
+    collocation = changed(change)
+    found = find_misspecifications(ReducedSpace()(collocation), budget=0)
+    assert found[0].code == cause
+    assert cause_concerns(found)[0].grade == "doubtful"
+
+
+def test_a_wrench_that_fits_has_no_cause():
+    assert not find_misspecifications(
+        ReducedSpace()(changed(lambda w: w)), budget=0
+    )
+
+
+# Before solving -----------------------------------------------------------------------------------
+
+
+def sensed(fault: str | None, seed: int = 0) -> Problem:
+    """The swung cube with a sensor and a mistake of its wrench."""
+    right = Problem([swung(seed)], UNKNOWN)
+    return (
+        right
+        if fault is None
+        else WRENCH_FAULTS[fault](right, np.random.default_rng(0))
+    )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("fault", WRENCH_FAULTS)
+def test_a_mistake_is_named_before_solving(fault: str):
+    found = rank(wrench_mistakes(sensed(fault).collocation()))
+    assert found, fault
+    assert found[0].cause in WRENCH_FAULTS[fault].causes
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_right_wrench_is_not_doubted_before_solving(seed: int):
+    assert not wrench_mistakes(sensed(None, seed).collocation())
+
+
+@pytest.mark.long
+def test_a_large_tare_is_named_although_its_prior_can_follow_it():
+    experiment = swung(nuisance=Nuisance())
+    (grasp,) = experiment.grasps
+    assert grasp.wrench is not None
+    offset = replace(
+        grasp.wrench, values=grasp.wrench.values + 40 * grasp.wrench.sigmas
+    )
+    given = replace(experiment, grasps=[replace(grasp, wrench=offset)])
+    (cause,) = wrench_mistakes(Collocation([given], GUESS))
+    assert cause.cause == "wrench-tare"
+
+
+@pytest.mark.long
+def test_check_lists_a_wrong_wrench():
+    findings = check_problem(sensed("wrench: force alone reversed"))
+    assert "its forces fit with the opposite sign" in findings.warnings[0]

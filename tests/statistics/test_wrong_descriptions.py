@@ -1,0 +1,478 @@
+"""Wrong descriptions of known kinds are recognised, and correct ones are not accused."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kit.problem_files import both, replace_text, run_command
+from kit.problems import GUESS, TRUTH, box, released_cube
+from twins import BODIES, SOFT, STIFF, twin
+from wrong_twins import FAULTS, OBSTACLE_FAULTS, TRACK_FAULTS
+
+from collocation_sysid.errors import InputError
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import box_mesh
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.pipeline import run, solve
+from collocation_sysid.problem import Problem
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Grasp
+from collocation_sysid.runs.check import misspecification_hypotheses
+from collocation_sysid.runs.check.body_check import check_grasps, grasp_concerns
+from collocation_sysid.statistics.assessment import cause_concerns
+from collocation_sysid.statistics.misspecification import fit_misspecifications
+from collocation_sysid.statistics.misspecification.fit_misspecifications import (
+    find_misspecifications,
+)
+from collocation_sysid.statistics.misspecification.plausibility import (
+    material_hypothesis,
+    size_and_density_hypotheses,
+    step_hypotheses,
+)
+
+BEFORE = [
+    "poses in mm",
+    "poses in km",
+    "markers in mm",
+    "markers in km",
+    "poses inverted",
+    "wxyz as xyzw",
+    "xyzw as wxyz",
+    "gripper's frame",
+    "mesh's frame",
+    "cameras' frame",
+    "markers exchanged",
+    "pose jumps",
+]
+# These are small beside what an unknown stiffness may do: the fit tells them.
+AFTER = ["gravity", "grasp one layer deeper", "marker slips"]
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(3)
+
+
+def soft(name: str, seed: int = 1) -> Problem:
+    return _twin(name, "soft", seed)
+
+
+@cache
+def _twin(name: str, kind: str, seed: int) -> Problem:
+    return twin(name, {"soft": SOFT, "stiff": STIFF}[kind], seed)
+
+
+# Before solving -----------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize(("kind", "seed"), [("soft", 1), ("stiff", 0)])
+def test_a_right_description_is_not_doubted(name: str, kind: str, seed: int):
+    assert misspecification_hypotheses(_twin(name, kind, seed)) == ()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("fault", BEFORE)
+def test_a_wrong_description_is_named_before_solving(
+    name: str, fault: str, rng
+):
+    causes = misspecification_hypotheses(FAULTS[fault](soft(name), rng))
+    assert causes, fault
+    assert causes[0].cause in FAULTS[fault].causes
+    assert causes[0].strength > 2
+
+
+@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("fault", TRACK_FAULTS)
+def test_tracks_that_no_grasped_body_has_are_named_before_solving(
+    name: str, fault: str, rng
+):
+    causes = misspecification_hypotheses(TRACK_FAULTS[fault](soft(name), rng))
+    assert causes, fault
+    assert causes[0].cause in TRACK_FAULTS[fault].causes
+
+
+def test_the_order_and_signs_of_the_tracks_axes_are_stated(rng):
+    exchanged = TRACK_FAULTS["markers: y and z exchanged"](soft("block"), rng)
+    assert (
+        "fit with (x, z, y) in place of (x, y, z)"
+        in misspecification_hypotheses(exchanged)[0].message
+    )
+
+
+@pytest.mark.long
+def test_a_body_held_still_after_it_is_let_go_undeformed_may_swing():
+    tracks = simulate(released_cube(20), TRUTH, "newmark").markers_m
+    given = Problem([with_markers(released_cube(20), tracks)], GUESS)
+    assert misspecification_hypotheses(given) == ()
+
+
+@pytest.mark.long
+def test_an_unstable_simulation_is_named_after_solving(rng):
+    reset = TRACK_FAULTS["simulation reset after NaN"](soft("bar"), rng)
+    answer = run(reset)
+    assert answer.trust.verdict == "doubtful"
+    assert "which a grasped body cannot do" in answer.trust.reasons[0]
+
+
+# Obstacles ----------------------------------------------------------------------------------------
+
+
+def shipped(name: str) -> Problem:
+    return Problem.read(
+        Path(__file__).parents[2] / "problems" / name / "problem.toml"
+    )
+
+
+@pytest.mark.parametrize("name", ["laid_block", "poked_block"])
+def test_obstacles_that_are_right_are_not_doubted(name: str):
+    assert misspecification_hypotheses(shipped(name)) == ()
+
+
+def test_an_obstacle_that_contains_the_body_has_its_normal_reversed(rng):
+    reversed_plate = OBSTACLE_FAULTS["obstacle: normal reversed"](
+        shipped("laid_block"), rng
+    )
+    assert (
+        misspecification_hypotheses(reversed_plate)[0].cause
+        == "obstacle-normal"
+    )
+
+
+@pytest.mark.parametrize("zero", ["z", ""])
+def test_the_load_of_an_indentation_that_pulls_is_named(zero: str, rng):
+    """Whether the tip moves by a displacement or by poses."""
+    given = shipped("poked_block")
+    right = replace(given, experiments=[with_zero(given.experiments[0], zero)])
+    assert misspecification_hypotheses(right) == ()
+    wrong = OBSTACLE_FAULTS["obstacle: load reversed"](right, rng)
+    (cause,) = misspecification_hypotheses(wrong)
+    assert cause.cause == "sign"
+    assert cause_concerns([cause])[0].grade == "doubtful"
+
+
+def with_zero(experiment: Experiment, zero: str) -> Experiment:
+    return experiment.with_obstacles(
+        [replace(each, zero=zero) for each in experiment.obstacles]
+    )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", BODIES)
+def test_a_late_clock_comes_with_its_lag_and_sign(name: str, rng):
+    for fault, said in (
+        ("clock 100 ms late", "late"),
+        ("clock 30 ms early", "early"),
+    ):
+        (first, *_) = misspecification_hypotheses(
+            FAULTS[fault](_twin(name, "stiff", 1), rng)
+        )
+        assert first.cause == "clock"
+        assert f"{said} by about {fault.split()[1]} ms" in first.message
+
+
+def test_the_sentence_says_by_how_much_and_which_key(rng):
+    (first, *_) = misspecification_hypotheses(
+        FAULTS["poses in mm"](soft("block"), rng)
+    )
+    assert "0.001 times as large" in first.message
+    assert 'grasp.length_unit = "mm"' in first.message
+
+
+# Names exchanged for a while ----------------------------------------------------------------------
+
+
+def exchanged(problem: Problem, rows: slice, gap: int = 0) -> Problem:
+    """With the names of the first two markers exchanged in some samples, unseen just before."""
+    (experiment,) = problem.experiments
+    tracks = np.array(experiment.markers.positions_m)
+    tracks[rows, :2] = tracks[rows, 1::-1]
+    tracks[rows.start - gap : rows.start, :2] = np.nan
+    return replace(problem, experiments=[with_markers(experiment, tracks)])
+
+
+@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("gap", [0, 5])
+def test_names_exchanged_midway_are_told_with_their_time(name: str, gap: int):
+    given = soft(name)
+    (experiment,) = given.experiments
+    half, names = len(experiment.t_s) // 2, experiment.markers.names
+    (first, *_) = misspecification_hypotheses(
+        exchanged(given, slice(half, None), gap)
+    )
+    assert first.cause == "markers-exchanged"
+    assert f"from t = {experiment.t_s[half]:.4g} s on" in first.message
+    assert (
+        f": {names[0]} is {names[1]}, {names[1]} is {names[0]};"
+        in first.message
+    )
+
+
+def test_names_exchanged_and_back_are_told_with_both_times():
+    given = soft("bar")
+    t_s = given.experiments[0].t_s
+    (first, *_) = misspecification_hypotheses(exchanged(given, slice(20, 30)))
+    assert f"from t = {t_s[20]:.4g} s to {t_s[29]:.4g} s:" in first.message
+
+
+def test_a_short_exchange_is_left_to_hubers_loss():
+    brief = exchanged(soft("bar"), slice(20, 24))
+    assert misspecification_hypotheses(brief)[0].cause == "markers-exchanged"
+    assert misspecification_hypotheses(replace(brief, huber=3.0)) == ()
+
+
+@pytest.mark.long
+def test_of_markers_that_are_exchanged_nothing_is_fitted_again(monkeypatch):
+    solution = solve(exchanged(soft("bar"), slice(20, None)))
+    monkeypatch.setattr(
+        fit_misspecifications,
+        "ReducedSpace",
+        None,
+    )
+    assert [cause.cause for cause in find_misspecifications(solution)] == [
+        "markers-exchanged"
+    ]
+
+
+@pytest.mark.long
+def test_the_search_for_causes_is_bounded_by_what_the_fit_took(
+    monkeypatch, rng
+):
+    solution, sweeps = solve(FAULTS["marker slips"](soft("block"), rng)), []
+
+    class Counted(ReducedSpace):
+        def __call__(self, *given, **options):
+            found = super().__call__(*given, **options)
+            sweeps.append(found.iterations)
+            return found
+
+    monkeypatch.setattr(
+        fit_misspecifications,
+        "ReducedSpace",
+        Counted,
+    )
+    monkeypatch.setattr(
+        fit_misspecifications,
+        "find_misspecifications_by_modes",
+        lambda *_, **__: (),
+    )
+    assert find_misspecifications(solution)[0].cause == "marker-slip"
+    assert len(sweeps) > 1
+    assert (
+        max(sweeps) <= max(15, solution.iterations) + 2
+    )  # simulations count when they are done
+    assert sum(sweeps) <= 3 * max(15, solution.iterations) + 2
+
+
+@pytest.mark.parametrize("count", [0, 4])
+def test_markers_that_are_hardly_ever_seen_are_nothing_sudden(count: int):
+    (experiment,) = soft("block").experiments
+    tracks = np.array(experiment.markers.positions_m)
+    tracks[: len(tracks) - count, 0] = np.nan
+    with warnings.catch_warnings(action="error"):
+        assert list(step_hypotheses(with_markers(experiment, tracks))) == []
+
+
+# Sizes and densities ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("edge_m", "density_kg_m3", "expected"),
+    [
+        (0.1, 30.0, []),
+        (60.0, 1100.0, ["length-unit"]),
+        (2e-5, 1100.0, ["length-unit"]),
+        (0.1, 1.1, ["density"]),
+        (0.1, 1.1e6, ["density"]),
+        (60.0, 1.1, ["length-unit", "density"]),
+    ],
+)
+def test_odd_sizes_and_densities_are_told(edge_m, density_kg_m3, expected):
+    body = Body(box_mesh((edge_m,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
+    assert [
+        oddity.cause for oddity in size_and_density_hypotheses(body)
+    ] == expected
+
+
+def test_an_odd_size_leads_to_what_states_it():
+    generated = box_mesh((60.0,) * 3, (1, 1, 1))
+    read = TetMesh(generated.points_m, generated.tetrahedra)
+    for mesh, words in (
+        (generated, "check its lengths, which"),
+        (read, "check object.length_unit, "),
+    ):
+        (oddity,) = size_and_density_hypotheses(
+            Body(mesh, density_kg_m3=1100.0)
+        )
+        assert words in oddity.message
+
+
+def test_a_metal_as_soft_as_rubber_is_odd():
+    theta = {
+        "young_pa": 5e5,
+        "poisson": 0.4,
+        "gamma_r_s": 0.01,
+        "gamma_m_1_s": 0.0,
+    }
+
+    def found(density_kg_m3: float, young_pa: float) -> str | None:
+        body = Body(
+            box_mesh((0.1,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3
+        )
+        odd = material_hypothesis(
+            body, body.theta_from_values(theta | {"young_pa": young_pa})
+        )
+        return odd and odd.message
+
+    assert found(1100.0, 5e5) is None
+    assert found(7850.0, 2e11) is None
+    assert "if the mass was stated in g" in (found(2e4, 5e5) or "")
+
+
+@pytest.mark.parametrize(
+    ("edge_m", "density_kg_m3"), [(2e3, 1e3), (0.1, 0.03), (0.1, 1e7)]
+)
+def test_impossible_ones_are_refused(edge_m, density_kg_m3):
+    body = Body(box_mesh((edge_m,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
+    with pytest.raises(InputError, match="expected"):
+        size_and_density_hypotheses(body)
+
+
+@pytest.mark.parametrize(
+    "fault", ["density in g/cm3", "mass in g", "mesh in mm"]
+)
+def test_they_come_first(fault, rng):
+    heavy = Body(box_mesh(*BODIES["block"]), density_kg_m3=1000.0)
+    given = soft("block")
+    silicone = replace(
+        given, experiments=[replace(given.experiments[0], body=heavy)]
+    )
+    wrong = FAULTS[fault](silicone, rng)
+    assert misspecification_hypotheses(wrong)[0].cause in FAULTS[fault].causes
+    assert any(
+        "expected 10 to" in note or "expected 0.0001" in note
+        for note in wrong.notes
+    )
+
+
+# The nodes of a grasp -----------------------------------------------------------------------------
+
+
+def held_of(points_m: np.ndarray, below_m: float) -> Problem:
+    experiment = soft("block").experiments[0]
+    mesh = replace_points(experiment.body, points_m)
+    nodes = np.flatnonzero(mesh.nodes_m[:, 2] > below_m)
+    return replace(
+        experiment, body=mesh, grasps=[Grasp(nodes, experiment.grasps[0].poses)]
+    )
+
+
+def replace_points(body: Body, points_m: np.ndarray) -> Body:
+    return Body(
+        type(body.mesh)(points_m, body.mesh.tetrahedra), density_kg_m3=30.0
+    )
+
+
+def test_a_layer_is_held_for_sure():
+    (hold,) = check_grasps(soft("block").experiments[0], 0.03)
+    assert (hold.nodes, hold.nearly_grasped, hold.nearly_free) == (9, 0, 0)
+    assert hold.share == pytest.approx(9 / 36)
+    assert grasp_concerns(hold) == []
+
+
+def test_nodes_at_the_edge_of_the_box_are_warned_of():
+    points_m = np.array(box(*BODIES["block"]).mesh.points_m)
+    top = np.flatnonzero(points_m[:, 2] > 0.089)
+    points_m[top[:3], 2] -= 6e-4
+    missed = held_of(points_m, 0.0895)
+    (hold,) = check_grasps(missed, 0.03)
+    assert (hold.nodes, hold.nearly_grasped) == (6, 3)
+    assert (
+        "enlarged by a tenth of an element's edge"
+        in grasp_concerns(hold)[0].message
+    )
+
+
+# After solving ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_a_good_fit_has_no_cause(name: str):
+    assert find_misspecifications(solve(soft(name))) == ()
+
+
+@pytest.mark.long
+def test_a_clock_that_is_estimated_is_told(rng):
+    problem = FAULTS["clock 10 ms late"](soft("bar"), rng)
+    reasons = run(problem).trust.reasons
+    assert any(
+        "ms" in said and "than their times state" in said for said in reasons
+    ), reasons
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "fault",  # of gravity `test_trust` asks for the verdict and the cause
+    [
+        pytest.param(f, marks=pytest.mark.slow) if f == "gravity" else f
+        for f in AFTER
+    ],
+)
+def test_a_wrong_description_is_named_after_solving(fault: str, rng):
+    causes = find_misspecifications(solve(FAULTS[fault](soft("bar"), rng)))
+    assert causes, fault
+    assert causes[0].cause in FAULTS[fault].causes
+    assert causes[0].strength > 1.5
+
+
+# On the command line ------------------------------------------------------------------------------
+
+
+def test_check_does_not_call_a_doubtful_problem_valid(tiny: Path):
+    late = 'start = "equilibrium"\ngravity_m_s2 = [0.0, 0.0, -9.81]\n'
+    replace_text('name = "swing"\n', f'name = "swing"\n{late}')(tiny)
+    low, mid = "low = [0.0, 0.0, 0.0]", "mid = [0.03, 0.02, 0.03]"
+    both(
+        replace_text(low, "LOW"), replace_text(mid, mid.replace("mid", "low"))
+    )(tiny)
+    replace_text("LOW", low.replace("low", "mid"))(tiny)
+    outcome = run_command("check", "problem.toml")
+    assert outcome.code == 1
+    flat = " ".join(outcome.out.split())
+    assert "The problem is valid" not in flat
+    assert "looks wrong: 'swing': the names of markers are exchanged" in flat
+    assert "grasp of 'swing' 9 nodes, 25% of all" in flat
+
+
+def test_a_refusal_names_the_likeliest_cause(tiny: Path):
+    file = tiny / "swing_motion.csv"
+    rows = file.read_text().splitlines()
+    moved = [rows[0]]
+    for row in rows[1:]:
+        cells = row.split(",")
+        cells[1:4] = [str(1e3 * (float(x) + 0.5)) for x in cells[1:4]]
+        moved.append(",".join(cells))
+    file.write_text("\n".join(moved) + "\n")
+    tracks = tiny / "swing_markers.csv"
+    rows = tracks.read_text().splitlines()
+    shifted = [rows[0]]
+    for row in rows[1:]:
+        t, *cells = row.split(",")
+        shifted.append(",".join([t, *(str(float(x) + 0.5) for x in cells)]))
+    tracks.write_text("\n".join(shifted) + "\n")
+    outcome = run_command("check", "problem.toml")
+    assert outcome.code == 2
+    said = " ".join(outcome.err.split())
+    assert "from the pose of the grasp" in said
+    assert (
+        "likely 'swing': the poses would fit if they were 0.001 times as large"
+        in said
+    )
