@@ -1,8 +1,10 @@
 """Table of mistakes in descriptions and data: what `check` reports, and what `solve` reports.
 
-Every mistake of `wrong_twins` is made in a right problem: in twins of two small bodies seen by
-markers, in twins that also have a force sensor, and, of obstacles, in two shipped problems. Right
-problems of several seeds stand first: a report there is a false alarm.
+Every mistake is made in a correct problem: in twins of a soft bar with markers (`twins`), also with
+a force sensor, in twins with depth images (`depth_twins`), and in twins with an obstacle
+(`contact_twins`). Correct problems of several seeds stand first: a report there is a false alarm.
+
+    python scripts/study_mistakes.py [--groups tracks wrench depth obstacle] [--only NAME]
 """
 
 from __future__ import annotations
@@ -10,147 +12,347 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
+import contact_twins
+import depth_twins
 import numpy as np
 from twins import BODIES, SOFT, sensing_twin, twin
-from wrong_twins import (
-    FAULTS,
-    OBSTACLE_FAULTS,
-    TRACK_FAULTS,
-    WRENCH_FAULTS,
-    Fault,
-)
+from wrong_cameras import DEPTH_FAULTS, MOVING_FAULTS
+from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
+from wrong_twins import FAULTS, TRACK_FAULTS, WRENCH_FAULTS, Fault
 
 from collocation_sysid.errors import InputError, SimulationError
+from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
-from collocation_sysid.runs.check import misspecification_hypotheses
+from collocation_sysid.runs.check import (
+    depth_image_hypotheses,
+    may_be_images,
+    misspecification_hypotheses,
+)
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
+    Hypothesis,
     rank,
 )
 from collocation_sysid.statistics.misspecification.wrench_causes import (
     wrench_mistakes,
 )
 
-PROBLEMS = Path(__file__).parents[1] / "problems"
-# Of the twelve places of the poked block two are enough.
-PLACES = 2
-RIGHT = "none"
-NOTHING = Fault(lambda experiment, rng: experiment, ())
+# Seed of the random choices of a mistake, such as which markers are exchanged.
+FAULT_SEED = 3
+# Seed of the correct problem in which mistakes are made.
+PROBLEM_SEED = 1
+# Number of causes that a cell shows.
+SHOWN_CAUSES = 2
+
+
+@dataclass(frozen=True)
+class Family:
+    """Correct problems of one kind, and the mistakes that are made in them.
+
+    Attributes
+    ----------
+    group, name : str
+        The group that `--groups` selects, and the name of the kind.
+    make : callable
+        Returns the correct problem of a seed.
+    faults : mapping of name to Fault
+    parameter : str
+        Estimated parameter that is compared with the truth.
+    truth : float
+        Its true value.
+    """
+
+    group: str
+    name: str
+    make: Callable[[int], Problem]
+    faults: Mapping[str, Fault]
+    parameter: str
+    truth: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the table.
+
+    Attributes
+    ----------
+    name : str
+    checked, solved : str
+        What `check` and `solve` report; the second is empty if it was left out.
+    is_right : bool
+        Whether the problem has no mistake.
+    is_reported : bool
+        Whether `check` names a cause, or refuses the problem.
+    is_good : bool
+        Whether `solve` rates the answer "good".
+    """
+
+    name: str
+    checked: str
+    solved: str
+    is_right: bool
+    is_reported: bool
+    is_good: bool
+
+
+@dataclass(frozen=True)
+class SolveReport:
+    """Verdict of `solve` and its reasons as text, and whether the verdict is "good"."""
+
+    text: str
+    is_good: bool
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    options = _options()
+    began_s = time.perf_counter()
+    print(
+        _line(["mistake", "`check`", "`solve`"]), _line(["---"] * 3), sep="\n"
+    )
+    rows = []
+    for row in table_rows(
+        families(options.body, options.samples),
+        groups=options.groups,
+        seeds=options.seeds,
+        only=options.only,
+        is_solved=not options.check_only,
+    ):
+        print(_line([row.name, row.checked, row.solved]), flush=True)
+        rows.append(row)
+    print(f"\n{summary(rows)}; {time.perf_counter() - began_s:.0f} s")
+
+
+def _options() -> argparse.Namespace:
+    """Return the options of the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    groups = ["tracks", "wrench", "depth", "obstacle"]
+    parser.add_argument("--groups", nargs="+", choices=groups, default=groups)
     parser.add_argument("--body", choices=list(BODIES), default="bar")
     parser.add_argument("--samples", type=int, default=40)
     parser.add_argument(
-        "--seeds", type=int, default=5, help="of right problems"
+        "--seeds", type=int, default=5, help="of correct problems"
     )
     parser.add_argument(
-        "--only", default="", help="mistakes whose name contains this"
+        "--only", default="", help="rows whose name contains this"
     )
     parser.add_argument(
         "--check-only", action="store_true", help="leave out what solve reports"
     )
-    given = parser.parse_args()
-    began, counts = time.perf_counter(), [0, 0, 0]
-    print(
-        _line(["mistake", "`check`", "`solve`"]),
-        _line(["---"] * 3),
-        sep="\n",
-        flush=True,
-    )
-    for name, fault, problem in cases(given.body, given.samples, given.seeds):
-        if given.only not in name:
-            continue
-        rng = np.random.default_rng(3)
-        try:
-            wrong = fault(problem, rng)
-            checked = named(found := checked_causes(wrong))
-        except (InputError, SimulationError) as error:
-            found, checked = (), f"refused: {error}"
-        right = name.startswith(RIGHT)
-        counts[0] += not right
-        counts[1] += not right and (
-            bool(found) or checked.startswith("refused")
-        )
-        counts[2] += right and bool(found)
-        solved = "" if given.check_only else solved_report(wrong)
-        print(_line([name, checked, solved]), flush=True)
-    of = f"{counts[1]} of {counts[0]} mistakes reported by check, {counts[2]} false alarms"
-    print(f"\n{of}; {time.perf_counter() - began:.0f} s")
+    return parser.parse_args()
 
 
-def cases(
-    body: str, samples: int, seeds: int
-) -> Iterator[tuple[str, Fault, Problem]]:
-    """Yield every mistake with a right problem to make it in."""
-    for seed in range(1, seeds + 1):
-        yield f"{RIGHT}, seed {seed}", NOTHING, twin(body, SOFT, seed, samples)
-        yield (
-            f"{RIGHT}, with a sensor, seed {seed}",
-            NOTHING,
-            sensing_twin(body, SOFT, seed, samples),
-        )
-    seen, felt = (
-        twin(body, SOFT, 1, samples),
-        sensing_twin(body, SOFT, 1, samples),
+def families(body: str, samples: int) -> list[Family]:
+    """Return all kinds of problems; the arguments are the body and the number of samples of those
+    with markers.
+    """
+    shear_pa = SOFT["mu_pa"]
+    bar_pa = depth_twins.TRUTH["young_pa"]
+    block_pa = contact_twins.TRUTH["young_pa"]
+    return [
+        Family(
+            "tracks",
+            "markers",
+            lambda seed: twin(body, SOFT, seed, samples),
+            {**FAULTS, **TRACK_FAULTS},
+            "mu_pa",
+            shear_pa,
+        ),
+        Family(
+            "wrench",
+            "markers and sensor",
+            lambda seed: sensing_twin(body, SOFT, seed, samples),
+            WRENCH_FAULTS,
+            "mu_pa",
+            shear_pa,
+        ),
+        Family(
+            "depth",
+            "one depth image",
+            depth_twins.hanging_twin,
+            DEPTH_FAULTS,
+            "young_pa",
+            bar_pa,
+        ),
+        Family(
+            "depth",
+            "depth images of a motion",
+            depth_twins.swinging_twin,
+            MOVING_FAULTS,
+            "young_pa",
+            bar_pa,
+        ),
+        Family(
+            "obstacle",
+            "indentation",
+            contact_twins.poked_twin,
+            POKING_FAULTS,
+            "young_pa",
+            block_pa,
+        ),
+        Family(
+            "obstacle",
+            "block on a plate",
+            contact_twins.sheared_twin,
+            PLATE_FAULTS,
+            "young_pa",
+            block_pa,
+        ),
+    ]
+
+
+def table_rows(
+    kinds: Sequence[Family],
+    *,
+    groups: Sequence[str],
+    seeds: int,
+    only: str,
+    is_solved: bool,
+) -> Iterator[Row]:
+    """Yield the rows of all correct problems, then those of all mistakes.
+
+    Parameters
+    ----------
+    kinds : sequence of Family
+    groups : sequence of str
+        Groups of the families that are included.
+    seeds : int
+        Number of correct problems of each kind.
+    only : str
+        Text that the names of the rows contain.
+    is_solved : bool
+        Whether the problems are solved.
+    """
+    chosen = [family for family in kinds if family.group in groups]
+    for family in chosen:
+        for seed in range(1, seeds + 1):
+            name = f"none: {family.name}, seed {seed}"
+            if only in name:
+                yield table_row(name, family, None, seed, is_solved=is_solved)
+    for family in chosen:
+        for name, fault in family.faults.items():
+            if only in name:
+                yield table_row(
+                    name, family, fault, PROBLEM_SEED, is_solved=is_solved
+                )
+
+
+def table_row(
+    name: str,
+    family: Family,
+    fault: Fault | None,
+    seed: int,
+    *,
+    is_solved: bool,
+) -> Row:
+    """Return the row of a problem with a mistake, or without one (None).
+
+    Parameters
+    ----------
+    name : str
+        Name of the row.
+    family : Family
+    fault : Fault or None
+    seed : int
+        Of the correct problem.
+    is_solved : bool
+        Whether the problem is solved.
+    """
+    problem = family.make(seed)
+    causes: tuple[Hypothesis, ...] = ()
+    refusal = ""
+    try:
+        if fault is not None:
+            problem = fault(problem, np.random.default_rng(FAULT_SEED))
+        causes = checked_causes(problem)
+    except (InputError, SimulationError) as error:
+        refusal = f"refused: {error}"
+    report = (
+        solve_report(problem, family) if is_solved else SolveReport("", False)
     )
-    yield from (
-        (name, fault, seen)
-        for name, fault in {**FAULTS, **TRACK_FAULTS}.items()
-    )
-    yield from ((name, fault, felt) for name, fault in WRENCH_FAULTS.items())
-    laid = Problem.read(PROBLEMS / "laid_block" / "problem.toml")
-    poked = Problem.read(PROBLEMS / "poked_block" / "problem.toml")
-    poked = replace(poked, experiments=poked.experiments[:PLACES])
-    for problem in (laid, poked):
-        yield f"{RIGHT}, {problem.title}", NOTHING, problem
-    yield (
-        "obstacle: normal reversed",
-        OBSTACLE_FAULTS["obstacle: normal reversed"],
-        laid,
-    )
-    yield (
-        "obstacle: load reversed",
-        OBSTACLE_FAULTS["obstacle: load reversed"],
-        poked,
+    return Row(
+        name,
+        refusal or named(causes),
+        solved=report.text,
+        is_right=fault is None,
+        is_reported=bool(causes) or bool(refusal),
+        is_good=report.is_good,
     )
 
 
-def checked_causes(problem: Problem) -> tuple:
+def checked_causes(problem: Problem) -> tuple[Hypothesis, ...]:
     """Return the causes that `check` lists."""
     causes = misspecification_hypotheses(problem)
-    return causes or rank(wrench_mistakes(problem.collocation()))
+    has_images = any(e.depths for e in problem.experiments)
+    if causes and not (has_images and may_be_images(causes)):
+        return causes
+    collocation = problem.collocation()
+    if has_images:
+        variables, _ = initial_variables(collocation)
+        mistakes = depth_image_hypotheses(
+            problem, collocation.iterates(variables)
+        )
+        causes = rank((*causes, *mistakes))
+    return causes or rank(wrench_mistakes(collocation))
 
 
-def solved_report(problem: Problem) -> str:
-    """Return the verdict of `solve` and the likely causes that it names."""
+def solve_report(problem: Problem, family: Family) -> SolveReport:
+    """Return the verdict of `solve` with the likely causes that it names, or with the status of
+    the search; a "good" one also with the estimate over the truth.
+    """
     try:
         answer = run(problem)
     except (InputError, SimulationError) as error:
-        return f"refused: {error}"
-    causes = (
-        named(answer.causes) if answer.causes else answer.solution.status.value
+        return SolveReport(f"refused: {error}", False)
+    status = answer.solution.status.value
+    reason = named(answer.causes) if answer.causes else status
+    verdict = answer.trust.verdict
+    if verdict != "good":
+        return SolveReport(f"{verdict}: {reason}", False)
+    ratio = answer.estimates[family.parameter].value / family.truth
+    return SolveReport(
+        f"{verdict}: {reason}, {family.parameter} {ratio:.3g} of the truth",
+        True,
     )
-    return f"{answer.trust.verdict}: {causes}"
 
 
-def named(causes: Sequence) -> str:
+def named(causes: Sequence[Hypothesis]) -> str:
     """Return the likeliest causes with the factors by which the misfit falls without them."""
-    shown = (f"{each.code} ({each.strength:.2g})" for each in causes[:2])
+    shown = (
+        f"{each.code} ({each.strength:.2g})" for each in causes[:SHOWN_CAUSES]
+    )
     return ", ".join(shown) or "nothing"
 
 
-def _line(cells: Sequence[str]) -> str:
-    return (
-        "| "
-        + " | ".join(" ".join(cell.split()).replace("|", "/") for cell in cells)
-        + " |"
+def summary(rows: Sequence[Row]) -> str:
+    """Return the numbers of mistakes that are reported or rated good, and of false alarms."""
+    counts = Counter(
+        (row.is_right, key)
+        for row in rows
+        for key, counted in (
+            ("all", True),
+            ("reported", row.is_reported),
+            ("good", row.is_good),
+        )
+        if counted
     )
+    return (
+        f"{counts[False, 'reported']} of {counts[False, 'all']} mistakes reported by check, "
+        f"{counts[False, 'good']} rated good by solve; {counts[True, 'reported']} false alarms in "
+        f"{counts[True, 'all']} correct problems, {counts[True, 'good']} rated good"
+    )
+
+
+def _line(cells: Sequence[str]) -> str:
+    """Return one row of a Markdown table."""
+    plain = (" ".join(cell.split()).replace("|", "/") for cell in cells)
+    return f"| {' | '.join(plain)} |"
 
 
 if __name__ == "__main__":

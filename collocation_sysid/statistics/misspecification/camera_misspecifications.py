@@ -28,8 +28,9 @@ from .misspecification_hypothesis import Hypothesis
 HARDLY = 0.1
 # Share from which on it is well visible.
 WELL = 0.5
-# Descriptions whose share is smaller than the best by less than this are not distinguishable.
-EQUIVALENT_MISFIT = 0.1
+# Descriptions whose share is smaller than the best by less than this are not distinguishable,
+# because the undeformed body is compared with points of the deformed one.
+EQUIVALENT_MISFIT = 0.35
 # The axes of a camera in frames of other conventions: right, down and ahead in columns.
 FRAMES = {
     "x to the right, y up, z backwards": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
@@ -86,6 +87,13 @@ def _rotated(
     return replace(seeing, pose=pose)
 
 
+def _with_transposed_rotation(seeing: CameraDescription) -> CameraDescription:
+    """Return the description with the rotation of the camera's pose transposed."""
+    pose = seeing.pose.copy()
+    pose[:3, :3] = pose[:3, :3].T
+    return replace(seeing, pose=pose)
+
+
 def _with_factor(seeing: CameraDescription, factor: float) -> CameraDescription:
     """Return the description with another factor of the points."""
     return replace(seeing, factor=factor)
@@ -116,6 +124,11 @@ MISTAKES: tuple[dict[str, Undo], ...] = (
         ),
         "its points were larger by 1000 (state count_m or length_unit)": (
             lambda s: replace(s, factor=1 / MILLI)
+        ),
+    },
+    {
+        "camera.pose had a transposed rotation (state its rotation row by row)": (
+            _with_transposed_rotation
         ),
     },
     {"camera.pose were in mm (state it in m)": partial(_scaled, factor=MILLI)},

@@ -25,6 +25,9 @@ from ...program.modes.modal_prediction import DeclaredMotion
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...recording.poses import PoseSequence
+from .camera_clock_misspecifications import camera_clock_hypotheses
+from .camera_image_misspecifications import camera_image_hypotheses
+from .camera_misspecifications import camera_hypotheses
 from .misspecification_hypothesis import (
     Hypothesis,
     HypothesisTest,
@@ -36,12 +39,16 @@ from .modal_misspecifications import (
     find_misspecifications_by_modes,
     gravity_hypotheses,
 )
+from .obstacle_misspecifications import obstacle_hypotheses
 from .plausibility import load_sign_hypotheses
 from .specimen_misspecifications import find_specimen_misspecifications
 from .wrench_causes import wrench_causes
 
 # RMS residual in standard deviations up to which there is nothing to explain.
 NOISE = 1.15
+# RMS distance of depth points in standard deviations up to which there is nothing to explain: noise
+# along the normal is rarely known better.
+DEPTH_NOISE = 1.5
 # Factor by which the misfit of a refit must decrease, unless only noise remains.
 BETTER = 1.5
 # Factor by which two means, before and after, must explain residuals better than one.
@@ -97,7 +104,9 @@ def find_misspecifications(
     hypotheses = [
         *wrench_causes(solution),
         *(cause for e in fitted for cause in load_sign_hypotheses(e)),
+        *(cause for e in fitted for cause in obstacle_hypotheses(e)),
         *find_specimen_misspecifications(solution),
+        *_camera_hypotheses(solution),
     ]
     if max(misfits) > NOISE:
         worst = fitted[int(np.argmax(misfits))]
@@ -107,6 +116,32 @@ def find_misspecifications(
         if max((each.strength for each in hypotheses), default=0.0) < CERTAIN:
             hypotheses += _refit_hypotheses(solution, worst, budget=budget)
     return rank(hypotheses)
+
+
+def _camera_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
+    """Yield hypotheses about the depth cameras of those experiments that do not fit."""
+    constants = solution.parameters
+    for part in solution.parts:
+        if not any(
+            _misses_surface(
+                reading.signed_distances_m(observation, part.phi)
+                / reading.correspondences.camera.depth.sigma_m
+            )
+            for reading, observation in part.depth_residuals
+        ):
+            continue
+        experiment = part.segment.experiment
+        yield from camera_hypotheses(experiment)
+        yield from camera_clock_hypotheses(part)
+        yield from camera_image_hypotheses(experiment, constants)
+
+
+def _misses_surface(distances: Array) -> bool:
+    """Whether the distances of depth points from the surface, in standard deviations, are larger
+    than noise; also if none is compared (all NaN).
+    """
+    compared = distances[np.isfinite(distances)]
+    return not len(compared) or root_mean(compared**2) > DEPTH_NOISE
 
 
 def _refit_hypotheses(

@@ -6,16 +6,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import casadi as ca
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ...common.array_types import Array
 from ...recording.experiment import Experiment
 from ...recording.obstacle import Obstacle
 from ...recording.obstacle_solids import Plane
 from .misspecification_hypothesis import Hypothesis
+from .obstacle_misspecifications import signed_distances_m
 
 # Depth in a solid from which on a node is inside, over the body's diagonal.
 DEEP = 0.01
@@ -75,7 +74,9 @@ def _containing(
         0, : len(experiment.body.nodes.points_m)
     ]
     rotations, translations_m = obstacle.poses.at(experiment.t_s[:1])
-    gaps_m = _gaps_m(obstacle, (nodes_m - translations_m[0]) @ rotations[0])
+    gaps_m = signed_distances_m(
+        obstacle, (nodes_m - translations_m[0]) @ rotations[0]
+    )
     deep_m = DEEP * float(np.linalg.norm(np.ptp(nodes_m, axis=0)))
     share = float((gaps_m < -deep_m).mean())
     if share <= MOST_INSIDE:
@@ -88,14 +89,3 @@ def _containing(
     yield Hypothesis(
         code, f"'{experiment.name}'", data=data, strength=100 * share
     )
-
-
-def _gaps_m(obstacle: Obstacle, points_m: Array) -> Array:
-    """Return the signed distances (n,) of points (n, 3) in an obstacle's frame from its
-    surface [m], negative inside.
-    """
-    point = ca.SX.sym("point", 3)
-    gap = ca.Function("gap", [point], [obstacle.shape.signed_distance(point)])
-    return np.asarray(
-        gap.map(len(points_m))(points_m.T), dtype=np.float64
-    ).ravel()

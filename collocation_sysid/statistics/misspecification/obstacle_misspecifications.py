@@ -1,0 +1,305 @@
+"""Misspecification hypotheses about obstacles that contradict their measured loads.
+
+No simulation is needed: contact without adhesion only pushes, friction is within its cone, and the
+load of a body that nothing deforms does not change. In static tests without gravity, where the body
+is undeformed until something touches it, a load also needs a contact, and deep contact a load.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import casadi as ca
+import numpy as np
+
+from ...common.array_types import Array
+from ...recording.experiment import Experiment
+from ...recording.obstacle import Obstacle
+from ...recording.obstacle_solids import Plane
+from .misspecification_hypothesis import Hypothesis
+
+# Loads in standard deviations of their noise from which on they are loads.
+LOADED = 6.0
+# Share of the largest load that calibration and axes may be off.
+CALIBRATION = 0.1
+# Fewest samples that contradict the description.
+FEWEST_SAMPLES = 2
+# Distance over the body's diagonal that need not be known.
+PLACE = 0.05
+# Depth in the undeformed body, over its motion, up to which an obstacle does not press on it.
+PRESSING = 0.05
+# Motion of an obstacle over the body's diagonal that no static test has.
+LARGEST_STROKE = 10.0
+# Most samples at which gaps are computed, evenly spread.
+MOST_SAMPLES = 30
+
+
+def obstacle_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Yield hypotheses about the obstacles of an experiment; mostly none."""
+    for obstacle in experiment.obstacles:
+        strokes = list(_long_stroke(experiment, obstacle))
+        yield from strokes
+        if obstacle.wrench is None or strokes:
+            continue
+        yield from _pulling(experiment, obstacle)
+        yield from _outside_friction_cone(experiment, obstacle)
+        if experiment.is_static and not experiment.actuators:
+            yield from _undriven_load(experiment, obstacle)
+            if not experiment.gravity_m_s2.any():
+                yield from _load_without_contact(experiment, obstacle)
+
+
+def signed_distances_m(obstacle: Obstacle, points_m: Array) -> Array:
+    """Return the signed distances (n,) of points (n, 3) in an obstacle's frame from its
+    surface [m], negative inside.
+    """
+    point = ca.SX.sym("point", 3)
+    gap = ca.Function("gap", [point], [obstacle.shape.signed_distance(point)])
+    return np.asarray(
+        gap.map(len(points_m))(points_m.T), dtype=np.float64
+    ).ravel()
+
+
+def _diagonal_m(experiment: Experiment) -> float:
+    """Return the diagonal of the undeformed body [m]."""
+    nodes_m = experiment.body.nodes.points_m
+    return float(np.linalg.norm(np.ptp(nodes_m, axis=0)))
+
+
+def _subject(experiment: Experiment, obstacle: Obstacle) -> str:
+    """Return the names of an obstacle and its experiment, for messages."""
+    return f"obstacle '{obstacle.name}' of '{experiment.name}'"
+
+
+def _world_forces_n(obstacle: Obstacle) -> Array:
+    """Return the measured forces (S, 3) of an obstacle on the body in world axes [N], NaN where a
+    component is missing.
+    """
+    wrench = obstacle.wrench
+    assert wrench is not None
+    forces_n = wrench.values[:, :3]
+    if wrench.frame == "world":
+        return np.array(forces_n)
+    rotations, _ = obstacle.poses.at(wrench.t_s)
+    return np.einsum("sij,sj->si", rotations, forces_n)
+
+
+def _noise_n(experiment: Experiment, obstacle: Obstacle) -> float:
+    """Return the force that noise and tare explain [N]."""
+    wrench = obstacle.wrench
+    assert wrench is not None
+    tare = experiment.nuisance.tare or 0.0
+    return LOADED * float(np.hypot(1.0, tare)) * wrench.sigma_n
+
+
+def _normal_and_tangential_n(obstacle: Obstacle) -> tuple[Array, Array]:
+    """Return the components (S,) of the measured force along the normal of a plane and across it
+    [N]; empty for other shapes, and without samples of all components.
+    """
+    shape = obstacle.shape
+    wrench = obstacle.wrench
+    if not isinstance(shape, Plane) or wrench is None:
+        return np.zeros(0), np.zeros(0)
+    forces_n = _world_forces_n(obstacle)
+    complete = np.isfinite(forces_n).all(axis=1)
+    rotations, _ = obstacle.poses.at(wrench.t_s[complete])
+    normals = rotations @ shape.normal
+    normal_n = np.sum(forces_n[complete] * normals, axis=1)
+    across_n = forces_n[complete] - normal_n[:, None] * normals
+    return normal_n, np.linalg.norm(across_n, axis=1)
+
+
+def _pulling(
+    experiment: Experiment, obstacle: Obstacle
+) -> Iterator[Hypothesis]:
+    """Yield the hypothesis that the load of an obstacle has a wrong sign or zero, because it pulls
+    at the body.
+    """
+    limit_n = _noise_n(experiment, obstacle)
+    pushing_n, _ = _normal_and_tangential_n(obstacle)
+    if not len(pushing_n):
+        pushing_n = _load_along_motion_n(experiment, obstacle)
+    if not len(pushing_n):
+        return
+    largest_n = float(np.abs(pushing_n).max())
+    pulls = pushing_n < -max(limit_n, CALIBRATION * largest_n)
+    if np.count_nonzero(pulls) < FEWEST_SAMPLES:
+        return
+    data = {
+        "pull_n": -float(pushing_n.min()),
+        "samples": int(pulls.sum()),
+        "of_samples": len(pushing_n),
+    }
+    yield Hypothesis(
+        "obstacle-pull",
+        _subject(experiment, obstacle),
+        data=data,
+        strength=-float(pushing_n.min()) / limit_n,
+    )
+
+
+def _load_along_motion_n(experiment: Experiment, obstacle: Obstacle) -> Array:
+    """Return the load (S,) of an obstacle that advances along one axis of the world [N], positive
+    if it pushes; empty if it does not, or the experiment moves.
+    """
+    wrench = obstacle.wrench
+    if wrench is None or not experiment.is_static:
+        return np.zeros(0)
+    _, shifts_m = obstacle.poses.at(wrench.t_s)
+    stroke_m = shifts_m[-1] - shifts_m[0]
+    axis = int(np.abs(stroke_m).argmax())
+    monotonic = np.abs(np.diff(shifts_m[:, axis])).sum() <= 1.01 * np.abs(
+        stroke_m[axis]
+    )
+    if not stroke_m[axis] or not monotonic:
+        return np.zeros(0)
+    load_n = np.sign(stroke_m[axis]) * _world_forces_n(obstacle)[:, axis]
+    return load_n[np.isfinite(load_n)]
+
+
+def _outside_friction_cone(
+    experiment: Experiment, obstacle: Obstacle
+) -> Iterator[Hypothesis]:
+    """Yield the hypothesis that the friction of a plane is stated too small for its load."""
+    if isinstance(obstacle.friction, str):
+        return
+    normal_n, tangential_n = _normal_and_tangential_n(obstacle)
+    if not len(normal_n):
+        return
+    limit_n = _noise_n(experiment, obstacle)
+    excess_n = tangential_n - obstacle.friction * np.maximum(normal_n, 0.0)
+    is_loaded = normal_n > limit_n
+    outside = is_loaded & (excess_n > limit_n + CALIBRATION * normal_n)
+    if np.count_nonzero(outside) < FEWEST_SAMPLES:
+        return
+    ratio = float(np.max(tangential_n[outside] / normal_n[outside]))
+    data = {"ratio": ratio, "stated": float(obstacle.friction)}
+    yield Hypothesis(
+        "obstacle-friction",
+        _subject(experiment, obstacle),
+        data=data,
+        strength=float(excess_n.max()) / limit_n,
+    )
+
+
+def _undriven_load(
+    experiment: Experiment, obstacle: Obstacle
+) -> Iterator[Hypothesis]:
+    """Yield the hypothesis that an obstacle moves, because its load changes although nothing
+    does.
+    """
+    wrench = obstacle.wrench
+    assert wrench is not None
+    times_s = wrench.t_s
+    motions = [
+        part for grasp in experiment.grasps for part in grasp.poses.at(times_s)
+    ]
+    loads = [
+        experiment.declared_node_forces_n(times_s),
+        experiment.point_mass_at_nodes_kg(times_s),
+    ]
+    changes = any(
+        np.ptp(each, axis=0).max(initial=0.0) > 1e-9
+        for each in (*motions, *loads)
+    )
+    forces_n = wrench.values[:, :3]
+    measured = np.isfinite(forces_n).all(axis=0)
+    change_n = float(np.ptp(forces_n[:, measured], axis=0).max(initial=0.0))
+    limit_n = 2 * LOADED * wrench.sigma_n
+    if not changes and change_n > limit_n:
+        yield Hypothesis(
+            "obstacle-fixed",
+            _subject(experiment, obstacle),
+            data={"change_n": change_n},
+            strength=change_n / limit_n,
+        )
+
+
+def _long_stroke(
+    experiment: Experiment, obstacle: Obstacle
+) -> Iterator[Hypothesis]:
+    """Yield the hypothesis that the motion of an obstacle is in another unit, because it is far
+    longer than the body; none for a motion.
+    """
+    if not experiment.is_static:
+        return
+    stroke_m = _stroke_m(obstacle, experiment.t_s)
+    ratio = stroke_m / _diagonal_m(experiment)
+    if ratio > LARGEST_STROKE:
+        data = {"stroke_m": stroke_m, "size_m": _diagonal_m(experiment)}
+        yield Hypothesis(
+            "obstacle-stroke",
+            _subject(experiment, obstacle),
+            data=data,
+            strength=ratio,
+        )
+
+
+def _stroke_m(obstacle: Obstacle, times_s: Array) -> float:
+    """Return the diagonal of the box of an obstacle's shifts at times (S,) [s], in metres."""
+    _, shifts_m = obstacle.poses.at(times_s)
+    return float(np.linalg.norm(np.ptp(shifts_m, axis=0)))
+
+
+def _load_without_contact(
+    experiment: Experiment, obstacle: Obstacle
+) -> Iterator[Hypothesis]:
+    """Yield the hypothesis that an obstacle is elsewhere, because it has loads far from the
+    undeformed body, none deep inside, or loads without ever pressing.
+    """
+    wrench = obstacle.wrench
+    assert wrench is not None
+    spread = np.linspace(
+        0, len(wrench.t_s) - 1, min(len(wrench.t_s), MOST_SAMPLES)
+    )
+    samples = np.unique(spread.astype(int))
+    forces_n = wrench.values[samples, :3]
+    load_n = np.sqrt(np.nansum(forces_n**2, axis=1))
+    is_measured = np.isfinite(forces_n).any(axis=1)
+    gaps_m = _smallest_gaps_m(experiment, obstacle, wrench.t_s[samples])
+    limit_n = _noise_n(experiment, obstacle)
+    far_m = PLACE * _diagonal_m(experiment)
+    loaded = is_measured & (load_n > limit_n)
+    stroke_m = _stroke_m(obstacle, wrench.t_s)
+    never_presses = bool(-gaps_m.min() < PRESSING * stroke_m)
+    cases = {
+        "far": (loaded & (gaps_m > far_m), float(gaps_m.max())),
+        "deep": (
+            is_measured & ~loaded & (gaps_m < -far_m),
+            -float(gaps_m.min()),
+        ),
+        "never": (loaded & never_presses, stroke_m),
+    }
+    for which, (contradicts, distance_m) in cases.items():
+        needed = 1 if which == "deep" else FEWEST_SAMPLES
+        if loaded.any() and np.count_nonzero(contradicts) >= needed:
+            yield Hypothesis(
+                f"obstacle-load/{which}",
+                _subject(experiment, obstacle),
+                data={"by_mm": 1e3 * distance_m},
+                strength=distance_m / far_m,
+            )
+            return
+
+
+def _smallest_gaps_m(
+    experiment: Experiment, obstacle: Obstacle, times_s: Array
+) -> Array:
+    """Return the smallest signed distance of the undeformed body in its grasps from an obstacle at
+    times (S,) [s], as (S,) [m].
+
+    Corners, edges and faces of the surface are sampled.
+    """
+    body = experiment.body
+    triangles = body.mesh.surface
+    corners = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    middles = np.array([[1, 1, 0], [0, 1, 1], [1, 0, 1]]) / 2
+    weights = np.vstack([corners, middles, np.full((1, 3), 1 / 3)])
+    shapes_m = experiment.rigid_positions(times_s)
+    rotations, translations_m = obstacle.poses.at(times_s)
+    gaps_m = np.zeros(len(times_s))
+    for k, shape_m in enumerate(shapes_m):
+        points_m = (weights @ shape_m[triangles]).reshape(-1, 3)
+        in_frame_m = (points_m - translations_m[k]) @ rotations[k]
+        gaps_m[k] = signed_distances_m(obstacle, in_frame_m).min()
+    return gaps_m

@@ -1,0 +1,200 @@
+"""Correct problems of a soft bar that one depth camera of low resolution observes.
+
+A bar of 120 x 30 x 20 mm is clamped at one end. `hanging_twin` has one image of its sag,
+`swinging_twin` several images of its motion. Each seed has its own noise, and its own error of the
+stated camera pose, drawn from the prior that the problem states.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from collocation_sysid.common.array_types import Array, Index
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.meshes.structured import box_mesh
+from collocation_sysid.model.parameters import Parameters, Unknown
+from collocation_sysid.problem import Problem
+from collocation_sysid.program.depth.visible_surface import VisibleSurface
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.recording import (
+    Depth,
+    DepthCamera,
+    Experiment,
+    Grasp,
+    Nuisance,
+    PoseSequence,
+)
+from collocation_sysid.recording.depth_camera import depth_image
+
+SIZE_M = (0.12, 0.03, 0.02)
+DIVISIONS = (4, 1, 1)
+DENSITY_KG_M3 = 1070.0
+TRUTH = {
+    "young_pa": 1e5,
+    "poisson": 0.4,
+    "gamma_r_s": 5e-3,
+    "gamma_m_1_s": 0.1,
+}
+UNKNOWN = {**TRUTH, "young_pa": Unknown(2e5)}
+# The principal point is beside the middle of the image, as in a cropped one.
+MATRIX = [[260.0, 0.0, 66.0], [0.0, 260.0, 70.0], [0.0, 0.0, 1.0]]
+SHAPE_PX = (120, 160)
+# Noise of the depth of each pixel [m].
+NOISE_M = 3e-4
+# Standard deviation along the normal of the surface, which the rays meet at an angle.
+SIGMA_M = 0.6 * NOISE_M
+# Distance of the points that are compared [m].
+SPACING_M = 0.005
+EYE_M = np.array([0.12, -0.30, 0.16])
+TARGET_M = np.array([0.05, 0.015, 0.0])
+# Standard deviations of the error of the stated camera pose, and its priors.
+TURN_RAD = 0.02
+SHIFT_M = 0.004
+# Samples and step of the motion, and the samples that have an image.
+SAMPLES = 31
+STEP_S = 0.01
+IMAGE_SAMPLES = np.arange(0, SAMPLES, 5)
+
+
+@cache
+def bar() -> Body:
+    """Return the bar; all twins share it, so that its kernels compile once."""
+    return Body(
+        box_mesh(SIZE_M, DIVISIONS),
+        density_kg_m3=DENSITY_KG_M3,
+        element="tet10",
+    )
+
+
+def camera_pose() -> Array:
+    """Return the pose (4, 4) of a camera that looks at the bar from the side and from above."""
+    ahead = (TARGET_M - EYE_M) / np.linalg.norm(TARGET_M - EYE_M)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.column_stack([right, np.cross(ahead, right), ahead, EYE_M])
+    return pose
+
+
+def hanging_twin(seed: int) -> Problem:
+    """Return the problem of one image of the bar that sags at rest."""
+    times_s = np.array([0.0])
+    clamped = PoseSequence.fixed()
+    return _problem(times_s, clamped, image_samples=np.array([0]), seed=seed)
+
+
+def swinging_twin(seed: int) -> Problem:
+    """Return the problem of several images of the bar, whose clamp moves."""
+    times_s: Array = STEP_S * np.arange(SAMPLES, dtype=np.float64)
+    return _problem(
+        times_s, _motion(times_s), image_samples=IMAGE_SAMPLES, seed=seed
+    )
+
+
+def _motion(times_s: Array) -> PoseSequence:
+    """Return a motion of the clamp from rest, in translation and rotation, at times (T,) [s]."""
+    rise = times_s**2 / (times_s**2 + 0.08**2)
+    waves = np.sin(2 * np.pi * np.outer(times_s, [2.0, 2.7, 3.3]))
+    positions_m = rise[:, None] * waves * np.array([0.01, 0.015, 0.03])
+    turns_rad = rise[:, None] * waves[:, ::-1] * np.array([0.05, 0.2, 0.15])
+    return PoseSequence(
+        times_s, positions_m, Rotation.from_rotvec(turns_rad).as_quat()
+    )
+
+
+def _experiment(
+    times_s: Array, clamp: PoseSequence, depth: Depth
+) -> Experiment:
+    """Return the experiment of the bar in a clamp that a camera observes."""
+    held = Grasp(np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), clamp)
+    return Experiment(
+        bar(),
+        times_s,
+        [held],
+        name="bar",
+        kind="static" if len(times_s) == 1 else "dynamic",
+        depths=[depth],
+        air_density_kg_m3=0.0,
+        nuisance=Nuisance.none(depth_turn_rad=TURN_RAD, depth_shift_m=SHIFT_M),
+    )
+
+
+def _problem(
+    times_s: Array, clamp: PoseSequence, image_samples: Index, seed: int
+) -> Problem:
+    """Return the problem of one twin.
+
+    Parameters
+    ----------
+    times_s : (T,) array
+        Samples [s].
+    clamp : PoseSequence
+    image_samples : (S,) array of int
+        Indices of the samples that have an image.
+    seed : int
+        Of noise and pose error.
+    """
+    rng = np.random.default_rng(seed)
+    images_m = np.array(
+        _images_m(tuple(times_s), tuple(image_samples))
+    ) + NOISE_M * rng.normal(size=(len(image_samples), *SHAPE_PX))
+    camera = DepthCamera(MATRIX, pose=_stated_pose(rng))
+    depth = Depth.of_images(
+        "front",
+        images_m,
+        camera,
+        SIGMA_M,
+        times_s[image_samples],
+        spacing_m=SPACING_M,
+    )
+    return Problem(
+        [_experiment(times_s, clamp, depth)],
+        Parameters.from_mapping(UNKNOWN),
+        substeps=1,
+    )
+
+
+@cache
+def _images_m(
+    times_s: tuple[float, ...], image_samples: tuple[int, ...]
+) -> Array:
+    """Return the images (S, rows, columns) without noise, NaN beside the bar; cached."""
+    times = np.array(times_s)
+    image_times_s = times[list(image_samples)]
+    blank = Depth(
+        "none", image_times_s, [np.zeros((1, 3))] * len(image_times_s), SIGMA_M
+    )
+    clamp = PoseSequence.fixed() if len(times) == 1 else _motion(times)
+    experiment = _experiment(times, clamp, blank)
+    positions_m = simulate(experiment, TRUTH).positions_m
+    surface = VisibleSurface.from_body(experiment.body, blank)
+    pose = camera_pose()
+    camera = DepthCamera(MATRIX, pose=pose)
+    images_m = []
+    for sample in image_samples:
+        triangles_m = surface.subdivided_triangles(
+            positions_m[sample][surface.nodes]
+        )
+        in_camera_m = (triangles_m - pose[:3, 3]) @ pose[:3, :3]
+        images_m.append(depth_image(camera, SHAPE_PX, in_camera_m))
+    return np.array(images_m)
+
+
+def _stated_pose(rng: np.random.Generator) -> Array:
+    """Return the camera pose (4, 4) with a random error of one standard deviation or less."""
+    pose = camera_pose()
+    turn = Rotation.from_rotvec(TURN_RAD * rng.uniform(-1, 1, 3)).as_matrix()
+    shift_m = SHIFT_M * rng.uniform(-1, 1, 3)
+    stated = pose.copy()
+    stated[:3, :3] = turn @ pose[:3, :3]
+    stated[:3, 3] = turn @ (pose[:3, 3] - TARGET_M) + TARGET_M + shift_m
+    return stated
+
+
+def with_depth(experiment: Experiment, depth: Depth) -> Experiment:
+    """Return the experiment with another description of its only camera."""
+    return replace(experiment, depths=[depth])
