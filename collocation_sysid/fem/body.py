@@ -64,7 +64,8 @@ class Linearisation:
         Lower triangles of the symmetric part of ∂f/∂v [N·s/m]; with Rayleigh damping −γ_r K − γ_m
         M.
     by_theta : (T, 3n, k)
-        Derivatives ∂f/∂θ, or by all k inputs.
+        Derivatives by the k constants θ (result of `Body`), or by all k inputs u (result of the
+        sum of forces in `model.forces`).
     by_position_skew : (T, m) or (T, 0)
         Lower triangles of the skew part of ∂f/∂x; empty if it is zero.
     by_velocity_skew : (T, m) or (T, 0)
@@ -240,9 +241,8 @@ class Body(Discretisation):
 
     @property
     def scan_conditions(self) -> UnderGravity | None:
-        """Gravity and held nodes of the scan of the mesh.
-
-        None if the mesh counts as stress-free.
+        """Gravity and held nodes during the scan of the mesh; None if the mesh counts as stress-free,
+        also where `rest_shape` was not stated.
         """
         return (
             self.rest_shape
@@ -258,7 +258,9 @@ class Body(Discretisation):
         )
 
     def rest_shape_failure(self, theta: Theta) -> str | None:
-        """Return why there is no stress-free shape at θ, with a remedy; None if there is one."""
+        """Return the message of the `RestShapeError` at θ (k,), with a remedy; None if there is a
+        stress-free shape, or if the mesh counts as stress-free.
+        """
         if self.inverse_equilibrium is None:
             return None
         try:
@@ -268,7 +270,15 @@ class Body(Discretisation):
         return None
 
     def stress_free_geometry(self, theta: Theta) -> Array:
-        """Return shape gradients and volumes (E, q, 3·nodes + 1) of the stress-free shape at θ."""
+        """Return shape gradients [1/m] and volumes [m³] (E, q, 3·nodes + 1) of the stress-free shape
+        at
+        θ (k,); `geometry` itself if the mesh counts as stress-free.
+
+        Raises
+        ------
+        RestShapeError
+            If no stress-free shape has the mesh as its equilibrium under gravity.
+        """
         if self.inverse_equilibrium is None:
             return self.geometry
         return self._geometry_at(
@@ -276,12 +286,15 @@ class Body(Discretisation):
         )
 
     def with_stress_free(self, positions_m: Array) -> Body:
-        """Return this body with the same masses and another stress-free shape.
+        """Return a copy of this body with the same masses and another stress-free shape.
+
+        The mesh and `nodes_m` stay the computational reference; only `geometry` is that of the new
+        shape, and `rest_shape` is "stress_free". Kernels are built again at their first use.
 
         Parameters
         ----------
         positions_m : (n, 3)
-            Stress-free positions of the nodes.
+            Stress-free positions of all nodes [m], mid nodes included.
         """
         other = copy(self)
         other.geometry = self._geometry_at(positions_m)
@@ -330,7 +343,9 @@ class Body(Discretisation):
 
     @property
     def density_indices(self) -> list[int]:
-        """Indices in θ of the free densities."""
+        """Indices in θ of the free densities, in the order of the parts; empty if all are
+        stated.
+        """
         pairs = zip(self.parts, self._gamma_m_indices, strict=True)
         return [place + 1 for part, place in pairs if part.has_free_density]
 
@@ -362,12 +377,18 @@ class Body(Discretisation):
         return volume
 
     def with_free_densities(self, parts: Collection[str]) -> Body:
-        """Return this body with the densities of exactly these parts among its constants.
+        """Return a body with the densities of exactly these parts among its constants.
 
         Parameters
         ----------
         parts : collection of str
-            Names of the parts; "" for the cells outside all regions.
+            Names of the parts; "" for the cells outside all regions. Densities of all other parts
+            have their stated values; names that no part has are ignored.
+
+        Returns
+        -------
+        Body
+            This body itself if the densities of exactly these parts are free already.
         """
         free = tuple(
             part
@@ -379,7 +400,9 @@ class Body(Discretisation):
 
     @property
     def field_lengths_m(self) -> dict[str, float]:
-        """Correlation lengths of the fields, by the names of their constants."""
+        """Correlation lengths [m] of the fields, by the names of their constants; empty without
+        fields.
+        """
         return {
             part.field_name: part.field.length_m
             for part in self.parts
@@ -387,8 +410,10 @@ class Body(Discretisation):
         }
 
     def with_field_lengths(self, lengths_m: Mapping[str, float]) -> Body:
-        """Return this body with other correlation lengths [m] of its fields, by the names of the
-        fields' constants; every field must be named.
+        """Return a copy of this body with other correlation lengths [m] of its fields, by the names of
+        the fields' constants (keys of `field_lengths_m`).
+
+        Other names are ignored; a field without a length is a KeyError.
         """
         fields = (
             part.field and part.field.with_length(lengths_m[part.field_name])
@@ -412,9 +437,9 @@ class Body(Discretisation):
         )
 
     def with_fields(self, fields: Mapping[str, FieldModes]) -> Body:
-        """Return this body with other fields, by the names of their constants.
+        """Return a copy of this body with other fields, by the names of their constants.
 
-        Fields that are not named stay.
+        Fields that are not named stay; names of constants without a field are ignored.
         """
         return self.with_parts(
             tuple(
@@ -424,7 +449,12 @@ class Body(Discretisation):
         )
 
     def with_parts(self, parts: tuple[BodyPart, ...]) -> Body:
-        """Return this body with other parts, which have the same cells as before."""
+        """Return a copy of this body with other parts, in the same number and with the same cells.
+
+        Custom forces and friction coefficients stay, and so do stated masses (`node_mass`) and
+        obstacle
+        frames; θ and everything that depends on it follow the new parts.
+        """
         other = copy(self)
         for name in self._cached_names - {
             "pattern",
@@ -443,20 +473,21 @@ class Body(Discretisation):
         has_skew_contact: bool = False,
         frictions: tuple[Constant, ...] = (),
     ) -> Body:
-        """Return this body with the frames of obstacles: four further nodes each, which no cell
-        has.
+        """Return this body with the frames of obstacles: four further nodes each, which no cell has.
 
-        The nodes are at `frame_nodes_m`, after all others, and have no mass. Bodies with frames are
-        cached.
+        The nodes are at `frame_nodes_m`, after all others, and have no mass. Frames and friction
+        coefficients that the body already has are replaced, not extended. The result is this body
+        itself
+        if nothing changes, and the same object for the same arguments.
 
         Parameters
         ----------
         count : int
-            Number of obstacles.
+            Number of obstacles; 0 removes all frames.
         has_skew_contact : bool
             Whether derivatives of the contact forces have a skew part.
         frictions : tuple of Constant
-            Friction coefficients that are parameters.
+            Friction coefficients that are parameters; the last entries of θ.
         """
         key = count, has_skew_contact, frictions
         if key == (len(self.frames), self.has_skew_contact, self.frictions):
@@ -500,7 +531,9 @@ class Body(Discretisation):
 
     @cached_property
     def elastic_indices(self) -> list[int]:
-        """Indices in θ on which the stress depends: constants of the materials, and of fields."""
+        """Indices in θ on which the long-term stress depends: constants of the materials, and
+        coefficients of fields that scale a constant of the material or the damping law.
+        """
         indices: list[int] = []
         for part, start, modes in zip(
             self.parts, self.starts, self.field_slices, strict=False
@@ -513,7 +546,9 @@ class Body(Discretisation):
 
     @property
     def mass_kg(self) -> float:
-        """Total mass with the stated densities [kg]."""
+        """Total mass with the stated densities [kg], without tied masses; free densities and density
+        fields do not change it.
+        """
         return float(self.node_mass.sum())
 
     @cached_property
@@ -552,7 +587,10 @@ class Body(Discretisation):
         return slopes
 
     def densities(self, theta: Theta) -> list[float]:
-        """Return the mean density of each part at θ (k,) [kg/m³]."""
+        """Return the mean density of each part at θ (k,) [kg/m³]: the entry of θ if it is free, else
+        the
+        stated value, which a density field does not change.
+        """
         return [
             float(theta[place + 1])
             if part.has_free_density
@@ -563,7 +601,9 @@ class Body(Discretisation):
         ]
 
     def mass_of_dofs(self, theta: Theta) -> Array:
-        """Return the lumped mass (3n,) of every degree of freedom at θ [kg]."""
+        """Return the lumped mass (3n,) of every degree of freedom at θ (k,) [kg], without tied masses;
+        zero at nodes of obstacle frames.
+        """
         if not self.mass_derivatives:
             return self.dof_mass
         return np.sum(self._part_masses(theta), axis=0)
@@ -620,7 +660,10 @@ class Body(Discretisation):
 
     @cached_property
     def placed_forces(self) -> tuple[LocatedForce, ...]:
-        """Custom forces on their nodes or faces."""
+        """Custom forces on their nodes or faces, in the order of `forces`; a force without `nodes`
+        acts
+        on all nodes. Constants of each are the entries of θ after those of the parts.
+        """
         volume = self.dof_volume_m3[::3]
         first = self.starts[-1]
         placed = []
@@ -666,8 +709,13 @@ class Body(Discretisation):
     def joint_pattern_with(
         self, couplings: Sequence[SymmetricPattern]
     ) -> JointPattern:
-        """Return the union of the mesh graph, other couplings and the couplings of custom
+        """Return the union of the mesh graph with further couplings of nodes and those of custom
         forces.
+
+        Parameters
+        ----------
+        couplings : sequence of SymmetricPattern
+            Couplings of the same dofs by other forces.
         """
         custom = (placed.points.couplings for placed in self.placed_forces)
         return JointPattern.from_patterns((self.pattern, *couplings, *custom))
@@ -693,7 +741,7 @@ class Body(Discretisation):
     def elastic_force(self, positions: ArrayLike, **constants: float) -> Array:
         """Return the elastic force −∂Ψ/∂x, (n, 3) [N], at (n, 3) node positions [m].
 
-        See `energy` for the constants.
+        See `energy` for the constants and errors.
         """
         x = self._state(positions)
         force = self._evaluate(
@@ -706,7 +754,9 @@ class Body(Discretisation):
     ) -> sp.csc_array:
         """Return the stiffness K = ∂²Ψ/∂x², sparse (3n, 3n) [N/m], at (n, 3) node positions [m].
 
-        Row 3i + j is coordinate j of node i. See `energy` for the constants.
+        Both triangles are stored. Row 3i + j is coordinate j of node i. See `energy` for the
+        constants
+        and errors.
         """
         x = self._state(positions)
         theta = self.elastic_theta(constants)
@@ -724,7 +774,9 @@ class Body(Discretisation):
         tied_kg: Array | None = None,
         memory_input: MemoryInput | None = None,
     ) -> Array:
-        """Return the internal force f(x, v; θ), (T, 3n) [N].
+        """Return the internal force f(x, v; θ), (T, 3n) [N]: elastic, viscous and −γ_m M v.
+
+        Weight and custom forces are not included.
 
         Parameters
         ----------
@@ -733,9 +785,18 @@ class Body(Discretisation):
         theta : (k,)
             Constants in the order of `constants`.
         tied_kg : (3n,) or (T, 3n), optional
-            Tied masses, which γ_m damps beside the mass of the body.
+            Tied masses [kg], which γ_m damps beside the mass of the body; None for no tied mass.
         memory_input : MemoryInput, optional
-            Internal variables of a body with memory; zero overstress by default.
+            Internal variables of a body with memory; None for relaxed memory, without overstress
+            and
+            stiffening.
+
+        Raises
+        ------
+        InputError
+            If θ or the node fields have the wrong size.
+        RestShapeError
+            If the mesh is a shape under gravity and no stress-free shape exists at θ.
         """
         x, v = self._states(positions, velocities)
         internal = self._evaluate(
@@ -754,20 +815,32 @@ class Body(Discretisation):
     ) -> Linearisation:
         """Return the internal force and its first derivatives at T states, see `force`.
 
-        The internal variables of a memory are held fixed; `viscoelasticity` provides their
-        derivatives.
+        The internal variables of a memory are constant in the derivatives; `model.viscoelasticity`
+        provides derivatives by them.
 
         Parameters
         ----------
         positions, velocities : (T, n, 3), (T, 3n) or one state (n, 3)
+            Positions [m] and velocities [m/s].
         theta : (k,)
             Constants in the order of `constants`.
         out : (T, linearisation_width), optional
-            Memory for the result, whose arrays are views of it.
+            Contiguous memory for the result, overwritten. All returned arrays are views of it, or
+            of new
+            memory if None.
         tied_kg : (3n,) or (T, 3n), optional
-            Tied masses, which γ_m damps beside the mass of the body.
+            Tied masses [kg], which γ_m damps beside the mass of the body; None for no tied mass.
         memory_input : MemoryInput, optional
-            Internal variables of a body with memory; zero overstress by default.
+            Internal variables of a body with memory; None for relaxed memory, where derivatives by
+            the
+            constants of the memory are zero.
+
+        Raises
+        ------
+        InputError
+            If θ, the node fields or `out` have the wrong size.
+        RestShapeError
+            If the mesh is a shape under gravity and no stress-free shape exists at θ.
         """
         x, v = self._states(positions, velocities)
         rows = self._evaluate("linearisation", [x, v], theta, out, memory_input)
@@ -873,10 +946,10 @@ class Body(Discretisation):
         tied_kg: Array | None = None,
         memory_input: MemoryInput | None = None,
     ) -> SecondDerivatives:
-        """Return the second derivatives of wᵀ f + σ·S at T states, see `SecondDerivatives` and
-        `force`.
+        """Return the second derivatives of φ = wᵀ f + σ·S at T states, see `SecondDerivatives` and
+        `force`; ∂²φ/∂v² is empty, (T, 0).
 
-        The internal variables of a memory are held fixed.
+        The internal variables of a memory are constant in the derivatives.
 
         Parameters
         ----------
@@ -885,11 +958,20 @@ class Body(Discretisation):
         theta : (k,)
             Constants in the order of `constants`.
         out : (T, curvature_width), optional
-            Memory for the result, whose arrays are views of it.
+            Contiguous memory for the result, overwritten; returned arrays may be views of it.
         tied_kg : (3n,) or (T, 3n), optional
-            Tied masses, which γ_m damps beside the mass of the body.
+            Tied masses [kg], which γ_m damps beside the mass of the body; None for no tied mass.
         memory_input : MemoryInput, optional
-            Internal variables of a body with memory and the weights σ of the stress S.
+            Internal variables of a body with memory and the weights σ of the stress S. None for
+            relaxed
+            memory and σ = 0; without `stress_weights` σ = 0. Ignored if the body has no memory.
+
+        Raises
+        ------
+        InputError
+            If θ, the node fields or `out` have the wrong size.
+        RestShapeError
+            If the mesh is a shape under gravity and no stress-free shape exists at θ.
         """
         x, v, w = self._states(positions, velocities, weights)
         if self.has_memory:

@@ -65,15 +65,21 @@ class Discretisation(ConstantsModel):
     nodes : ElementNodes
         Nodes of the elements.
     nodes_m : (n, 3)
-        Undeformed node positions, including obstacle frames.
+        Undeformed node positions, including obstacle frames [m].
     frames : (k, 4)
-        Indices of the nodes of obstacle frames.
+        Indices of the nodes of obstacle frames; (0, 4) until `Body.with_frames` adds some.
     has_skew_contact : bool
         Whether derivatives of contact forces have a skew part.
     cells : (E, nodes per element)
         Node indices of each element.
     geometry : (E, q, 3·nodes + 1)
         Shape gradients and volumes, see `elements.reference_geometry`.
+
+    Raises
+    ------
+    InputError
+        For an unknown element or evaluator, memory in an element with mean dilatation, constants of
+        equal names, or a material that the evaluator "simd" cannot evaluate.
     """
 
     def __init__(
@@ -131,7 +137,9 @@ class Discretisation(ConstantsModel):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Reasons why the evaluator is not "simd", if the material is the cause."""
+        """Sentences that state why the evaluator is "casadi" although "auto" was chosen; empty if the
+        material is not the cause.
+        """
         return self._choice.notes
 
     def make_evaluator(self, batch: KernelBatch) -> Evaluator:
@@ -262,15 +270,23 @@ class Discretisation(ConstantsModel):
         return with_ascending_nodes(cells, geometry)
 
     def field_output_slices(self, name: str) -> dict[tuple[int, str], slice]:
-        """Return the slices of a result row that hold derivatives by the logarithm of each cell.
-
-        The keys are the index of the part and the output. Each cell has d numbers of a vector, or
-        one; for ∂²φ/∂θ² those with each θ of the points, with the logarithm, and the first again.
+        """Return the slices of a result row that hold derivatives by the logarithm z of each cell.
 
         Parameters
         ----------
         name : str
-            Kernel.
+            Kernel in `expressions.KERNELS`; the result is empty unless `BY_FIELD` has it.
+
+        Returns
+        -------
+        dict of (int, str) to slice
+            By the index of the part and the name of the output, cell after cell. Each cell has one
+            number
+            for "gradient_theta" (∂φ/∂z), one for every dof of the cell for the outputs that are
+            vectors by
+            θ, and 2 c + 1 for "theta_theta" with the c constants of the points: ∂²φ/∂z∂θ (c),
+            ∂²φ/∂z²,
+            and ∂²φ/∂θ∂z (c) again.
         """
         start = self._width_without_fields(name)
         slices = {}
@@ -291,7 +307,9 @@ class Discretisation(ConstantsModel):
 
     @cached_property
     def memory(self) -> MemoryLayout:
-        """Layout of the internal variables of the parts with memory."""
+        """Layout of the internal variables of the parts with memory; of width zero if there are
+        none.
+        """
         first_indices = [
             s + p.law_constant_count
             for p, s in zip(self.parts, self.starts, strict=False)
@@ -305,8 +323,8 @@ class Discretisation(ConstantsModel):
 
     @cached_property
     def is_unsymmetric(self) -> bool:
-        """Whether a derivative of the forces by position or velocity has a skew part: that of a
-        damping law with a stress, of contact with friction, or of a custom force.
+        """Whether a derivative of the forces by position or velocity can have a skew part: that of a
+        damping law given as a stress, of contact (`has_skew_contact`), or of a custom force.
         """
         laws = any(part.damping.stress is not None for part in self.parts)
         return (
@@ -324,12 +342,12 @@ class Discretisation(ConstantsModel):
 
     @cached_property
     def linearisation_width(self) -> int:
-        """Length of one time step's row of `linearise`."""
+        """Length of one time step's row of `Body.linearise`."""
         return self._width("linearisation")
 
     @cached_property
     def curvature_width(self) -> int:
-        """Length of one time step's row of `curvature`."""
+        """Length of one time step's row of `Body.second_derivatives`."""
         return self._width("curvature")
 
     def volume_ratios(self, positions: ArrayLike) -> Array:
@@ -356,7 +374,10 @@ class Discretisation(ConstantsModel):
 
     @cached_property
     def shape_gradients(self) -> sp.csr_array:
-        """Derivatives of the shape functions (3 E q, n), axis by axis at all quadrature points."""
+        """Derivatives of the shape functions by position [1/m], sparse (3 E q, n): all quadrature
+        points
+        for axis x, element by element, then for y, then for z. Frame nodes have empty columns.
+        """
         count, points = self.geometry.shape[:2]
         gradients = self.geometry[..., :-1].reshape(
             count, points, self.element.nodes, 3
@@ -475,7 +496,7 @@ class Discretisation(ConstantsModel):
         return out
 
     def _width(self, name: str) -> int:
-        """Return the length of a result row of a kernel."""
+        """Return the length of a result row of a kernel, including derivatives by fields."""
         ends = (place.stop for place in self.field_output_slices(name).values())
         return max(ends, default=self._width_without_fields(name))
 

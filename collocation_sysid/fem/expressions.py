@@ -94,15 +94,18 @@ class PointLaw:
     def damping_potential(
         self, psi: ca.SX, F: ca.SX, rate: ca.SX, theta: ca.SX
     ) -> ca.SX:
-        """Return the potential of the damping law; 0 if it has none.
+        """Return the density ψ_d of the potential of the damping law; 0 if it has none.
 
         Parameters
         ----------
         psi : SX
             Energy density as an expression in F.
         F, rate : SX
-            Stacked deformation gradient, with m if the dilatation is averaged, and its rate.
+            Stacked deformation gradient, with m if the dilatation is averaged, and its rate;
+            further
+            symbols of `psi` and their rates may follow if the law accepts them.
         theta : (k,) SX
+            Constants of the law.
         """
         potential = self.damping.potential
         return (
@@ -281,7 +284,9 @@ UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def six_entries(matrix: ca.SX) -> ca.SX:
-    """Return the entries xx, yy, zz, xy, xz, yz of a symmetric matrix."""
+    """Return the entries xx, yy, zz, xy, xz, yz (6,) of a symmetric matrix (3, 3); entries below the
+    diagonal are not read.
+    """
     return ca.vertcat(*[matrix[a, b] for a, b in UPPER])
 
 
@@ -302,8 +307,8 @@ def _damping(
     point: QuadraturePoint, law: PointLaw
 ) -> tuple[ca.SX, ca.SX] | None:
     """Return V P_v (9,) of a point and its derivative (9, 9) by F, with the viscous first
-    Piola–Kirchhoff stress P_v and the volume V of the point; None if the damping law is none or has
-    a potential.
+    Piola–Kirchhoff stress P_v and the volume V of the point; None if the damping law has a
+    potential.
     """
     stress_and_slope = law.damping_stress(
         ca.vec(point.material_gradient),
@@ -322,7 +327,9 @@ def _damping(
 
 @lru_cache(CACHED_KERNELS)
 def energy_kernel(element: Element, law: PointLaw) -> ElementKernel:
-    """Return the kernel of the elastic energy Ψ [J]."""
+    """Return the kernel of the elastic energy Ψ [J] of the long-term law, without damping and
+    memory.
+    """
     point = quadrature_point(element, law, "x", internal_variable_count=0)
     return kernel_from_outputs(
         "energy",

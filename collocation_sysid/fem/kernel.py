@@ -55,7 +55,9 @@ class Phase:
 
     @cached_property
     def function(self) -> ca.Function:
-        """Contribution of one point, with the contractions written out."""
+        """Function of the contribution of one point, with the contractions written out: inputs of
+        `pieces`, and each contracted output as a dense column.
+        """
         sx = self.pieces
         names = sx.name_in()
         inputs = [
@@ -131,7 +133,9 @@ class ElementKernel:
 
     @property
     def point_data_count(self) -> int:
-        """Number of internal variables and other data of a point."""
+        """Number of internal variables and other data of a point; 0 if the kernel has no such
+        input.
+        """
         names = self.pieces.name_in()
         return (
             self.pieces.nnz_in(names.index("carried"))
@@ -523,7 +527,10 @@ class QuadraturePoint:
         """Return a derivative of a scalar by zero, one or two variables; x, v and w stand for their
         gradients (9,), "theta" for the differentiated constants.
 
-        It is the scalar itself, a gradient as a column, or the matrix of second derivatives.
+        Averaged stretches and other symbols are constant. The result is the scalar itself, a
+        gradient as a
+        column (k,), or the matrix (k, l) of second derivatives by the first and the second
+        variable.
         """
         inputs = [
             self.differentiated_constants

@@ -80,7 +80,9 @@ class Material:
         Raises
         ------
         InputError
-            If the function has no constants, or the undeformed material has energy or stress.
+            If the function has no constants, cannot be evaluated, or the undeformed material has
+            energy
+            or stress; if a definition is of no argument.
         """
         name = name or getattr(energy, "__name__", "energy").replace("_", "-")
         definitions = {constant.name: constant for constant in constants}
@@ -103,13 +105,16 @@ class Material:
         return material
 
     def psi(self, F: ca.SX, values: ca.SX) -> ca.SX:
-        """Return the energy density as an expression, from the constants as a vector in their
-        order.
+        """Return the energy density (1, 1) [J/m³] as an expression, from F (3, 3) and the constants
+        (c,) in
+        their order.
         """
         return ca.SX(self.energy(F, **self._named(values)))
 
     def chain_rule(self, F: ca.SX, values: ca.SX) -> ChainRule:
-        """Return the chain rule for derivatives of `psi_in`.
+        """Return the chain rule for derivatives of `psi_in`; without functions for all materials but
+        those
+        in powers of the stretches.
 
         Parameters
         ----------
@@ -123,8 +128,9 @@ class Material:
         return ChainRule((self.energy.symbolic(F, values),))
 
     def psi_in(self, rule: ChainRule, F: ca.SX, values: ca.SX) -> ca.SX:
-        """Return the energy density as the symbol of a rule from `chain_rule`, if it has one, else
-        as an expression in F (3, 3) and the constants (c,).
+        """Return the energy density as the symbol of a rule from `chain_rule` for the same F (3, 3)
+        and
+        constants (c,), if it has one, else as an expression in them.
         """
         return (
             rule.functions[0].symbol()
@@ -149,7 +155,10 @@ class Material:
         )
 
     def _check_at_rest(self) -> None:
-        """Raise an `InputError` unless energy and stress vanish at F = I."""
+        """Raise an `InputError` if the energy cannot be evaluated, or unless energy and stress vanish
+        at
+        F = I, for constants within their bounds, up to rounding.
+        """
         F = ca.SX.sym("F", 9)
         values = ca.SX.sym("values", len(self.constants))
         try:
@@ -354,7 +363,7 @@ MATERIALS |= {
 
 def as_material(material: str | Energy | Material) -> Material:
     """Return a material from its name in `MATERIALS`, from an energy function, or the given
-    material.
+    material itself.
 
     Raises
     ------

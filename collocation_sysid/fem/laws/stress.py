@@ -119,7 +119,8 @@ def stress_kernel(name: str, element: Element, law: PointLaw) -> ElementKernel:
 
 @dataclass(frozen=True, eq=False)
 class JacobianEntries:
-    """Row and column of each entry of `stress_jacobian` and `memory_force_jacobian`.
+    """Point value and dof of each entry of `stress_jacobian` and `memory_force_jacobian`; entries of
+    the same place add up.
 
     Attributes
     ----------
@@ -136,11 +137,19 @@ class JacobianEntries:
 class StressEvaluator:
     """Stresses of a body with memory, and their derivatives and transposed derivatives.
 
-    Kernels are compiled when they are first needed.
+    Stresses are those of the long-term energy, without overstress and damping. Entries of parts
+    without
+    memory do not occur. Kernels are compiled when they are first needed.
 
     Parameters
     ----------
     body : Discretisation
+        Body of which at least one part has a memory.
+
+    Attributes
+    ----------
+    width : int
+        Length of a row of values at points, see `MemoryLayout`.
     """
 
     def __init__(self, body: Discretisation) -> None:
@@ -203,21 +212,26 @@ class StressEvaluator:
     def stress_jvp(
         self, x: Array, direction: Array, theta: Array, out: Array | None = None
     ) -> Array:
-        """Return ∂S/∂x along a direction (T, 3n) as (T, width), added to `out` in place if it is
-        given.
+        """Return ∂S/∂x along a direction (T, 3n) as (T, width), at positions x (T, 3n) and θ (k,).
+
+        With `out` (T, width) the result is added to it in place, and `out` is returned.
         """
         return self._evaluate_at_points(
             "stress_along", [x, direction], theta=theta, out=out
         )
 
     def stress_vjp(self, x: Array, weights: Array, theta: Array) -> Array:
-        """Return (∂S/∂x)ᵀ weights (T, 3n), for weights (T, width)."""
+        """Return (∂S/∂x)ᵀ weights (T, 3n), for weights (T, width) of the entries of S, at positions x
+        (T, 3n) and θ (k,).
+        """
         return self._evaluate_at_nodes(
             "pulled", [x], theta=theta, point_data=weights
         )
 
     def memory_force(self, x: Array, overstress: Array, theta: Array) -> Array:
-        """Return f_H (T, 3n) [N], which is linear in H (`overstress`, (T, width))."""
+        """Return f_H (T, 3n) [N] at positions x (T, 3n): linear in H (`overstress`, (T, width)
+        [Pa]).
+        """
         return self._evaluate_at_nodes(
             "carried_force", [x], theta=theta, point_data=overstress
         )
@@ -225,7 +239,9 @@ class StressEvaluator:
     def memory_force_vjp(
         self, x: Array, direction: Array, theta: Array
     ) -> Array:
-        """Return (∂f_H/∂H)ᵀ direction (T, width), for a direction (T, 3n)."""
+        """Return (∂f_H/∂H)ᵀ direction (T, width), for a direction (T, 3n) in the space of forces, at
+        positions x (T, 3n).
+        """
         return self._evaluate_at_points("against", [x, direction], theta=theta)
 
     @cached_property
@@ -247,11 +263,16 @@ class StressEvaluator:
         return JacobianEntries(np.concatenate(points), np.concatenate(dofs))
 
     def stress_jacobian(self, x: Array, theta: Array) -> Array:
-        """Return the entries (T, K) of ∂S/∂x."""
+        """Return the entries (T, K) of ∂S/∂x at positions x (T, 3n) and θ (k,), at
+        `jacobian_entries`.
+        """
         return self._slopes("stress_slope", x, theta)
 
     def memory_force_jacobian(self, x: Array, theta: Array) -> Array:
-        """Return the entries (T, K) of ∂f_H/∂H, which is linear in x."""
+        """Return the entries (T, K) of ∂f_H/∂H at positions x (T, 3n) and θ (k,), in which it is
+        linear in
+        x, at `jacobian_entries`.
+        """
         return self._slopes("force_slope", x, theta)
 
     def _slopes(self, name: str, x: Array, theta: Array) -> Array:
