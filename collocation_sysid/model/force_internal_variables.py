@@ -26,6 +26,7 @@ from ..fem.body import SecondDerivatives
 from .force_term import States
 from .forces import Forces
 from .point_forces import LawDerivatives, Pointwise, PreviousState
+from .recursion import HistoryGradient
 
 # Number of evaluations whose derivatives are kept at a time; limits memory.
 CHUNK = 16
@@ -210,9 +211,8 @@ class ForceHistory:
 
     def vector_jacobian_product(
         self, force_weights: Array, by_p: Array
-    ) -> tuple[Array, Array, Array]:
-        """Return the derivatives of Σ λ_k F_k(h_{k−1}) through h by ξ and ν, (N, 3n) each, and by p
-        (m,).
+    ) -> HistoryGradient:
+        """Return the derivatives of Σ λ_k · F_k(h_{k−1}) through the internal variables h.
 
         Parameters
         ----------
@@ -231,7 +231,7 @@ class ForceHistory:
                 pulling.input_gradient() @ by_p[k][self.input_columns]
             )
             pulling.step_back(force_weights[k])
-        return by_xi, by_nu, by_parameters
+        return HistoryGradient(by_xi, by_nu, by_parameters=by_parameters)
 
 
 @dataclass(frozen=True, eq=False)

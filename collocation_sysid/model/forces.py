@@ -113,9 +113,9 @@ class Forces:
     def of_body_alone(
         cls, body: Body, theta: Sequence[float] | Array
     ) -> Forces:
-        """Return the forces on a body without loads, gravity or contact, at one time.
+        """Return the forces on a body without loads, gravity, air or contact, at one time (0 s).
 
-        Custom forces of the body's own are included.
+        Internal forces at θ (k,) and the custom forces of the body are included.
         """
         custom = custom_force_terms(body, np.zeros(1))
         known = np.asarray(theta, dtype=float)
@@ -123,7 +123,10 @@ class Forces:
         return cls(weight, custom, body.joint_pattern_with(()), known)
 
     def with_theta(self, theta: Sequence[float] | Array) -> Forces:
-        """Return these forces for a body with constants θ (k,)."""
+        """Return these forces for a body with constants θ (k,), which are copied; masses follow the
+        free
+        densities.
+        """
         known = np.array(theta, dtype=float)
         return replace(self, theta=known, weight=self.weight.with_theta(known))
 
@@ -159,8 +162,9 @@ class Forces:
         return self.weight.mass_derivatives(self._input_offsets[0])
 
     def with_inputs(self, u: Array) -> Forces:
-        """Return these forces at inputs u (T, U): θ from the first time, then the inputs of each
-        term.
+        """Return these forces at inputs u (T, U): θ from the first time, then the inputs of each term,
+        in
+        the order of `terms`.
         """
         forces = self.with_theta(u[0, : self._input_offsets[0]])
         if self._input_offsets[0] == self._input_offsets[-1]:
@@ -177,14 +181,16 @@ class Forces:
         return replace(forces, weight=weight, external_terms=tuple(further))
 
     def at_times(self, rows: slice) -> Forces:
-        """Return these forces at some of the T times, given as a slice."""
+        """Return these forces at some of the T times, given as a slice; `memory_state` is kept as it
+        is.
+        """
         further = tuple(term.at_times(rows) for term in self.external_terms)
         return replace(
             self, weight=self.weight.at_times(rows), external_terms=further
         )
 
     def scaled(self, factor: float) -> Forces:
-        """Return these forces with gravity, loads and other external forces multiplied by a factor.
+        """Return these forces with weight, loads and other external forces multiplied by a factor.
 
         Masses and internal forces are unchanged.
         """
@@ -231,7 +237,8 @@ class Forces:
         return replace(self, external_terms=(*before, term, *after))
 
     def without_contact(self) -> tuple[Forces, list[Contact]]:
-        """Return these forces without the contacts that have an energy, and the contacts removed.
+        """Return these forces without the contacts that have an energy, and a list of the contacts
+        removed, empty if there were none.
 
         The sparsity pattern is unchanged. Contact as complementarity stays.
         """
@@ -266,8 +273,9 @@ class Forces:
         )
 
     def total(self, xi: Array, nu: Array) -> Array:
-        """Return the sum of all forces F (T, 3n) [N] at positions ξ (T, 3n) [m] and velocities ν
-        (T, 3n) [m/s].
+        """Return the sum of all forces F (T, 3n) [N], internal and external, at positions ξ (T, 3n)
+        [m] and
+        velocities ν (T, 3n) [m/s].
         """
         states_for = self.states_of_terms(xi, nu)
         total = self.body.force(
@@ -284,16 +292,20 @@ class Forces:
     def linearise(
         self, xi: Array, nu: Array, out: Array | None = None
     ) -> Linearisation:
-        """Return the forces and their first derivatives by state and inputs.
+        """Return the forces and their first derivatives by state and inputs; columns of `by_theta` are
+        those of θ, then of the inputs of each term.
 
-        Internal variables of `memory_state` and of the terms are held fixed.
+        Internal variables of `memory_state` and of the terms are constant. In a static experiment
+        `by_velocity` has only the parts of terms with `uses_increments`. Skew parts are empty, (T,
+        0),
+        if no force has one.
 
         Parameters
         ----------
         xi, nu : (T, 3n)
             Positions [m] and velocities [m/s].
         out : (T, linearisation_width), optional
-            Memory for the body's part of the result, which holds views of it.
+            Memory for the body's part of the result, which holds views of it; overwritten.
         """
         states_for = self.states_of_terms(xi, nu)
         still_nu = states_for(self.weight).nu
@@ -469,7 +481,7 @@ class Forces:
         Parameters
         ----------
         number : int
-            Index in `external_terms`; the term must be a `Pointwise`.
+            Index in `external_terms`; the term must be a `Pointwise` (AssertionError otherwise).
         """
         term, places = self._terms_with_indices[1 + number]
         assert isinstance(term, Pointwise)

@@ -93,7 +93,10 @@ class Inputs:
         )
 
     def weighted_hessian(self, p: Array, weights: Array) -> Array:
-        """Return Σ_t weights[t] · ∂²u_t/∂p² (m, m) at parameters p (m,), for weights (N, U)."""
+        """Return Σ_t weights[t] · ∂²u_t/∂p² (m, m), summed over all evaluations and entries, at
+        parameters p
+        (m,), for weights (N, U).
+        """
         hessian = np.zeros((self.parameter_count,) * 2)
         offset = 0
         for each, generated in zip(self.groups, self._functions, strict=True):
@@ -127,7 +130,11 @@ class Inputs:
 
 
 def with_inputs(dynamics: Dynamics, nuisance: NuisanceMap) -> Dynamics:
-    """Return equations of motion with the inputs that φ changes: gravity and load shares."""
+    """Return equations of motion whose weight has the inputs that φ changes: gravity, if a parameter
+    rotates it, and the shares of loads with an estimated time.
+
+    Values are unchanged until `Dynamics.with_inputs` sets the inputs.
+    """
     forces = dynamics.forces
     loads = [timed.load for timed in nuisance.timed_loads]
     has_gravity_input = len(nuisance.gravity_indices) > 0
@@ -143,17 +150,22 @@ def inputs_from_experiment(
     nuisance: NuisanceMap,
     evaluated_s: Array,
 ) -> Inputs:
-    """Return the inputs of an experiment.
+    """Return the inputs of an experiment, in the order that the module states.
 
     Parameters
     ----------
     experiment : Experiment
     parameters : Parameters
-        Parameters of the problem; p begins with the free ones.
+        Parameters of the problem; p begins with the free ones, by their coordinates q.
     nuisance : NuisanceMap
         Nuisance parameters of the experiment; p ends with those of `motion_indices`.
     evaluated_s : (N,)
         Times at which forces are evaluated.
+
+    Raises
+    ------
+    InputError
+        If the parameters do not determine the constants of the body.
     """
     constants = ThetaMap(parameters, experiment.body)
     no_data = np.zeros((0, 1))

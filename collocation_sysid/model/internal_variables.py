@@ -28,7 +28,8 @@ def histories_of_trajectory(
     loaded_s: float,
     previous_states: Mapping[int, Array],
 ) -> tuple[AnyHistory, ...]:
-    """Return the internal variables along a motion: of the memory, then of each force.
+    """Return the internal variables along a motion: of the memory, if the body has one, then of each
+    force with internal variables, in the order of the forces.
 
     Parameters
     ----------
@@ -71,13 +72,15 @@ def histories_of_trajectory(
 def insert_histories(
     forces: Forces, histories: Sequence[AnyHistory], rows: slice
 ) -> Forces:
-    """Return the forces of some evaluations with the internal variables of the histories.
+    """Return the forces of some evaluations with the internal variables of the histories; without
+    histories, the forces themselves.
 
     Parameters
     ----------
     forces : Forces
-        Forces at the evaluations `rows`.
+        Forces at the evaluations `rows` alone.
     histories : sequence of histories
+        Histories of the complete motion.
     rows : slice
         Indices of the evaluations.
     """

@@ -133,7 +133,9 @@ class Pointwise(ForceTerm):
         )
 
     def interval_and_start(self, times: int) -> tuple[Array, Array]:
-        """Return the time since the previous evaluation (T,), and 1 at the start, else 0 (T,).
+        """Return the time since the previous evaluation (T,) [s], and 1 where it is zero, as at the
+        start,
+        else 0 (T,). Without `previous_state` all evaluations count as starts.
 
         Parameters
         ----------
@@ -324,7 +326,9 @@ class Pointwise(ForceTerm):
     # Of one that carries ----------------------------------------------------------------------
 
     def internal_variables(self, states: States) -> Array:
-        """Return the internal variables h (n, T, I) after the evaluations."""
+        """Return the internal variables h (n, T, I) of all instances after the evaluations; zero at
+        instances that cannot act.
+        """
         evaluated = self._inputs_at(states)
         return self._expanded(
             self.law.evaluate(evaluated.u, evaluated.data)[evaluated.y.stop :],
@@ -526,7 +530,8 @@ class CustomForce(Pointwise):
 
     def data(self, chosen: Index | None) -> Array:
         """Return the data (d, T, I) of the law at all instances, in the order in which a
-        `ForceContext` reads them; `chosen` is not used.
+        `ForceContext` reads
+        them; `chosen` is not used, because all instances act.
         """
         data = np.empty((CONTEXT_SIZE, len(self.t_s), self.points.count))
         data[0] = self.t_s[:, None]
@@ -574,5 +579,5 @@ def air_drag_terms(
 
 
 def custom_force_terms(body: Body, t_s: Array) -> tuple[CustomForce, ...]:
-    """Return the custom forces declared for a body, at times (T,)."""
+    """Return the custom forces declared for a body, at times (T,) [s]; empty if there are none."""
     return tuple(CustomForce(placed, t_s) for placed in body.placed_forces)

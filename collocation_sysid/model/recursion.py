@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -22,6 +23,22 @@ from ..common.array_types import Array
 from .generated_functions import GeneratedFunction
 
 Expression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]
+
+
+class HistoryGradient(NamedTuple):
+    """Gradient, through internal variables, of a scalar along a motion with N evaluations.
+
+    Attributes
+    ----------
+    by_xi, by_nu : (N, 3n)
+        Derivatives by positions and velocities at the evaluations.
+    by_parameters : (m,)
+        Derivatives by the parameters p.
+    """
+
+    by_xi: Array
+    by_nu: Array
+    by_parameters: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +189,9 @@ class RecursionTrajectory:
     def jacobian_vector_product(
         self, signal_changes: Array, constant_changes: Array
     ) -> Array:
-        """Return the changes of the states (n, N, I, c) for c directions at once.
+        """Return the changes of the states (n, N, I, c) for c directions at once, including those
+        through
+        earlier states.
 
         Parameters
         ----------
@@ -194,7 +213,9 @@ class RecursionTrajectory:
         return changes
 
     def vector_jacobian_product(self, weights: Array) -> tuple[Array, Array]:
-        """Return the gradient of Σ weights · h by the signal (i, N, I) and by the constants (C,).
+        """Return the gradient of Σ weights · h, over all times and instances, by the signal (i, N, I)
+        and by
+        the constants (C,).
 
         Parameters
         ----------

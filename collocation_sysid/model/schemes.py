@@ -69,9 +69,11 @@ class Scheme:
     start: tuple[Stencil, ...]
 
     def stencil(self, row: int) -> Stencil:
-        """Return the stencil of a row, given by its index.
+        """Return the stencil of a row, given by its index from 0.
 
-        Row 0, which exists where an experiment starts in equilibrium, has the stencil of statics.
+        Row 0, which exists where an experiment starts in equilibrium, has the stencil of statics;
+        rows
+        after those of `start` have the regular one.
         """
         if row == 0:
             return STATIC

@@ -35,7 +35,7 @@ from ..fem.body import Body, SecondDerivatives
 from ..fem.laws.memory import MemoryInput, MemoryLayout, fading_coefficients
 from .forces import Forces
 from .generated_functions import GeneratedFunction
-from .recursion import Recursion
+from .recursion import HistoryGradient, Recursion
 
 # Number of evaluations whose stress derivatives are kept at a time; limits memory.
 EVALUATIONS_PER_CHUNK = 16
@@ -318,8 +318,8 @@ class MemoryHistory:
 
     @property
     def recursion_residuals(self) -> Array:
-        """Residuals m_k − d_k m_{k−1} − a_k S_k for k = 0 … N − 2 (N − 1, all branches) [Pa]; zero
-        if m satisfies the recursion.
+        """Residuals m_k − d_k m_{k−1} − a_k S_k for k = 0 … N − 2 (N − 1, all branches) [Pa]; zero if
+        `previous_variables` satisfy the recursion, as those do that are computed from the states.
         """
         d, a = (
             self.memory.repeat_over_points(each[:, :-1])
@@ -368,11 +368,8 @@ class MemoryHistory:
 
     def vector_jacobian_product(
         self, force_weights: Array, by_p: Array
-    ) -> tuple[Array, Array, Array]:
-        """Return the derivatives of Σ λ_k f_H(H_k) through H by ξ and ν, (N, 3n) each, and by p
-        (m,).
-
-        Those by ν are zero.
+    ) -> HistoryGradient:
+        """Return the derivatives of Σ λ_k · f_H(H_k) through H; those by ν are zero.
 
         Parameters
         ----------
@@ -402,10 +399,10 @@ class MemoryHistory:
         for rows, slopes in self.stress_derivatives(theta_q):
             by_q += np.einsum("tqp,tp->q", slopes, sigma[rows])
         by_parameters[used] = by_q
-        return (
+        return HistoryGradient(
             stresses.stress_vjp(self.xi, sigma, self.theta),
             np.zeros_like(self.xi),
-            by_parameters,
+            by_parameters=by_parameters,
         )
 
     def add_curvature(self, curvature: SecondDerivatives, mu: Array) -> None:
@@ -544,7 +541,9 @@ class MemoryState:
 
 
 def with_start_memory(forces: Forces, loaded_s: float) -> Forces:
-    """Return forces on the start shape, with the overstress of a load that was applied recently.
+    """Return forces on the start shape, with the additional stiffness of a load that was applied a
+    time
+    `loaded_s` [s] ago: Q = g e^(−t/τ) S.
 
     The forces are unchanged for a body without memory, or if `loaded_s` is infinite.
     """

@@ -41,18 +41,20 @@ def cylinder_of_edge(
     edge_length_m: float,
     quarter: bool = False,
 ) -> TetMesh:
-    """Mesh an upright cylinder of exact volume, with edges of about this length.
+    """Mesh an upright cylinder with edges of about this length: axis z, base at z = 0, volume exactly
+    that of the round cylinder, so that the nodes of the rim are slightly outside the radius.
 
     Parameters
     ----------
     diameter_m, height_m, edge_length_m : float
+        Positive lengths; the edge length is not checked.
     quarter : bool
         Only x, y ≥ 0, between the planes of symmetry x = 0 and y = 0.
 
     Raises
     ------
     InputError
-        If this takes more than a million elements.
+        If this takes more than a million elements, or diameter or height are not positive.
     """
     rings, layers = _divisions(
         np.array([diameter_m / 2, height_m]), edge_length_m
@@ -88,7 +90,8 @@ def cylinder_of_edge(
 def count_box_elements(
     size_m: ArrayLike, edge_length_m: float
 ) -> tuple[int, int]:
-    """Return the numbers of nodes and elements of `box_of_edge` without creating the mesh.
+    """Return the numbers of nodes and elements, in this order, of `box_of_edge` without creating the
+    mesh; lengths are not checked.
 
     Raises
     ------
@@ -107,7 +110,8 @@ def count_cylinder_elements(
     edge_length_m: float,
     quarter: bool = False,
 ) -> tuple[int, int]:
-    """Return the approximate numbers of nodes and elements of `cylinder_of_edge`, without the mesh.
+    """Return the numbers of nodes and elements, in this order, of `cylinder_of_edge` without creating
+    the mesh; that of a quarter's nodes is approximate. Lengths are not checked.
 
     Raises
     ------
@@ -125,7 +129,9 @@ def count_cylinder_elements(
 
 
 def _divisions(size_m: np.ndarray, edge_length_m: float) -> np.ndarray:
-    """Return the numbers of elements along lengths, rounded, at least 1."""
+    """Return the numbers of elements along lengths, as floats: rounded to the nearest whole number, at
+    least 1.
+    """
     return np.maximum(np.round(size_m / edge_length_m), 1)
 
 
@@ -216,9 +222,11 @@ def cylinder_mesh(
     rings, layers : int
         Elements along the radius and along the height.
     sectors : int
-        Nodes of the innermost ring. With a multiple of four no element crosses the planes x = 0 and
-        y = 0. With six, a mesh has (1 + 3 rings (rings + 1)) (layers + 1) nodes and 18 rings²
-        layers elements.
+        Nodes of the innermost ring, 3 or more (not checked). With a multiple of four no element
+        crosses
+        the planes x = 0 and y = 0. With six, a mesh has (1 + 3 rings (rings + 1)) (layers + 1)
+        nodes
+        and 18 rings² layers elements.
 
     Returns
     -------
@@ -228,7 +236,7 @@ def cylinder_mesh(
     Raises
     ------
     InputError
-        For lengths or numbers that are not positive.
+        For lengths, rings or layers that are not positive.
     """
     for name, value in (("radius_m", radius_m), ("height_m", height_m)):
         if not 0 < value < np.inf:
@@ -265,7 +273,9 @@ def cylinder_mesh(
 
 
 def _disc(rings: int, sectors: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes (·, 2) and triangles (sectors · rings², 3) of the unit disc."""
+    """Return nodes (1 + sectors · rings (rings + 1)/2, 2) and triangles (sectors · rings², 3) of the
+    unit disc: its centre first, then ring by ring.
+    """
     counts = [sectors * k for k in range(1, rings + 1)]
     angles = [2 * np.pi * np.arange(count) / count for count in counts]
     circles = [

@@ -92,12 +92,14 @@ def tetrahedralize_surface(
     if not cached.exists():
         with replaced_file(cached) as draft:
             # A mesh that is refused must not be kept.
-            nodes, tetrahedra, *_ = clean_mesh(
+            cleaned = clean_mesh(
                 *_run_ftetwild(points, faces, edge_length_m=edge_length_m)
             )
-            write_tetrahedra(draft, nodes, tetrahedra=tetrahedra)
-    nodes, tetrahedra, *_ = read_tetrahedra(cached)
-    return nodes, tetrahedra
+            write_tetrahedra(
+                draft, cleaned.points_m, tetrahedra=cleaned.tetrahedra
+            )
+    content = read_tetrahedra(cached)
+    return content.points_m, content.tetrahedra
 
 
 def merge_coincident(
@@ -150,7 +152,9 @@ def _checked_surface(
 
 
 def _require_closed(triangles: np.ndarray) -> None:
-    """Raise an `InputError` unless every edge belongs to exactly two triangles."""
+    """Raise an `InputError` unless every edge belongs to exactly two triangles (F, 3), or if there is
+    no triangle.
+    """
     edges = np.sort(
         triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1
     )
