@@ -50,10 +50,9 @@ def kawabata_1981(
     """Return biaxial tension of an isoprene rubber vulcanisate at stretches up to 3.7.
 
     Stretches and engineering stresses, one experiment for each kind of test, in the order of
-    `tests`.
-    Values of the file: MPa. The standard deviation of the stresses, 0.01 MPa, is an assumption;
-    zero of
-    the strain and area count as exact, since one sheet and one instrument gave all tests.
+    `tests`. Values of the file: MPa. The standard deviation of the stresses, 0.01 MPa, is an
+    assumption; zero of the strain and area count as exact, since one sheet and one instrument gave
+    all tests.
 
     Source: S. Kawabata, M. Matsuda, K. Tei, H. Kawai, Experimental survey of the strain energy
     density function of isoprene rubber vulcanizate, Macromolecules 14(1), 154–162 (1981). Numbers
@@ -91,9 +90,8 @@ def kawabata_1981(
 def treloar_1944(
     material: MaterialLaw = "gent", *, largest_stretch: float | None = None
 ) -> list[Experiment]:
-    """Return uniaxial tension of vulcanised rubber (8 % S) at 20 °C at stretches up to 7.6, a list of
-    one
-    experiment.
+    """Return uniaxial tension of vulcanised rubber (8 % S) at 20 °C at stretches up to 7.6, a list
+    of one experiment.
 
     Stretch and engineering stress. Values of the file: MPa, converted from kgf/cm². The standard
     deviation of the stresses, 0.02 MPa, is an assumption.

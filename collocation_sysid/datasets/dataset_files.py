@@ -93,16 +93,14 @@ def copy_dataset(name: str, folder: Path) -> list[Path]:
     copied.
 
     Problem files name the JSON schema for editors like those of `create_problem`: by its address if
-    it
-    has one, else the schema is written to the folder, too. Measured data of others come with their
-    licence.
+    it has one, else the schema is written to the folder, too. Measured data of others come with
+    their licence.
 
     Returns
     -------
     list of Path
         The problem file, followed by the other files by name, the licence and the schema, if there
-        is
-        one.
+        is one.
 
     Raises
     ------
@@ -135,8 +133,7 @@ def copy_dataset(name: str, folder: Path) -> list[Path]:
 
 def _copy_file(file: Path, copy: Path, schema: str) -> None:
     """Copy a file of a dataset; in a TOML file whose first line names a schema, that is replaced by
-    the
-    address or file name `schema`.
+    the address or file name `schema`.
     """
     if file.suffix == ".toml":
         text = file.read_text(encoding="utf-8")

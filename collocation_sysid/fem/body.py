@@ -219,7 +219,12 @@ class Body(Discretisation):
         if self.scan_conditions is not None:
             require_supported(parts)
         super().__init__(
-            parts, tuple(forces), mesh, element, evaluator, threads
+            parts,
+            tuple(forces),
+            mesh=mesh,
+            element=element,
+            evaluator=evaluator,
+            threads=threads,
         )
         # Lumped volume of every dof (3n,) for each part.
         self._lumped_m3 = [
@@ -270,9 +275,8 @@ class Body(Discretisation):
         return None
 
     def stress_free_geometry(self, theta: Theta) -> Array:
-        """Return shape gradients [1/m] and volumes [m³] (E, q, 3·nodes + 1) of the stress-free shape
-        at
-        θ (k,); `geometry` itself if the mesh counts as stress-free.
+        """Return shape gradients [1/m] and volumes [m³] (E, q, 3·nodes + 1) of the stress-free
+        shape at θ (k,); `geometry` itself if the mesh counts as stress-free.
 
         Raises
         ------
@@ -452,8 +456,7 @@ class Body(Discretisation):
         """Return a copy of this body with other parts, in the same number and with the same cells.
 
         Custom forces and friction coefficients stay, and so do stated masses (`node_mass`) and
-        obstacle
-        frames; θ and everything that depends on it follow the new parts.
+        obstacle frames; θ and everything that depends on it follow the new parts.
         """
         other = copy(self)
         for name in self._cached_names - {
@@ -462,7 +465,9 @@ class Body(Discretisation):
             "part_of_cells",
         }:
             vars(other).pop(name, None)
-        ConstantsModel.__init__(other, parts, self.forces, self.frictions)
+        ConstantsModel.__init__(
+            other, parts, forces=self.forces, frictions=self.frictions
+        )
         other._evaluators = {}
         other._framed = {}
         return other
@@ -477,8 +482,7 @@ class Body(Discretisation):
 
         The nodes are at `frame_nodes_m`, after all others, and have no mass. Frames and friction
         coefficients that the body already has are replaced, not extended. The result is this body
-        itself
-        if nothing changes, and the same object for the same arguments.
+        itself if nothing changes, and the same object for the same arguments.
 
         Parameters
         ----------
@@ -496,7 +500,9 @@ class Body(Discretisation):
             other = copy(self)
             for name in self._cached_names - {"part_of_cells", "frame_nodes_m"}:
                 vars(other).pop(name, None)
-            ConstantsModel.__init__(other, self.parts, self.forces, frictions)
+            ConstantsModel.__init__(
+                other, self.parts, forces=self.forces, frictions=frictions
+            )
             other.has_skew_contact = has_skew_contact
             other._evaluators = {}
             first = len(self.nodes.points_m)
@@ -587,9 +593,8 @@ class Body(Discretisation):
         return slopes
 
     def densities(self, theta: Theta) -> list[float]:
-        """Return the mean density of each part at θ (k,) [kg/m³]: the entry of θ if it is free, else
-        the
-        stated value, which a density field does not change.
+        """Return the mean density of each part at θ (k,) [kg/m³]: the entry of θ if it is free,
+        else the stated value, which a density field does not change.
         """
         return [
             float(theta[place + 1])
@@ -661,8 +666,7 @@ class Body(Discretisation):
     @cached_property
     def placed_forces(self) -> tuple[LocatedForce, ...]:
         """Custom forces on their nodes or faces, in the order of `forces`; a force without `nodes`
-        acts
-        on all nodes. Constants of each are the entries of θ after those of the parts.
+        acts on all nodes. Constants of each are the entries of θ after those of the parts.
         """
         volume = self.dof_volume_m3[::3]
         first = self.starts[-1]
@@ -735,7 +739,9 @@ class Body(Discretisation):
         """
         x = self._state(positions)
         return float(
-            self._evaluate("energy", [x], self.elastic_theta(constants))[0, 0]
+            self._evaluate("energy", [x], theta=self.elastic_theta(constants))[
+                0, 0
+            ]
         )
 
     def elastic_force(self, positions: ArrayLike, **constants: float) -> Array:
@@ -745,7 +751,7 @@ class Body(Discretisation):
         """
         x = self._state(positions)
         force = self._evaluate(
-            "force", [x, np.zeros_like(x)], self.elastic_theta(constants)
+            "force", [x, np.zeros_like(x)], theta=self.elastic_theta(constants)
         )
         return force.reshape(-1, 3)
 
@@ -755,13 +761,12 @@ class Body(Discretisation):
         """Return the stiffness K = ∂²Ψ/∂x², sparse (3n, 3n) [N/m], at (n, 3) node positions [m].
 
         Both triangles are stored. Row 3i + j is coordinate j of node i. See `energy` for the
-        constants
-        and errors.
+        constants and errors.
         """
         x = self._state(positions)
         theta = self.elastic_theta(constants)
         return self.pattern.matrix(
-            -self.linearise(x, np.zeros_like(x), theta).by_position[0]
+            -self.linearise(x, np.zeros_like(x), theta=theta).by_position[0]
         )
 
     # Many states ----------------------------------------------------------------------------
@@ -788,8 +793,7 @@ class Body(Discretisation):
             Tied masses [kg], which γ_m damps beside the mass of the body; None for no tied mass.
         memory_input : MemoryInput, optional
             Internal variables of a body with memory; None for relaxed memory, without overstress
-            and
-            stiffening.
+            and stiffening.
 
         Raises
         ------
@@ -800,7 +804,7 @@ class Body(Discretisation):
         """
         x, v = self._states(positions, velocities)
         internal = self._evaluate(
-            "force", [x, v], theta, memory_input=memory_input
+            "force", [x, v], theta=theta, memory_input=memory_input
         )
         return internal - self._damping_coefficients(theta, tied_kg) * v
 
@@ -826,14 +830,12 @@ class Body(Discretisation):
             Constants in the order of `constants`.
         out : (T, linearisation_width), optional
             Contiguous memory for the result, overwritten. All returned arrays are views of it, or
-            of new
-            memory if None.
+            of new memory if None.
         tied_kg : (3n,) or (T, 3n), optional
             Tied masses [kg], which γ_m damps beside the mass of the body; None for no tied mass.
         memory_input : MemoryInput, optional
             Internal variables of a body with memory; None for relaxed memory, where derivatives by
-            the
-            constants of the memory are zero.
+            the constants of the memory are zero.
 
         Raises
         ------
@@ -843,7 +845,13 @@ class Body(Discretisation):
             If the mesh is a shape under gravity and no stress-free shape exists at θ.
         """
         x, v = self._states(positions, velocities)
-        rows = self._evaluate("linearisation", [x, v], theta, out, memory_input)
+        rows = self._evaluate(
+            "linearisation",
+            [x, v],
+            theta=theta,
+            out=out,
+            memory_input=memory_input,
+        )
         size = self.pattern.size
         entries = self.pattern.entry_count
         width = len(self.constants) * size
@@ -863,7 +871,7 @@ class Body(Discretisation):
             spread = self.field_assemblies[number]
             slopes = spread.field.jacobian(np.asarray(theta)[columns])
             spread.assemble_nodal(
-                outputs["by_theta"], slopes, by_theta[:, :, columns]
+                outputs["by_theta"], slopes, out=by_theta[:, :, columns]
             )
         for column, slope in self._damping_derivatives(theta, tied_kg):
             # A density also changes the stress-free shape of a mesh made under gravity.
@@ -963,8 +971,8 @@ class Body(Discretisation):
             Tied masses [kg], which γ_m damps beside the mass of the body; None for no tied mass.
         memory_input : MemoryInput, optional
             Internal variables of a body with memory and the weights σ of the stress S. None for
-            relaxed
-            memory and σ = 0; without `stress_weights` σ = 0. Ignored if the body has no memory.
+            relaxed memory and σ = 0; without `stress_weights` σ = 0. Ignored if the body has no
+            memory.
 
         Raises
         ------
@@ -984,9 +992,11 @@ class Body(Discretisation):
                 memory_input,
                 overstress=np.hstack([memory_input.overstress, stress_weights]),
             )
-            rows = self._evaluate("curvature", [x, v, w], theta, out, past)
+            rows = self._evaluate(
+                "curvature", [x, v, w], theta=theta, out=out, memory_input=past
+            )
         else:
-            rows = self._evaluate("curvature", [x, v, w], theta, out)
+            rows = self._evaluate("curvature", [x, v, w], theta=theta, out=out)
         size = self.pattern.size
         entries = self.pattern.entry_count
         k = len(self.constants)
@@ -1009,10 +1019,14 @@ class Body(Discretisation):
             coefficients = np.asarray(theta)[field_columns]
             slopes = spread.field.jacobian(coefficients)
             spread.assemble_nodal(
-                outputs["position_theta"], slopes, x_theta[:, :, field_columns]
+                outputs["position_theta"],
+                slopes,
+                out=x_theta[:, :, field_columns],
             )
             spread.assemble_nodal(
-                outputs["velocity_theta"], slopes, v_theta[:, :, field_columns]
+                outputs["velocity_theta"],
+                slopes,
+                out=v_theta[:, :, field_columns],
             )
             by_theta[:, field_columns] = outputs["gradient_theta"] @ slopes
             first = self.starts[number]

@@ -38,9 +38,8 @@ class SymbolicFunction:
     symbols: dict[PartialIndex, ca.SX] = field(default_factory=dict)
 
     def symbol(self, index: PartialIndex = ()) -> ca.SX:
-        """Return the symbol of a partial derivative, in any order of its index; of the function itself
-        by
-        default. A new symbol is added to `symbols`.
+        """Return the symbol of a partial derivative, in any order of its index; of the function
+        itself by default. A new symbol is added to `symbols`.
         """
         key = tuple(sorted(index))
         if key not in self.symbols:
@@ -65,8 +64,7 @@ class SymbolicFunction:
     ) -> ca.SX:
         """Return the symbols (k, a) of the derivatives of k partial derivatives by a of the arguments,
         given by index: entry (i, j) is the derivative of the ith by the jth. New symbols are added
-        to
-        `symbols`.
+        to `symbols`.
         """
         return ca.vertcat(
             *(

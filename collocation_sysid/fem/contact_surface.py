@@ -63,9 +63,8 @@ class ContactSurface:
     def from_body(
         cls, body: Body, frame: Index, chosen: Selection | None
     ) -> ContactSurface:
-        """Return the contact points of a body and the frame of an obstacle: 3 on each linear face, 6
-        on
-        each quadratic one, face after face.
+        """Return the contact points of a body and the frame of an obstacle: 3 on each linear face,
+        6 on each quadratic one, face after face.
 
         Parameters
         ----------

@@ -281,12 +281,9 @@ class Discretisation(ConstantsModel):
         -------
         dict of (int, str) to slice
             By the index of the part and the name of the output, cell after cell. Each cell has one
-            number
-            for "gradient_theta" (∂φ/∂z), one for every dof of the cell for the outputs that are
-            vectors by
-            θ, and 2 c + 1 for "theta_theta" with the c constants of the points: ∂²φ/∂z∂θ (c),
-            ∂²φ/∂z²,
-            and ∂²φ/∂θ∂z (c) again.
+            number for "gradient_theta" (∂φ/∂z), one for every dof of the cell for the outputs that
+            are vectors by θ, and 2 c + 1 for "theta_theta" with the c constants of the points:
+            ∂²φ/∂z∂θ (c), ∂²φ/∂z², and ∂²φ/∂θ∂z (c) again.
         """
         start = self._width_without_fields(name)
         slices = {}
@@ -375,8 +372,8 @@ class Discretisation(ConstantsModel):
     @cached_property
     def shape_gradients(self) -> sp.csr_array:
         """Derivatives of the shape functions by position [1/m], sparse (3 E q, n): all quadrature
-        points
-        for axis x, element by element, then for y, then for z. Frame nodes have empty columns.
+        points for axis x, element by element, then for y, then for z. Frame nodes have empty
+        columns.
         """
         count, points = self.geometry.shape[:2]
         gradients = self.geometry[..., :-1].reshape(
@@ -479,19 +476,28 @@ class Discretisation(ConstantsModel):
                 point_data = self.point_data(
                     k, theta, with_second_derivatives=name == "curvature"
                 )
-                evaluate(fields, values, out, self.threads, k > 0, point_data)
+                evaluate(
+                    fields,
+                    values,
+                    out=out,
+                    threads=self.threads,
+                    add=k > 0,
+                    data_of_points=point_data,
+                )
                 continue
             past = memory_input or self.memory.relaxed(len(out))
             for rows, values[-1] in past.equal_stiffening_rows(k):
                 row_fields = [field[rows] for field in fields]
-                point_data = self.point_data(k, theta, past.overstress[rows])
+                point_data = self.point_data(
+                    k, theta, internal_variables=past.overstress[rows]
+                )
                 evaluate(
                     row_fields,
                     values,
-                    out[rows],
-                    self.threads,
-                    k > 0,
-                    point_data,
+                    out=out[rows],
+                    threads=self.threads,
+                    add=k > 0,
+                    data_of_points=point_data,
                 )
         return out
 

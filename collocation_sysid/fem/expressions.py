@@ -102,8 +102,7 @@ class PointLaw:
             Energy density as an expression in F.
         F, rate : SX
             Stacked deformation gradient, with m if the dilatation is averaged, and its rate;
-            further
-            symbols of `psi` and their rates may follow if the law accepts them.
+            further symbols of `psi` and their rates may follow if the law accepts them.
         theta : (k,) SX
             Constants of the law.
         """
@@ -225,7 +224,9 @@ def _energy_density(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     expression.
     """
     constants = _material_constants(point, law)
-    return law.material.psi_in(point.rule, point.material_gradient, constants)
+    return law.material.psi_in(
+        point.rule, point.material_gradient, values=constants
+    )
 
 
 def _material_constants(point: QuadraturePoint, law: PointLaw) -> ca.SX:
@@ -260,7 +261,9 @@ def _damping_potential(
         rate = ca.vertcat(rate, rates)
     elif law.damping.potential:
         (energy,) = point.rule.eliminate([energy])
-    return law.damping_potential(energy, strain, rate, point.local_constants)
+    return law.damping_potential(
+        energy, strain, rate=rate, theta=point.local_constants
+    )
 
 
 def memory_energy(point: QuadraturePoint) -> ca.SX:
@@ -313,7 +316,7 @@ def _damping(
     stress_and_slope = law.damping_stress(
         ca.vec(point.material_gradient),
         point.material_gradient_rate,
-        point.local_constants,
+        theta=point.local_constants,
     )
     return (
         None

@@ -70,7 +70,7 @@ class ForcePoints:
         return cls(
             nodes,
             np.broadcast_to(np.eye(count), (len(nodes), count, count)),
-            node_count,
+            node_count=node_count,
         )
 
     @property

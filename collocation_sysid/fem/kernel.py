@@ -397,18 +397,22 @@ class QuadraturePoint:
         return cls(
             element.nodes,
             {name: ca.SX.sym(name, 3 * element.nodes) for name in fields},
-            ca.SX.sym("geometry", 3 * element.nodes + 1),
-            ca.SX.sym("theta", constants),
-            {name: ca.SX.sym(f"gradient_{name}", 9) for name in fields},
-            tuple(ca.SX.sym(f"stretch_{k}") for k in range(stretches)),
-            ca.SX.sym(
+            geometry=ca.SX.sym("geometry", 3 * element.nodes + 1),
+            theta=ca.SX.sym("theta", constants),
+            gradients={
+                name: ca.SX.sym(f"gradient_{name}", 9) for name in fields
+            },
+            stretches=tuple(
+                ca.SX.sym(f"stretch_{k}") for k in range(stretches)
+            ),
+            point_data=ca.SX.sym(
                 "carried",
                 internal_variable_count
                 + bool(scaled)
                 + (rest.count if rest else 0),
             ),
-            scaled,
-            rest,
+            scaled_indices=scaled,
+            rest=rest,
         )
 
     @property
@@ -491,7 +495,9 @@ class QuadraturePoint:
         """Return the derivative of an expression by symbols (k,) along a direction (k,), including
         that through `rule`.
         """
-        return self.rule.directional_derivative(expression, by, direction)
+        return self.rule.directional_derivative(
+            expression, by, direction=direction
+        )
 
     @property
     def strain_rate_symbols(self) -> ca.SX:
@@ -521,16 +527,15 @@ class QuadraturePoint:
         """
         inputs = ca.vertcat(self.gradients["x"], *self.stretches[:2])
         direction = ca.vertcat(self.gradients["w"], *self.stretches[2:])
-        return self.directional_derivative(scalar, inputs, direction)
+        return self.directional_derivative(scalar, inputs, direction=direction)
 
     def derivative(self, scalar: ca.SX, by: By) -> ca.SX:
         """Return a derivative of a scalar by zero, one or two variables; x, v and w stand for their
         gradients (9,), "theta" for the differentiated constants.
 
         Averaged stretches and other symbols are constant. The result is the scalar itself, a
-        gradient as a
-        column (k,), or the matrix (k, l) of second derivatives by the first and the second
-        variable.
+        gradient as a column (k,), or the matrix (k, l) of second derivatives by the first and the
+        second variable.
         """
         inputs = [
             self.differentiated_constants

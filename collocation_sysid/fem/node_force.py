@@ -143,8 +143,7 @@ class NodeForce:
         ------
         InputError
             If the law cannot be evaluated, has the wrong shape, or is not finite at rest; if a
-            definition
-            is of no argument, or `on` is unknown.
+            definition is of no argument, or `on` is unknown.
         """
         name = name or str(getattr(law, "__name__", "force")).replace("_", "-")
         definitions = {constant.name: constant for constant in constants}
@@ -172,7 +171,14 @@ class NodeForce:
             raise InputError(
                 f"force {name!r} is on {on!r}; expected one of {', '.join(get_args(On))}"
             )
-        force = cls(name, law, known, chosen, on, carries)
+        force = cls(
+            name,
+            law,
+            constants=known,
+            nodes=chosen,
+            on=on,
+            internal_variable_count=carries,
+        )
         force._check()
         return force
 
@@ -181,13 +187,11 @@ class NodeForce:
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
-        """Return forces (3k,) on k nodes, followed by the internal variables after the evaluation, as
-        an
-        expression.
+        """Return forces (3k,) on k nodes, followed by the internal variables after the evaluation,
+        as an expression.
 
         A force on a face is shared by its last three nodes: the corners, or the mid nodes of a
-        quadratic
-        face, whose corners get zero.
+        quadratic face, whose corners get zero.
 
         Parameters
         ----------
@@ -251,9 +255,8 @@ class NodeForce:
         return _as_column(force), _as_column(after)
 
     def input_size(self, dofs: int) -> int:
-        """Return the length of u of `expression` for a number of position dofs: 3 of a node, 9 or 18
-        of a
-        face.
+        """Return the length of u of `expression` for a number of position dofs: 3 of a node, 9 or
+        18 of a face.
         """
         return 2 * dofs + len(self.constants) + self.internal_variable_count
 
@@ -271,9 +274,8 @@ class NodeForce:
 
     @cached_property
     def has_skew_damping(self) -> bool:
-        """Whether the derivative of the force by v is not symmetric at one of three random points, as
-        for
-        gyroscopic forces.
+        """Whether the derivative of the force by v is not symmetric at one of three random points,
+        as for gyroscopic forces.
         """
         return self._relative_skew_parts[1] > SYMMETRY_TOLERANCE
 
@@ -294,8 +296,7 @@ class NodeForce:
     @cached_property
     def _relative_skew_parts(self) -> tuple[float, float]:
         """Largest relative skew parts of the derivatives by x and by v, at three random points of a
-        fixed
-        seed; 0 for a derivative that is zero.
+        fixed seed; 0 for a derivative that is zero.
         """
         rng = np.random.default_rng(0)
         largest = np.zeros(2)
@@ -452,7 +453,10 @@ class LocatedForce:
             data = data[:, nodes[:, -3:]].mean(axis=2)
             data[3:] = 0.0
         return cls(
-            force, ForcePoints.at_nodes(nodes, len(volume_m3)), data, columns
+            force,
+            ForcePoints.at_nodes(nodes, len(volume_m3)),
+            data=data,
+            columns=columns,
         )
 
 

@@ -68,7 +68,7 @@ class SymmetricPattern:
         codes = np.unique(
             np.append(columns * size + rows, np.arange(size) * (size + 1))
         )
-        return cls(size, codes % size, codes // size)
+        return cls(size, codes % size, columns=codes // size)
 
     @property
     def entry_count(self) -> int:
@@ -114,8 +114,7 @@ class SymmetricPattern:
 
     def matrix(self, values: NDArray[np.float64]) -> sp.csc_array:
         """Return the full symmetric matrix, sparse (3n, 3n) with both triangles, with the
-        lower-triangle
-        values (m,).
+        lower-triangle values (m,).
         """
         rows, columns, source = self.full
         return sp.csc_array(
@@ -150,14 +149,13 @@ class JointPattern:
     @staticmethod
     @lru_cache(maxsize=16)
     def from_patterns(patterns: tuple[SymmetricPattern, ...]) -> JointPattern:
-        """Return the union of patterns of one size, at least one; the latest 16 results are cached by
-        the
-        identity of the patterns.
+        """Return the union of patterns of one size, at least one; the latest 16 results are cached
+        by the identity of the patterns.
         """
         rows = np.concatenate([pattern.rows for pattern in patterns])
         columns = np.concatenate([pattern.columns for pattern in patterns])
         union = SymmetricPattern.from_entries(
-            rows, columns, patterns[0].size // 3
+            rows, columns, nodes=patterns[0].size // 3
         )
         union = (
             patterns[0]
@@ -174,8 +172,7 @@ class JointPattern:
         elsewhere.
 
         The same array is returned if both patterns are equal, or if it is empty, (T, 0), as absent
-        skew
-        parts are.
+        skew parts are.
         """
         if not values.size or values.shape[1] == self.pattern.entry_count:
             return values

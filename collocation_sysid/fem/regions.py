@@ -158,9 +158,8 @@ class BodyPart:
 
     @property
     def point_constant_count(self) -> int:
-        """Number of constants that the kernel of a quadrature point reads: those of the material and
-        the
-        damping law, and one more, the stiffening by memory, if the part has branches.
+        """Number of constants that the kernel of a quadrature point reads: those of the material
+        and the damping law, and one more, the stiffening by memory, if the part has branches.
         """
         return self.law_constant_count + bool(self.prony)
 
@@ -284,7 +283,9 @@ def _with_field(part: BodyPart, field: Field | None, mesh: TetMesh) -> BodyPart:
         return part
     law = (*part.material.constants, *part.damping.constants)
     kind = TwoPhaseModes if field.prior == TWO_PHASE else FieldModes
-    return replace(part, field=kind.from_field(field, mesh, part.cells, law))
+    return replace(
+        part, field=kind.from_field(field, mesh, cells=part.cells, law=law)
+    )
 
 
 def _densities(
@@ -546,8 +547,7 @@ class ConstantsModel:
         values : mapping of str to number or expression
             Constants, or moduli and `mass_kg` in their place. Names that the body does not use are
             ignored. A coefficient of a field or a contrast that is missing has its usual value: 0
-            for a
-            coefficient, so that the field equals its mean.
+            for a coefficient, so that the field equals its mean.
 
         Raises
         ------
@@ -616,10 +616,8 @@ class ConstantsModel:
         """Return the names of the parts whose densities are given by parameters of these names.
 
         `mass_kg` among the names frees all densities; ``density_kg_m3`` those that are stated for
-        the body,
-        not for a region alone; ``core.density_kg_m3`` that of the region "core" in any case. "" is
-        the part
-        outside all regions.
+        the body, not for a region alone; ``core.density_kg_m3`` that of the region "core" in any
+        case. "" is the part outside all regions.
         """
         return [
             part.name
@@ -631,8 +629,7 @@ class ConstantsModel:
 
     def split_theta(self, theta: Any) -> list[Any]:
         """Return the slices of θ (numbers or a CasADi expression) of each part, in the order of
-        `parts`;
-        constants of custom forces and frictions are left out.
+        `parts`; constants of custom forces and frictions are left out.
         """
         return [theta[a:b] for a, b in pairwise(self.starts)]
 

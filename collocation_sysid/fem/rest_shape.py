@@ -372,8 +372,7 @@ class InverseEquilibrium:
         Dofs of the nodes that were not held.
     places : (k,)
         Indices in θ of the inputs on which the stress-free shape depends: elastic constants, then
-        free
-        densities.
+        free densities.
     layout : RestPointLayout
         Layout of the data of the points.
 
@@ -410,8 +409,7 @@ class InverseEquilibrium:
         inputs; the latest 16 are cached.
 
         Newton's method starts from the latest solution if that is near, then from the mesh: where
-        several
-        shapes exist, the result can depend on earlier calls.
+        several shapes exist, the result can depend on earlier calls.
 
         Raises
         ------
@@ -493,8 +491,7 @@ class InverseEquilibrium:
 
     def point_data_columns(self, part: int) -> Index:
         """Return the columns (E, q, `layout.count`) of the data of each point in a row of
-        `point_data`,
-        for the part of this index.
+        `point_data`, for the part of this index.
         """
         count, points = self._parts[part][1].shape[:2]
         size = self.layout.count

@@ -82,7 +82,7 @@ class PolylineLength:
         """Pairs of dofs with a nonzero second derivative, and the diagonal."""
         pairs = self._pairs
         return SymmetricPattern.from_entries(
-            pairs.row, pairs.column, self.node_count
+            pairs.row, pairs.column, nodes=self.node_count
         )
 
     @cached_property
@@ -251,7 +251,7 @@ class EnclosedVolume:
         """Pairs of dofs with a nonzero second derivative, and the diagonal."""
         terms = self._terms
         return SymmetricPattern.from_entries(
-            terms.row, terms.column, self.node_count
+            terms.row, terms.column, nodes=self.node_count
         )
 
     @cached_property
@@ -297,8 +297,7 @@ class EnclosedVolume:
 
     def hessian_derivative(self, x: Array, w: Array) -> Array:
         """Return Σ w_i ∂³V/∂x_i∂x² (T, entries) on `couplings` in the directions w (T, 3n); it does
-        not
-        depend on the positions x (T, 3n).
+        not depend on the positions x (T, 3n).
         """
         return np.asarray(w @ self._hessian_matrix)
 

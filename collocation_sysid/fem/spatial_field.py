@@ -135,8 +135,7 @@ class Laplacian:
         """Return the lowest eigenpairs after the constant eigenvector, ascending.
 
         Signs are such that the entry of largest magnitude at a node is positive. Further
-        eigenvalues of a
-        body of several pieces are zero.
+        eigenvalues of a body of several pieces are zero.
 
         Parameters
         ----------
@@ -195,7 +194,9 @@ class Laplacian:
             basis[np.abs(basis).argmax(axis=0), np.arange(count + 1)]
         )
         vectors = (root @ basis[:, 1:])[local_nodes].mean(axis=1).T
-        return cls(np.maximum(values[1:], 0.0), vectors, matrix, basis)
+        return cls(
+            np.maximum(values[1:], 0.0), vectors, matrix=matrix, basis=basis
+        )
 
     def weights(self, length_m: float) -> Array:
         """Return 1/(1/l² + λ) (m,) for a correlation length l [m]: the prior deviations of the
@@ -292,8 +293,7 @@ class FieldModes:
         ------
         InputError
             If the field's parameter is not one of these constants, all moduli, or the density, or
-            if the
-            cells have too few nodes for its shapes.
+            if the cells have too few nodes for its shapes.
         """
         names = [constant.name for constant in law]
         moduli = [k for k, name in enumerate(names) if is_modulus(name)]
@@ -305,19 +305,18 @@ class FieldModes:
             raise InputError(
                 f"parameter of a field is {field.parameter!r}; expected one of {', '.join(known)}"
             )
-        laplacian = Laplacian.from_mesh(mesh, cells, field.modes)
+        laplacian = Laplacian.from_mesh(mesh, cells, count=field.modes)
         return cls(
             field,
             laplacian,
-            tuple(scaled),
-            field.lengths_m[0],
-            mesh.volumes_m3[cells],
+            scaled_indices=tuple(scaled),
+            length_m=field.lengths_m[0],
+            volumes_m3=mesh.volumes_m3[cells],
         )
 
     def logarithms(self, coefficients: Array) -> Array:
         """Return ln c − ln c̄ (E,) in every cell, from the coefficients (k,) of `constants`; for a
-        density
-        it is ρ/ρ_s − 1 instead, see the module.
+        density it is ρ/ρ_s − 1 instead, see the module.
         """
         return self.shapes @ coefficients
 
@@ -382,8 +381,7 @@ class FieldModes:
 
     def split_in_eight(self) -> FieldModes:
         """Return this field on a mesh whose cells are split into eight, each in place of one; the
-        shapes
-        have the value of the cell before, and nothing is computed again.
+        shapes have the value of the cell before, and nothing is computed again.
         """
         vectors = np.repeat(self.laplacian.vectors, 8, axis=1)
         volumes_m3 = np.repeat(self.volumes_m3 / 8, 8)
@@ -391,9 +389,8 @@ class FieldModes:
         return replace(self, laplacian=laplacian, volumes_m3=volumes_m3)
 
     def with_length(self, length_m: float) -> FieldModes:
-        """Return this field with another correlation length [m] and the same eigenvectors; it need not
-        be
-        one of `Field.lengths_m`.
+        """Return this field with another correlation length [m] and the same eigenvectors; it need
+        not be one of `Field.lengths_m`.
         """
         return replace(self, length_m=length_m)
 

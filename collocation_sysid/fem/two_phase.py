@@ -122,23 +122,21 @@ class TwoPhaseModes(FieldModes):
                 f"length_m of a two-phase field has {len(field.lengths_m)} values; expected one: "
                 "lengths to choose from are for prior = 'smooth'"
             )
-        modes = super().from_field(field, mesh, cells, law)
+        modes = super().from_field(field, mesh, cells=cells, law=law)
         assert isinstance(modes, cls)
         return replace(modes, phase=np.zeros(len(cells)))
 
     @property
     def has_phases(self) -> bool:
         """Whether any element is in an inclusion; false until phases are known, and also if the
-        solution
-        has none.
+        solution has none.
         """
         return bool(self.phase.any())
 
     @property
     def smooth_field(self) -> FieldModes:
         """Smooth field of the same cells and correlation length, with the default amplitude, with
-        which
-        the search for the phases starts.
+        which the search for the phases starts.
         """
         field = replace(self.field, prior=SMOOTH, amplitude=None)
         return FieldModes(
@@ -165,9 +163,8 @@ class TwoPhaseModes(FieldModes):
         return (CONTRAST,)
 
     def split_in_eight(self) -> TwoPhaseModes:
-        """Return this field on a mesh whose cells are split into eight, each in place of one; phases
-        and
-        samples are those of the cell before.
+        """Return this field on a mesh whose cells are split into eight, each in place of one;
+        phases and samples are those of the cell before.
         """
         finer = super().split_in_eight()
         assert isinstance(finer, TwoPhaseModes)
@@ -225,10 +222,10 @@ class ElementLogarithms(FieldModes):
         return cls(
             field,
             modes.laplacian,
-            modes.scaled_indices,
-            modes.length_m,
-            volumes_m3,
-            base,
+            scaled_indices=modes.scaled_indices,
+            length_m=modes.length_m,
+            volumes_m3=volumes_m3,
+            base=base,
         )
 
     @cached_property

@@ -181,8 +181,7 @@ class ContactLaw:
 
     def friction_coefficient(self, constants: ca.SX) -> ca.SX:
         """Return the friction coefficient μ: the stated number (0 without friction), or the last of
-        the law's
-        constants (c,) if it is a parameter.
+        the law's constants (c,) if it is a parameter.
         """
         coefficient = self.obstacle.friction
         return (
@@ -254,9 +253,9 @@ class ContactLaw:
     def mean_scaled_pressure(
         self, gaps: tuple[ca.SX, ca.SX], data: ca.SX
     ) -> ca.SX:
-        """Return the mean of b [m] over a step in which the gap changes linearly from the first to the
-        second
-        of `gaps` [m]; `data` (5,) are those of the point. Relaxed contact has no such mean.
+        """Return the mean of b [m] over a step in which the gap changes linearly from the first to
+        the second of `gaps` [m]; `data` (5,) are those of the point. Relaxed contact has no such
+        mean.
         """
         width_m = data[2]
         reach = mean_square(*(width_m - gap for gap in gaps))
@@ -580,8 +579,7 @@ class Contact(Pointwise):
 
     def scaled_pressures(self, xi: Array) -> Array:
         """Return the pressures divided by κ, b (1, T, i) [m], at positions ξ (T, 3n) [m], from the
-        gaps there:
-        without an average over the step, and without a given b.
+        gaps there: without an average over the step, and without a given b.
         """
         gaps = self.law_of_contact.gaps(self.points.vectors(xi))
         data = np.broadcast_to(
@@ -683,9 +681,8 @@ class Contact(Pointwise):
         )
 
     def deepest_point(self, x: Array) -> tuple[float, Array]:
-        """Return the depth δ − g [m] of the point with the smallest gap at positions x (3n,) [m], and
-        the
-        gradient of its gap (3,) in the axes of the world, the obstacle's outward normal.
+        """Return the depth δ − g [m] of the point with the smallest gap at positions x (3n,) [m],
+        and the gradient of its gap (3,) in the axes of the world, the obstacle's outward normal.
 
         The depth is negative if no point has a pressure.
         """

@@ -77,7 +77,7 @@ class StencilTables:
             ):
                 table[row, : len(values)] = values
             r[row] = stencil.r
-        return cls(p, q, w, s, r)
+        return cls(p, q, w=w, s=s, r=r)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +169,7 @@ class Dynamics:
             table = as_scheme(scheme, experiment.start_rule)
         rows = len(t_s)
         first_row = 0 if experiment.start == "equilibrium" else 1
-        tables = StencilTables.from_scheme(table, rows, first_row)
+        tables = StencilTables.from_scheme(table, rows, first_row=first_row)
         velocity = experiment.start_velocities_m_s
         dofs = experiment.body.pattern.size
         lags = tables.p @ np.arange(tables.p.shape[1])
@@ -217,9 +217,9 @@ class Dynamics:
         )
 
     def rows_to_evaluations(self, row_values: Array) -> Array:
-        """Return quantities of the rows (N, …), distributed to the evaluations (N, …) by the transpose
-        of
-        `evaluations_to_rows`. A row without forces has its value at its own evaluation.
+        """Return quantities of the rows (N, …), distributed to the evaluations (N, …) by the
+        transpose of `evaluations_to_rows`. A row without forces has its value at its own
+        evaluation.
         """
         total = self.tables.w.sum(axis=1).reshape(
             (-1,) + (1,) * (row_values.ndim - 1)
@@ -231,8 +231,8 @@ class Dynamics:
 
     def evaluations_to_rows(self, evaluation_values: Array) -> Array:
         """Return the mean over the evaluations of each row (N, …), weighted like the forces; a row
-        without
-        forces has the value of its own evaluation. If all values are equal, the argument itself.
+        without forces has the value of its own evaluation. If all values are equal, the argument
+        itself.
         """
         return _evaluation_mean(self.tables, evaluation_values)
 
@@ -404,9 +404,8 @@ class Dynamics:
         )
 
     def combine(self, table: Array, rows: Array) -> Array:
-        """Return Σ_i table[t, i] rows[t − i] for every t, from coefficients (N, lags) and `rows` (N,
-        …), in
-        the shape of `rows`; terms before the start are omitted.
+        """Return Σ_i table[t, i] rows[t − i] for every t, from coefficients (N, lags) and `rows`
+        (N, …), in the shape of `rows`; terms before the start are omitted.
         """
         return _combine(table, rows)
 
@@ -612,10 +611,10 @@ class StencilRow:
         return cls(
             tuple(tables.p[t].tolist()),
             tuple((tables.q[t] / step_s).tolist()),
-            tuple(tables.w[t].tolist()),
-            tuple((tables.s[t] / step_s**2).tolist()),
-            float(tables.r[t]) / step_s,
-            dynamics.mass.inertia_at(t),
+            w=tuple(tables.w[t].tolist()),
+            s=tuple((tables.s[t] / step_s**2).tolist()),
+            r=float(tables.r[t]) / step_s,
+            mass_kg=dynamics.mass.inertia_at(t),
         )
 
     @cached_property

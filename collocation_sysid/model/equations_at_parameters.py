@@ -66,8 +66,7 @@ class EquationsAtParameters:
         self, rows: int | slice, input_slopes: Array
     ) -> Array:
         """Return the derivatives ∂F/∂p (…, 3n, m) of the total forces at some evaluations, at fixed
-        states:
-        ∂F/∂u ∂u/∂p.
+        states: ∂F/∂u ∂u/∂p.
 
         Parameters
         ----------
@@ -105,8 +104,7 @@ class EquationsAtParameters:
         self, rows: int | slice, acceleration: Array, dofs: Index | slice
     ) -> Array | float:
         """Return ∂(M a)/∂p (…, k, m) of rows at given accelerations; the number 0.0 if M is
-        independent of
-        p.
+        independent of p.
 
         Parameters
         ----------
@@ -139,8 +137,7 @@ class EquationsAtParameters:
             Positions [m].
         force_curvature : SecondDerivatives
             Second derivatives of the forces at all N evaluations, by x, v and u, with the weights
-            that the
-            stencils give the forces.
+            that the stencils give the forces.
         row_weights : (N, 3n)
             Weights of the residuals c.
         """

@@ -84,7 +84,7 @@ class ForceHistory:
         previous = PreviousState(
             np.zeros(shape) if before is None else before, since_s
         )
-        history = cls(forces, number, xi, nu, previous)
+        history = cls(forces, number, xi=xi, nu=nu, previous_state=previous)
         if before is None:
             for k in range(len(xi) - 1):
                 previous.before[:, k + 1] = history.internal_variables(
@@ -271,7 +271,7 @@ class ForcePreviousState:
         return cls(
             number,
             term,
-            term.internal_variables(forces.states_of_terms(x, v)(term)),
+            after=term.internal_variables(forces.states_of_terms(x, v)(term)),
         )
 
     def insert_at_same_time(self, forces: Forces) -> Forces:
@@ -312,7 +312,10 @@ class ForcePreviousState:
         interval_s : float
         """
         return ForcePreviousState.from_state(
-            self.insert_after_interval(forces, interval_s), self.number, x, v
+            self.insert_after_interval(forces, interval_s),
+            self.number,
+            x=x,
+            v=v,
         )
 
 

@@ -103,9 +103,9 @@ class Forces:
         forces = cls(
             Weight.from_experiment(experiment, times),
             further,
-            experiment.coupled_graph,
-            unknown,
-            still,
+            joint_pattern=experiment.coupled_graph,
+            theta=unknown,
+            is_static=still,
         )
         return forces if theta is None else forces.with_theta(theta)
 
@@ -120,12 +120,16 @@ class Forces:
         custom = custom_force_terms(body, np.zeros(1))
         known = np.asarray(theta, dtype=float)
         weight = Weight.of_body_alone(body).with_theta(known)
-        return cls(weight, custom, body.joint_pattern_with(()), known)
+        return cls(
+            weight,
+            custom,
+            joint_pattern=body.joint_pattern_with(()),
+            theta=known,
+        )
 
     def with_theta(self, theta: Sequence[float] | Array) -> Forces:
         """Return these forces for a body with constants θ (k,), which are copied; masses follow the
-        free
-        densities.
+        free densities.
         """
         known = np.array(theta, dtype=float)
         return replace(self, theta=known, weight=self.weight.with_theta(known))
@@ -162,9 +166,8 @@ class Forces:
         return self.weight.mass_derivatives(self._input_offsets[0])
 
     def with_inputs(self, u: Array) -> Forces:
-        """Return these forces at inputs u (T, U): θ from the first time, then the inputs of each term,
-        in
-        the order of `terms`.
+        """Return these forces at inputs u (T, U): θ from the first time, then the inputs of each
+        term, in the order of `terms`.
         """
         forces = self.with_theta(u[0, : self._input_offsets[0]])
         if self._input_offsets[0] == self._input_offsets[-1]:
@@ -274,16 +277,15 @@ class Forces:
 
     def total(self, xi: Array, nu: Array) -> Array:
         """Return the sum of all forces F (T, 3n) [N], internal and external, at positions ξ (T, 3n)
-        [m] and
-        velocities ν (T, 3n) [m/s].
+        [m] and velocities ν (T, 3n) [m/s].
         """
         states_for = self.states_of_terms(xi, nu)
         total = self.body.force(
             xi,
             states_for(self.weight).nu,
-            self.theta,
-            self.mass.compact_tied_kg,
-            self.memory_state,
+            theta=self.theta,
+            tied_kg=self.mass.compact_tied_kg,
+            memory_input=self.memory_state,
         )
         for term in self.terms:
             total = total + term.force(states_for(term))
@@ -297,8 +299,7 @@ class Forces:
 
         Internal variables of `memory_state` and of the terms are constant. In a static experiment
         `by_velocity` has only the parts of terms with `uses_increments`. Skew parts are empty, (T,
-        0),
-        if no force has one.
+        0), if no force has one.
 
         Parameters
         ----------
@@ -312,10 +313,10 @@ class Forces:
         at = self.body.linearise(
             xi,
             still_nu,
-            self.theta,
-            out,
-            self.mass.compact_tied_kg,
-            self.memory_state,
+            theta=self.theta,
+            out=out,
+            tied_kg=self.mass.compact_tied_kg,
+            memory_input=self.memory_state,
         )
         if self.is_static:
             at.by_velocity[:] = 0.0
@@ -335,7 +336,7 @@ class Forces:
                 ),
             )
         for term, places in self._terms_with_indices:
-            term.add_derivatives(at, places, states_for(term))
+            term.add_derivatives(at, places, states=states_for(term))
         return at
 
     @property
@@ -375,11 +376,11 @@ class Forces:
         at = self.body.second_derivatives(
             xi,
             states_for(self.weight).nu,
-            weights,
-            self.theta,
-            out,
-            self.mass.compact_tied_kg,
-            self.memory_state,
+            weights=weights,
+            theta=self.theta,
+            out=out,
+            tied_kg=self.mass.compact_tied_kg,
+            memory_input=self.memory_state,
         )
         if self.is_static:
             for by_velocity in (
@@ -413,7 +414,10 @@ class Forces:
         for term, places in self._terms_with_indices:
             states = states_for(term)
             term.add_second_derivatives(
-                at, places, states, weights.reshape(states.xi.shape)
+                at,
+                places,
+                states=states,
+                weights=weights.reshape(states.xi.shape),
             )
         return at
 

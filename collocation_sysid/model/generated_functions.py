@@ -55,8 +55,7 @@ class GeneratedFunction:
         """Return the values y (m, …) at inputs (k, …) or (k,) and data (d, …).
 
         The axes … of the result are those of the data, also if their product is zero; (0, …) are
-        data of an
-        expression that uses none.
+        data of an expression that uses none.
         """
         return self._evaluate_at_instances(self._value, u, data)[0][:, 0]
 

@@ -70,8 +70,8 @@ class GraspConstraint:
 
     def evaluate_at(self, phi: Array) -> PrescribedDisplacements:
         """Return the prescribed positions at all nuisance parameters φ of the experiment, with
-        derivatives by
-        the m φ of the motion; positions are NaN and derivatives zero while a dof is free.
+        derivatives by the m φ of the motion; positions are NaN and derivatives zero while a dof is
+        free.
         """
         if not self.nuisance.affects_grasps:
             return self._constant_positions
@@ -88,15 +88,12 @@ class GraspConstraint:
         return PrescribedDisplacements(self.dofs, positions, by_phi=by_phi)
 
     def displaced_nodes(self, phi: Array) -> tuple[Array, Array]:
-        """Return for each grasped dof the displaced place of its node (g, 3) [m], in the frame of its
-        grasp,
-        and the derivatives (g, 3, m) by the m φ of the motion.
+        """Return for each grasped dof the displaced place of its node (g, 3) [m], in the frame of
+        its grasp, and the derivatives (g, 3, m) by the m φ of the motion.
 
         It is H X with the hand–eye transform H for a node of the body. A node of an obstacle's
-        frame is at
-        X, displaced to first order by offset and tilt of the obstacle; the delay of an obstacle and
-        the
-        zeros of displacements are not included.
+        frame is at X, displaced to first order by offset and tilt of the obstacle; the delay of an
+        obstacle and the zeros of displacements are not included.
         """
         places, by_own = self.nuisance.grasp_motion.evaluate_with_jacobian(
             self._phi_of_grasps(phi), self._points
@@ -142,7 +139,7 @@ class GraspConstraint:
         node_weights[~self._is_body_node] = 0.0
         hessian = np.zeros((len(self.nuisance.motion_indices),) * 2)
         second = self.nuisance.grasp_motion.weighted_hessian(
-            self._phi_of_grasps(phi), self._points, node_weights.T
+            self._phi_of_grasps(phi), self._points, weights=node_weights.T
         )
         hessian[np.ix_(self._columns, self._columns)] = second.sum(axis=2)
         return hessian
@@ -159,8 +156,7 @@ class GraspConstraint:
     @cached_property
     def _direct_derivatives(self) -> Array:
         """Derivatives of positions (N, g, m) by zeros of displacements and of the strain, and by
-        delays of
-        obstacles, which enter to first order; zero for all other φ.
+        delays of obstacles, which enter to first order; zero for all other φ.
         """
         derivatives = np.zeros(
             (len(self.t_s), len(self.dofs), len(self.nuisance.motion_indices))

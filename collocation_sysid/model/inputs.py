@@ -94,8 +94,7 @@ class Inputs:
 
     def weighted_hessian(self, p: Array, weights: Array) -> Array:
         """Return Σ_t weights[t] · ∂²u_t/∂p² (m, m), summed over all evaluations and entries, at
-        parameters p
-        (m,), for weights (N, U).
+        parameters p (m,), for weights (N, U).
         """
         hessian = np.zeros((self.parameter_count,) * 2)
         offset = 0
@@ -104,7 +103,7 @@ class Inputs:
             if each.data.shape[1] == 1:
                 group_weights = group_weights.sum(axis=1, keepdims=True)
             hessian += generated.weighted_hessian(
-                p, each.data, group_weights
+                p, each.data, weights=group_weights
             ).sum(axis=2)
             offset += each.size
         return hessian
@@ -139,7 +138,7 @@ def with_inputs(dynamics: Dynamics, nuisance: NuisanceMap) -> Dynamics:
     loads = [timed.load for timed in nuisance.timed_loads]
     has_gravity_input = len(nuisance.gravity_indices) > 0
     weight = forces.weight.with_load_inputs(
-        has_gravity_input, loads, dynamics.evaluated_s
+        has_gravity_input, loads, t_s=dynamics.evaluated_s
     )
     return replace(dynamics, forces=replace(forces, weight=weight))
 

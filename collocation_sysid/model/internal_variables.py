@@ -107,12 +107,15 @@ def start_states(
         Time for which the body has been in its start shape; infinite if its memory has relaxed.
     """
     states: list[PreviousState] = [
-        ForcePreviousState.from_state(forces, number, x, v)
+        ForcePreviousState.from_state(forces, number, x=x, v=v)
         for number in forces.terms_with_internal_variables
     ]
     if forces.body.has_memory:
         states.insert(
-            0, MemoryState.at_start(forces.body, x, forces.theta, loaded_s)
+            0,
+            MemoryState.at_start(
+                forces.body, x, theta=forces.theta, loaded_s=loaded_s
+            ),
         )
     return tuple(states)
 
@@ -146,5 +149,6 @@ def advance_states(
     `previous_states`; `forces` are those at the later time.
     """
     return tuple(
-        each.advance(forces, x, v, interval_s) for each in previous_states
+        each.advance(forces, x, v=v, interval_s=interval_s)
+        for each in previous_states
     )

@@ -121,8 +121,8 @@ class NuisanceEntry:
         Row of the table of nuisance parameters.
     number : int
         Index of the component among those of the kind `row.of`: marker, grasp, actuator (tendons,
-        then
-        pressures), load, camera or sensor of the experiment; 0 for a parameter of the recording.
+        then pressures), load, camera or sensor of the experiment; 0 for a parameter of the
+        recording.
     axis : int
         Index of the axis of a vector-valued row.
     label : str
@@ -238,21 +238,21 @@ class NuisanceMap:
                 f"{scope.get(e.row.name, experiment.name)}: {e.label}"
                 for e in entries
             ),
-            scales,
-            np.array(reach),
-            experiment.timestep_s,
-            experiment.duration_s,
-            np.array(experiment.gravity_m_s2),
-            middle_m if pivot_m is None else pivot_m,
-            body.nodes_m[
+            scales=scales,
+            step_limits=np.array(reach),
+            interval_s=experiment.timestep_s,
+            duration_s=experiment.duration_s,
+            gravity_m_s2=np.array(experiment.gravity_m_s2),
+            pivot_m=middle_m if pivot_m is None else pivot_m,
+            grasp_pivot_m=body.nodes_m[
                 grasped_nodes if len(grasped_nodes) else slice(None)
             ].mean(axis=0),
-            np.array([a.calibration for a in experiment.actuators]).reshape(
-                -1, 3
-            ),
-            tuple(timed for _, timed in _timed_loads(experiment)),
-            (float(experiment.t_s[0]), float(experiment.t_s[-1])),
-            _strain_shifts_m(experiment),
+            declared_calibration=np.array(
+                [a.calibration for a in experiment.actuators]
+            ).reshape(-1, 3),
+            timed_loads=tuple(timed for _, timed in _timed_loads(experiment)),
+            recorded_s=(float(experiment.t_s[0]), float(experiment.t_s[-1])),
+            strain_shifts_m=_strain_shifts_m(experiment),
         )
         for row in experiment.nuisance.own:
             nuisance_map._require_valid_expression(row)
@@ -304,9 +304,8 @@ class NuisanceMap:
     def iterate_values(
         self, phi: Array
     ) -> Iterator[tuple[NuisanceEntry, str, float]]:
-        """Yield entry, name and value (in the entry's unit) of each parameter at φ (k,), in the order
-        of
-        φ, without the places of markers.
+        """Yield entry, name and value (in the entry's unit) of each parameter at φ (k,), in the
+        order of φ, without the places of markers.
         """
         for entry, name, value in zip(
             self.entries, self.names, phi * self.scales, strict=True
@@ -334,8 +333,7 @@ class NuisanceMap:
 
     def _indices_where(self, chosen: Callable[[NuisanceEntry], bool]) -> Index:
         """Return the indices in φ, ascending, of the entries for which a function is true; empty if
-        there
-        are none.
+        there are none.
         """
         return np.array(
             [k for k, e in enumerate(self.entries) if chosen(e)], dtype=np.int64
@@ -344,8 +342,7 @@ class NuisanceMap:
     @cached_property
     def motion_indices(self) -> Index:
         """Indices in φ, ascending, of the parameters that affect the motion: gravity, grasps,
-        obstacles,
-        loads, actuators.
+        obstacles, loads, actuators.
         """
         return self._indices_where(
             lambda e: not CHANGES_OF_MOTION.isdisjoint(e.row.changes)
@@ -394,8 +391,7 @@ class NuisanceMap:
 
     def marker_indices(self, count: int) -> Index:
         """Return the indices in φ (count, f) of the parameters on which the measurement of each of
-        `count`
-        markers depends: those of the marker, then those of all markers.
+        `count` markers depends: those of the marker, then those of all markers.
 
         f is the same for all markers; it may be 0.
         """
@@ -424,8 +420,7 @@ class NuisanceMap:
 
     def marker_delay_s(self, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
         """Return the delay of a marker's measurement relative to the time t_s [s]: the sum of all
-        clocks,
-        0 without any.
+        clocks, 0 without any.
 
         Parameters
         ----------
@@ -478,9 +473,8 @@ class NuisanceMap:
         return len(np.setdiff1d(self.motion_indices, self.gravity_indices)) > 0
 
     def displacement_zero_indices(self, number: int) -> Index:
-        """Return the indices in φ of the zeros of the displacement of the grasp with index `number`,
-        axis by
-        axis; empty if they are not estimated.
+        """Return the indices in φ of the zeros of the displacement of the grasp with index
+        `number`, axis by axis; empty if they are not estimated.
         """
         return self.indices_of_rows(ZERO, component=number)
 
@@ -492,9 +486,8 @@ class NuisanceMap:
     def obstacle_parameters(
         self, number: int
     ) -> list[tuple[NuisanceRow, int, int]]:
-        """Return row, axis and index in φ of every nuisance parameter of an obstacle, ascending in φ;
-        empty
-        for a gripper.
+        """Return row, axis and index in φ of every nuisance parameter of an obstacle, ascending in
+        φ; empty for a gripper.
 
         Parameters
         ----------
@@ -517,8 +510,7 @@ class NuisanceMap:
         self, grasps: Sequence[Grasp], phi: Array
     ) -> tuple[Grasp, ...]:
         """Return grasps and obstacles at their poses at φ (k,): with the hand–eye transform and the
-        zeros of
-        displacement and strain, obstacles with offset, tilt and delay.
+        zeros of displacement and strain, obstacles with offset, tilt and delay.
 
         Parameters
         ----------
@@ -558,7 +550,7 @@ class NuisanceMap:
                 for r in (OBSTACLE_OFFSET, OBSTACLE_TIME)
             )
             return grasp.displaced(
-                offset, deviations.get(OBSTACLE_TILT, zeros), delay_s
+                offset, deviations.get(OBSTACLE_TILT, zeros), delay_s=delay_s
             )
         zero_m = np.zeros(3)
         for place in self.displacement_zero_indices(number):
@@ -575,16 +567,14 @@ class NuisanceMap:
         """Return the lowest and the highest φ with valid measurements and loads, (k,) each.
 
         They are those of the rows, except for the clock and the times of loads, whose bounds follow
-        from
-        the recording. They may be infinite.
+        from the recording. They may be infinite.
 
         Parameters
         ----------
         samples : int
             Number of whole samples by which marker measurements are currently shifted; delays may
             deviate from it by `LARGEST_SHIFT_SAMPLES`, and are limited to `LARGEST_DELAY_FRACTION`
-            of the
-            duration.
+            of the duration.
         """
         low = np.array([entry.row.low for entry in self.entries])
         high = np.array([entry.row.high for entry in self.entries])
@@ -665,9 +655,8 @@ class NuisanceMap:
         return matrix
 
     def gravity(self, phi: Array) -> Array:
-        """Return gravity (3,) in the frame of the body at φ (k,) [m/s²]; `gravity_m_s2` itself if no
-        parameter
-        rotates it.
+        """Return gravity (3,) in the frame of the body at φ (k,) [m/s²]; `gravity_m_s2` itself if
+        no parameter rotates it.
         """
         if not len(self.gravity_indices):
             return self.gravity_m_s2
@@ -684,8 +673,8 @@ class NuisanceMap:
 
     def gravity_expression(self, phi: ca.SX) -> ca.SX:
         """Return gravity (3,) in the frame of the body [m/s²] as an expression of the φ of
-        `gravity_indices`
-        (in prior standard deviations): tilted first, then rotated into the frame of the body.
+        `gravity_indices` (in prior standard deviations): tilted first, then rotated into the frame
+        of the body.
         """
         values = self.values_by_row(phi, self.gravity_indices)
         gravity = ca.DM(self.gravity_m_s2)

@@ -374,8 +374,7 @@ class Parameters:
 
     def with_fields(self, bodies: Iterable[Body]) -> Parameters:
         """Return these parameters, then those of the bodies' fields that are not stated yet:
-        contrasts, then
-        coefficients.
+        contrasts, then coefficients.
 
         A stated contrast that is neither fixed nor has a prior gets the prior of its field.
         """
@@ -444,8 +443,7 @@ class Parameters:
 
     def scale_and_bounds(self, name: str) -> tuple[bool, tuple[float, float]]:
         """Return whether a parameter has a linear scale (else a logarithmic one), and the (lower,
-        upper)
-        bounds of its value.
+        upper) bounds of its value.
 
         The bounds of a derived modulus, or of a fixed or tied parameter, are infinite.
         """
@@ -537,8 +535,7 @@ class Parameters:
 
     def with_guess(self, values: Mapping[str, float]) -> Parameters:
         """Return these parameters with other guesses; for a fixed parameter with another value. The
-        guess
-        of a tied parameter has no effect. Parameters that are not named keep theirs.
+        guess of a tied parameter has no effect. Parameters that are not named keep theirs.
 
         Raises
         ------
@@ -559,8 +556,7 @@ class Parameters:
 
     def with_fixed(self, values: Mapping[str, float]) -> Parameters:
         """Return these parameters with some of them fixed at given values; a fixed one loses its
-        prior, its
-        bounds and its tie to another.
+        prior, its bounds and its tie to another.
 
         Names that do not exist are ignored; parameters that are not named stay.
 
@@ -684,9 +680,8 @@ class ThetaMap:
 
     @property
     def derived_names(self) -> tuple[str, ...]:
-        """Names of the derived moduli, such as "young_pa", that are not parameters themselves; empty
-        if
-        there are none.
+        """Names of the derived moduli, such as "young_pa", that are not parameters themselves;
+        empty if there are none.
         """
         return self._derived[0]
 
@@ -803,8 +798,7 @@ def resolve_theta(
     ------
     InputError
         If names are missing or (in a mapping) unknown, a parameter has no guess, or the sequence
-        has
-        another length than the body has constants.
+        has another length than the body has constants.
     """
     if isinstance(values, Parameters):
         return body.theta_from_values(values.guesses)

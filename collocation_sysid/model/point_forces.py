@@ -134,8 +134,7 @@ class Pointwise(ForceTerm):
 
     def interval_and_start(self, times: int) -> tuple[Array, Array]:
         """Return the time since the previous evaluation (T,) [s], and 1 where it is zero, as at the
-        start,
-        else 0 (T,). Without `previous_state` all evaluations count as starts.
+        start, else 0 (T,). Without `previous_state` all evaluations count as starts.
 
         Parameters
         ----------
@@ -217,20 +216,28 @@ class Pointwise(ForceTerm):
         add = points.add_matrices
         depends_on_place = bool(self.law.dependent_inputs[evaluated.y].any())
         if depends_on_place:
-            add(linearisation.by_position, entries, by_x, chosen)
+            add(linearisation.by_position, entries, blocks=by_x, chosen=chosen)
         if (
             depends_on_place
             and self.has_skew_stiffness
             and linearisation.by_position_skew.size
         ):
             add(
-                linearisation.by_position_skew, entries, by_x, chosen, skew=True
+                linearisation.by_position_skew,
+                entries,
+                blocks=by_x,
+                chosen=chosen,
+                skew=True,
             )
         if self.is_nonlinear_in_velocity:
-            add(linearisation.by_velocity, entries, by_v, chosen)
+            add(linearisation.by_velocity, entries, blocks=by_v, chosen=chosen)
         if self.has_skew_damping:
             add(
-                linearisation.by_velocity_skew, entries, by_v, chosen, skew=True
+                linearisation.by_velocity_skew,
+                entries,
+                blocks=by_v,
+                chosen=chosen,
+                skew=True,
             )
         for k, column in enumerate(self.constant_columns(places)):
             linearisation.by_theta[:, :, column] += points.assemble(
@@ -265,24 +272,41 @@ class Pointwise(ForceTerm):
         w = self._weights(evaluated, weights)
         x = evaluated.y
         v = evaluated.v
-        second = self.law.weighted_hessian(evaluated.u, evaluated.data, w)
+        second = self.law.weighted_hessian(
+            evaluated.u, evaluated.data, weights=w
+        )
         add = points.add_matrices
         chosen = evaluated.chosen
         depends_on_place = bool(self.law.dependent_inputs[x].any())
         if depends_on_place:
-            add(curvature.position_position, entries, second[x, x], chosen)
+            add(
+                curvature.position_position,
+                entries,
+                blocks=second[x, x],
+                chosen=chosen,
+            )
         if self.is_nonlinear_in_velocity and depends_on_place:
-            add(curvature.position_velocity, entries, second[x, v], chosen)
+            add(
+                curvature.position_velocity,
+                entries,
+                blocks=second[x, v],
+                chosen=chosen,
+            )
             if curvature.position_velocity_skew.size:
                 add(
                     curvature.position_velocity_skew,
                     entries,
-                    second[x, v],
-                    chosen,
+                    blocks=second[x, v],
+                    chosen=chosen,
                     skew=True,
                 )
         if self.is_nonlinear_in_velocity:
-            add(curvature.velocity_velocity, entries, second[v, v], chosen)
+            add(
+                curvature.velocity_velocity,
+                entries,
+                blocks=second[v, v],
+                chosen=chosen,
+            )
         _, slopes = self.law.evaluate_with_jacobian(evaluated.u, evaluated.data)
         columns = list(
             enumerate(self.constant_columns(places), evaluated.c.start)
@@ -357,7 +381,9 @@ class Pointwise(ForceTerm):
         """
         evaluated = self._inputs_at(states)
         second = self.law.weighted_hessian(
-            evaluated.u, evaluated.data, self._weights(evaluated, weights)
+            evaluated.u,
+            evaluated.data,
+            weights=self._weights(evaluated, weights),
         )
         return evaluated.split(
             self._expanded(second[:, evaluated.b], evaluated), 0
@@ -530,8 +556,7 @@ class CustomForce(Pointwise):
 
     def data(self, chosen: Index | None) -> Array:
         """Return the data (d, T, I) of the law at all instances, in the order in which a
-        `ForceContext` reads
-        them; `chosen` is not used, because all instances act.
+        `ForceContext` reads them; `chosen` is not used, because all instances act.
         """
         data = np.empty((CONTEXT_SIZE, len(self.t_s), self.points.count))
         data[0] = self.t_s[:, None]

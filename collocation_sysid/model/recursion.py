@@ -154,7 +154,9 @@ class RecursionTrajectory:
         """
         data = np.broadcast_to(data, (recursion.data_size, *signal.shape[1:]))
         states = np.zeros((recursion.state_size, *signal.shape[1:]))
-        trajectory = cls(recursion, constants, data, signal, states)
+        trajectory = cls(
+            recursion, constants, data=data, signal=signal, states=states
+        )
         for k in range(signal.shape[1]):
             now = slice(k, k + 1)
             states[:, now] = recursion.step_function.evaluate(
@@ -190,8 +192,7 @@ class RecursionTrajectory:
         self, signal_changes: Array, constant_changes: Array
     ) -> Array:
         """Return the changes of the states (n, N, I, c) for c directions at once, including those
-        through
-        earlier states.
+        through earlier states.
 
         Parameters
         ----------
@@ -213,9 +214,8 @@ class RecursionTrajectory:
         return changes
 
     def vector_jacobian_product(self, weights: Array) -> tuple[Array, Array]:
-        """Return the gradient of Σ weights · h, over all times and instances, by the signal (i, N, I)
-        and by
-        the constants (C,).
+        """Return the gradient of Σ weights · h, over all times and instances, by the signal (i, N,
+        I) and by the constants (C,).
 
         Parameters
         ----------

@@ -72,8 +72,7 @@ class Scheme:
         """Return the stencil of a row, given by its index from 0.
 
         Row 0, which exists where an experiment starts in equilibrium, has the stencil of statics;
-        rows
-        after those of `start` have the regular one.
+        rows after those of `start` have the regular one.
         """
         if row == 0:
             return STATIC

@@ -158,7 +158,7 @@ class FadingCoefficients:
             theta[places][..., None], (2, branches, len(until_next_s))
         )
         (c, d, a), by = COEFFICIENTS.evaluate_with_jacobian(u, data)
-        return cls(places, u, data, c, d, a, by)
+        return cls(places, u, data=data, c=c, d=d, a=a, by=by)
 
     def jacobian_vector_product(self, theta_q: Array) -> tuple[Array, Array]:
         """Return the derivatives (q, B, N) of the coefficients d and a along the q directions
@@ -224,7 +224,7 @@ class MemoryHistory:
         """
         stress = body.stresses.stress(xi, theta)
         fades = FadingCoefficients.from_body(
-            body, theta, until_next_s, loaded_s
+            body, theta, until_next_s=until_next_s, loaded_s=loaded_s
         )
         if previous_variables is None:
             borne = body.memory.to_branches(stress)
@@ -234,7 +234,14 @@ class MemoryHistory:
                 previous_variables[k + 1] = (
                     d[k] * previous_variables[k] + a[k] * borne[k]
                 )
-        return cls(body, theta, xi, stress, fades, previous_variables)
+        return cls(
+            body,
+            theta,
+            xi=xi,
+            stress=stress,
+            fading=fades,
+            previous_variables=previous_variables,
+        )
 
     @property
     def memory(self) -> MemoryLayout:
@@ -362,7 +369,7 @@ class MemoryHistory:
             yield (
                 rows,
                 self.body.stresses.stress_theta_derivatives(
-                    self.xi[rows], self.theta, theta_q
+                    self.xi[rows], self.theta, theta_q=theta_q
                 ),
             )
 
@@ -385,7 +392,7 @@ class MemoryHistory:
         stresses = self.body.stresses
         d = self.memory.repeat_over_points(self.fading.d)
         pushes = self.memory.to_branches(
-            stresses.memory_force_vjp(self.xi, force_weights, self.theta)
+            stresses.memory_force_vjp(self.xi, force_weights, theta=self.theta)
         )
         mu = np.zeros_like(pushes)
         for k in range(len(mu) - 1, 0, -1):
@@ -400,7 +407,7 @@ class MemoryHistory:
             by_q += np.einsum("tqp,tp->q", slopes, sigma[rows])
         by_parameters[used] = by_q
         return HistoryGradient(
-            stresses.stress_vjp(self.xi, sigma, self.theta),
+            stresses.stress_vjp(self.xi, sigma, theta=self.theta),
             np.zeros_like(self.xi),
             by_parameters=by_parameters,
         )
@@ -440,7 +447,9 @@ class MemoryHistory:
             memory.repeat_over_points(np.eye(len(memory.branches)))
         ):
             weights = memory.sum_over_branches(branch_mask * mu)
-            by_xi = self.body.stresses.stress_vjp(self.xi, weights, self.theta)
+            by_xi = self.body.stresses.stress_vjp(
+                self.xi, weights, theta=self.theta
+            )
             for place, factor in zip(
                 places[:, number], mixed[:, number], strict=True
             ):
@@ -542,8 +551,7 @@ class MemoryState:
 
 def with_start_memory(forces: Forces, loaded_s: float) -> Forces:
     """Return forces on the start shape, with the additional stiffness of a load that was applied a
-    time
-    `loaded_s` [s] ago: Q = g e^(−t/τ) S.
+    time `loaded_s` [s] ago: Q = g e^(−t/τ) S.
 
     The forces are unchanged for a body without memory, or if `loaded_s` is infinite.
     """
@@ -551,7 +559,9 @@ def with_start_memory(forces: Forces, loaded_s: float) -> Forces:
     if not body.has_memory or np.isinf(loaded_s):
         return forces
     past = body.memory.relaxed(1)
-    c = FadingCoefficients.from_body(body, forces.theta, np.ones(1), loaded_s).c
+    c = FadingCoefficients.from_body(
+        body, forces.theta, until_next_s=np.ones(1), loaded_s=loaded_s
+    ).c
     for branch, own in zip(body.memory.branches, c, strict=True):
         past.stiffening[:, branch.part] += own
     return replace(forces, memory_state=past)
@@ -609,7 +619,9 @@ class MemoryForwardColumns:
         """
         self._state[:] = self.history.xi[self.next]
         return self.stresses.memory_force(
-            self._state, self.memory.sum_over_branches(self.columns), self.theta
+            self._state,
+            self.memory.sum_over_branches(self.columns),
+            theta=self.theta,
         ).T
 
     def advance(
@@ -638,7 +650,7 @@ class MemoryForwardColumns:
         else:
             stress.fill(0.0)
         self.stresses.stress_jvp(
-            self._state, self._direction, self.theta, stress
+            self._state, self._direction, theta=self.theta, out=stress
         )
         for column, slope in zip(
             self._moduli, self._elastic_stress_derivatives(k), strict=True
@@ -665,7 +677,7 @@ class MemoryForwardColumns:
             first = k - k % EVALUATIONS_PER_CHUNK
             xi = self.history.xi[first : first + EVALUATIONS_PER_CHUNK]
             self._by_moduli = self.stresses.stress_theta_derivatives(
-                xi, self.theta, self._theta_q
+                xi, self.theta, theta_q=self._theta_q
             )
         return self._by_moduli[k % EVALUATIONS_PER_CHUNK]
 
@@ -693,7 +705,7 @@ class MemoryAdjoint:
         )
         state = history.xi[k]
         by_x = history.body.stresses.stress_vjp(
-            state[None], weights[None], history.theta
+            state[None], weights[None], theta=history.theta
         )[0]
         return by_x, np.zeros_like(by_x)
 
@@ -710,7 +722,7 @@ class MemoryAdjoint:
         state = history.xi[k][None]
         weight = force_weight[None]
         push = history.body.stresses.memory_force_vjp(
-            state, weight, history.theta
+            state, weight, theta=history.theta
         )[0]
         d = history.memory.repeat_over_points(history.fading.d[:, k])
         self.columns = d * self.columns + history.memory.to_branches(push)

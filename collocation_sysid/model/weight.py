@@ -134,9 +134,8 @@ class Weight(ForceTerm):
 
     @classmethod
     def from_experiment(cls, experiment: Experiment, t_s: ArrayLike) -> Weight:
-        """Return the weight and loads of an experiment at the times `t_s` (T,); a free density gives
-        NaN
-        masses until `with_theta`.
+        """Return the weight and loads of an experiment at the times `t_s` (T,); a free density
+        gives NaN masses until `with_theta`.
         """
         applied = experiment.declared_node_forces_n(t_s)
         body = experiment.body
@@ -177,8 +176,7 @@ class Weight(ForceTerm):
 
     def with_theta(self, theta: Theta) -> Self:
         """Return this weight for a body with constants θ (k,); self if no density is free, because
-        then
-        masses do not depend on θ.
+        then masses do not depend on θ.
         """
         if not self.body.mass_derivatives:
             return self
@@ -223,8 +221,7 @@ class Weight(ForceTerm):
 
     def with_inputs(self, u: Array) -> Self:
         """Return this weight at inputs u (T, size): gravity from the first time if it is an input,
-        then
-        the shares of the loads, as changes from the stated shares.
+        then the shares of the loads, as changes from the stated shares.
 
         Tied masses and applied forces follow the shares; self if there are no inputs.
         """

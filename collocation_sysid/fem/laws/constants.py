@@ -292,8 +292,7 @@ def unit_of(name: str) -> str:
 
 def symbol_of(name: str) -> str:
     """Return the symbol of a constant, followed by a blank and the prefix (region or branch) of its
-    name
-    if it has one: "μ core"; for an unknown constant the name without its unit.
+    name if it has one: "μ core"; for an unknown constant the name without its unit.
     """
     region, _, name_in_region = name.rpartition(".")
     symbol = (

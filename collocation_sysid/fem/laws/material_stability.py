@@ -70,8 +70,7 @@ def principal_stretches(body: Body, positions: Array, theta: Array) -> Array:
     They are relative to the stress-free shape, with the averaged dilatation of elements that
     average it. Stretches are square roots of the eigenvalues of FᵀF, so that they do not show an
     inversion, except with averaged dilatation: there they are negative if det F has another sign
-    than
-    its mean.
+    than its mean.
 
     Parameters
     ----------

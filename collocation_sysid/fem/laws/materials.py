@@ -81,8 +81,7 @@ class Material:
         ------
         InputError
             If the function has no constants, cannot be evaluated, or the undeformed material has
-            energy
-            or stress; if a definition is of no argument.
+            energy or stress; if a definition is of no argument.
         """
         name = name or getattr(energy, "__name__", "energy").replace("_", "-")
         definitions = {constant.name: constant for constant in constants}
@@ -99,22 +98,22 @@ class Material:
         material = cls(
             name,
             energy,
-            tuple(definitions.get(a) or constant_named(a) for a in arguments),
+            constants=tuple(
+                definitions.get(a) or constant_named(a) for a in arguments
+            ),
         )
         material._check_at_rest()
         return material
 
     def psi(self, F: ca.SX, values: ca.SX) -> ca.SX:
         """Return the energy density (1, 1) [J/m³] as an expression, from F (3, 3) and the constants
-        (c,) in
-        their order.
+        (c,) in their order.
         """
         return ca.SX(self.energy(F, **self._named(values)))
 
     def chain_rule(self, F: ca.SX, values: ca.SX) -> ChainRule:
-        """Return the chain rule for derivatives of `psi_in`; without functions for all materials but
-        those
-        in powers of the stretches.
+        """Return the chain rule for derivatives of `psi_in`; without functions for all materials
+        but those in powers of the stretches.
 
         Parameters
         ----------
@@ -129,8 +128,7 @@ class Material:
 
     def psi_in(self, rule: ChainRule, F: ca.SX, values: ca.SX) -> ca.SX:
         """Return the energy density as the symbol of a rule from `chain_rule` for the same F (3, 3)
-        and
-        constants (c,), if it has one, else as an expression in them.
+        and constants (c,), if it has one, else as an expression in them.
         """
         return (
             rule.functions[0].symbol()
@@ -155,9 +153,8 @@ class Material:
         )
 
     def _check_at_rest(self) -> None:
-        """Raise an `InputError` if the energy cannot be evaluated, or unless energy and stress vanish
-        at
-        F = I, for constants within their bounds, up to rounding.
+        """Raise an `InputError` if the energy cannot be evaluated, or unless energy and stress
+        vanish at F = I, for constants within their bounds, up to rounding.
         """
         F = ca.SX.sym("F", 9)
         values = ca.SX.sym("values", len(self.constants))

@@ -135,9 +135,8 @@ class MemoryLayout:
         return self.starts[-1]
 
     def part_columns(self, number: int) -> NDArray[np.int64]:
-        """Return the columns (E, q, 6) in the row of the points of a part: the six entries of a point
-        are
-        not neighbours, but E·q columns apart.
+        """Return the columns (E, q, 6) in the row of the points of a part: the six entries of a
+        point are not neighbours, but E·q columns apart.
 
         Parameters
         ----------
@@ -224,8 +223,7 @@ class MemoryLayout:
 
     def relaxed(self, states: int) -> MemoryInput:
         """Return the contribution of a memory that has relaxed, at a number of states: all zero,
-        without
-        stress weights.
+        without stress weights.
         """
         count = self.constant_count
         sizes = (self.width,), (len(self.parts),), (count,), (count, count)

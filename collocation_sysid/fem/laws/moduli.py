@@ -43,8 +43,8 @@ class ConstantSource:
         """Return every constant by its name without region.
 
         If elastic parameters replace constants, the result also contains λ, μ and κ, whether the
-        material
-        has them or not. A density given by `MASS` is the value of the mass; the caller converts it.
+        material has them or not. A density given by `MASS` is the value of the mass; the caller
+        converts it.
 
         Parameters
         ----------
@@ -109,10 +109,8 @@ def find_source(
     ------
     InputError
         If a constant is missing, if the density is given by itself and by the mass, or if the
-        elastic
-        parameters do not determine exactly one of the choices of the material. Elastic parameters
-        with
-        the prefix of the region must all be used; those without it need not.
+        elastic parameters do not determine exactly one of the choices of the material. Elastic
+        parameters with the prefix of the region must all be used; those without it need not.
     """
 
     def name_of(own: str) -> str | None:

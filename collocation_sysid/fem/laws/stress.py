@@ -51,7 +51,7 @@ def _stress_derivative(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     rate = point.gradients["v"]
     inverse = ca.inv_minor(point.material_gradient)
     stress = inverse @ ca.reshape(piola, 3, 3)
-    piola_rate = point.directional_derivative(piola, F, rate)
+    piola_rate = point.directional_derivative(piola, F, direction=rate)
     change = ca.reshape(piola_rate, 3, 3) - ca.reshape(rate, 3, 3) @ stress
     return six_entries(inverse @ change)
 
@@ -138,8 +138,7 @@ class StressEvaluator:
     """Stresses of a body with memory, and their derivatives and transposed derivatives.
 
     Stresses are those of the long-term energy, without overstress and damping. Entries of parts
-    without
-    memory do not occur. Kernels are compiled when they are first needed.
+    without memory do not occur. Kernels are compiled when they are first needed.
 
     Parameters
     ----------
@@ -266,14 +265,13 @@ class StressEvaluator:
         """Return the entries (T, K) of ∂S/∂x at positions x (T, 3n) and θ (k,), at
         `jacobian_entries`.
         """
-        return self._slopes("stress_slope", x, theta)
+        return self._slopes("stress_slope", x, theta=theta)
 
     def memory_force_jacobian(self, x: Array, theta: Array) -> Array:
         """Return the entries (T, K) of ∂f_H/∂H at positions x (T, 3n) and θ (k,), in which it is
-        linear in
-        x, at `jacobian_entries`.
+        linear in x, at `jacobian_entries`.
         """
-        return self._slopes("force_slope", x, theta)
+        return self._slopes("force_slope", x, theta=theta)
 
     def _slopes(self, name: str, x: Array, theta: Array) -> Array:
         """Return the entries (T, K) of a derivative, given by the name of its kernel, at
@@ -402,7 +400,9 @@ class StressEvaluator:
             theta[first : first + body.parts[number].law_constant_count],
             dtype=float,
         )
-        part_point_data = body.point_data(number, theta, point_data)
+        part_point_data = body.point_data(
+            number, theta, internal_variables=point_data
+        )
         threads = body.threads if len(out) > SINGLE_THREAD_STATES else 1
         self._evaluators[key](
             [np.ascontiguousarray(field) for field in fields],

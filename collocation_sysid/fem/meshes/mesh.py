@@ -70,8 +70,7 @@ class TetMesh:
         Values per element.
     face_sets : mapping of name to (k, 3) integer array, optional
         Corners of triangles, such as those of a cavity's wall; counted like `tetrahedra`, stored
-        with
-        the indices after dropping, where −1 stands for a dropped node.
+        with the indices after dropping, where −1 stands for a dropped node.
     is_generated : bool, default False
         Whether the mesh was made of stated lengths, as those of `structured` are, not of a scan.
 
@@ -244,8 +243,7 @@ class TetMesh:
         """Write the mesh, in metres, to any format that meshio knows by the file's extension.
 
         Point and cell arrays are written (booleans as integers), face sets are not. A file that
-        exists is
-        replaced.
+        exists is replaced.
 
         Raises
         ------
@@ -321,8 +319,7 @@ class TetMesh:
         """Return the indices (…) of the mid nodes between pairs (…, 2) of corners, in either order.
 
         Mid nodes follow the corners, in the order of `edges`. Pairs must be edges of the mesh; this
-        is not
-        checked.
+        is not checked.
         """
         count = len(self.points_m)
         codes = np.sort(pairs, axis=-1) @ [count, 1]
@@ -402,8 +399,8 @@ class ElementNodes:
         return cls(
             mesh,
             mesh.points_m,
-            mesh.tetrahedra,
-            np.empty((0, 2), dtype=np.int64),
+            cells=mesh.tetrahedra,
+            ends=np.empty((0, 2), dtype=np.int64),
         )
 
     @classmethod
@@ -416,20 +413,21 @@ class ElementNodes:
         )
         middles = mesh.mid_node_indices(mesh.tetrahedra[:, element.edges])
         return cls(
-            mesh, points, np.hstack([mesh.tetrahedra, middles]), mesh.edges
+            mesh,
+            points,
+            cells=np.hstack([mesh.tetrahedra, middles]),
+            ends=mesh.edges,
         )
 
     def with_mid_nodes(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Extend a mask of mesh nodes (corners,) to all nodes (n,): a mid node is selected if both
-        ends of
-        its edge are.
+        ends of its edge are.
         """
         return np.concatenate([chosen, chosen[self.ends].all(axis=1)])
 
     def nodes_of_faces(self, triangles: Index) -> Index:
         """Return the nodes of triangles of corners (F, 3): the corners and, for quadratic elements,
-        the mid
-        nodes of the edges ab, bc, ca, (F, 6).
+        the mid nodes of the edges ab, bc, ca, (F, 6).
         """
         if not len(self.ends):
             return triangles

@@ -100,8 +100,7 @@ def checked_faces(faces: ArrayLike, node_count: int) -> np.ndarray:
 
 def require_known_nodes(cells: np.ndarray, node_count: int) -> None:
     """Raise an `InputError` if cells (E, k), E > 0, have node indices outside 0 … `node_count` − 1;
-    the
-    message says if they seem to count from 1.
+    the message says if they seem to count from 1.
     """
     bad = np.flatnonzero(((cells < 0) | (cells >= node_count)).any(axis=1))
     if len(bad):

@@ -155,8 +155,7 @@ def read_triangles(
     """Read the vertices (p, 3) in metres and triangles (F, 3) of a surface file.
 
     Quadrilaterals and polygons are split into triangles, as fans about their first corner; other
-    cells
-    are ignored. The surface is not checked.
+    cells are ignored. The surface is not checked.
 
     Parameters
     ----------

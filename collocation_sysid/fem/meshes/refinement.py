@@ -37,8 +37,7 @@ def split_in_eight(mesh: TetMesh) -> TetMesh:
     deteriorate (Zhang 1995). The nodes of the mesh come first, then the middle of each of
     `TetMesh.edges`; the eight parts of element i are 8 i … 8 i + 7. Masks of nodes are true in
     the middle of an edge if they are at both ends; other arrays of nodes are omitted. Arrays of
-    cells
-    are repeated, and face sets split.
+    cells are repeated, and face sets split.
     """
     finer = ElementNodes.for_element(mesh, ELEMENTS["tet10"])
     ends = mesh.edges
@@ -96,10 +95,10 @@ def split_faces_in_four(faces: Index, mesh: TetMesh) -> Index:
 def refine_body(body: Body) -> Body:
     """Return the body on a mesh with half the element size, see `split_in_eight`.
 
-    Materials, stated and free densities, fields (not computed again), custom forces and the rest
-    shape
-    are those of `body`; the total mass and `has_declared_mass` follow from the densities. Frames of
-    obstacles are not copied.
+    Materials, stated and free densities, fields (not computed again), custom forces, the rest shape
+    and `has_declared_mass` are those of `body`; the total mass is the same. Frames of obstacles are
+    not
+    copied.
     """
     cells = [8 * part.cells[:, None] + np.arange(8) for part in body.parts]
     regions = [
@@ -135,6 +134,7 @@ def refine_body(body: Body) -> Body:
         evaluator=body.evaluator,
         threads=body.threads,
     )
+    finer.has_declared_mass = body.has_declared_mass
     finer = finer.with_free_densities(
         [part.name for part in body.parts if part.has_free_density]
     )

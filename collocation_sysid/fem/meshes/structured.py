@@ -223,10 +223,8 @@ def cylinder_mesh(
         Elements along the radius and along the height.
     sectors : int
         Nodes of the innermost ring, 3 or more (not checked). With a multiple of four no element
-        crosses
-        the planes x = 0 and y = 0. With six, a mesh has (1 + 3 rings (rings + 1)) (layers + 1)
-        nodes
-        and 18 rings² layers elements.
+        crosses the planes x = 0 and y = 0. With six, a mesh has (1 + 3 rings (rings + 1)) (layers +
+        1) nodes and 18 rings² layers elements.
 
     Returns
     -------
