@@ -984,19 +984,36 @@ class Body(Discretisation):
         x, v, w = self._states(positions, velocities, weights)
         if self.has_memory:
             memory_input = memory_input or self.memory.relaxed(len(x))
-            stress_weights = memory_input.stress_weights
-            if stress_weights is None:
-                stress_weights = np.zeros_like(memory_input.overstress)
-            # The kernel reads H and σ as one row.
-            past = replace(
-                memory_input,
-                overstress=np.hstack([memory_input.overstress, stress_weights]),
-            )
-            rows = self._evaluate(
-                "curvature", [x, v, w], theta=theta, out=out, memory_input=past
-            )
-        else:
-            rows = self._evaluate("curvature", [x, v, w], theta=theta, out=out)
+        rows = self._evaluate(
+            "curvature",
+            [x, v, w],
+            theta=theta,
+            out=out,
+            memory_input=_with_weights_appended(memory_input)
+            if self.has_memory and memory_input is not None
+            else None,
+        )
+        curvature = self._curvature_views(rows)
+        for column, slope in self._damping_derivatives(theta, tied_kg):
+            drag = -slope * w
+            curvature.velocity_theta[:, :, column] += drag
+            curvature.theta[:, column] += np.einsum("ti,ti->t", drag, v)
+        self._set_field_curvature(curvature, rows, theta=theta)
+        self._apply_stiffening_to_curvature(curvature, memory_input)
+        for gamma, mass_slopes in zip(
+            self._gamma_m_indices, self._mass_slopes, strict=True
+        ):
+            for place, slope in mass_slopes.items():
+                mixed = -np.einsum("ti,ti,i->t", w, v, slope)
+                curvature.theta_theta[:, place, gamma] = mixed
+                curvature.theta_theta[:, gamma, place] = mixed
+        return curvature
+
+    def _curvature_views(self, rows: Array) -> SecondDerivatives:
+        """Return result rows (T, width) of the kernel "curvature" as views by their meaning, without
+        derivatives by fields; ∂²φ/∂v² is empty.
+        """
+        count = len(rows)
         size = self.pattern.size
         entries = self.pattern.entry_count
         k = len(self.constants)
@@ -1005,52 +1022,70 @@ class Body(Discretisation):
             np.cumsum([entries, entries, k * size, k * size, k * k, k]),
             axis=1,
         )
-        x_theta, v_theta = (
-            part.reshape(len(x), size, k) for part in (x_theta, v_theta)
+        return SecondDerivatives(
+            xx,
+            xv,
+            position_theta=x_theta.reshape(count, size, k),
+            velocity_theta=v_theta.reshape(count, size, k),
+            theta_theta=theta_theta.reshape(count, k, k),
+            theta=by_theta,
+            position_velocity_skew=skew,
+            velocity_velocity=np.zeros((count, 0)),
         )
-        for column, slope in self._damping_derivatives(theta, tied_kg):
-            drag = -slope * w
-            v_theta[:, :, column] += drag
-            by_theta[:, column] += np.einsum("ti,ti->t", drag, v)
-        theta_theta = theta_theta.reshape(len(x), k, k)
+
+    def _set_field_curvature(
+        self, curvature: SecondDerivatives, rows: Array, theta: Theta
+    ) -> None:
+        """Set the derivatives by coefficients of fields, in place, from those by the logarithm of
+        each cell.
+
+        Parameters
+        ----------
+        curvature : SecondDerivatives
+            Entries of the coefficients are overwritten.
+        rows : (T, width)
+            Result of the kernel "curvature".
+        theta : (k,)
+        """
         for number, outputs in self._field_outputs("curvature", rows):
-            field_columns = self.field_slices[number]
+            columns = self.field_slices[number]
             spread = self.field_assemblies[number]
-            coefficients = np.asarray(theta)[field_columns]
+            coefficients = np.asarray(theta)[columns]
             slopes = spread.field.jacobian(coefficients)
-            spread.assemble_nodal(
-                outputs["position_theta"],
-                slopes,
-                out=x_theta[:, :, field_columns],
-            )
-            spread.assemble_nodal(
-                outputs["velocity_theta"],
-                slopes,
-                out=v_theta[:, :, field_columns],
-            )
-            by_theta[:, field_columns] = outputs["gradient_theta"] @ slopes
+            for output, by_nodes in (
+                ("position_theta", curvature.position_theta),
+                ("velocity_theta", curvature.velocity_theta),
+            ):
+                spread.assemble_nodal(
+                    outputs[output], slopes, out=by_nodes[:, :, columns]
+                )
+            by_logarithm = outputs["gradient_theta"]
+            curvature.theta[:, columns] = by_logarithm @ slopes
             first = self.starts[number]
-            points = self.parts[number].point_constant_count
-            second_by_theta = outputs["theta_theta"].reshape(
-                len(x), len(slopes), -1
-            )
-            mixed = np.einsum(
-                "tek,em->tkm", second_by_theta[:, :, :points], slopes
-            )
-            theta_theta[:, first : first + points, field_columns] = mixed
-            theta_theta[:, field_columns, first : first + points] = (
-                mixed.swapaxes(1, 2)
-            )
-            weighted_slopes = second_by_theta[:, :, points, None] * slopes
+            count = self.parts[number].point_constant_count
+            constants = slice(first, first + count)
+            second = outputs["theta_theta"].reshape(len(rows), len(slopes), -1)
+            mixed = np.einsum("tek,em->tkm", second[:, :, :count], slopes)
+            curvature.theta_theta[:, constants, columns] = mixed
+            curvature.theta_theta[:, columns, constants] = mixed.swapaxes(1, 2)
             by_coefficients = spread.field.weighted_hessian(
-                coefficients, outputs["gradient_theta"]
+                coefficients, by_logarithm
             )
-            theta_theta[:, field_columns, field_columns] = (
-                slopes.T @ weighted_slopes + by_coefficients
+            curvature.theta_theta[:, columns, columns] = (
+                slopes.T @ (second[:, :, count, None] * slopes)
+                + by_coefficients
             )
+
+    def _apply_stiffening_to_curvature(
+        self, curvature: SecondDerivatives, memory_input: MemoryInput | None
+    ) -> None:
+        """Replace first and second derivatives by the stiffening of each part by those by the
+        constants of its memory, in place; see `_apply_stiffening_chain_rule`.
+        """
+        theta_theta = curvature.theta_theta
         for values in (
-            x_theta,
-            v_theta,
+            curvature.position_theta,
+            curvature.velocity_theta,
             theta_theta,
             theta_theta.swapaxes(1, 2),
         ):
@@ -1061,27 +1096,10 @@ class Body(Discretisation):
                     :, columns, columns
                 ]
                 theta_theta[:, columns, columns] += (
-                    by_theta[:, first, None, None] * bends
+                    curvature.theta[:, first, None, None] * bends
                 )
-        self._apply_stiffening_chain_rule(by_theta[:, None], memory_input)
-        for gamma, mass_slopes in zip(
-            self._gamma_m_indices, self._mass_slopes, strict=True
-        ):
-            for place, slope in mass_slopes.items():
-                mixed = -np.einsum("ti,ti,i->t", w, v, slope)
-                theta_theta[:, place, gamma] = theta_theta[:, gamma, place] = (
-                    mixed
-                )
-        empty = np.zeros((len(x), 0))
-        return SecondDerivatives(
-            xx,
-            xv,
-            position_theta=x_theta,
-            velocity_theta=v_theta,
-            theta_theta=theta_theta,
-            theta=by_theta,
-            position_velocity_skew=skew,
-            velocity_velocity=empty,
+        self._apply_stiffening_chain_rule(
+            curvature.theta[:, None], memory_input
         )
 
     @cached_property
@@ -1155,3 +1173,15 @@ class Body(Discretisation):
             yield from (
                 (place, theta[gamma] * slope) for place, slope in own.items()
             )
+
+
+def _with_weights_appended(memory_input: MemoryInput) -> MemoryInput:
+    """Return the memory with rows (T, 2 width) of H, then σ, as the kernel "curvature" reads them;
+    σ is zero where no stress weights are given.
+    """
+    weights = memory_input.stress_weights
+    if weights is None:
+        weights = np.zeros_like(memory_input.overstress)
+    return replace(
+        memory_input, overstress=np.hstack([memory_input.overstress, weights])
+    )

@@ -19,6 +19,7 @@ from ..common.array_types import Array, Index
 from ..errors import InputError
 from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS, PointLaw, energy_kernel
+from .kernel import ElementKernel
 from .kernels import (
     COMPILING,
     Evaluator,
@@ -528,6 +529,34 @@ class Discretisation(ConstantsModel):
         memory = bool(part.prony) and name != "energy"
         kernel = KERNELS[name](self.element, self.law(number, memory))
         cells, geometry = self.part_elements(part)
+        destinations = self._destinations(name, number, cells, kernel)
+        columns = self._data_columns(name, number, points=geometry.shape[1])
+        return KernelBatch(
+            kernel,
+            cells,
+            geometry=geometry,
+            destinations=destinations,
+            width=self._width(name),
+            data_columns=columns if columns.shape[-1] else None,
+        )
+
+    def _destinations(
+        self, name: str, number: int, cells: Index, kernel: ElementKernel
+    ) -> Index:
+        """Return the position (E, outputs) in a result row of every entry of the outputs of a
+        kernel.
+
+        Parameters
+        ----------
+        name : str
+            Name of the kernel.
+        number : int
+            Index of the part.
+        cells : (E, nodes) int
+            Nodes of the part's elements, in the order of the kernel.
+        kernel : ElementKernel
+        """
+        part = self.parts[number]
         vector, lower = element_destinations(self.pattern, cells)
         total = len(self.constants)
         count = len(cells)
@@ -540,82 +569,75 @@ class Discretisation(ConstantsModel):
             count, -1
         )
         square = (columns[:, None] + total * columns).ravel()
-        first_entry = np.zeros((count, 1), dtype=np.int64)
+        # Positions and length of each kind of output.
+        energy = np.zeros((count, 1), dtype=np.int64), 1
+        nodal = vector, self.pattern.size
+        matrix = lower, self.pattern.entry_count
+        nodal_by_theta = by_theta, total * self.pattern.size
+        theta = np.broadcast_to(columns, (count, len(columns))), total
+        theta_theta = np.broadcast_to(square, (count, len(square))), total**2
         places = {
-            "energy": (first_entry, 1),
-            "force": (vector, self.pattern.size),
-            "by_position": (lower, self.pattern.entry_count),
-            "by_velocity": (lower, self.pattern.entry_count),
-            "by_theta": (by_theta, total * self.pattern.size),
-            "position_position": (lower, self.pattern.entry_count),
-            "position_velocity": (lower, self.pattern.entry_count),
-            "position_theta": (by_theta, total * self.pattern.size),
-            "velocity_theta": (by_theta, total * self.pattern.size),
-            "theta_theta": (
-                np.broadcast_to(square, (count, len(square))),
-                total**2,
-            ),
-            "gradient_theta": (
-                np.broadcast_to(columns, (count, len(columns))),
-                total,
-            ),
-            "by_position_skew": (lower, self.pattern.entry_count),
-            "position_velocity_skew": (lower, self.pattern.entry_count),
+            "energy": energy,
+            "force": nodal,
+            "by_position": matrix,
+            "by_velocity": matrix,
+            "by_theta": nodal_by_theta,
+            "position_position": matrix,
+            "position_velocity": matrix,
+            "position_theta": nodal_by_theta,
+            "velocity_theta": nodal_by_theta,
+            "theta_theta": theta_theta,
+            "gradient_theta": theta,
+            "by_position_skew": matrix,
+            "position_velocity_skew": matrix,
         }
-        used = {output: places[output] for output in kernel.contractions}
-        starts = np.cumsum([0] + [length for _, length in used.values()])
-        positions = {
-            output: place + start
-            for (output, (place, _)), start in zip(
-                used.items(), starts, strict=False
-            )
-        }
-        for (part_index, output), field_slice in self.field_output_slices(
-            name
-        ).items():
+        positions: dict[str, Index] = {}
+        start = 0
+        for output in kernel.contractions:
+            place, length = places[output]
+            positions[output] = place + start
+            start += length
+        field_slices = self.field_output_slices(name)
+        for (part_index, output), field_slice in field_slices.items():
             if part_index == number:
-                field_positions = np.arange(
-                    field_slice.start, field_slice.stop
-                ).reshape(count, -1)
+                own = np.arange(field_slice.start, field_slice.stop)
                 positions[output] = _with_field_columns(
                     positions[output],
-                    field_positions,
+                    own.reshape(count, -1),
                     output=output,
                     constants=part.point_constant_count,
                 )
-        destinations = np.hstack(list(positions.values()))
-        internal_columns = np.zeros(
-            (count, geometry.shape[1], 0), dtype=np.int64
-        )
-        width = 0
-        if memory:
-            places_of = self.memory.part_columns(number)
-            width = self.memory.width
-            sets = 2 if name == "curvature" else 1
-            internal_columns = np.concatenate(
-                [places_of + k * width for k in range(sets)], axis=-1
-            )
-            width *= sets
-        if part.stress_field is not None:
-            logs = np.broadcast_to(
-                width + np.arange(count)[:, None, None],
-                (*internal_columns.shape[:2], 1),
-            )
-            internal_columns = np.concatenate([internal_columns, logs], axis=-1)
+        return np.hstack(list(positions.values()))
+
+    def _data_columns(self, name: str, number: int, points: int) -> Index:
+        """Return the columns (E, q, m) of the data of each quadrature point in a row of data, see
+        `point_data`; m = 0 if the points have none.
+
+        Parameters
+        ----------
+        name : str
+            Name of the kernel; "curvature" reads weights of the stress after the internal
+            variables, "energy" reads neither.
+        number : int
+            Index of the part.
+        points : int
+            Number q of quadrature points of an element.
+        """
         if self.inverse_equilibrium is not None:
-            internal_columns = self.inverse_equilibrium.point_data_columns(
-                number
-            )
-        return KernelBatch(
-            kernel,
-            cells,
-            geometry=geometry,
-            destinations=destinations,
-            width=self._width(name),
-            data_columns=internal_columns
-            if internal_columns.shape[-1]
-            else None,
-        )
+            return self.inverse_equilibrium.point_data_columns(number)
+        part = self.parts[number]
+        count = len(part.cells)
+        columns = [np.zeros((count, points, 0), dtype=np.int64)]
+        width = 0
+        if part.prony and name != "energy":
+            own = self.memory.part_columns(number)
+            for _ in range(2 if name == "curvature" else 1):
+                columns.append(own + width)
+                width += self.memory.width
+        if part.stress_field is not None:
+            logarithms = width + np.arange(count)[:, None, None]
+            columns.append(np.broadcast_to(logarithms, (count, points, 1)))
+        return np.concatenate(columns, axis=-1)
 
 
 def _with_field_columns(
