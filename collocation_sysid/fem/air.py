@@ -49,6 +49,7 @@ def unit_drag() -> NodeForce:
     """
 
     def air_drag(x: ca.SX, v: ca.SX, at: ForceContext) -> ca.SX:
+        """Return the drag (3,) on a node, in a fluid of density 1 kg/m³."""
         speed = ca.sqrt(ca.sumsqr(v) + SMOOTH_BELOW_M_S**2)
         return -0.5 * DRAG_COEFFICIENT * FACING_SHARE * at.area_m2 * speed * v
 

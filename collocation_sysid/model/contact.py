@@ -211,7 +211,7 @@ class ContactLaw:
 
     @property
     def _frame_size_m(self) -> float:
-        """Length of the axes of the obstacle's frame [m]."""
+        """Length of the axes of the obstacle's frame before it moves [m]."""
         return float(
             self.body.frame_nodes_m[1, 0] - self.body.frame_nodes_m[0, 0]
         )
@@ -509,6 +509,7 @@ class ContactLaw:
         """
 
         def friction_values(u: ca.SX, data: ca.SX) -> ca.SX:
+            """Return the 6 values of friction, with u = (y, ẏ, c)."""
             place, axes, slope, normal_n = self._normal(u, data, pressing=None)
             limit_n, friction, tangential = self._friction(
                 u, place, slope=axes @ slope, normal_n=normal_n

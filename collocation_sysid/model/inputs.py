@@ -195,6 +195,7 @@ def inputs_from_experiment(
         interval_s = experiment.timestep_s
 
         def change(p: ca.SX, since_s: ca.SX) -> ca.SX:
+            """Return the change of the share, from the time since the stated one [s]."""
             late_s = value(p, phi)
             return sign * (
                 smooth_ramp((since_s - late_s) / interval_s)
@@ -209,6 +210,7 @@ def inputs_from_experiment(
         places = nuisance.actuator_calibration_indices(number)
 
         def driven(p: ca.SX, data: ca.SX) -> ca.SX:
+            """Return the amplitude at the calibration in p."""
             calibration = (
                 nominal + value(p, phi)
                 for nominal, phi in zip(

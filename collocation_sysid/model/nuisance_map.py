@@ -607,6 +607,7 @@ class NuisanceMap:
         late_s = (phi * self.scales)[self.indices_of_rows(JOINING)]
 
         def moved(load: Load) -> Load:
+            """Return a load with its estimated times; the load itself if it has none."""
             times = {
                 timed.change: timed.declared_s + float(late)
                 for timed, late in zip(self.timed_loads, late_s, strict=True)

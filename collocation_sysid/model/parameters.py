@@ -714,6 +714,7 @@ class ThetaMap:
         )
 
         def values(q: ca.SX, _: ca.SX) -> ca.SX:
+            """Return the derived moduli as an expression in q."""
             return _derived_moduli(names, body, theta=self.expression(q))[1]
 
         return derived_names, GeneratedFunction(

@@ -45,9 +45,19 @@ OPTIMISED_FROM_POINTS = 200
 class SimdEvaluator:
     """Evaluator of a `KernelBatch` by native vector code, with time steps distributed over threads.
 
+    Arrays passed to a call must be contiguous float64 arrays of the right shapes; this is not
+    checked.
+
     Parameters
     ----------
     batch : KernelBatch
+
+    Raises
+    ------
+    VectorCodeError
+        For operations that vector code does not support.
+    RuntimeError
+        If LLVM cannot compile the kernel.
     """
 
     def __init__(self, batch: KernelBatch) -> None:
@@ -122,6 +132,7 @@ class SimdEvaluator:
         stride = fields[0].shape[1]
 
         def run(start: int, stop: int) -> None:
+            """Evaluate the time steps `start` … `stop` − 1."""
             self._run(
                 start,
                 stop,
@@ -465,6 +476,7 @@ class _KernelEmitter:
         """Evaluate the pieces of one quadrature point and store them."""
 
         def read(slot: int, entry: int) -> Value:
+            """Return an entry of the input with the index `slot`."""
             if isinstance(inputs[slot], list):
                 return inputs[slot][entry]
             place = self.sums[entry] if slot == len(inputs) - 1 else entry
@@ -604,6 +616,7 @@ class _KernelEmitter:
         columns: list[dict[int, list]] = [{} for _ in outputs]
 
         def read(_: int, entry: int) -> Value:
+            """Load an entry of the vector of all uncontracted sums."""
             return self._load(totals, I64(self.sums[entry]))
 
         for k, entry, value in emit_function(

@@ -55,7 +55,8 @@ class SkylineFactorisation:
     size : int
         Number n of rows.
     rows, columns : (e,) int
-        Row and column of the entries of one triangle, with the diagonal.
+        Row and column of the entries of one triangle, with the diagonal; each entry may be given in
+        either triangle.
     source : (e,) int
         Positions of the entries in given values.
 
@@ -63,6 +64,11 @@ class SkylineFactorisation:
     ----------
     shape : (n, width)
         Shape of a side.
+
+    Raises
+    ------
+    RuntimeError
+        If LLVM cannot compile the code.
     """
 
     def __init__(
@@ -118,16 +124,18 @@ class SkylineFactorisation:
     def factorise(
         self, room: FactorMemory, symmetric: Array, skew: Array
     ) -> tuple[Array, Array]:
-        """Compute L and U without their unit diagonals in the given memory.
+        """Compute L and U without their unit diagonals in the given memory; only L for a symmetric
+        matrix.
 
-        For a symmetric matrix only L.
+        Zero pivots are not detected: they give infinite or NaN results.
 
         Parameters
         ----------
         room : FactorMemory
-            Memory; overwritten.
+            Memory with one side for a symmetric matrix, else two; overwritten.
         symmetric, skew : array
-            Values of the symmetric and skew parts of the matrix; `skew` is empty if there is none.
+            Values of the symmetric and skew parts of the matrix, in which `source` are positions;
+            `skew` is empty if there is none.
 
         Returns
         -------
@@ -158,7 +166,9 @@ class SkylineFactorisation:
     def solve(
         self, first: Array, pivots: Array, second: Array, right: Array
     ) -> Array:
-        """Return the solutions of L D Uᵀ x = b for the rows b of `right`, (columns, n).
+        """Return the solutions of L D Uᵀ x = b for the rows b of `right`, (columns, n), in new memory.
+
+        Exchange `first` and `second` to solve with the transposed matrix.
 
         Parameters
         ----------
@@ -167,7 +177,7 @@ class SkylineFactorisation:
         pivots : (n,)
             Diagonal D.
         right : (columns, n)
-            Right-hand sides.
+            Right-hand sides; not modified.
         """
         size, width = self.shape
         rows = np.empty((len(right), size + width))
@@ -202,7 +212,9 @@ def _addresses(*arrays: NDArray[Any]) -> list[int]:
 
 
 def _compile(name: str, sides: int) -> CompiledFunction:
-    """Return one of the compiled functions "fill", "factorise" and "solve"."""
+    """Return one of the compiled functions "fill", "factorise" and "solve", for a symmetric matrix
+    (1 of `sides`) or any other (2).
+    """
     emit: Callable[[_SkylineEmitter], ir.Module] = getattr(
         _SkylineEmitter, name
     )

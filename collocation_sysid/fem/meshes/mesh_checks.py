@@ -82,7 +82,7 @@ def checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
 
 
 def checked_faces(faces: ArrayLike, node_count: int) -> np.ndarray:
-    """Return an int64 copy of (k, 3) node indices; k may be 0 only for an integer array.
+    """Return an int64 copy of (k, 3) node indices.
 
     Raises
     ------
@@ -99,8 +99,8 @@ def checked_faces(faces: ArrayLike, node_count: int) -> np.ndarray:
 
 
 def require_known_nodes(cells: np.ndarray, node_count: int) -> None:
-    """Raise an `InputError` if cells (E, k), E > 0, have node indices outside 0 … `node_count` − 1;
-    the message says if they seem to count from 1.
+    """Raise an `InputError` if cells (E, k) have node indices outside 0 … `node_count` − 1; the
+    message says if they seem to count from 1.
     """
     bad = np.flatnonzero(((cells < 0) | (cells >= node_count)).any(axis=1))
     if len(bad):

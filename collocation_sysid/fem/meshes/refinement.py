@@ -97,8 +97,7 @@ def refine_body(body: Body) -> Body:
 
     Materials, stated and free densities, fields (not computed again), custom forces, the rest shape
     and `has_declared_mass` are those of `body`; the total mass is the same. Frames of obstacles are
-    not
-    copied.
+    not copied.
     """
     cells = [8 * part.cells[:, None] + np.arange(8) for part in body.parts]
     regions = [
