@@ -370,7 +370,14 @@ class Body(Discretisation):
         }
 
     def _lumped_volume(self, part: BodyPart, shares: ArrayLike = 1.0) -> Array:
-        """Return the lumped volume (n,) of a part [m³], or of given fractions (E,) of its cells."""
+        """Return the lumped volume (n,) of a part [m³], in the mesh; zero at nodes outside the part.
+
+        Parameters
+        ----------
+        part : BodyPart
+        shares : (k,) or float
+            Factors of the volumes of the part's cells; coefficients of a field may be negative.
+        """
         volumes_m3 = self.mesh.volumes_m3[part.cells] * shares
         volume = np.zeros(len(self.nodes_m))
         np.add.at(
@@ -1148,8 +1155,8 @@ class Body(Discretisation):
     def _damping_coefficients(
         self, theta: Theta, tied_kg: Array | None
     ) -> Array:
-        """Return the coefficients Σ γ_m M (3n,) or (T, 3n) of mass-proportional damping [N·s/m];
-        see `_damped_masses` for the tied masses.
+        """Return the coefficients Σ γ_m M of mass-proportional damping [N·s/m] at θ (k,): (3n,), or
+        (T, 3n) if `tied_kg` is; see `_damped_masses` for the tied masses.
         """
         # `numpy.sum` of a list takes longer than the products.
         return reduce(
@@ -1163,8 +1170,9 @@ class Body(Discretisation):
     def _damping_derivatives(
         self, theta: Theta, tied_kg: Array | None
     ) -> Iterator[tuple[int, Array]]:
-        """Yield index and derivative of `_damping_coefficients` by each γ_m and by each constant of
-        a density; an index can occur more than once, then derivatives add up.
+        """Yield index in θ and derivative, (3n,) or (T, 3n), of `_damping_coefficients` at `theta`
+        by each γ_m and by each constant of a density; an index can occur more than once, then
+        derivatives add up. `tied_kg` is that of `_damped_masses`.
         """
         yield from self._damped_masses(theta, tied_kg)
         for gamma, own in zip(

@@ -186,10 +186,13 @@ class Discretisation(ConstantsModel):
         return None
 
     def point_constants(self, number: int, theta: Theta) -> Array:
-        """Return the constants of the quadrature points of a part at θ, by the index of the part.
+        """Return the constants (`PointLaw.constant_count`,) of the quadrature points of the part
+        with index `number`, at θ (k,).
 
-        For a stress-free shape that is not the mesh, changes of its inputs follow; they are zero,
-        because the shape has been computed at this θ.
+        These are the constants of material and damping law, of a part with memory also the first
+        constant of its first branch, in whose place the caller sets the stiffening. For a
+        stress-free shape that is not the mesh, changes of its inputs follow; they are zero, because
+        the shape has been computed at this θ.
         """
         part_constants = np.asarray(
             self.split_theta(theta)[number], dtype=float
@@ -208,11 +211,11 @@ class Discretisation(ConstantsModel):
         internal_variables: Array | None = None,
         with_second_derivatives: bool = False,
     ) -> Array | None:
-        """Return the data of the quadrature points of a part, or None if they have none.
+        """Return the data of the quadrature points of a part; None if they have none.
 
-        These are the internal variables (T, any), followed by the logarithms of a field; for a
-        stress-free shape that is not the mesh its data (1, any), since such a body has neither
-        memory nor field.
+        These are the internal variables (T, any), followed by the logarithms of a field, the same
+        at all times: (1, any) without internal variables. For a stress-free shape that is not the
+        mesh they are its data (1, any), since such a body has neither memory nor field.
 
         Parameters
         ----------
@@ -220,9 +223,14 @@ class Discretisation(ConstantsModel):
             Index of the part.
         theta : (k,)
         internal_variables : (T, any), optional
-            Internal variables of the points.
+            Internal variables of the points; not used for a stress-free shape that is not the mesh.
         with_second_derivatives : bool
-            Whether to include second derivatives of the stress-free shape.
+            Whether to include second derivatives of the stress-free shape; zero otherwise.
+
+        Raises
+        ------
+        RestShapeError
+            If the mesh is a shape under gravity and no stress-free shape exists at θ.
         """
         if self.inverse_equilibrium is not None:
             return self.inverse_equilibrium.point_data(
@@ -520,10 +528,16 @@ class Discretisation(ConstantsModel):
         }[name]
 
     def _batch(self, name: str, number: int) -> KernelBatch:
-        """Return the batch of a kernel and part, given by the name of the kernel and the index of
-        the part: where each output goes in the result row.
+        """Return the batch of a kernel for a part: where each output goes in the result row.
 
         A row holds vectors, lower triangles, and columns for all of θ.
+
+        Parameters
+        ----------
+        name : str
+            Kernel in `expressions.KERNELS`.
+        number : int
+            Index of the part.
         """
         part = self.parts[number]
         memory = bool(part.prony) and name != "energy"

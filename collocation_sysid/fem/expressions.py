@@ -87,7 +87,7 @@ class PointLaw:
 
     def psi(self, F: ca.SX, theta: ca.SX) -> ca.SX:
         """Return the energy density [J/m³] at the deformation gradient F (3, 3), from the constants
-        θ of the law, which begin with those of the material.
+        `theta` of the law, which begin with those of the material.
         """
         return self.material.psi(F, theta[: len(self.material.constants)])
 
@@ -294,12 +294,17 @@ def six_entries(matrix: ca.SX) -> ca.SX:
 
 
 def first_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return the first Piola–Kirchhoff stress P = ∂ψ/∂F, stacked (9,)."""
+    """Return the first Piola–Kirchhoff stress P = ∂ψ/∂F of the elastic law at a point, stacked column
+    after column (9,), by the gradient F of the positions. It contains symbols of `point.rule`.
+    """
     return point.gradient(_energy_density(point, law), point.gradients["x"])
 
 
 def second_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return the second Piola–Kirchhoff stress S = F⁻¹ P by its entries (6,)."""
+    """Return the second Piola–Kirchhoff stress S = F⁻¹ P of the elastic law at a point by its
+    entries xx, yy, zz, xy, xz, yz (6,), without overstress and damping. It contains symbols of
+    `point.rule`.
+    """
     return six_entries(
         ca.inv_minor(point.material_gradient)
         @ ca.reshape(first_piola(point, law), 3, 3)
@@ -330,8 +335,8 @@ def _damping(
 
 @lru_cache(CACHED_KERNELS)
 def energy_kernel(element: Element, law: PointLaw) -> ElementKernel:
-    """Return the kernel of the elastic energy Ψ [J] of the long-term law, without damping and
-    memory.
+    """Return the kernel of the elastic energy Ψ [J] of an element with the long-term law, without
+    damping and memory; the latest kernels are cached.
     """
     point = quadrature_point(element, law, "x", internal_variable_count=0)
     return kernel_from_outputs(
@@ -343,7 +348,9 @@ def energy_kernel(element: Element, law: PointLaw) -> ElementKernel:
 
 @lru_cache(CACHED_KERNELS)
 def force_kernel(element: Element, law: PointLaw) -> ElementKernel:
-    """Return the kernel of the elastic and damping forces on the nodes [N]."""
+    """Return the kernel of the forces on the nodes [N] of an element: those of the elastic law, of the
+    damping law and of the memory. Its output is "force"; the latest kernels are cached.
+    """
     point = quadrature_point(element, law, "x", "v")
     force = (Derivative(-_potential(point, law), ("x",)),)
     if damping := _damping(point, law):

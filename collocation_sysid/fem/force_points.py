@@ -64,7 +64,7 @@ class ForcePoints:
     @classmethod
     def at_nodes(cls, nodes: Index, node_count: int) -> ForcePoints:
         """Return instances whose vectors are the positions of their nodes, L = K, from node indices
-        (i, K).
+        (i, K) of a body with `node_count` nodes.
         """
         count = nodes.shape[1]
         return cls(

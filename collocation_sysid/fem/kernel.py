@@ -244,8 +244,9 @@ def _coupled(
 
 
 def _contracted(piece: ca.SX, how: Contraction, gradients: ca.SX) -> ca.SX:
-    """Return a piece multiplied with the shape gradients (nodes, 3): unchanged for "none", the node
-    vectors (3·nodes, k) for "nodes", the matrix between nodes for "pairs".
+    """Return a piece multiplied with the shape gradients (nodes, 3), by its contraction `how`:
+    unchanged for "none", the node vectors (3·nodes, k) for "nodes", the lower triangle of the
+    matrix between nodes, stacked column after column, for "pairs".
     """
     if how == "none":
         return piece
@@ -264,8 +265,8 @@ def _contracted(piece: ca.SX, how: Contraction, gradients: ca.SX) -> ca.SX:
 
 
 def _at_node(stress: ca.SX, gradient: ca.SX) -> ca.SX:
-    """Return the columns of (9, k), conjugate to F, times the shape gradient of one node: (3,
-    k).
+    """Return the columns of `stress` (9, k), conjugate to F, times the shape gradient (1, 3) of one
+    node: (3, k).
     """
     columns = [
         ca.reshape(stress[:, k], 3, 3) @ gradient.T

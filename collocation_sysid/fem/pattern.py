@@ -122,8 +122,8 @@ class SymmetricPattern:
         )
 
     def products(self, values: Array, vectors: Array) -> Array:
-        """Return for each t the product (3n,) of the symmetric matrix with lower-triangle values
-        (T, m) and a vector (T, 3n), (T, 3n).
+        """Return for each t the product of the symmetric matrix with lower-triangle values (T, m)
+        and a vector (T, 3n); (T, 3n), for T ≥ 1.
         """
         pairs = zip(values, vectors, strict=True)
         return np.stack(
@@ -189,7 +189,14 @@ def dofs_of(nodes: Index) -> Index:
 def element_destinations(
     pattern: SymmetricPattern, cells: Index
 ) -> tuple[Index, Index]:
-    """Return the positions of an element's vector and lower-triangle entries in global arrays.
+    """Return the positions of the vectors and lower triangles of elements in global arrays.
+
+    Parameters
+    ----------
+    pattern : SymmetricPattern
+        Pattern that contains all pairs of dofs of an element.
+    cells : (E, nodes) int
+        Nodes of each element, in any order.
 
     Returns
     -------
@@ -197,6 +204,11 @@ def element_destinations(
         Global row of each local one.
     lower : (E, 3·nodes·(3·nodes + 1)/2) ndarray
         Position in `pattern` of each local lower-triangle entry, column after column.
+
+    Raises
+    ------
+    IndexError
+        If an entry is not in the pattern.
     """
     dofs = dofs_of(cells)
     size = dofs.shape[1]

@@ -324,15 +324,16 @@ class Dynamics:
     def histories(
         self, x: Array, previous_states: Mapping[int, Array] | None = None
     ) -> tuple[AnyHistory, ...]:
-        """Return the internal variables along a motion; an empty tuple if there are none.
+        """Return the internal variables along a motion: of the memory, if the body has one, then of
+        each force with internal variables; an empty tuple if there are none.
 
         Parameters
         ----------
         x : (N, 3n)
             Positions [m]; fewer rows for the beginning of the motion.
         previous_states : mapping, optional
-            Given internal variables of the previous evaluation, by the index of the history.
-            Internal variables that are not given are computed from x.
+            Given internal variables of the previous evaluation, by the index of the history in the
+            result. Internal variables that are not given are computed from x.
         """
         if not (
             self.body.has_memory or self.forces.terms_with_internal_variables
@@ -559,7 +560,9 @@ def _combine(table: Array, rows: Array) -> Array:
 
 
 def _row_masses(tables: StencilTables, at_evaluations: DofMasses) -> DofMasses:
-    """Return the mass in each row, from the mass at the evaluations."""
+    """Return the mass in each row, from the mass at the evaluations: tied masses are averaged with the
+    weights of the forces, the others are constant.
+    """
     return replace(
         at_evaluations, tied_kg=_evaluation_mean(tables, at_evaluations.tied_kg)
     )
@@ -605,7 +608,7 @@ class StencilRow:
 
     @classmethod
     def from_dynamics(cls, dynamics: Dynamics, t: int) -> StencilRow:
-        """Return the coefficients and masses of the row with index t."""
+        """Return the coefficients and masses of the row with index t of equations of motion."""
         tables = dynamics.tables
         step_s = dynamics.step_s
         return cls(

@@ -442,10 +442,11 @@ class Forces:
         self, xi: Array, nu: Array
     ) -> Callable[[ForceTerm], States]:
         """Return a function that gives each term its states, from positions ξ and velocities ν, (T,
-        3n) or (3n,).
+        3n), or (3n,) for T = 1.
 
         In a static experiment only terms that use displacements since the previous sample
-        (`uses_increments`) get a nonzero ν. The states of the weight are also those of the body.
+        (`uses_increments`) get ν, all others zero. The states of the weight are also those of the
+        body.
         """
         size = self.body.pattern.size
         moving = States(

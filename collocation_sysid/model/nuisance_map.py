@@ -599,8 +599,8 @@ class NuisanceMap:
         return low, high
 
     def with_times(self, experiment: Experiment, phi: Array) -> Experiment:
-        """Return the experiment with its loads joining and leaving at the times estimated by φ; the
-        experiment itself if none is estimated.
+        """Return the experiment with its loads joining and leaving at the times estimated by φ
+        (k,); the experiment itself if no time is estimated.
         """
         if not self.timed_loads:
             return experiment

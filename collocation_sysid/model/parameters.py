@@ -167,7 +167,10 @@ class Parameter:
             )
 
     def _check_fixed(self) -> None:
-        """Raise an `InputError` if the fixed value is inadmissible for the constant."""
+        """Raise an `InputError` if the fixed value is missing, not finite, or outside the
+        admissible values of the constant, or negative although the scale is logarithmic; zero is
+        admissible there.
+        """
         constant = constant_named(self.name)
         least = (
             constant.at_least

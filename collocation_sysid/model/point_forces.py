@@ -123,8 +123,8 @@ class Pointwise(ForceTerm):
         previous_state: PreviousState,
         variable_weights: Array | None = None,
     ) -> Self:
-        """Return this force with given internal variables, and with weights of h in second
-        derivatives, which are zero for None.
+        """Return this force with given internal variables of the previous evaluations, and with
+        weights of h in second derivatives, (n, T, I), which are zero for None.
         """
         return replace(
             self,  # type: ignore[type-var]
@@ -540,7 +540,8 @@ class CustomForce(Pointwise):
         return replace(self, t_s=self.t_s[rows])
 
     def interpolate(self, other: Self, share: float) -> Self:
-        """Return the force of `other`, at times interpolated linearly between both.
+        """Return the force of `other`, at times interpolated linearly between both: `share` is 0
+        for the times of this force and 1 for those of the other.
 
         Internal variables are those of `other`.
         """

@@ -489,8 +489,8 @@ class MemoryState:
     def at_start(
         cls, body: Body, x: Array, theta: Array, loaded_s: float
     ) -> MemoryState:
-        """Return the memory in the start shape x (3n,) [m], loaded for a time `loaded_s` [s];
-        infinite if the memory has relaxed.
+        """Return the memory in the start shape x (3n,) [m] of a body with constants θ (k,), which
+        has been loaded for a time `loaded_s` [s]; infinite if the memory has relaxed.
         """
         return MemoryHistory.from_states(
             body,
@@ -522,7 +522,8 @@ class MemoryState:
     def advance(
         self, forces: Forces, x: Array, v: Array, interval_s: float
     ) -> MemoryState:
-        """Return the memory in the state x (3n,) one interval later.
+        """Return the memory in the state x (3n,) [m] that follows after an interval [s]; `self` is
+        unchanged.
 
         Forces and velocity are not used.
         """

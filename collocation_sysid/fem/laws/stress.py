@@ -45,7 +45,9 @@ def _stress_by_theta(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _stress_derivative(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return ∂S/∂x v, from dS = F⁻¹ (dP − dF S)."""
+    """Return the entries (6,) of dS along velocities v, the second field of a point: dS = F⁻¹ (dP − dF
+    S).
+    """
     F = point.gradients["x"]
     piola = first_piola(point, law)
     rate = point.gradients["v"]
@@ -65,12 +67,14 @@ def _stress_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _memory_force(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return f_H, with H as data of the points."""
+    """Return f_H of a point (9,), conjugate to F: −∂/∂F ½ V H : FᵀF, with H as data of the
+    point.
+    """
     return -ca.gradient(memory_energy(point), point.gradients["x"])
 
 
 def _memory_force_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return (∂f_H/∂H)ᵀ v, with velocities v."""
+    """Return (∂f_H/∂H)ᵀ v (6,) of a point, for velocities v as its second field."""
     power = ca.jtimes(
         -memory_energy(point), point.gradients["x"], point.gradients["v"]
     )
@@ -78,12 +82,12 @@ def _memory_force_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _stress_jacobian(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return (∂S/∂x)ᵀ, column after column."""
+    """Return (∂S/∂F)ᵀ (9, 6) of a point, to be contracted to nodes."""
     return point.jacobian(second_piola(point, law), point.gradients["x"]).T
 
 
 def _memory_force_jacobian(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return ∂f_H/∂H, column after column."""
+    """Return ∂f_H/∂H (9, 6) of a point, to be contracted to nodes."""
     return ca.jacobian(_memory_force(point, law), point.internal_variables)
 
 
@@ -371,7 +375,8 @@ class StressEvaluator:
         add: bool,
         point_data: Array | None = None,
     ) -> None:
-        """Evaluate a kernel for one part.
+        """Evaluate a kernel for one part; its evaluator is built at the first use. Up to
+        `SINGLE_THREAD_STATES` states run on one thread.
 
         Parameters
         ----------
@@ -382,11 +387,12 @@ class StressEvaluator:
         fields : list of (T, 3n)
             Node fields.
         theta : (k,)
+            Constants of the complete body.
         out : array
             Result; overwritten, or added to if `add`.
         add : bool
         point_data : (T, width), optional
-            Data of the points: H or weights.
+            Data of the points: H or weights; None for kernels that read none.
         """
         body = self.body
         key = (name, number)

@@ -216,7 +216,7 @@ def orient_elements(
 
 
 def signed_volumes(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Return the volume of each tetrahedron (E,) [m³].
+    """Return the volume of each tetrahedron (E,) [m³], from points (n, 3) [m] and nodes (E, 4).
 
     Positive if x₁−x₀, x₂−x₀, x₃−x₀ is right-handed.
     """
@@ -271,7 +271,9 @@ def edge_lengths(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 
 def _require_finite(points: np.ndarray, used: np.ndarray) -> None:
-    """Raise an `InputError` if a used node has coordinates that are not finite."""
+    """Raise an `InputError` if a used node has coordinates that are not finite; `used` are the
+    indices of the nodes that an element has.
+    """
     bad = used[~np.isfinite(points[used]).all(axis=1)]
     if len(bad):
         raise InputError(

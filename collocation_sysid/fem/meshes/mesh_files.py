@@ -383,7 +383,9 @@ def _group_name(tag: int, dimension: int, ambiguous: bool) -> str:
 
 
 def _nodes_of(data: MeshContent, masks: list[np.ndarray]) -> np.ndarray:
-    """Return the mask of the nodes of cells that are selected block by block."""
+    """Return the mask (n,) of the nodes of cells that are selected by one mask for each block of the
+    file.
+    """
     chosen = np.zeros(len(data.points), dtype=bool)
     for block, mask in zip(data.cells, masks, strict=True):
         chosen[np.asarray(block.data)[mask].ravel()] = True

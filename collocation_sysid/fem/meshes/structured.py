@@ -22,13 +22,13 @@ _MOST_ELEMENTS = 1_000_000
 
 
 def box_of_edge(size_m: ArrayLike, edge_length_m: float) -> TetMesh:
-    """Mesh a box of size (3,) [m] with a corner at the origin, with a whole number of cells along
-    each axis whose edges are about `edge_length_m` long.
+    """Mesh a box of size (3,) [m] with its lowest corner at the origin and a whole number of cells
+    along each axis, whose edges are about `edge_length_m` long; see `box_mesh`.
 
     Raises
     ------
     InputError
-        For sizes or an edge length that are not positive, or more than a million elements.
+        For sizes that are not positive, or more than a million elements.
     """
     divisions = _divisions(np.asarray(size_m, dtype=float), edge_length_m)
     _require_element_limit(6 * float(np.prod(divisions)))
@@ -282,7 +282,9 @@ def _disc(rings: int, sectors: int) -> tuple[np.ndarray, np.ndarray]:
     ]
 
     def node(ring: int, sector: int, step: int) -> int:
-        """Return the index of a node of a ring; of the centre for ring 0."""
+        """Return the index of a node: number `step` of a sector of a ring, counting from 0 and on
+        into the next sector; of the centre for ring 0.
+        """
         if not ring:
             return 0
         before = 1 + sectors * ring * (ring - 1) // 2

@@ -105,8 +105,11 @@ def tetrahedralize_surface(
 def merge_coincident(
     points: np.ndarray, triangles: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices and triangles with vertices merged that coincide in single precision (10⁻⁶ of
-    the diagonal), and without the triangles that become degenerate.
+    """Return vertices (p', 3) and triangles (F', 3) with vertices merged that coincide in single
+    precision (10⁻⁶ of the diagonal), and without the triangles that become degenerate.
+
+    Vertices that are linked by a chain of such pairs become one, at the first of them. Unused
+    vertices stay.
     """
     tolerance = 1e-6 * np.linalg.norm(np.ptp(points, axis=0))
     pairs = KDTree(points).query_pairs(tolerance, output_type="ndarray")
@@ -172,8 +175,8 @@ def _require_closed(triangles: np.ndarray) -> None:
 def _require_suitable_edge_length(
     points: np.ndarray, triangles: np.ndarray, edge_length_m: float
 ) -> None:
-    """Raise an `InputError` if the edge length is not positive, too large or too small for the
-    body.
+    """Raise an `InputError` if the edge length is not positive and finite, over half the diagonal
+    of the surface, or so small that more than `MOST_ELEMENTS` tetrahedra would result.
     """
     if not 0 < edge_length_m < np.inf:
         raise InputError(
