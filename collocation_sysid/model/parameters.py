@@ -167,9 +167,9 @@ class Parameter:
             )
 
     def _check_fixed(self) -> None:
-        """Raise an `InputError` if the fixed value is missing, not finite, or outside the
-        admissible values of the constant, or negative although the scale is logarithmic; zero is
-        admissible there.
+        """Raise an `InputError` if the fixed value is missing, not finite, or not admissible for
+        the constant: below its lower limit (zero is admissible for a logarithmic scale) or at or
+        above its upper one.
         """
         constant = constant_named(self.name)
         least = (

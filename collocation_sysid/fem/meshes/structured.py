@@ -28,7 +28,7 @@ def box_of_edge(size_m: ArrayLike, edge_length_m: float) -> TetMesh:
     Raises
     ------
     InputError
-        For sizes that are not positive, or more than a million elements.
+        For sizes or an edge length that are not positive, or more than a million elements.
     """
     divisions = _divisions(np.asarray(size_m, dtype=float), edge_length_m)
     _require_element_limit(6 * float(np.prod(divisions)))
@@ -47,14 +47,13 @@ def cylinder_of_edge(
     Parameters
     ----------
     diameter_m, height_m, edge_length_m : float
-        Positive lengths; the edge length is not checked.
     quarter : bool
         Only x, y ≥ 0, between the planes of symmetry x = 0 and y = 0.
 
     Raises
     ------
     InputError
-        If this takes more than a million elements, or diameter or height are not positive.
+        If a length is not positive, or if this takes more than a million elements.
     """
     rings, layers = _divisions(
         np.array([diameter_m / 2, height_m]), edge_length_m
@@ -91,12 +90,12 @@ def count_box_elements(
     size_m: ArrayLike, edge_length_m: float
 ) -> tuple[int, int]:
     """Return the numbers of nodes and elements, in this order, of `box_of_edge` without creating the
-    mesh; lengths are not checked.
+    mesh; sizes are not checked.
 
     Raises
     ------
     InputError
-        For more than a million elements.
+        For an edge length that is not positive, or more than a million elements.
     """
     divisions = _divisions(np.asarray(size_m, dtype=float), edge_length_m)
     elements = float(6 * np.prod(divisions))
@@ -111,12 +110,12 @@ def count_cylinder_elements(
     quarter: bool = False,
 ) -> tuple[int, int]:
     """Return the numbers of nodes and elements, in this order, of `cylinder_of_edge` without creating
-    the mesh; that of a quarter's nodes is approximate. Lengths are not checked.
+    the mesh; that of a quarter's nodes is approximate. Diameter and height are not checked.
 
     Raises
     ------
     InputError
-        For more than a million elements.
+        For an edge length that is not positive, or more than a million elements.
     """
     rings, layers = _divisions(
         np.array([diameter_m / 2, height_m]), edge_length_m
@@ -129,9 +128,20 @@ def count_cylinder_elements(
 
 
 def _divisions(size_m: np.ndarray, edge_length_m: float) -> np.ndarray:
-    """Return the numbers of elements along lengths, as floats: rounded to the nearest whole number, at
-    least 1.
+    """Return the numbers of elements along lengths, as floats: rounded to the nearest whole number,
+    at least 1.
+
+    Raises
+    ------
+    InputError
+        If the edge length is not positive.
     """
+    if not edge_length_m > 0:
+        raise InputError(
+            f"found {edge_length_m!r}; expected a positive length in metres",
+            None,
+            where="edge_length_m",
+        )
     return np.maximum(np.round(size_m / edge_length_m), 1)
 
 
