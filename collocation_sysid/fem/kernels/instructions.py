@@ -179,7 +179,9 @@ def _emit_library_call(name: str) -> Emit:
 def _declare(
     module: ir.Module, name: str, kind: ir.Type, operands: int
 ) -> ir.Function:
-    """Return a function of the module, declared if necessary."""
+    """Return the function `name` of the module, declared with results and `operands` arguments of
+    one kind if necessary.
+    """
     declared = module.globals.get(name)
     return declared or ir.Function(
         module, ir.FunctionType(kind, [kind] * operands), name
@@ -196,8 +198,8 @@ def _emit_comparison(sign: str) -> Emit:
 
 
 def _comparison(b: Builder, sign: str, x: Value, y: Value) -> Value:
-    """Return a comparison as a vector of booleans; as in C, NaN differs from everything, itself
-    included.
+    """Return a comparison of two vectors by a sign such as "<" as a vector of booleans; as in C, NaN
+    differs from everything, itself included.
     """
     return (b.fcmp_unordered if sign == "!=" else b.fcmp_ordered)(sign, x, y)
 

@@ -44,7 +44,9 @@ FUNCTIONS_IN_MEMORY = 128
 def for_range(
     builder: Builder, start: Value, stop: Value, name: str
 ) -> Iterator[Value]:
-    """Emit a loop over start ≤ i < stop; the context gives i."""
+    """Emit a loop over start ≤ i < stop in steps of 1; the body of the context is that of the loop,
+    and the context gives i. `name` appears in the LLVM code only.
+    """
     before = builder.block
     head = builder.append_basic_block(f"{name}.head")
     body = builder.append_basic_block(f"{name}.body")
@@ -192,7 +194,7 @@ def address(array: NDArray[Any]) -> int:
 
 
 def _object_code(code: NativeCode, machine: llvm.TargetMachine) -> bytes:
-    """Return the object code from the cache, or compile and store it."""
+    """Return the object code from the cache, or compile it for `machine` and store it."""
     host = f"{llvmlite_version} {llvm.llvm_version_info} {llvm.get_host_cpu_name()} "
     host += llvm.get_host_cpu_features().flatten()
     cache_key = (

@@ -250,7 +250,9 @@ class _SkylineEmitter:
         self.module = ir.Module()
 
     def _begin(self, name: str) -> Sequence[Value]:
-        """Begin a function, and return its arguments."""
+        """Begin a function with the arguments that `ARGUMENTS` states, and return them; `b` becomes
+        its builder.
+        """
         integers, maps, arrays = ARGUMENTS[name]
         kinds = (
             [I64] * integers + [I64.as_pointer()] * maps + [DOUBLES] * arrays
@@ -308,7 +310,9 @@ class _SkylineEmitter:
         return self.module
 
     def _eliminate(self, pivots: Sequence[Value]) -> None:
-        """Eliminate consecutive pivots from all rows within their reach."""
+        """Emit the elimination of consecutive pivots from all rows within their reach, which are
+        read and written once for all of these pivots.
+        """
         b = self.b
         last = b.load(b.gep(self.reach, [pivots[-1]]))
         for p, pivot in enumerate(pivots):
@@ -322,8 +326,9 @@ class _SkylineEmitter:
             self._subtract(pivots, row, last=last)
 
     def _scale(self, pivot: Value, last: Value) -> None:
-        """Divide the entries below and right of a pivot by the pivot, and set the others to
-        zero.
+        """Emit the division of the entries beyond a pivot, up to the position `last`, by the pivot,
+        which is stored in D; the pivot itself and entries before it in its vector become zero. With
+        two sides, add |L_ik D_k U_ik| to the growth of each row i.
         """
         b = self.b
         diagonal = b.load(self._entry(self.sides[0], pivot, place=pivot))
@@ -352,8 +357,8 @@ class _SkylineEmitter:
     def _subtract(
         self, pivots: Sequence[Value], row: Value, last: Value
     ) -> None:
-        """Subtract the contribution of pivots from a row of either side, up to the position
-        `last`.
+        """Emit the subtraction of the contribution of pivots from a row of each side, up to the
+        position `last`.
         """
         b = self.b
         scales = []

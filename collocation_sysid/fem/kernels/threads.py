@@ -128,7 +128,7 @@ def run_single_threaded(run: Callable[..., R], *arguments: Any) -> R:
 
 def concurrent_count(items: int, threads: int) -> int:
     """Return how many of this many items `map_experiments` runs at the same time: one with one
-    thread or within an experiment, else at most two per thread.
+    thread or within an experiment, else at most two for each of the `threads`, and at least one.
     """
     if threads == 1 or getattr(_alone, "in_experiment", False):
         return 1
