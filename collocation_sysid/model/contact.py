@@ -642,7 +642,7 @@ class Contact(Pointwise):
         return self
 
     def at_times(self, rows: slice) -> Self:
-        """Return self: contact is the same at all times."""
+        """Return self: contact is the same at all times; a `previous_state` is not cut."""
         return self
 
     def interpolate(self, other: Self, share: float) -> Self:

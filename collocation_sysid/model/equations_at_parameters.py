@@ -54,7 +54,7 @@ class EquationsAtParameters:
 
     @cached_property
     def theta_p(self) -> Array:
-        """Derivatives ∂θ/∂p of the constants (k, m)."""
+        """Derivatives ∂θ/∂p of the constants (k, m); zero for the nuisance parameters among p."""
         return np.array(self.input_derivatives[0, : len(self.theta)])
 
     @property

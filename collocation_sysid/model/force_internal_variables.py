@@ -134,7 +134,9 @@ class ForceHistory:
         )
 
     def derivatives(self, rows: slice) -> LawDerivatives:
-        """Return the derivatives of F and h at some evaluations, each (d + n, …, T, I)."""
+        """Return the derivatives of F and h at the evaluations `rows`, each (d + n, …, T, I): first
+        those of the d forces, then of the n internal variables.
+        """
         return self._without_static_velocity(
             self.term_at(rows).derivatives(self._states(rows))
         )

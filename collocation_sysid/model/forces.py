@@ -76,10 +76,11 @@ class Forces:
         Parameters
         ----------
         experiment : Experiment
-        t_s : (T,)
+        t_s : (T,) or float
             Times of the evaluations.
         theta : (k,), optional
-            Constants of the body; NaN by default.
+            Constants of the body; NaN by default, and with them the masses of parts with free
+            densities.
         step_s : float
             Length of the time steps over which contact pressures are averaged; 0 for the pressures
             at each state.

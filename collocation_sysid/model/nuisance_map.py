@@ -572,9 +572,9 @@ class NuisanceMap:
         Parameters
         ----------
         samples : int
-            Number of whole samples by which marker measurements are currently shifted; delays may
-            deviate from it by `LARGEST_SHIFT_SAMPLES`, and are limited to `LARGEST_DELAY_FRACTION`
-            of the duration.
+            Number of whole samples by which marker measurements are currently shifted. The delay
+            may deviate from it by `LARGEST_SHIFT_SAMPLES` samples, within `LARGEST_DELAY_FRACTION`
+            of the duration, or within `LARGEST_SHIFT_SAMPLES` samples if that is more.
         """
         low = np.array([entry.row.low for entry in self.entries])
         high = np.array([entry.row.high for entry in self.entries])

@@ -91,8 +91,9 @@ def principal_root(
     Parameters
     ----------
     stencil : Stencil
+        Regular stencil of a scheme.
     h : float
-        Dimensionless time step ωΔt.
+        Dimensionless time step ωΔt, positive.
     damping_ratio : float
         Physical damping ratio ζ.
     """

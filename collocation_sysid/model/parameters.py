@@ -676,7 +676,7 @@ class ThetaMap:
         return self._theta.evaluate(_as_float_array(q), NOTHING)
 
     def jacobian(self, q: Array) -> Array:
-        """Return the derivatives ∂θ/∂q (k, nq)."""
+        """Return the derivatives ∂θ/∂q (k, nq) at q (nq,)."""
         return self._theta.evaluate_with_jacobian(_as_float_array(q), NOTHING)[
             1
         ]

@@ -97,7 +97,9 @@ class Pointwise(ForceTerm):
 
     @abstractmethod
     def constant_columns(self, places: AssemblyIndices) -> Index:
-        """Return the columns (c,) of the constants among all inputs."""
+        """Return the columns (c,) of the constants among all inputs u; `places` are those of this
+        term.
+        """
 
     @abstractmethod
     def data(self, chosen: Index | None) -> Array:
@@ -360,7 +362,10 @@ class Pointwise(ForceTerm):
         )
 
     def derivatives(self, states: States) -> LawDerivatives:
-        """Return the first derivatives of F and h by y, ẏ, c and h_{k−1}, (d + n, …, T, I) each."""
+        """Return the first derivatives of F and h at all I instances by y, ẏ, c and h_{k−1}, (d +
+        n, …, T, I) each: first those of the d forces, with `factor`, then of the n internal
+        variables.
+        """
         evaluated = self._inputs_at(states)
         _, slopes = self.law.evaluate_with_jacobian(evaluated.u, evaluated.data)
         slopes[evaluated.y] *= self.factor

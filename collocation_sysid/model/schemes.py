@@ -174,7 +174,8 @@ def as_scheme(
     ----------
     scheme_or_name : str or Scheme
     start_rule : {"standard", "paper"}
-        "paper" drops the inertia of the first step (a = 0); for backward Euler only.
+        "standard": the scheme as it is. "paper" drops the inertia of the first step (a = 0); for
+        backward Euler only.
 
     Raises
     ------
